@@ -1,0 +1,48 @@
+"""The errors a user of the package can meet; all share one root."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+class MeglocError(Exception):
+    """Root of every error the package raises on purpose.
+
+    The message is one line that says what is wrong, where, and what to do. The command line
+    prints it and exits with 2; anything that is not a ``MeglocError`` is a defect of ours.
+    """
+
+
+class DataError(MeglocError):
+    """Data is missing, broken or inconsistent; names the file and, where it can, the line."""
+
+    def __init__(
+        self, message: str, *, path: Path | str | None = None, line: int | None = None
+    ) -> None:
+        where = "" if path is None else f"{path}: " if line is None else f"{path}:{line}: "
+        super().__init__(where + message)
+        self.message = message
+        self.path = path
+        self.line = line
+
+    def __reduce__(self) -> tuple[object, ...]:
+        # the keyword-only fields are lost by Exception's own pickling (process pools)
+        return (_rebuild_data_error, (type(self), self.message, self.path, self.line))
+
+
+def _rebuild_data_error(
+    kind: type[DataError], message: str, path: Path | str | None, line: int | None
+) -> DataError:
+    return kind(message, path=path, line=line)
+
+
+class OptionError(MeglocError):
+    """An option or argument has a value that cannot be used; lists what would be valid."""
+
+
+class OutputError(MeglocError):
+    """The output cannot be written: not ours to overwrite, no space, no permission."""
+
+
+class PluginError(MeglocError):
+    """A plugin is unknown, cannot be loaded, or does not fulfil its protocol."""

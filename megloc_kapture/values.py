@@ -1,0 +1,181 @@
+"""Plain value types that every storey shares: cameras, rigid transforms, features."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict
+
+from megloc_kapture.errors import DataError
+
+# COLMAP camera models by number of parameters (formats: colmap doc/cameras.rst)
+CAMERA_MODEL_NUM_PARAMS: dict[str, int] = {
+    "SIMPLE_PINHOLE": 3,
+    "PINHOLE": 4,
+    "SIMPLE_RADIAL": 4,
+    "RADIAL": 5,
+    "OPENCV": 8,
+    "OPENCV_FISHEYE": 8,
+    "FULL_OPENCV": 12,
+    "FOV": 5,
+    "SIMPLE_RADIAL_FISHEYE": 4,
+    "RADIAL_FISHEYE": 5,
+    "THIN_PRISM_FISHEYE": 12,
+}
+
+
+class Options(BaseModel):
+    """Base of all option models: frozen, validated, unknown keys refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """Intrinsics of one camera, as COLMAP defines them.
+
+    Parameters
+    ----------
+    model : name of a COLMAP camera model, e.g. ``"PINHOLE"``.
+    width, height : image size in pixels.
+    params : the model's parameters in COLMAP's order; pixels for focal lengths and principal
+        point. The centre of the first pixel is (0.5, 0.5).
+
+    Raises
+    ------
+    DataError : unknown model, wrong number of parameters, or a size or parameter that is not
+        finite and positive where it must be.
+    """
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        expected = CAMERA_MODEL_NUM_PARAMS.get(self.model)
+        if expected is None:
+            known = ", ".join(CAMERA_MODEL_NUM_PARAMS)
+            raise DataError(f"unknown camera model {self.model!r}; known: {known}")
+        object.__setattr__(self, "params", tuple(float(p) for p in self.params))
+        if len(self.params) != expected:
+            raise DataError(
+                f"camera model {self.model} takes {expected} parameters, got {len(self.params)}"
+            )
+        if self.width <= 0 or self.height <= 0:
+            raise DataError(f"image size {self.width}x{self.height} is not positive")
+        if not np.isfinite(self.params).all():
+            raise DataError("camera parameters must be finite")
+        if self.params[0] <= 0:
+            raise DataError(f"focal length {self.params[0]} is not positive")
+
+
+@dataclass(frozen=True, slots=True)
+class RigidTransform:
+    """Rotation and translation: ``x_a = R x_b + t`` for a transform named ``a_from_b``.
+
+    Parameters
+    ----------
+    quat_wxyz : unit quaternion (Hamilton), w first.
+    translation : in the unit of the world (metres for metric maps).
+    """
+
+    quat_wxyz: tuple[float, float, float, float]
+    translation: tuple[float, float, float]
+
+    @classmethod
+    def identity(cls) -> RigidTransform:
+        return cls((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+
+    @classmethod
+    def from_matrix(
+        cls, rotation: NDArray[np.float64], translation: NDArray[np.float64]
+    ) -> RigidTransform:
+        """From a rotation matrix (3, 3) and a translation (3,)."""
+        m = np.asarray(rotation, dtype=np.float64)
+        # the symmetric 4x4 matrix whose largest eigenvector is the quaternion: stable everywhere
+        k = np.array(
+            [
+                [m[0, 0] + m[1, 1] + m[2, 2], 0.0, 0.0, 0.0],
+                [m[2, 1] - m[1, 2], m[0, 0] - m[1, 1] - m[2, 2], 0.0, 0.0],
+                [m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], m[1, 1] - m[0, 0] - m[2, 2], 0.0],
+                [
+                    m[1, 0] - m[0, 1],
+                    m[0, 2] + m[2, 0],
+                    m[1, 2] + m[2, 1],
+                    m[2, 2] - m[0, 0] - m[1, 1],
+                ],
+            ]
+        )
+        _, vectors = np.linalg.eigh(k / 3.0)  # reads the lower triangle
+        quat = vectors[:, -1]
+        quat = quat if quat[0] >= 0 else -quat
+        quat = quat / np.linalg.norm(quat)
+        t = np.asarray(translation, dtype=np.float64).reshape(3)
+        return cls(
+            (float(quat[0]), float(quat[1]), float(quat[2]), float(quat[3])),
+            (float(t[0]), float(t[1]), float(t[2])),
+        )
+
+    def rotation_matrix(self) -> NDArray[np.float64]:
+        """Rotation as (3, 3) float64."""
+        w, x, y, z = self.quat_wxyz
+        return np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+
+    def inverse(self) -> RigidTransform:
+        """``b_from_a`` of an ``a_from_b``."""
+        w, x, y, z = self.quat_wxyz
+        t = -self.rotation_matrix().T @ np.array(self.translation)
+        return RigidTransform((w, -x, -y, -z), (float(t[0]), float(t[1]), float(t[2])))
+
+    def __matmul__(self, other: RigidTransform) -> RigidTransform:
+        """``a_from_b @ b_from_c`` is ``a_from_c``."""
+        w1, x1, y1, z1 = self.quat_wxyz
+        w2, x2, y2, z2 = other.quat_wxyz
+        quat = np.array(
+            [
+                w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
+                w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
+                w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
+                w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
+            ]
+        )
+        quat /= np.linalg.norm(quat)
+        t = self.rotation_matrix() @ np.array(other.translation) + np.array(self.translation)
+        return RigidTransform(
+            (float(quat[0]), float(quat[1]), float(quat[2]), float(quat[3])),
+            (float(t[0]), float(t[1]), float(t[2])),
+        )
+
+    def apply(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Transform points of shape (N, 3)."""
+        return points @ self.rotation_matrix().T + np.array(self.translation)
+
+    def center(self) -> NDArray[np.float64]:
+        """For a ``cam_from_world``: the camera centre in the world, (3,) float64."""
+        return -self.rotation_matrix().T @ np.array(self.translation)
+
+
+@dataclass(frozen=True, slots=True)
+class LocalFeatures:
+    """Local features of one image.
+
+    Parameters
+    ----------
+    keypoints_px : float32 (N, 2 or more); x, y first. The first pixel's centre is (0.5, 0.5).
+    scores : float32 (N,), higher is better; keypoints are sorted by it, best first.
+    descriptors : (N, D), float32 or uint8.
+    """
+
+    keypoints_px: NDArray[np.float32]
+    scores: NDArray[np.float32]
+    descriptors: NDArray[Any]
