@@ -101,7 +101,12 @@ class RigidTransform:
             [
                 [m[0, 0] + m[1, 1] + m[2, 2], 0.0, 0.0, 0.0],
                 [m[2, 1] - m[1, 2], m[0, 0] - m[1, 1] - m[2, 2], 0.0, 0.0],
-                [m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], m[1, 1] - m[0, 0] - m[2, 2], 0.0],
+                [
+                    m[0, 2] - m[2, 0],
+                    m[0, 1] + m[1, 0],
+                    m[1, 1] - m[0, 0] - m[2, 2],
+                    0.0,
+                ],
                 [
                     m[1, 0] - m[0, 1],
                     m[0, 2] + m[2, 0],
@@ -179,3 +184,41 @@ class LocalFeatures:
     keypoints_px: NDArray[np.float32]
     scores: NDArray[np.float32]
     descriptors: NDArray[Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """A query that was localized; truthy.
+
+    Attributes
+    ----------
+    cam_from_world : the pose, COLMAP axes.
+    num_matches, num_inliers : of the 2D-3D matches.
+    inliers : bool (num_matches,) or None.
+    covariance : float64 (6, 6) or None: rotation in radians, then translation in the map's unit,
+        of a left perturbation of ``cam_from_world``.
+    candidates : map images that took part, best first.
+    """
+
+    cam_from_world: RigidTransform
+    num_matches: int
+    num_inliers: int
+    inliers: NDArray[np.bool_] | None = None
+    covariance: NDArray[np.float64] | None = None
+    candidates: tuple[str, ...] = ()
+
+    def __bool__(self) -> bool:
+        return True
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A query that was not localized; falsy, and says why."""
+
+    reason: str
+    num_matches: int = 0
+    num_inliers: int = 0
+    candidates: tuple[str, ...] = ()
+
+    def __bool__(self) -> bool:
+        return False

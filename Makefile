@@ -1,0 +1,74 @@
+# Every target sets up .venv by itself the first time; after that it costs nothing and needs no
+# network. `make help` lists the targets and variables.
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.SUFFIXES:
+.PHONY: help venv eval test lint bench kloc-env clean
+
+# make eval
+DATASET ?= synthetic
+ROOT ?=
+PRESET ?=
+WORKSPACE ?=
+ARGS ?=
+# make bench
+SCENE ?= ../shared/data/scenes/redkitchen_rgbd
+KLOC_PYTHON ?=
+# set-up
+PYTHON ?=
+TORCH_INDEX ?=
+
+VENV := .venv
+BIN := $(VENV)/bin
+# named by content, not by date: a checkout alone installs nothing again
+STAMP := $(VENV)/.installed-$(shell cat pyproject.toml constraints.txt | cksum | cut -d ' ' -f 1)
+INSTALL := $(BIN)/python -m pip install -qq --disable-pip-version-check
+
+help:
+	@echo 'make eval       localize a data set: import, map, localize, pose file, recall table'
+	@echo '                DATASET=$(DATASET) ROOT=folder PRESET=name WORKSPACE=folder ARGS="more options"'
+	@echo 'make test       run the tests'
+	@echo 'make lint       check style, types and the import contracts'
+	@echo 'make bench      measure speed; SCENE=folder, KLOC_PYTHON=.venv-kloc/bin/python to compare'
+	@echo 'make kloc-env   build .venv-kloc: kapture-localization with its old packages, and COLMAP'
+	@echo 'make clean      remove caches; leaves .venv, runs/ and submissions/ alone'
+	@echo 'Set-up happens once, by itself, in .venv: PYTHON=interpreter (3.11 or newer),'
+	@echo 'TORCH_INDEX=URL to take torch from another package index (the CPU wheels are smaller).'
+
+venv: $(STAMP)
+
+eval: $(STAMP)
+	@$(BIN)/megloc eval '$(DATASET)' $(if $(ROOT),--root '$(ROOT)') $(if $(PRESET),--preset '$(PRESET)') \
+		$(if $(WORKSPACE),--workspace '$(WORKSPACE)') $(ARGS)
+
+test: $(STAMP)
+	@$(BIN)/python -m pytest $(ARGS)
+
+lint: $(STAMP)
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/mypy
+	@$(BIN)/lint-imports --no-cache --no-logo
+
+bench: $(STAMP)
+	@$(BIN)/python benchmarks/speed/run.py --scene '$(SCENE)' \
+		$(if $(KLOC_PYTHON),--kloc-python '$(KLOC_PYTHON)') $(ARGS)
+
+kloc-env:
+	@PYTHON='$(PYTHON)' sh benchmarks/speed/kloc_env.sh .venv-kloc
+
+clean:
+	@rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache build dist
+	@find megloc_kapture tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# torch first: the other packages then take the one that is there. kapture-localization is the
+# tests' oracle; its own requirements (opencv-python, cvxpy) would break the environment.
+$(STAMP):
+	@python=$$(PYTHON='$(PYTHON)' sh scripts/find_python.sh) && \
+		{ test -x $(BIN)/python || "$$python" -m venv $(VENV); }
+	@echo 'Setting up $(VENV), once: about 2 GB of packages, a few minutes.'
+	@$(INSTALL) $(if $(TORCH_INDEX),--index-url '$(TORCH_INDEX)') -c constraints.txt torch
+	@$(INSTALL) -c constraints.txt -e '.[dev]'
+	@$(INSTALL) -c constraints.txt --no-deps kapture-localization
+	@rm -f $(VENV)/.installed-* && touch $@

@@ -1,0 +1,73 @@
+"""A scene from images to poses and recall: seconds of each stage.
+
+    .venv/bin/python benchmarks/speed/end_to_end.py --scene ../shared/data/scenes/redkitchen_rgbd
+
+The scene holds mapping/, query/ and query_gt/ in kapture. Without ``--workspace`` the run is made
+in a temporary folder, from nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from timing import table
+
+
+def megloc_command(scene: Path, workspace: Path, arguments: list[str]) -> list[str]:
+    """The command line of our run, with the ``megloc`` beside this Python."""
+    megloc = Path(sys.executable).with_name("megloc")
+    places = ["--root", str(scene), "--workspace", str(workspace)]
+    return [str(megloc), "eval", "kapture", *places, *arguments]
+
+
+def megloc_environment(threads: int) -> dict[str, str]:
+    return {**os.environ, "OMP_NUM_THREADS": str(threads)}
+
+
+def stage_seconds(workspace: Path) -> dict[str, float]:
+    """Seconds by stage out of the workspace's manifests, in the order the stages ended."""
+    manifests = sorted(
+        (workspace / "stages").glob("*.json"), key=lambda path: path.stat().st_mtime_ns
+    )
+    return {path.stem: float(json.loads(path.read_text())["seconds"]) for path in manifests}
+
+
+def stage_table(seconds: dict[str, float]) -> str:
+    rows = [("stage", "seconds"), *((name, f"{s:.1f}") for name, s in seconds.items())]
+    return table([*rows, ("all stages", f"{sum(seconds.values()):.1f}")])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--scene", type=Path, required=True)
+    parser.add_argument("--workspace", type=Path, help="keep the run here")
+    parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
+    options, arguments = parser.parse_known_args()
+    if not (options.scene / "mapping").is_dir():
+        parser.error(f"{options.scene} has no mapping/ folder (SCENE=folder names another scene)")
+
+    with tempfile.TemporaryDirectory(prefix="megloc-speed-") as temporary:
+        workspace = options.workspace or Path(temporary) / "workspace"
+        start = time.perf_counter()
+        done = subprocess.run(
+            megloc_command(options.scene, workspace, arguments),
+            env=megloc_environment(options.threads),
+            check=False,
+        )
+        wall_s = time.perf_counter() - start
+        if done.returncode != 0:
+            sys.exit(done.returncode)
+        print(f"\n{options.scene.name}, {options.threads} threads")
+        print(stage_table(stage_seconds(workspace)))
+        print(f"whole command, with its start: {wall_s:.1f} s")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,93 @@
+"""Ours beside kapture-localization: the same images, features and pairs, in one run.
+
+    make kloc-env
+    .venv/bin/python benchmarks/speed/kloc_side_by_side.py \\
+        --kloc-python .venv-kloc/bin/python --scene ../shared/data/scenes/redkitchen_rgbd
+
+Ours runs first, from images to poses. Its features and pairs are then given to
+kapture-localization, which matches, verifies, triangulates and localizes with them. The totals
+compare what both do; finding features and pairs is ours alone and stands apart. One evaluation,
+kapture-localization's, judges both sides' poses.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+from pathlib import Path
+
+from end_to_end import megloc_command, megloc_environment, stage_seconds
+from kloc_pipeline import Inputs, KaptureLocalization, Score, evaluate, localize
+from timing import Timed, table, timed_command
+
+# of our stages, those whose work kapture-localization is not asked to do
+NOT_COMPARED = {
+    *("render", "import", "local_features", "global_features", "mapping_pairs", "query_pairs"),
+    *("submission", "evaluation"),
+}
+THRESHOLDS = ((0.05, 5.0), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
+OURS, THEIRS = "megloc-kapture", "kapture-localization"
+
+
+def compared(stages: dict[str, float]) -> dict[str, float]:
+    """Our stages that count: all but those known to be ours alone."""
+    return {name: s for name, s in stages.items() if name not in NOT_COMPARED}
+
+
+def report(stages: dict[str, float], steps: list[Timed], scores: dict[str, Score]) -> str:
+    counted = compared(stages)
+    ours_s, theirs_s = sum(counted.values()), sum(step.wall_s for step in steps)
+    rows = [(OURS, "seconds"), *((name, f"{s:.1f}") for name, s in counted.items())]
+    parts = [table([*rows, ("total", f"{ours_s:.1f}")])]
+    alone = {name: s for name, s in stages.items() if name not in counted}
+    listed = ", ".join(f"{name} {s:.1f}" for name, s in alone.items())
+    parts.append(f"not compared, given to both: {listed}")
+
+    steps_rows = [(step.name, f"{step.wall_s:.1f}", f"{step.cpu_s:.1f}") for step in steps]
+    cpu_s = sum(step.cpu_s for step in steps)
+    total = ("total", f"{theirs_s:.1f}", f"{cpu_s:.1f}")
+    parts.append(table([(THEIRS, "seconds", "cpu seconds"), *steps_rows, total]))
+
+    bins = list(next(iter(scores.values())).recalls)
+    judged = [("recall, %", *bins, "median m", "median deg")]
+    for label, score in scores.items():
+        recalls = [f"{score.recalls[name]:.1f}" for name in bins]
+        judged.append((label, *recalls, f"{score.median_m:.4f}", f"{score.median_deg:.3f}"))
+    parts.append(table(judged))
+    parts.append(f"{OURS} is {theirs_s / max(ours_s, 1e-9):.1f} times as fast as {THEIRS}")
+    return "\n\n".join(parts)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--kloc-python", type=Path, required=True, help="made by make kloc-env")
+    parser.add_argument("--scene", type=Path, required=True, help="mapping/, query/, query_gt/")
+    parser.add_argument("--workspace", type=Path, help="keep our run here, or take the one here")
+    parser.add_argument("--features", default="rootsift", help="the type of local features")
+    parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
+    options, arguments = parser.parse_known_args()
+    for name in ("mapping", "query", "query_gt"):
+        if not (options.scene / name).is_dir():
+            parser.error(f"{options.scene} has no {name}/ folder")
+    if not options.kloc_python.exists():
+        parser.error(f"no Python at {options.kloc_python}; build it with: make kloc-env")
+
+    with tempfile.TemporaryDirectory(prefix="megloc-kloc-") as temporary:
+        folder = Path(temporary)
+        tools = KaptureLocalization(options.kloc_python, folder, options.threads)
+        print(f"{THEIRS}: {tools.versions()}")
+        print(f"{options.scene.name}, {options.threads} threads, load {os.getloadavg()[0]:.1f}")
+        sys.stdout.flush()
+        workspace = (options.workspace or folder / "workspace").resolve()
+        command = megloc_command(options.scene.resolve(), workspace, arguments)
+        timed_command(OURS, command, megloc_environment(options.threads), folder / "ours.log")
+        theirs = localize(tools, Inputs.of_workspace(workspace, options.features))
+        results = {OURS: workspace / "localized", THEIRS: theirs}
+        scores = evaluate(tools, results, options.scene.resolve() / "query_gt", THRESHOLDS)
+        print(report(stage_seconds(workspace), tools.steps, scores))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,39 @@
+"""All speed measurements, each in a process of its own: what ``make bench`` runs.
+
+Every script here also runs alone; see benchmarks/README.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+
+
+def run(script: str, *arguments: str) -> None:
+    """Run one script; a failure ends the run with its exit code."""
+    print(f"\n== {script} {' '.join(arguments)}".rstrip(), flush=True)
+    done = subprocess.run([sys.executable, str(HERE / script), *arguments], check=False)
+    if done.returncode != 0:
+        sys.exit(done.returncode)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument(
+        "--scene", required=True, help="kapture folders mapping/, query/, query_gt/"
+    )
+    parser.add_argument("--kloc-python", help="also run kapture-localization, with this Python")
+    options, arguments = parser.parse_known_args()
+    run("map_reading.py")
+    run("end_to_end.py", "--scene", options.scene, *arguments)
+    if options.kloc_python:
+        kloc = ("--kloc-python", options.kloc_python, "--scene", options.scene)
+        run("kloc_side_by_side.py", *kloc, *arguments)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,55 @@
+"""Flags that commands share, named as kapture's tools name theirs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from megloc_kapture.cli.console import Console, configure_logging
+from megloc_kapture.pipeline.executors import ExecutorKind
+
+Input = Annotated[Path, tyro.conf.arg(aliases=["-i"])]
+Output = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+Force = Annotated[bool, tyro.conf.arg(aliases=["-f"])]
+
+
+@dataclass(frozen=True)
+class Common:
+    """Flags of every command."""
+
+    verbose: Annotated[
+        Literal["debug", "info", "warning", "error"], tyro.conf.arg(aliases=["-v"])
+    ] = "warning"
+    """Level of log messages."""
+    quiet: Annotated[bool, tyro.conf.arg(aliases=["-q"])] = False
+    """Print results and errors only."""
+    debug: bool = False
+    """Show the traceback of an error."""
+
+    def console(self) -> Console:
+        """The console these flags ask for."""
+        configure_logging("debug" if self.debug else self.verbose)
+        return Console(quiet=self.quiet)
+
+
+@dataclass(frozen=True)
+class Working:
+    """Flags of commands with per-image or per-pair work."""
+
+    executor: ExecutorKind = "processes"
+    """Where the work runs: in this process, or in local processes."""
+    workers: int | None = None
+    """Number of processes; all cores unless given."""
+
+
+@dataclass(frozen=True)
+class Choosing:
+    """Flags that choose options."""
+
+    preset: str | None = None
+    """A set of options by name: classic."""
+    set: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
+    """Change an option: key.key=value; may be repeated."""

@@ -1,0 +1,77 @@
+"""``megloc doctor``: versions, and combinations known to be bad."""
+
+from __future__ import annotations
+
+import importlib.util
+from dataclasses import dataclass
+from importlib import metadata
+
+from megloc_kapture.cli.common import Common
+from megloc_kapture.errors import MeglocError
+
+_PACKAGES = (
+    "megloc-kapture",
+    "kapture",
+    "numpy",
+    "scipy",
+    "opencv-python-headless",
+    "pycolmap",
+    "poselib",
+    "torch",
+    "numba",
+)
+
+
+@dataclass(frozen=True)
+class Doctor(Common):
+    """Check the environment: versions, known-bad combinations, GPU."""
+
+    def run(self) -> int:
+        """Print what there is; exit status 2 when something is wrong."""
+        console = self.console()
+        for package in _PACKAGES:
+            console.result(f"{package:24s}{installed(package) or 'not installed'}")
+        console.result(f"{'GPU':24s}{gpu()}")
+        problems = find_problems()
+        for problem in problems:
+            console.result(f"problem: {problem}")
+        if problems:
+            raise MeglocError(f"{len(problems)} problems found, see above")
+        console.result("no problem found")
+        return 0
+
+
+def installed(package: str) -> str | None:
+    """Installed version of a package, None where it is absent."""
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def gpu() -> str:
+    """Name of the GPU that torch sees."""
+    if importlib.util.find_spec("torch") is None:
+        return "unknown: torch is not installed"
+    import torch
+
+    return torch.cuda.get_device_name(0) if torch.cuda.is_available() else "none"
+
+
+def find_problems() -> list[str]:
+    """Known-bad combinations of installed packages, each with its remedy."""
+    problems = []
+    torch, vision = installed("torch"), installed("torchvision")
+    if vision and torch and "+cpu" in torch:
+        problems.append(
+            f"torchvision {vision} beside torch {torch}: its CPU builds fail to import and break "
+            "transformers too; pip uninstall torchvision"
+        )
+    if installed("opencv-python") and installed("opencv-python-headless"):
+        problems.append(
+            "opencv-python beside opencv-python-headless: both write the folder cv2; uninstall "
+            "both and install opencv-python-headless"
+        )
+    if importlib.util.find_spec("cv2") is None:
+        problems.append("cv2 cannot be imported; pip install opencv-python-headless")
+    return problems

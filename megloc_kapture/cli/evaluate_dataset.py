@@ -1,0 +1,176 @@
+"""``megloc eval``: everything, from a dataset to a pose file and a recall table; resumable."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from megloc_kapture.cli.common import Choosing, Common, Force, Working
+from megloc_kapture.cli.console import Console
+from megloc_kapture.errors import OptionError
+from megloc_kapture.evaluation.outputs import RECALL_JSON, RECALL_TEXT, REPORT_HTML
+from megloc_kapture.evaluation.thresholds import Threshold
+from megloc_kapture.io.outputs import release_if_empty
+from megloc_kapture.io.status_table import STATUS_FILE, read_status
+from megloc_kapture.pipeline.datasets import DatasetChoice, choose_dataset
+from megloc_kapture.pipeline.evaluation_plan import (
+    EVALUATION,
+    LOCALIZED,
+    Run,
+    plan_evaluation,
+)
+from megloc_kapture.pipeline.executors import available_cores, open_executor, single_threaded
+from megloc_kapture.pipeline.plan import StageReport, all_kept, run_plan
+from megloc_kapture.pipeline.presets import (
+    DEFAULT_PRESET,
+    BenchmarkFile,
+    options_of_preset,
+    read_benchmark,
+)
+from megloc_kapture.pipeline.workspace import Workspace
+
+BELOW_RECALL = 3
+
+
+@dataclass(frozen=True)
+class Eval(Choosing, Working, Common):
+    """Run all stages on a dataset; what is done and still true is kept."""
+
+    dataset: tyro.conf.Positional[str] = "synthetic"
+    """kapture (any pair of kapture folders) or synthetic (a rendered world)."""
+    root: Path | None = None
+    """Folder of the dataset; for kapture: with mapping/, query/ and perhaps query_gt/."""
+    workspace: Annotated[Path | None, tyro.conf.arg(aliases=["-w"])] = None
+    """Where everything is kept; runs/DATASET-PRESET unless given."""
+    config: Path | None = None
+    """A benchmark file (TOML) with this dataset's options."""
+    thresholds: tuple[str, ...] = ()
+    """Recall thresholds, metres and degrees: 0.25,2 0.5,5."""
+    query_prefix: str = ""
+    """Put the queries into a folder of this name, where they share names with the map."""
+    from_stage: Annotated[str | None, tyro.conf.arg(name="from")] = None
+    """Run this stage again, and what follows; take those before it as they are."""
+    until: str | None = None
+    """Stop behind this stage."""
+    dry_run: bool = False
+    """Say which stages would run, and why."""
+    fail_below: float | None = None
+    """Exit with 3 when the share of queries at the coarsest threshold is lower (0 to 1)."""
+    force: Force = False
+    """Use a workspace folder that has other things in it."""
+
+    def run(self) -> int:
+        """Run it; returns the exit status."""
+        console = self.console()
+        choice = choose_dataset(self.dataset, self.root)
+        benchmark = read_benchmark(self.config) if self.config else None
+        if benchmark and benchmark.dataset != self.dataset:
+            raise OptionError(
+                f"{self.config} is for dataset {benchmark.dataset}, not {self.dataset}"
+            )
+        return self._run(console, choice, benchmark or BenchmarkFile(dataset=self.dataset))
+
+    def _run(self, console: Console, choice: DatasetChoice, benchmark: BenchmarkFile) -> int:
+        preset = self.preset or benchmark.preset or DEFAULT_PRESET
+        options = options_of_preset(preset, changes=benchmark.options, assignments=self.set)
+        thresholds = benchmark.thresholds
+        if self.thresholds:
+            parsed = [Threshold.parse(text) for text in self.thresholds]
+            thresholds = tuple((t.position_m, t.angle_deg) for t in parsed)
+        choice.check()
+        place = self.workspace or Path("runs") / f"{self.dataset}-{preset}"
+        workspace = Workspace(place, force=self.force)
+        try:
+            with (
+                workspace.lock(),
+                single_threaded(),
+                open_executor(self.executor, self.workers) as executor,
+            ):
+                run = Run(
+                    dataset=self.dataset,
+                    preset=preset,
+                    options=options,
+                    workspace=workspace,
+                    root=choice.root,
+                    render=choice.renderer(executor, console.track),
+                    render_options=choice.render_options(),
+                    query_prefix=self.query_prefix,
+                    thresholds=thresholds,
+                    executor=executor,
+                    track=console.track,
+                    num_threads=self.workers or available_cores(),
+                )
+                reports = run_plan(
+                    plan_evaluation(run),
+                    workspace,
+                    first=self.from_stage,
+                    last=self.until,
+                    dry_run=self.dry_run,
+                    on_start=lambda name, why: console.say(f"{name}: {why}"),
+                    on_report=lambda report: console.say(describe(report)),
+                )
+        finally:
+            release_if_empty(workspace.root)
+        if self.dry_run:
+            return 0
+        if all_kept(reports):
+            console.say("nothing to do: every stage is up to date")
+        if not any(report.name == "evaluation" for report in reports):
+            return 0
+        return self._conclude(console, workspace, run.pose_file)
+
+    def _conclude(self, console: Console, workspace: Workspace, pose_file: str) -> int:
+        evaluation = workspace.path(EVALUATION)
+        statuses = read_status(workspace.path(LOCALIZED) / STATUS_FILE)
+        if statuses and all(status.status == "failed" for status in statuses.values()):
+            console.say("warning: no query was localized; reasons are in localized/status.csv")
+        if (evaluation / RECALL_TEXT).is_file():
+            console.result((evaluation / RECALL_TEXT).read_text(encoding="utf-8"))
+        else:
+            console.result(
+                f"{sum(s.status == 'localized' for s in statuses.values())} of {len(statuses)} "
+                "queries localized; no true poses (query_gt/) to compare with\n"
+            )
+        console.result(f"pose file  {shown(workspace.path(pose_file))}")
+        if (evaluation / REPORT_HTML).is_file():
+            console.result(f"report     {shown(evaluation / REPORT_HTML)}")
+        if self.fail_below is not None:
+            return self._judge(console, evaluation)
+        return 0
+
+    def _judge(self, console: Console, evaluation: Path) -> int:
+        import json
+
+        if not (evaluation / RECALL_JSON).is_file():
+            raise OptionError("--fail-below needs true poses (query_gt/)")
+        rows = json.loads((evaluation / RECALL_JSON).read_text(encoding="utf-8"))["rows"]
+        recall = next(row for row in rows if row["name"] == "all")["recall"][-1]["recall"]
+        if self.fail_below is not None and recall < self.fail_below:
+            console.say(f"recall {recall:.3f} is below {self.fail_below:.3f}")
+            return BELOW_RECALL
+        return 0
+
+
+def describe(report: StageReport) -> str:
+    """One line about a stage."""
+    if report.state == "kept":
+        return f"{report.name}: up to date"
+    if report.state == "skipped":
+        return f"{report.name}: taken as it is"
+    if report.state == "pending":
+        return f"{report.name}: would run ({report.why})"
+    counts = ", ".join(
+        f"{value:g} {name.replace('_', ' ')}" for name, value in report.counts.items()
+    )
+    return f"{report.name}: {counts}; {report.seconds:.1f} s"
+
+
+def shown(path: Path) -> str:
+    """A path as short as it can be typed from here."""
+    try:
+        return str(path.relative_to(Path.cwd()))
+    except ValueError:
+        return str(path)

@@ -1,0 +1,57 @@
+"""``megloc``: parse, run, and turn errors into one line and an exit status."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import Annotated, Any, Protocol
+
+import tyro
+
+from megloc_kapture.cli.doctor import Doctor
+from megloc_kapture.cli.evaluate_dataset import Eval
+from megloc_kapture.errors import MeglocError
+
+DONE, DEFECT, USER_ERROR, INTERRUPTED = 0, 1, 2, 130
+
+
+class Command(Protocol):
+    """A command: its flags are its fields."""
+
+    debug: bool
+
+    def run(self) -> int:
+        """Run it; returns the exit status."""
+        ...
+
+
+COMMANDS: dict[str, type[Any]] = {
+    "eval": Eval,
+    "doctor": Doctor,
+}
+
+
+def _parser() -> Any:
+    union: Any = None
+    for name, kind in COMMANDS.items():
+        entry = Annotated[kind, tyro.conf.subcommand(name, description=kind.__doc__)]
+        union = entry if union is None else union | entry
+    return tyro.conf.OmitArgPrefixes[union]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point of the console script; exits with 0, 1 (defect), 2 (user's error) or 3."""
+    command: Command = tyro.cli(_parser(), args=arguments, prog="megloc", config=())
+    try:
+        status = command.run()
+    except MeglocError as error:
+        if command.debug:
+            raise
+        print(f"megloc: {error}", file=sys.stderr)
+        status = USER_ERROR
+    except KeyboardInterrupt:
+        print("megloc: interrupted; run the same command again to go on", file=sys.stderr)
+        status = INTERRUPTED
+    except BrokenPipeError:
+        status = DONE
+    sys.exit(status)

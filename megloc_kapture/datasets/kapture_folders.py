@@ -1,0 +1,203 @@
+"""Any pair of kapture folders as a dataset: mapping/, query/ and perhaps query_gt/ and megloc/."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.atomic import output_error
+from megloc_kapture.io.images import image_size
+from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, write_sensors
+from megloc_kapture.io.links import link_images
+from megloc_kapture.io.paths import check_relative
+from megloc_kapture.io.side_tables import (
+    GROUPS_FILE,
+    PRIORS_FILE,
+    PROTOCOL_FILE,
+    WORLD_FILE,
+    ImageGroup,
+    Protocol,
+    read_groups,
+    read_protocol,
+    write_groups,
+    write_protocol,
+)
+
+MAPPING, QUERY, QUERY_GT, SIDE_TABLES = "mapping", "query", "query_gt", "megloc"
+
+
+def check_root(root: Path) -> Path:
+    """The root of a pair of kapture folders.
+
+    Raises
+    ------
+    DataError : it is no folder, or lacks mapping/ or query/.
+    """
+    root = Path(root)
+    if not root.is_dir():
+        raise DataError("no such folder", path=root)
+    for part in (MAPPING, QUERY):
+        if not (root / part / "sensors" / "sensors.txt").is_file():
+            raise DataError(
+                f"{part}/sensors/sensors.txt is missing; a dataset of kapture folders has "
+                "mapping/ and query/, and query_gt/ where the true poses are known",
+                path=root,
+            )
+    return root
+
+
+def input_files(root: Path) -> Iterator[Path]:
+    """Every file whose content an import depends on: sensors, images, masks, side tables."""
+    for part in (MAPPING, QUERY, QUERY_GT):
+        sensors = root / part / "sensors"
+        if not sensors.is_dir():
+            continue
+        yield from sorted(sensors.glob("*.txt"))
+        folder = KaptureFolder(root / part)
+        if part == QUERY_GT:
+            continue
+        for image in folder.read().image_names():
+            yield folder.image_path(image)
+            mask = sensors / "masks" / f"{image}.png"
+            if mask.is_file():
+                yield mask
+    for name in (GROUPS_FILE, PRIORS_FILE, PROTOCOL_FILE, WORLD_FILE):
+        if (root / SIDE_TABLES / name).is_file():
+            yield root / SIDE_TABLES / name
+
+
+def import_kapture_folders(
+    root: Path,
+    output: Path,
+    *,
+    query_prefix: str = "",
+    protocol_change: Callable[[Protocol], Protocol] | None = None,
+) -> dict[str, float]:
+    """Import ``root``'s folders into ``output``: checked, written anew, images linked.
+
+    Parameters
+    ----------
+    query_prefix : a folder name put before the queries' names, for datasets whose map and queries
+        share names.
+    protocol_change : what the user wants different in the protocol.
+
+    Returns
+    -------
+    Counts for the log.
+
+    Raises
+    ------
+    DataError : something is missing or broken, or map and queries share names.
+    """
+    root = check_root(root)
+    mapping, query = KaptureFolder(root / MAPPING), KaptureFolder(root / QUERY)
+    map_data, query_data = mapping.read(), query.read()
+    for folder in (mapping, query):
+        check_images(folder)
+    poses = map_data.poses()
+    if not poses:
+        raise DataError("no mapping image has a pose", path=mapping.root)
+    if not query_data.records_camera:
+        raise DataError("there are no query images", path=query.root)
+    rename = prefixed(query_prefix)
+    shared = sorted(set(map_data.image_names()) & {rename(n) for n in query_data.image_names()})
+    if shared:
+        raise DataError(
+            f"{len(shared)} images have the same name in map and query, the first is "
+            f"{shared[0]}; give the queries a folder of their own with --query-prefix",
+            path=root,
+        )
+    write_sensors(output / MAPPING, map_data)
+    link_images(mapping.root, output / MAPPING)
+    # a query folder with poses in it must not let a stage see them
+    write_sensors(output / QUERY, _renamed(query_data, rename, keep_poses=False))
+    _link_queries(query.root, output / QUERY, query_prefix)
+    truth = 0
+    if (root / QUERY_GT / "sensors" / "sensors.txt").is_file():
+        truth_data = KaptureFolder(root / QUERY_GT).read()
+        truth = len(truth_data.poses())
+        write_sensors(output / QUERY_GT, _renamed(truth_data, rename, keep_poses=True))
+    _copy_side_tables(root, output, rename, query_data.image_names(), protocol_change)
+    return {
+        "map_images": len(map_data.image_names()),
+        "map_images_with_pose": len(poses),
+        "queries": len(query_data.image_names()),
+        "queries_with_truth": truth,
+    }
+
+
+def check_images(folder: KaptureFolder) -> None:
+    """Every image is there, is an image, and has the size its camera says; headers only.
+
+    Raises
+    ------
+    DataError : names the first that is not.
+    """
+    data = folder.read()
+    for image in data.image_names():
+        path = folder.image_path(image)
+        camera = data.camera_of(image)
+        if image_size(path) != (camera.width, camera.height):
+            width, height = image_size(path)
+            raise DataError(
+                f"the image is {width}x{height}, its camera says {camera.width}x{camera.height}",
+                path=path,
+            )
+
+
+def prefixed(prefix: str) -> Callable[[str], str]:
+    """Puts a folder name before an image name; the empty prefix changes nothing."""
+    if not prefix:
+        return lambda name: name
+    folder = check_relative(prefix.rstrip("/"))
+    return lambda name: f"{folder}/{name}"
+
+
+def _renamed(data: KaptureData, rename: Callable[[str], str], *, keep_poses: bool) -> KaptureData:
+    return KaptureData(
+        sensors=dict(data.sensors),
+        rigs={rig: dict(members) for rig, members in data.rigs.items()},
+        trajectories=dict(data.trajectories) if keep_poses else {},
+        records_camera={key: rename(name) for key, name in data.records_camera.items()},
+        records_depth={},
+    )
+
+
+def _link_queries(source: Path, output: Path, prefix: str) -> None:
+    if not prefix:
+        link_images(source, output)
+        return
+    for name in ("records_data", "masks"):
+        folder = source.resolve() / "sensors" / name
+        if not folder.exists():
+            continue
+        place = output / "sensors" / name / prefix.rstrip("/")
+        try:
+            place.parent.mkdir(parents=True, exist_ok=True)
+            place.symlink_to(folder.resolve(), target_is_directory=True)
+        except OSError as error:
+            raise output_error(place, error) from error
+
+
+def _copy_side_tables(
+    root: Path,
+    output: Path,
+    rename: Callable[[str], str],
+    queries: list[str],
+    protocol_change: Callable[[Protocol], Protocol] | None,
+) -> None:
+    source, place = root / SIDE_TABLES, output / SIDE_TABLES
+    names = set(queries)
+    groups: dict[str, ImageGroup] = read_groups(source)
+    if groups:
+        write_groups(place, {rename(n) if n in names else n: group for n, group in groups.items()})
+    protocol = read_protocol(source)
+    write_protocol(place, protocol_change(protocol) if protocol_change else protocol)
+    for name in (PRIORS_FILE, WORLD_FILE):
+        if (source / name).is_file():
+            try:
+                shutil.copyfile(source / name, place / name)
+            except OSError as error:
+                raise output_error(place / name, error) from error

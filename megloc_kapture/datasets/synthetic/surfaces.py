@@ -1,0 +1,141 @@
+"""What places are made of: textured parallelograms, seen from their front only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Surfaces:
+    """N textured parallelograms.
+
+    Seen from its front, ``edge_u`` runs along the texture's rows and ``edge_v`` down its columns;
+    ``edge_u x edge_v`` points away from the viewer.
+
+    Parameters
+    ----------
+    origin : float64 (N, 3), metres, the corner where the texture begins.
+    edge_u, edge_v : float64 (N, 3), metres.
+    texture : int32 (N,), index of the texture.
+    uv : float64 (N, 4): the part (u0, v0, u1, v1) of the texture shown, 0..1.
+    glow : float32 (N,), light that the surface itself gives off at night, relative to its colour.
+    """
+
+    origin: Vector
+    edge_u: Vector
+    edge_v: Vector
+    texture: NDArray[np.int32]
+    uv: Vector
+    glow: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.texture)
+
+    def normals(self) -> Vector:
+        """Unit normals towards the viewer, float64 (N, 3)."""
+        normal = np.cross(self.edge_v, self.edge_u)
+        return normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+    def corners(self) -> Vector:
+        """Corners in the order of the outline, float64 (N, 4, 3)."""
+        o, u, v = self.origin, self.edge_u, self.edge_v
+        return np.stack([o, o + u, o + u + v, o + v], axis=1)
+
+    def moved(self, rotation: Vector, translation: Vector) -> Surfaces:
+        """The surfaces after ``x -> rotation x + translation``."""
+        return Surfaces(
+            self.origin @ rotation.T + translation,
+            self.edge_u @ rotation.T,
+            self.edge_v @ rotation.T,
+            self.texture,
+            self.uv,
+            self.glow,
+        )
+
+    def joined(self, other: Surfaces) -> Surfaces:
+        """These surfaces, then the others."""
+        return Surfaces(
+            np.concatenate([self.origin, other.origin]),
+            np.concatenate([self.edge_u, other.edge_u]),
+            np.concatenate([self.edge_v, other.edge_v]),
+            np.concatenate([self.texture, other.texture]),
+            np.concatenate([self.uv, other.uv]),
+            np.concatenate([self.glow, other.glow]),
+        )
+
+
+@dataclass
+class SurfaceBuilder:
+    """Collects parallelograms and boxes."""
+
+    _rows: list[tuple[Vector, Vector, Vector, int, tuple[float, ...], float]] = field(
+        default_factory=list
+    )
+
+    def add(
+        self,
+        origin: Vector,
+        edge_u: Vector,
+        edge_v: Vector,
+        texture: int,
+        *,
+        uv: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0),
+        glow: float = 0.0,
+    ) -> None:
+        """One parallelogram; see :class:`Surfaces`."""
+        self._rows.append((origin, edge_u, edge_v, texture, uv, glow))
+
+    def add_box(
+        self,
+        center: tuple[float, float],
+        size: tuple[float, float, float],
+        yaw: float,
+        sides: tuple[int, int, int, int],
+        top: int,
+        *,
+        base: float = 0.0,
+        bottom: int | None = None,
+        uv: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0),
+        glow: float = 0.0,
+    ) -> None:
+        """An upright box: ``size`` is (along x, along y, height) in metres before the turn by
+        ``yaw`` (radians); ``sides`` are the textures of the -y, +x, +y and -x faces, of which
+        each shows the part ``uv``."""
+        half_x, half_y, height = size[0] / 2, size[1] / 2, size[2]
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        along = np.array([cos, sin, 0.0])
+        across = np.array([-sin, cos, 0.0])
+        up = np.array([0.0, 0.0, 1.0])
+        middle = np.array([center[0], center[1], base])
+        frames = [
+            (along, -across, half_x, half_y),
+            (across, along, half_y, half_x),
+            (-along, across, half_x, half_y),
+            (-across, -along, half_y, half_x),
+        ]
+        for texture, (right, outward, half_width, distance) in zip(sides, frames, strict=True):
+            corner = middle + distance * outward - half_width * right + height * up
+            self.add(corner, 2 * half_width * right, -height * up, texture, uv=uv, glow=glow)
+        # from above, with the texture's columns running towards -y
+        corner = middle - half_x * along + half_y * across + height * up
+        self.add(corner, 2 * half_x * along, -2 * half_y * across, top, glow=glow)
+        if bottom is not None:
+            corner = middle - half_x * along - half_y * across
+            self.add(corner, 2 * half_x * along, 2 * half_y * across, bottom, glow=glow)
+
+    def build(self) -> Surfaces:
+        """All that was added, in order."""
+        count = len(self._rows)
+        return Surfaces(
+            np.array([r[0] for r in self._rows], np.float64).reshape(count, 3),
+            np.array([r[1] for r in self._rows], np.float64).reshape(count, 3),
+            np.array([r[2] for r in self._rows], np.float64).reshape(count, 3),
+            np.array([r[3] for r in self._rows], np.int32),
+            np.array([r[4] for r in self._rows], np.float64).reshape(count, 4),
+            np.array([r[5] for r in self._rows], np.float32),
+        )

@@ -1,0 +1,166 @@
+"""Pose files of visuallocalization.net: one line ``name qw qx qy qz tx ty tz`` per query.
+
+The pose is ``cam_from_world`` and ``t`` its translation, not the camera centre. Single spaces, no
+header, every line ended by a newline; a query without a pose has no line.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.atomic import write_bytes
+from megloc_kapture.io.side_tables import MAX_QUATERNION_NORM_ERROR, PoseFileNames
+from megloc_kapture.io.text import read_text
+from megloc_kapture.values import RigidTransform
+
+_COLUMNS = "name qw qx qy qz tx ty tz"
+
+
+def names_in_pose_file(images: Iterable[str], rule: PoseFileNames) -> dict[str, str]:
+    """Image -> the name it bears in a pose file, sorted by image.
+
+    Raises
+    ------
+    DataError : two images would bear one name (names both), or a name holds white space, which
+        the format cannot express.
+    """
+    names: dict[str, str] = {}
+    bearer: dict[str, str] = {}
+    for image in sorted(images):
+        name = image if rule == "full" else image.rsplit("/", 1)[-1]
+        if not name or name.split() != [name]:
+            raise DataError(f"image {image!r}: a pose file cannot hold the name {name!r}")
+        if name in bearer:
+            raise DataError(
+                f"images {bearer[name]!r} and {image!r} would both be called {name!r} in the pose "
+                "file; use full names"
+            )
+        bearer[name] = image
+        names[image] = name
+    return names
+
+
+def format_pose_file(poses: Mapping[str, RigidTransform], *, names: PoseFileNames = "full") -> str:
+    """The text of a pose file, sorted by the names it holds.
+
+    Numbers have the fewest digits that read back to the same float64, so nothing is lost.
+
+    Raises
+    ------
+    DataError : see :func:`names_in_pose_file`; or a pose that is not finite or whose quaternion
+        is off unit length by 1e-3 or more (names the image).
+    """
+    lines = []
+    for image, name in names_in_pose_file(poses, names).items():
+        pose = _checked(poses[image].quat_wxyz, poses[image].translation, f"image {image!r}")
+        numbers = " ".join(repr(float(v)) for v in (*pose.quat_wxyz, *pose.translation))
+        lines.append((name, numbers))
+    return "".join(f"{name} {numbers}\n" for name, numbers in sorted(lines))
+
+
+def write_pose_file(
+    path: Path | str, poses: Mapping[str, RigidTransform], *, names: PoseFileNames = "full"
+) -> None:
+    """Write a pose file atomically; see :func:`format_pose_file`.
+
+    Raises
+    ------
+    DataError : a pose or name that must not be handed in.
+    OutputError : the file cannot be written.
+    """
+    write_bytes(path, format_pose_file(poses, names=names).encode("utf-8"))
+
+
+def read_pose_file(path: Path | str) -> dict[str, RigidTransform]:
+    """Read a pose file, ours or foreign: name -> ``cam_from_world``, in the file's order.
+
+    Runs of spaces, tabs and CRLF line ends are taken; empty lines are passed over.
+
+    Raises
+    ------
+    DataError : not eight columns, a number that is none or not finite, a quaternion off unit
+        length by 1e-3 or more (below, it is normalised), a name given twice, or a last line
+        that is not ended: it may be cut short. Names file and line.
+    """
+    text = read_text(path)
+    lines = text.split("\n")
+    if lines.pop() != "":
+        raise DataError(
+            "the last line is not ended, so the file may be cut short; add a newline if it is not",
+            path=path,
+            line=len(lines) + 1,
+        )
+    poses: dict[str, RigidTransform] = {}
+    for number, line in enumerate(lines, start=1):
+        fields = line.split()
+        if not fields:
+            continue
+        if len(fields) != 8:
+            raise DataError(
+                f"{len(fields)} columns instead of 8 ({_COLUMNS})", path=path, line=number
+            )
+        name = fields[0]
+        if name in poses:
+            raise DataError(f"{name!r} is given twice", path=path, line=number)
+        try:
+            qw, qx, qy, qz, tx, ty, tz = (_number(field) for field in fields[1:])
+        except ValueError as error:
+            raise DataError(f"{name!r}: {error}", path=path, line=number) from error
+        try:
+            poses[name] = _checked((qw, qx, qy, qz), (tx, ty, tz), repr(name))
+        except DataError as error:
+            raise DataError(error.message, path=path, line=number) from error
+    return poses
+
+
+def poses_by_image(
+    poses: Mapping[str, RigidTransform], images: Iterable[str]
+) -> dict[str, RigidTransform]:
+    """Give the poses of a pose file the names that ``images`` bear in kapture.
+
+    A name that is an image stays; one that is the last part of exactly one image's path becomes
+    that image; any other stays as it is, unknown, for the evaluation to report.
+
+    Raises
+    ------
+    DataError : a name fits several images, or two names fit one.
+    """
+    known = set(images)
+    by_basename: dict[str, list[str]] = {}
+    for image in sorted(known):
+        by_basename.setdefault(image.rsplit("/", 1)[-1], []).append(image)
+    renamed: dict[str, RigidTransform] = {}
+    for name, pose in poses.items():
+        fitting = [name] if name in known else by_basename.get(name, [name])
+        if len(fitting) > 1:
+            raise DataError(f"{name!r} may be {fitting[0]!r} or {fitting[1]!r}; use full names")
+        if fitting[0] in renamed:
+            raise DataError(f"the pose file names image {fitting[0]!r} in two ways")
+        renamed[fitting[0]] = pose
+    return renamed
+
+
+def _number(text: str) -> float:
+    if "_" in text:  # python reads 1_0 as 10; nobody means that in a pose file
+        raise ValueError(f"could not convert string to float: {text!r}")
+    return float(text)
+
+
+def _checked(
+    quat_wxyz: tuple[float, float, float, float],
+    translation: tuple[float, float, float],
+    whose: str,
+) -> RigidTransform:
+    """The pose with a unit quaternion; one that is unit to rounding keeps its very digits."""
+    if not all(math.isfinite(v) for v in (*quat_wxyz, *translation)):
+        raise DataError(f"{whose}: the pose is not finite")
+    norm = math.sqrt(sum(q * q for q in quat_wxyz))
+    if not abs(norm - 1.0) < MAX_QUATERNION_NORM_ERROR:
+        raise DataError(f"{whose}: quaternion of length {norm:g}, not 1")
+    if abs(norm - 1.0) > 1e-12:
+        w, x, y, z = (q / norm for q in quat_wxyz)
+        quat_wxyz = (w, x, y, z)
+    return RigidTransform(quat_wxyz, translation)

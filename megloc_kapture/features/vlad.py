@@ -1,0 +1,195 @@
+"""VLAD: aggregation of local descriptors into one global descriptor.
+
+Hard assignment: Jegou et al., CVPR 2010. Soft assignment: Arandjelovic et al., NetVLAD,
+CVPR 2016, equations 1 and 2, as MegLoc uses it::
+
+    V(j, k) = sum_i a_k(x_i) (x_i(j) - c_k(j)),   a_k(x) = exp(-alpha |x - c_k|^2) / sum_k'(...)
+
+Intra-normalisation: Arandjelovic and Zisserman, All about VLAD, CVPR 2013. Power law: Perronnin
+et al., ECCV 2010.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.values import Options
+
+_CHUNK = 16384  # descriptors assigned at once: bounds memory at 16384 x clusters floats
+
+
+class VladOptions(Options):
+    """Options of the vocabulary and the aggregation."""
+
+    num_clusters: int = Field(default=64, gt=0)
+    assignment: Literal["hard", "soft"] = "hard"
+    alpha: float = Field(
+        default=30.0,
+        gt=0,
+        description="sharpness of soft assignment, for unit descriptors",
+    )
+    intra_normalization: bool = Field(default=True, description="unit length per cluster")
+    power: float = Field(default=1.0, gt=0, le=1, description="signed power law, 0.5 is usual")
+    training_descriptors: int = Field(
+        default=200_000, gt=0, description="sampled evenly over the map's images"
+    )
+    iterations: int = Field(default=20, gt=0, description="of Lloyd's algorithm, at most")
+    seed: int = Field(default=0, ge=0)
+
+
+@dataclass(frozen=True, eq=False)
+class Vocabulary:
+    """Cluster centres, float32 (K, D)."""
+
+    centres: NDArray[np.float32]
+
+
+def train_vocabulary(
+    descriptors: NDArray[np.floating[Any]], options: VladOptions | None = None
+) -> Vocabulary:
+    """k-means (k-means++ start, Lloyd) over descriptors (N, D).
+
+    Raises
+    ------
+    DataError : fewer distinct descriptors than clusters.
+    """
+    options = options or VladOptions()
+    data = np.ascontiguousarray(descriptors, dtype=np.float32)
+    if len(data) < options.num_clusters:
+        raise DataError(
+            f"a vocabulary of {options.num_clusters} clusters needs as many descriptors, the map "
+            f"has {len(data)}: use more images or fewer clusters"
+        )
+    rng = np.random.default_rng(options.seed)
+    centres = _plus_plus(data, options.num_clusters, rng)
+    previous = np.full(len(data), -1, dtype=np.int64)
+    for _ in range(options.iterations):
+        labels = _nearest(data, centres)
+        if np.array_equal(labels, previous):
+            break
+        previous = labels
+        sums = _sum_by_label(data, labels, len(centres))
+        counts = np.bincount(labels, minlength=len(centres))
+        filled = counts > 0
+        centres[filled] = (sums[filled] / counts[filled, None]).astype(np.float32)
+        for k in np.flatnonzero(~filled):  # a cluster that lost all starts anew somewhere else
+            centres[k] = data[rng.integers(len(data))]
+    return Vocabulary(centres)
+
+
+def _plus_plus(
+    data: NDArray[np.float32], num_clusters: int, rng: np.random.Generator
+) -> NDArray[np.float32]:
+    """k-means++ seeding on a subsample: the start needs no more than that."""
+    sample = data
+    if len(sample) > 20_000:
+        sample = data[np.sort(rng.choice(len(data), 20_000, replace=False))]
+    centres = [sample[rng.integers(len(sample))]]
+    squared = np.full(len(sample), np.inf)
+    for _ in range(num_clusters - 1):
+        difference = sample - centres[-1]
+        squared = np.minimum(squared, np.einsum("nd,nd->n", difference, difference))
+        total = squared.sum()
+        if total <= 0:
+            raise DataError(
+                f"the map's descriptors have fewer than {num_clusters} distinct values: "
+                "use fewer clusters"
+            )
+        centres.append(sample[rng.choice(len(sample), p=squared / total)])
+    return np.stack(centres).astype(np.float32)
+
+
+def _nearest(data: NDArray[np.float32], centres: NDArray[np.float32]) -> NDArray[np.int64]:
+    half = 0.5 * np.einsum("kd,kd->k", centres, centres)
+    labels = np.empty(len(data), dtype=np.int64)
+    for start in range(0, len(data), _CHUNK):
+        part = data[start : start + _CHUNK]
+        labels[start : start + _CHUNK] = np.argmax(part @ centres.T - half, axis=1)
+    return labels
+
+
+def _sum_by_label(
+    data: NDArray[np.float32], labels: NDArray[np.int64], num_clusters: int
+) -> NDArray[np.float64]:
+    order = np.argsort(labels, kind="stable")
+    present, starts = np.unique(labels[order], return_index=True)
+    sums = np.zeros((num_clusters, data.shape[1]))
+    sums[present] = np.add.reduceat(data[order].astype(np.float64), starts, axis=0)
+    return sums
+
+
+def sample_rows(counts: Iterable[int], total: int, seed: int) -> list[NDArray[np.int64]]:
+    """Which descriptor rows of each image train the vocabulary; about ``total`` rows in all."""
+    counts = list(counts)
+    rng = np.random.default_rng(seed)
+    everything = sum(counts)
+    share = min(1.0, total / everything) if everything else 0.0
+    chosen = []
+    for count in counts:
+        size = min(count, int(np.ceil(count * share)))
+        chosen.append(np.sort(rng.choice(count, size, replace=False)).astype(np.int64))
+    return chosen
+
+
+def aggregate(
+    descriptors: NDArray[np.floating[Any]],
+    vocabulary: Vocabulary,
+    options: VladOptions | None = None,
+) -> NDArray[np.float32]:
+    """VLAD of descriptors (N, D): float32 (K * D,), cluster after cluster, unit length.
+
+    An image without descriptors gets the zero vector: it is similar to nothing.
+    """
+    options = options or VladOptions()
+    centres = vocabulary.centres
+    data = np.ascontiguousarray(descriptors, dtype=np.float32)
+    if len(data) and data.shape[1] != centres.shape[1]:
+        raise DataError(
+            f"descriptors have {data.shape[1]} dimensions, the vocabulary {centres.shape[1]}"
+        )
+    if len(data) == 0:
+        return np.zeros(centres.size, dtype=np.float32)
+    if options.assignment == "hard":
+        labels = _nearest(data, centres)
+        sums = _sum_by_label(data, labels, len(centres))
+        counts = np.bincount(labels, minlength=len(centres))[:, None]
+        residuals = sums - counts * centres
+    else:
+        residuals = np.zeros(centres.shape)
+        for start in range(0, len(data), _CHUNK):
+            part = data[start : start + _CHUNK]
+            weights = soft_assignment(part, centres, options.alpha)
+            residuals += weights.T @ part - weights.sum(axis=0)[:, None] * centres
+    if options.intra_normalization:
+        residuals = _unit(residuals)
+    vector = residuals.ravel()
+    if options.power != 1.0:
+        vector = np.sign(vector) * np.abs(vector) ** options.power
+    return _unit(vector).astype(np.float32)
+
+
+def soft_assignment(
+    descriptors: NDArray[np.floating[Any]],
+    centres: NDArray[np.floating[Any]],
+    alpha: float,
+) -> NDArray[np.float64]:
+    """``a_k(x_i)`` of NetVLAD's equation 1: (N, K) float64, rows sum to one."""
+    data = np.asarray(descriptors, dtype=np.float64)
+    centres = np.asarray(centres, dtype=np.float64)
+    # |x|^2 is common to a row and cancels
+    logits = alpha * (2.0 * data @ centres.T - np.einsum("kd,kd->k", centres, centres))
+    logits -= logits.max(axis=1, keepdims=True)
+    weights = np.exp(logits)
+    return np.asarray(weights / weights.sum(axis=1, keepdims=True))
+
+
+def _unit(values: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+    norm = np.linalg.norm(values, axis=-1, keepdims=True)
+    return np.asarray(np.divide(values, norm, out=np.zeros_like(values), where=norm > 1e-12))

@@ -1,0 +1,70 @@
+"""Projection under COLMAP's camera models, and the pixel origin of intrinsics."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.io.colmap import normalized_from_px, px_from_cam
+from megloc_kapture.values import Camera, RigidTransform
+
+__all__ = [
+    "bearing_rays",
+    "focal_px",
+    "normalized_from_px",
+    "principal_point_px",
+    "project",
+    "px_from_cam",
+    "shift_principal_point",
+]
+
+# models with one focal length store the principal point at 1 and 2, the others at 2 and 3
+_ONE_FOCAL = {
+    "SIMPLE_PINHOLE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "SIMPLE_RADIAL_FISHEYE",
+    "RADIAL_FISHEYE",
+}
+
+
+def focal_px(camera: Camera) -> float:
+    """Mean focal length in pixels."""
+    if camera.model in _ONE_FOCAL:
+        return camera.params[0]
+    return 0.5 * (camera.params[0] + camera.params[1])
+
+
+def _principal_point_index(camera: Camera) -> int:
+    return 1 if camera.model in _ONE_FOCAL else 2
+
+
+def principal_point_px(camera: Camera) -> tuple[float, float]:
+    """Principal point (cx, cy) in pixels."""
+    k = _principal_point_index(camera)
+    return camera.params[k], camera.params[k + 1]
+
+
+def shift_principal_point(camera: Camera, shift_px: float) -> Camera:
+    """The camera with its principal point moved by the same shift in x and y."""
+    k = _principal_point_index(camera)
+    params = list(camera.params)
+    params[k] += shift_px
+    params[k + 1] += shift_px
+    return replace(camera, params=tuple(params))
+
+
+def bearing_rays(camera: Camera, points_px: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+    """Homogeneous rays (x/z, y/z, 1) in the camera frame of pixels (N, 2); float64 (N, 3)."""
+    xy = normalized_from_px(camera, points_px)
+    return np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
+
+
+def project(
+    camera: Camera, cam_from_world: RigidTransform, points_world: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Pixels (N, 2) float64 of world points (N, 3); NaN for points behind the camera."""
+    return px_from_cam(camera, cam_from_world.apply(points_world))

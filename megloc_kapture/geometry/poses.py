@@ -1,0 +1,134 @@
+"""Pose algebra on arrays: quaternions (..., 4) ordered w x y z, translations (..., 3), float64.
+
+The conventions are those of :class:`megloc_kapture.values.RigidTransform`: ``a_from_b`` maps
+``x_a = R x_b + t``, transforms compose right to left, and ``q`` and ``-q`` are one rotation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.values import RigidTransform
+
+Float64Array = NDArray[np.float64]
+
+
+def stack_poses(poses: Iterable[RigidTransform]) -> tuple[Float64Array, Float64Array]:
+    """Quaternions (N, 4) and translations (N, 3) of N transforms, in their order."""
+    listed = list(poses)
+    quats = np.array([p.quat_wxyz for p in listed], dtype=np.float64).reshape(-1, 4)
+    translations = np.array([p.translation for p in listed], dtype=np.float64).reshape(-1, 3)
+    return quats, translations
+
+
+def unstack_poses(quats_wxyz: Float64Array, translations: Float64Array) -> list[RigidTransform]:
+    """The transforms of quaternions (N, 4) and translations (N, 3); undoes :func:`stack_poses`."""
+    return [
+        RigidTransform((w, x, y, z), (tx, ty, tz))
+        for (w, x, y, z), (tx, ty, tz) in zip(
+            quats_wxyz.tolist(), translations.tolist(), strict=True
+        )
+    ]
+
+
+def normalize_quats(quats_wxyz: Float64Array) -> Float64Array:
+    """Quaternions (..., 4) at unit length; a zero quaternion gives NaN."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return quats_wxyz / np.linalg.norm(quats_wxyz, axis=-1, keepdims=True)
+
+
+def invert_quats(quats_wxyz: Float64Array) -> Float64Array:
+    """The inverses ``conj(q) / |q|^2`` of quaternions (..., 4)."""
+    return _conjugate(quats_wxyz) / _squared_length(quats_wxyz)[..., None]
+
+
+def multiply_quats(first: Float64Array, second: Float64Array) -> Float64Array:
+    """Hamilton products ``first * second`` of quaternions (..., 4); shapes broadcast."""
+    w1, x1, y1, z1 = np.moveaxis(np.asarray(first), -1, 0)
+    w2, x2, y2, z2 = np.moveaxis(np.asarray(second), -1, 0)
+    return np.stack(
+        [
+            w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
+            w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
+            w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
+            w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
+        ],
+        axis=-1,
+    )
+
+
+def rotation_matrices(quats_wxyz: Float64Array) -> Float64Array:
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4), whose length does not matter."""
+    quats = np.asarray(quats_wxyz, dtype=np.float64)
+    w, x, y, z = np.moveaxis(quats, -1, 0)
+    squared = _squared_length(quats)
+    # a length that is 1 to rounding is 1: dividing by it would only add rounding of its own
+    s = 2.0 / np.where(np.abs(squared - 1.0) < 1e-14, 1.0, squared)
+    rows = [
+        [1 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)],
+        [s * (x * y + z * w), 1 - s * (x * x + z * z), s * (y * z - x * w)],
+        [s * (x * z - y * w), s * (y * z + x * w), 1 - s * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def rotate(quats_wxyz: Float64Array, vectors: Float64Array) -> Float64Array:
+    """Vectors (..., 3) turned by quaternions (..., 4); shapes broadcast."""
+    return np.matmul(rotation_matrices(quats_wxyz), vectors[..., None])[..., 0]
+
+
+def compose(
+    quats_ab: Float64Array,
+    translations_ab: Float64Array,
+    quats_bc: Float64Array,
+    translations_bc: Float64Array,
+) -> tuple[Float64Array, Float64Array]:
+    """``a_from_c`` of ``a_from_b`` and ``b_from_c``: quaternions (..., 4), translations (..., 3).
+
+    The result's quaternions are normalised, so that long chains do not drift off unit length.
+    """
+    quats = normalize_quats(multiply_quats(quats_ab, quats_bc))
+    return quats, rotate(quats_ab, translations_bc) + translations_ab
+
+
+def invert(
+    quats_wxyz: Float64Array, translations: Float64Array
+) -> tuple[Float64Array, Float64Array]:
+    """``b_from_a`` of ``a_from_b``: quaternions (..., 4), translations (..., 3)."""
+    inverse = invert_quats(quats_wxyz)
+    return inverse, -rotate(inverse, translations)
+
+
+def camera_centers(quats_wxyz: Float64Array, translations: Float64Array) -> Float64Array:
+    """Centres ``-R^T t`` in the world (..., 3) of ``cam_from_world`` transforms."""
+    return -rotate(invert_quats(quats_wxyz), translations)
+
+
+def rotation_angles_deg(quats_a: Float64Array, quats_b: Float64Array) -> Float64Array:
+    """Angles (...) in degrees, 0 to 180, of the rotations ``a b^-1`` of quaternions (..., 4).
+
+    It is the length of the rotation vector, and the half angle is ``atan2(|v|, |w|)``. The usual
+    arccos, of the scalar part or of the matrix' trace, is flat at zero and cannot resolve below
+    about 1e-6 degrees; this keeps full precision there and at 180 degrees, needs no clipping, and
+    takes ``q`` and ``-q`` as the same. Lengths other than 1 do not matter.
+    """
+    relative = multiply_quats(quats_a, _conjugate(quats_b))
+    relative = relative / _squared_length(quats_b)[..., None]
+    vector = relative[..., 1:]
+    sine = np.linalg.norm(vector, axis=-1)
+    half = np.arctan2(sine, np.abs(relative[..., 0]))
+    scale = half / np.where(sine > 0, sine, 1.0)
+    return np.rad2deg(2.0 * np.linalg.norm(scale[..., None] * vector, axis=-1))
+
+
+def _conjugate(quats: Float64Array) -> Float64Array:
+    return quats * np.array([1.0, -1.0, -1.0, -1.0])
+
+
+def _squared_length(quats: Float64Array) -> Float64Array:
+    """``|q|^2`` (...) of quaternions (..., 4)."""
+    w, x, y, z = np.moveaxis(quats, -1, 0)
+    return w * w + x * x + y * y + z * z

@@ -1,0 +1,274 @@
+"""Every call into pycolmap: camera models, triangulation with known poses, verification.
+
+pycolmap changes its names between releases and has traps of its own (see docs/architecture.md);
+keeping it behind this one module keeps both away from the rest of the package.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import zlib  # noqa: F401  pycolmap 4.1.1 to 4.2.1 corrupt the heap when imported before zlib
+from collections.abc import Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.values import Camera, Options, RigidTransform
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+def _pycolmap() -> Any:
+    import pycolmap
+
+    pycolmap.logging.minloglevel = 2  # its INFO lines are no concern of our users
+    return pycolmap
+
+
+@lru_cache(maxsize=4096)
+def _colmap_camera(camera: Camera) -> Any:
+    return _pycolmap().Camera(
+        model=camera.model,
+        width=camera.width,
+        height=camera.height,
+        params=list(camera.params),
+    )
+
+
+def normalized_from_px(camera: Camera, points_px: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+    """Undistorted normalised image coordinates (x/z, y/z) of pixels; (N, 2) to (N, 2) float64."""
+    points = np.ascontiguousarray(points_px, dtype=np.float64).reshape(-1, 2)
+    if len(points) == 0:
+        return np.zeros((0, 2))
+    return np.asarray(_colmap_camera(camera).cam_from_img(points), dtype=np.float64)
+
+
+def px_from_cam(camera: Camera, points_in_cam: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Pixels of points in the camera frame; (N, 3) to (N, 2) float64, NaN behind the camera."""
+    points = np.ascontiguousarray(points_in_cam, dtype=np.float64).reshape(-1, 3)
+    out = np.full((len(points), 2), np.nan)
+    front = points[:, 2] > 0
+    if front.any():
+        out[front] = _colmap_camera(camera).img_from_cam(points[front])
+    return out
+
+
+class TriangulationOptions(Options):
+    """Options of COLMAP's triangulation with known poses; defaults are COLMAP's but where said."""
+
+    max_reprojection_error_px: float = Field(default=4.0, gt=0)
+    min_angle_deg: float = Field(default=1.5, ge=0)
+    two_view_tracks: bool = Field(
+        default=False, description="keep points that only two images observe"
+    )
+    seed: int = Field(default=0, ge=0)
+
+
+@dataclass(frozen=True, eq=False)
+class MapImage:
+    """One mapping image as triangulation needs it; keypoints are (N, 2), first pixel (0.5, 0.5)."""
+
+    name: str
+    camera: Camera
+    cam_from_world: RigidTransform
+    keypoints_px: NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class TriangulatedPoints:
+    """Points and their observations, in arrays.
+
+    Attributes
+    ----------
+    xyz : float64 (N, 3) in the world frame.
+    rgb : float64 (N, 3), 0..255 (zeros: colours need images).
+    errors_px : float64 (N,), mean reprojection error.
+    point_ids, image_ids, keypoint_ids : int64 (O,) rows of ``xyz``, indices into the images
+        given, rows of their keypoints; sorted by point, then image, then keypoint.
+    """
+
+    xyz: NDArray[np.float64]
+    errors_px: NDArray[np.float64]
+    point_ids: NDArray[np.int64]
+    image_ids: NDArray[np.int64]
+    keypoint_ids: NDArray[np.int64]
+
+
+@contextmanager
+def _quiet_stderr() -> Iterator[None]:
+    # COLMAP writes progress to the file descriptor whatever its log level says
+    if os.environ.get("MEGLOC_COLMAP_LOG"):
+        yield
+        return
+    saved = os.dup(2)
+    null = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(null, 2)
+        yield
+    finally:
+        os.dup2(saved, 2)
+        os.close(saved)
+        os.close(null)
+
+
+def _rigid3d(transform: RigidTransform) -> Any:
+    pycolmap = _pycolmap()
+    w, x, y, z = transform.quat_wxyz
+    return pycolmap.Rigid3d(
+        pycolmap.Rotation3d(np.array([x, y, z, w])), np.array(transform.translation)
+    )
+
+
+def triangulate(
+    images: Sequence[MapImage],
+    matches: Mapping[tuple[int, int], NDArray[np.integer[Any]]],
+    options: TriangulationOptions | None = None,
+    *,
+    num_threads: int = 1,
+) -> TriangulatedPoints:
+    """Triangulate verified matches between images of known pose; poses and cameras stay fixed.
+
+    The world is recentred on the cameras' mean while COLMAP works, so that maps far from the
+    origin (ECEF) lose no digits.
+
+    Parameters
+    ----------
+    images : the mapping images.
+    matches : (M, 2) keypoint rows for pairs (i, j) of indices into ``images``.
+
+    Raises
+    ------
+    DataError : a match refers past the keypoints of its image.
+    """
+    options = options or TriangulationOptions()
+    empty = np.zeros(0, dtype=np.int64)
+    if not images:
+        return TriangulatedPoints(np.zeros((0, 3)), np.zeros(0), empty, empty, empty)
+    for (i, j), pairs in matches.items():
+        sizes = np.array([len(images[i].keypoints_px), len(images[j].keypoints_px)])
+        if len(pairs) and ((np.asarray(pairs) >= sizes).any() or (np.asarray(pairs) < 0).any()):
+            raise DataError(
+                f"matches between {images[i].name} and {images[j].name} refer to keypoints "
+                f"that the images do not have ({sizes[0]} and {sizes[1]})"
+            )
+    pycolmap = _pycolmap()
+    offset = np.mean([image.cam_from_world.center() for image in images], axis=0)
+    with (
+        tempfile.TemporaryDirectory(prefix="megloc-colmap-") as folder,
+        _quiet_stderr(),
+    ):
+        database_path = Path(folder) / "database.db"
+        reconstruction = _write_database(pycolmap, database_path, images, matches, offset)
+        pipeline = pycolmap.IncrementalPipelineOptions()
+        pipeline.num_threads = num_threads
+        pipeline.random_seed = options.seed
+        pipeline.triangulation.random_seed = options.seed
+        pipeline.triangulation.ignore_two_view_tracks = not options.two_view_tracks
+        pipeline.triangulation.min_angle = options.min_angle_deg
+        pipeline.triangulation.merge_max_reproj_error = options.max_reprojection_error_px
+        pipeline.triangulation.complete_max_reproj_error = options.max_reprojection_error_px
+        pipeline.mapper.filter_max_reproj_error = options.max_reprojection_error_px
+        pipeline.mapper.filter_min_tri_angle = options.min_angle_deg
+        result_path = Path(folder) / "result"
+        result_path.mkdir()
+        result = pycolmap.triangulate_points(
+            reconstruction, str(database_path), folder, str(result_path), True, pipeline
+        )
+    return _collect(result, offset)
+
+
+def _write_database(
+    pycolmap: Any,
+    path: Path,
+    images: Sequence[MapImage],
+    matches: Mapping[tuple[int, int], NDArray[np.integer[Any]]],
+    offset: NDArray[np.float64],
+) -> Any:
+    """Write COLMAP's database for the images; returns the reconstruction with fixed poses."""
+    reconstruction = pycolmap.Reconstruction()
+    database = pycolmap.Database.open(str(path))
+    recentre = RigidTransform((1.0, 0.0, 0.0, 0.0), (offset[0], offset[1], offset[2]))
+    camera_ids: dict[Camera, int] = {}
+    with pycolmap.DatabaseTransaction(database):
+        for index, image in enumerate(images):
+            if image.camera not in camera_ids:
+                camera_id = camera_ids[image.camera] = len(camera_ids) + 1
+                camera = pycolmap.Camera(
+                    model=image.camera.model,
+                    width=image.camera.width,
+                    height=image.camera.height,
+                    params=list(image.camera.params),
+                )
+                camera.camera_id = camera_id
+                database.write_camera(camera, use_camera_id=True)
+                reconstruction.add_camera_with_trivial_rig(camera)
+                rig = pycolmap.Rig(rig_id=camera_id)
+                rig.add_ref_sensor(camera.sensor_id)
+                database.write_rig(rig, use_rig_id=True)
+            camera_id = camera_ids[image.camera]
+            image_id = index + 1
+            keypoints = np.ascontiguousarray(image.keypoints_px[:, :2], dtype=np.float64)
+            entry = pycolmap.Image(
+                image_id=image_id,
+                name=image.name,
+                camera_id=camera_id,
+                keypoints=keypoints,
+            )
+            entry.frame_id = image_id
+            frame = pycolmap.Frame()
+            frame.frame_id = image_id
+            frame.rig_id = camera_id
+            frame.add_data_id(entry.data_id)
+            database.write_frame(frame, use_frame_id=True)
+            database.write_image(entry, use_image_id=True)
+            database.write_keypoints(image_id, keypoints.astype(np.float32))
+            reconstruction.add_image_with_trivial_frame(
+                pycolmap.Image(
+                    image_id=image_id,
+                    name=image.name,
+                    camera_id=camera_id,
+                    keypoints=keypoints,
+                ),
+                _rigid3d(image.cam_from_world @ recentre),
+            )
+        for (i, j), pairs in matches.items():
+            if len(pairs) == 0:
+                continue
+            rows = np.ascontiguousarray(pairs, dtype=np.uint32)
+            geometry = pycolmap.TwoViewGeometry()
+            geometry.inlier_matches = rows
+            # left UNDEFINED, pycolmap 4.2 triangulates nothing, silently
+            geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+            database.write_matches(i + 1, j + 1, rows)
+            database.write_two_view_geometry(i + 1, j + 1, geometry)
+    database.close()
+    return reconstruction
+
+
+def _collect(reconstruction: Any, offset: NDArray[np.float64]) -> TriangulatedPoints:
+    xyz, errors, rows = [], [], []
+    for point in (reconstruction.points3D[i] for i in sorted(reconstruction.points3D)):
+        track = sorted((e.image_id - 1, e.point2D_idx) for e in point.track.elements)
+        rows.append(track)
+        xyz.append(point.xyz)
+        errors.append(point.error)
+    # COLMAP numbers points in an order that depends on its threads; order them by their tracks
+    order = sorted(range(len(rows)), key=lambda k: rows[k])
+    lengths = np.array([len(rows[k]) for k in order], dtype=np.int64)
+    flat = np.array([e for k in order for e in rows[k]], dtype=np.int64).reshape(-1, 2)
+    return TriangulatedPoints(
+        xyz=np.array([xyz[k] for k in order], dtype=np.float64).reshape(-1, 3) + offset,
+        errors_px=np.array([errors[k] for k in order], dtype=np.float64),
+        point_ids=np.repeat(np.arange(len(order), dtype=np.int64), lengths),
+        image_ids=flat[:, 0],
+        keypoint_ids=flat[:, 1],
+    )

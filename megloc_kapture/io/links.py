@@ -1,0 +1,26 @@
+"""Images are linked, never copied or changed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from megloc_kapture.io.atomic import output_error
+
+
+def link_images(source_root: Path, output_root: Path) -> None:
+    """Make ``output_root/sensors/records_data`` (and masks) a link to ``source_root``'s.
+
+    Raises
+    ------
+    OutputError : the link cannot be made.
+    """
+    for name in ("records_data", "masks"):
+        source = Path(source_root).resolve() / "sensors" / name
+        place = Path(output_root) / "sensors" / name
+        if not source.exists() or place.is_symlink():
+            continue
+        try:
+            place.parent.mkdir(parents=True, exist_ok=True)
+            place.symlink_to(source.resolve(), target_is_directory=True)
+        except OSError as error:
+            raise output_error(place, error) from error

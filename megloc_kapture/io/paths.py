@@ -1,0 +1,89 @@
+"""Paths named by data: checked as text, never trusted.
+
+Image names, type names and the like come from files somebody else wrote. They may only ever lead
+to something below the folder they belong to.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from megloc_kapture.errors import DataError
+
+
+def has_control_characters(text: str) -> bool:
+    """Whether a text has characters that no name or line of text should have (NUL, tab, ...)."""
+    if text.isprintable():
+        return False
+    return any(ord(c) < 32 or ord(c) == 127 or 0xD800 <= ord(c) <= 0xDFFF for c in text)
+
+
+def check_relative(text: str) -> str:
+    """Return ``text`` if it is a plain relative path (``a/b.jpg``), else raise.
+
+    Raises
+    ------
+    DataError : empty, absolute, ``.`` or ``..`` or an empty component, a backslash, or a control
+        character (NUL included) in it. A ``.`` or empty component is harmless, but would give
+        one file two names, and names are identities in kapture.
+    """
+    if not text:
+        raise DataError("empty path")
+    if "\\" in text:
+        raise DataError(f"backslash in path {text!r}")
+    if has_control_characters(text):
+        raise DataError(f"control character in path {text!r}")
+    if text.startswith("/"):
+        raise DataError(f"absolute path {text!r}; it must be relative to its folder")
+    for component in text.split("/"):
+        if component == "..":
+            raise DataError(f"path {text!r} leads out of its folder ('..')")
+        if component in ("", "."):
+            raise DataError(f"path {text!r} has an empty or '.' component")
+    return text
+
+
+def check_component(text: str) -> str:
+    """Return ``text`` if it can be the name of one folder and one CSV field, else raise.
+
+    Used for type names (``r2d2_500``), which stand both in paths and in CSV files.
+
+    Raises
+    ------
+    DataError : what :func:`check_relative` refuses, a slash, a comma, or a space at either end.
+    """
+    check_relative(text)
+    if "/" in text or "," in text or text != text.strip():
+        raise DataError(f"{text!r} cannot be a type name (slash, comma or space at the end)")
+    return text
+
+
+def safe_join(root: Path, relative_text: str) -> Path:
+    """``root / relative_text`` where the text is a plain relative path.
+
+    The check is on the text alone: links are not looked at, the file need not exist.
+
+    Raises
+    ------
+    DataError : see :func:`check_relative`.
+    """
+    return Path(root) / check_relative(relative_text)
+
+
+def check_no_escape(root: Path, path: Path) -> Path:
+    """Return ``path`` if what it is after following links still lies in ``root`` (links followed).
+
+    Raises
+    ------
+    DataError : a link on the way leads out of ``root``.
+    """
+    real_root = os.path.realpath(root)
+    real = os.path.realpath(path)
+    if real != real_root and not real.startswith(real_root.rstrip(os.sep) + os.sep):
+        raise DataError(
+            f"is or lies behind a link that leaves {root}; "
+            "links are allowed only as images under records_data",
+            path=path,
+        )
+    return path

@@ -1,0 +1,181 @@
+"""A plan: stages in order, each run only when it has to be."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Literal
+
+from megloc_kapture.errors import OptionError
+from megloc_kapture.evaluation.provenance import package_versions
+from megloc_kapture.io.json_model import write_json_model
+from megloc_kapture.pipeline.manifests import Manifest, fingerprint, read_manifest
+from megloc_kapture.pipeline.workspace import Workspace
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One step of a plan.
+
+    Attributes
+    ----------
+    version : to be raised when the stage's output changes for the same options and inputs.
+    options : what determines its output, as plain JSON values.
+    after : names of the stages whose output it reads.
+    outputs : paths below the workspace that it writes.
+    run : writes the outputs below the folder it is given; returns counts for the log.
+    external : fingerprints of what it reads from outside the workspace.
+    """
+
+    name: str
+    version: int
+    options: Mapping[str, Any]
+    after: tuple[str, ...]
+    outputs: tuple[str, ...]
+    run: Callable[[Path], Mapping[str, float]]
+    external: Mapping[str, str] = field(default_factory=dict)
+
+
+State = Literal["run", "kept", "pending", "skipped"]
+
+
+@dataclass(frozen=True)
+class StageReport:
+    """What happened to a stage, for the one who prints."""
+
+    name: str
+    state: State
+    seconds: float
+    counts: Mapping[str, float]
+    why: str
+
+
+def run_plan(
+    stages: Sequence[Stage],
+    workspace: Workspace,
+    *,
+    first: str | None = None,
+    last: str | None = None,
+    dry_run: bool = False,
+    on_start: Callable[[str, str], None] = lambda name, why: None,
+    on_report: Callable[[StageReport], None] = lambda report: None,
+) -> list[StageReport]:
+    """Run the stages that have to be run.
+
+    Parameters
+    ----------
+    first : stages before it are taken as they are, and it is run again in any case.
+    last : stages behind it are left out.
+    dry_run : say what would run, run nothing.
+
+    Raises
+    ------
+    OptionError : ``first`` or ``last`` is no stage, or ``first`` needs a stage that has not run.
+    """
+    names = [stage.name for stage in stages]
+    for name in (first, last):
+        if name is not None and name not in names:
+            raise OptionError(f"no stage {name!r}; stages: {', '.join(names)}")
+    fingerprints: dict[str, str] = {}
+    reports = []
+    start = names.index(first) if first else 0
+    stop = names.index(last) + 1 if last else len(names)
+    for number, stage in enumerate(stages[:stop]):
+        inputs = {name: fingerprints[name] for name in stage.after} | dict(stage.external)
+        mark = fingerprint(stage.name, stage.version, stage.options, inputs)
+        manifest = read_manifest(workspace.manifest_path(stage.name))
+        if number < start:
+            if manifest is None:
+                raise OptionError(
+                    f"--from {first} needs stage {stage.name}, which has not run; leave --from out"
+                )
+            fingerprints[stage.name] = manifest.fingerprint
+            report = StageReport(stage.name, "skipped", manifest.seconds, manifest.counts, "--from")
+            reports.append(report)
+            on_report(report)
+            continue
+        fingerprints[stage.name] = mark
+        why = _why(stage, manifest, mark, inputs, workspace)
+        if first and number == start and not why:
+            why = "asked for"
+        if not why and manifest is not None:
+            report = StageReport(stage.name, "kept", manifest.seconds, manifest.counts, "")
+        elif dry_run:
+            report = StageReport(stage.name, "pending", 0.0, {}, why)
+        else:
+            on_start(stage.name, why)
+            report = _run(stage, workspace, mark, inputs, why)
+        reports.append(report)
+        on_report(report)
+    return reports
+
+
+def _why(
+    stage: Stage,
+    manifest: Manifest | None,
+    mark: str,
+    inputs: Mapping[str, str],
+    workspace: Workspace,
+) -> str:
+    """Why a stage has to run; empty when it need not."""
+    if manifest is None:
+        return "not done yet"
+    gone = [output for output in manifest.outputs if not workspace.path(output).exists()]
+    if gone:
+        return f"{gone[0]} is gone"
+    if manifest.fingerprint == mark:
+        return ""
+    if manifest.version != stage.version:
+        return "a newer version of the stage"
+    changed = sorted(
+        name for name, value in inputs.items() if manifest.inputs.get(name) != value
+    ) or sorted(set(manifest.inputs) - set(inputs))
+    if changed:
+        return f"{changed[0]} changed"
+    return f"options changed: {', '.join(_differences(manifest.options, stage.options)[:3])}"
+
+
+def _differences(old: Any, new: Any, prefix: str = "") -> list[str]:
+    if isinstance(old, Mapping) and isinstance(new, Mapping):
+        found: list[str] = []
+        for key in sorted(set(old) | set(new)):
+            found += _differences(old.get(key), new.get(key), f"{prefix}.{key}" if prefix else key)
+        return found
+    return [] if old == new else [prefix]
+
+
+def _run(
+    stage: Stage, workspace: Workspace, mark: str, inputs: Mapping[str, str], why: str
+) -> StageReport:
+    started = datetime.now(UTC).isoformat(timespec="seconds")
+    clock = time.perf_counter()
+    with workspace.staging(stage.name) as folder:
+        counts = dict(stage.run(folder))
+        # without its manifest a stage counts as not done: killed between here and the end, it
+        # runs again whatever of its output has moved by then
+        workspace.manifest_path(stage.name).unlink(missing_ok=True)
+        written = tuple(o for o in stage.outputs if (folder / o).exists())
+        workspace.publish(folder, stage.outputs)
+    seconds = time.perf_counter() - clock
+    manifest = Manifest(
+        stage=stage.name,
+        version=stage.version,
+        options=dict(stage.options),
+        inputs=dict(inputs),
+        fingerprint=mark,
+        outputs=written,
+        counts=counts,
+        seconds=round(seconds, 3),
+        started=started,
+        versions=package_versions(),
+    )
+    write_json_model(workspace.manifest_path(stage.name), manifest)
+    return StageReport(stage.name, "run", seconds, counts, why)
+
+
+def all_kept(reports: Iterable[StageReport]) -> bool:
+    """Whether nothing had to be done."""
+    return all(report.state in ("kept", "skipped") for report in reports)

@@ -1,0 +1,151 @@
+"""Presets: every option of the pipeline in one frozen model, with defaults and units."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, ValidationError
+
+from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.features.vlad import VladOptions
+from megloc_kapture.io.colmap import TriangulationOptions
+from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
+from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS, Matcher, load_plugin
+from megloc_kapture.plugins import LocalFeatureExtractor as Extractor
+from megloc_kapture.stages.image_pairs import MappingPairsOptions, QueryPairsOptions
+from megloc_kapture.stages.matches import NoVerification, Verification
+from megloc_kapture.stages.query_poses import LocalizationOptions
+from megloc_kapture.values import Options
+
+
+class PluginChoice(Options):
+    """A plugin by its registered name, and its options."""
+
+    name: str
+    options: dict[str, Any] = Field(default_factory=dict)
+
+
+class PipelineOptions(Options):
+    """All options of a run. ``--set matching.options.max_ratio=0.9`` sets one of them."""
+
+    local_features: PluginChoice = PluginChoice(name="rootsift")
+    vlad: VladOptions = VladOptions()
+    mapping_pairs: MappingPairsOptions = MappingPairsOptions()
+    query_pairs: QueryPairsOptions = QueryPairsOptions()
+    matching: PluginChoice = PluginChoice(name="nn")
+    verification: Literal["geometric", "none"] = Field(
+        default="geometric", description="of matches, by known poses or a two-view model"
+    )
+    mapping_verification: KnownPoseOptions = KnownPoseOptions()
+    query_verification: TwoViewOptions = TwoViewOptions()
+    triangulation: TriangulationOptions = TriangulationOptions()
+    localization: LocalizationOptions = LocalizationOptions()
+
+    def make_extractor(self) -> Extractor:
+        """The local-feature extractor; raises PluginError."""
+        extractor: Extractor = load_plugin(
+            LOCAL_FEATURES, self.local_features.name, self.local_features.options
+        )
+        return extractor
+
+    def make_matcher(self) -> Matcher:
+        """The matcher; raises PluginError."""
+        matcher: Matcher = load_plugin(MATCHERS, self.matching.name, self.matching.options)
+        return matcher
+
+    def verify_mapping(self) -> Verification:
+        """How mapping pairs are verified."""
+        return NoVerification() if self.verification == "none" else self.mapping_verification
+
+    def verify_queries(self) -> Verification:
+        """How query pairs are verified."""
+        return NoVerification() if self.verification == "none" else self.query_verification
+
+
+PRESETS: dict[str, PipelineOptions] = {"classic": PipelineOptions()}
+DEFAULT_PRESET = "classic"
+
+
+def options_of_preset(
+    preset: str = DEFAULT_PRESET,
+    *,
+    changes: dict[str, Any] | None = None,
+    assignments: Sequence[str] = (),
+) -> PipelineOptions:
+    """A preset's options with changes: nested tables, then ``key.key=value`` assignments.
+
+    Raises
+    ------
+    OptionError : unknown preset or option, or a value the option cannot have.
+    """
+    if preset not in PRESETS:
+        raise OptionError(f"unknown preset {preset!r}; known: {', '.join(PRESETS)}")
+    tree = PRESETS[preset].model_dump()
+    _merge(tree, changes or {})
+    for assignment in assignments:
+        key, equals, text = assignment.partition("=")
+        if not equals or not key:
+            raise OptionError(f"--set takes key=value, got {assignment!r}")
+        nested: dict[str, Any] = {}
+        place = nested
+        *parents, last = key.strip().split(".")
+        for parent in parents:
+            place = place.setdefault(parent, {})
+        place[last] = _value(text.strip())
+        _merge(tree, nested)
+    try:
+        return PipelineOptions.model_validate(tree)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise OptionError(f"option {where}: {first['msg']}") from error
+
+
+def _merge(tree: dict[str, Any], changes: dict[str, Any]) -> None:
+    for key, value in changes.items():
+        if isinstance(value, dict) and isinstance(tree.get(key), dict):
+            _merge(tree[key], value)
+        else:
+            tree[key] = value
+
+
+def _value(text: str) -> Any:
+    """A TOML value, or the text itself where it is none (``--set verification=none``)."""
+    if text.lower() in ("none", "null") and text != "none":
+        return None
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+class BenchmarkFile(Options):
+    """``benchmarks/<dataset>.toml``: how one dataset is run."""
+
+    dataset: str
+    preset: str = DEFAULT_PRESET
+    thresholds: tuple[tuple[float, float | None], ...] | None = None
+    options: dict[str, Any] = Field(default_factory=dict)
+
+
+def read_benchmark(path: Path) -> BenchmarkFile:
+    """Read a benchmark file.
+
+    Raises
+    ------
+    DataError : absent, not TOML, or a key or value that is not of it; names the file.
+    """
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        return BenchmarkFile.model_validate(content)
+    except OSError as error:
+        raise DataError(f"cannot be read: {error.strerror}", path=path) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise DataError(f"not TOML: {error}", path=path) from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise DataError(f"{where}: {first['msg']}", path=path) from error

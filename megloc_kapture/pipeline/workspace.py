@@ -1,0 +1,94 @@
+"""The workspace: where a run keeps what it makes, and knows it again."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from megloc_kapture.errors import OutputError
+from megloc_kapture.io.atomic import output_error, replace_directory
+from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.outputs import claim_folder
+
+PARTIAL = ".partial"
+
+
+class Workspace:
+    """Paths of a workspace (docs/architecture.md, Contract 3).
+
+    Raises
+    ------
+    OutputError : the folder has something in it that is not a workspace's.
+    """
+
+    def __init__(self, root: Path, *, force: bool = False) -> None:
+        self.root = Path(root).absolute()
+        claim_folder(self.root, kind="workspace", force=force)
+
+    def path(self, relative: str) -> Path:
+        """A path below the workspace."""
+        return self.root / relative
+
+    def manifest_path(self, stage: str) -> Path:
+        """Where the manifest of a stage stands."""
+        return self.root / "stages" / f"{stage}.json"
+
+    def folder(self, name: str, *features: str) -> KaptureFolder:
+        """A kapture folder of the workspace, with features folders of the workspace."""
+        return KaptureFolder(self.path(name), features_dirs=[self.path(f) for f in features])
+
+    @contextmanager
+    def lock(self) -> Iterator[None]:
+        """Hold the workspace against a second run; the system lets go when the process dies."""
+        path = self.root / ".lock"
+        try:
+            handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        except OSError as error:
+            raise output_error(path, error) from error
+        try:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                raise OutputError(
+                    f"{self.root}: another run is using this workspace; wait for it or give "
+                    "another --workspace"
+                ) from error
+            yield
+        finally:
+            os.close(handle)
+
+    @contextmanager
+    def staging(self, stage: str) -> Iterator[Path]:
+        """A fresh folder to write a stage's output into; removed when the block ends."""
+        place = self.root / PARTIAL / stage
+        try:
+            if place.exists():
+                shutil.rmtree(place)
+            place.mkdir(parents=True)
+        except OSError as error:
+            raise output_error(place, error) from error
+        try:
+            yield place
+        finally:
+            shutil.rmtree(place, ignore_errors=True)
+
+    def publish(self, staging: Path, outputs: tuple[str, ...]) -> None:
+        """Move what a stage wrote to its places; outputs it did not write are taken away."""
+        for output in outputs:
+            new, place = staging / output, self.root / output
+            try:
+                place.parent.mkdir(parents=True, exist_ok=True)
+                if new.is_dir():
+                    replace_directory(new, place)
+                elif new.exists():
+                    os.replace(new, place)
+                elif place.is_dir() and not place.is_symlink():
+                    shutil.rmtree(place)
+                else:
+                    place.unlink(missing_ok=True)
+            except OSError as error:
+                raise output_error(place, error) from error

@@ -1,0 +1,99 @@
+"""The protocols of plugins, and how a plugin is found by name.
+
+A plugin is a class registered under one of the entry-point groups below; our own are registered
+in the same way. A class may carry ``Options``, a frozen pydantic model its constructor takes.
+"""
+
+from __future__ import annotations
+
+from importlib.metadata import entry_points
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.errors import PluginError
+from megloc_kapture.values import LocalFeatures
+
+LOCAL_FEATURES = "megloc_kapture.local_features"
+MATCHERS = "megloc_kapture.matchers"
+
+
+@runtime_checkable
+class LocalFeatureExtractor(Protocol):
+    """Group ``megloc_kapture.local_features``: image to local features."""
+
+    name: str
+    """The kapture type name its features are stored under."""
+
+    def extract(
+        self, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
+    ) -> LocalFeatures:
+        """Features of an RGB image, uint8 (H, W, 3); none on False pixels of the mask (H, W)."""
+        ...
+
+
+@runtime_checkable
+class Matcher(Protocol):
+    """Group ``megloc_kapture.matchers``: two sets of descriptors to matches."""
+
+    def match(
+        self, descriptors_a: NDArray[Any], descriptors_b: NDArray[Any]
+    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """Matches int64 (K, 2), rows of a and b, each row at most once, and scores (K,)."""
+        ...
+
+
+_PROTOCOLS: dict[str, type] = {LOCAL_FEATURES: LocalFeatureExtractor, MATCHERS: Matcher}
+
+
+def plugin_names(group: str) -> list[str]:
+    """Names registered under a group, sorted."""
+    return sorted({entry.name for entry in entry_points(group=group)})
+
+
+def load_plugin(group: str, name: str, options: dict[str, Any] | None = None) -> Any:
+    """Make the plugin ``name`` of ``group``, with its options.
+
+    Raises
+    ------
+    PluginError : no such plugin, it cannot be imported, does not fulfil the group's protocol, or
+        refuses its options; says which and why.
+    """
+    found = [entry for entry in entry_points(group=group) if entry.name == name]
+    if not found:
+        known = ", ".join(plugin_names(group)) or "none"
+        raise PluginError(f"no plugin {name!r} in {group}; registered: {known}")
+    origins = {entry.value for entry in found}
+    if len(origins) > 1:
+        raise PluginError(f"plugin {name!r} of {group} is registered twice: {sorted(origins)}")
+    try:
+        kind = found[0].load()
+    except Exception as error:  # whatever a foreign module raises while it is imported
+        raise PluginError(
+            f"plugin {name!r} ({found[0].value}) cannot be loaded: {error}"
+        ) from error
+    protocol = _PROTOCOLS[group]
+    missing = [member for member in _members(protocol) if not hasattr(kind, member)]
+    if not isinstance(kind, type) or missing:
+        what = "is no class" if not isinstance(kind, type) else f"lacks {', '.join(missing)}"
+        raise PluginError(
+            f"plugin {name!r} ({found[0].value}) does not fulfil {protocol.__name__}: it {what}"
+        )
+    model = getattr(kind, "Options", None)
+    try:
+        if model is None:
+            if options:
+                raise ValueError(f"it takes no options, got {sorted(options)}")
+            return kind()
+        return kind(model(**(options or {})))
+    except (TypeError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise PluginError(f"plugin {name!r} refuses its options: {reason}") from error
+
+
+def _members(protocol: type) -> list[str]:
+    names = set(getattr(protocol, "__annotations__", {})) | {
+        name for name, value in vars(protocol).items() if callable(value)
+    }
+    return sorted(name for name in names if not name.startswith("_"))

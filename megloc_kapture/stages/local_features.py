@@ -1,0 +1,160 @@
+"""Stage: local features of every image, as kapture keypoints and descriptors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.errors import DataError, PluginError
+from megloc_kapture.io.images import read_image_rgb
+from megloc_kapture.io.kapture_store import FeatureConfig, FeatureWriter, KaptureFolder
+from megloc_kapture.plugins import LocalFeatureExtractor
+from megloc_kapture.stages.parallel import Track, ordered_map, untracked
+from megloc_kapture.values import Camera, LocalFeatures
+
+
+@dataclass(frozen=True)
+class _Job:
+    extractor: LocalFeatureExtractor
+    image: str
+    image_path: Path
+    mask_path: Path
+    camera: Camera
+
+
+def extract_local_features(
+    folders: Sequence[KaptureFolder],
+    extractor: LocalFeatureExtractor,
+    output: Path,
+    *,
+    executor: Executor | None = None,
+    track: Track = untracked,
+) -> dict[str, int]:
+    """Extract from all images of the folders into ``output`` (orphan layout).
+
+    Masks are read from ``sensors/masks/<image>.png`` where there are any (0 = ignore).
+
+    Returns
+    -------
+    Counts for the log: images and keypoints.
+
+    Raises
+    ------
+    DataError : an image is absent, unreadable, or not of its camera's size; or two folders have
+        an image of the same name.
+    """
+    jobs = list(_jobs(folders, extractor))
+    duplicates = sorted(
+        {a.image for a, b in zip(jobs, jobs[1:], strict=False) if a.image == b.image}
+    )
+    if duplicates:
+        raise DataError(f"image {duplicates[0]} stands in two kapture folders at once")
+    total = 0
+    keypoint_writer: FeatureWriter | None = None
+    descriptor_writer: FeatureWriter | None = None
+    results = ordered_map(_extract, jobs, executor)
+    label = f"{extractor.name} features"
+    for job, features in zip(jobs, track(results, len(jobs), label), strict=True):
+        if keypoint_writer is None or descriptor_writer is None:
+            keypoint_writer, descriptor_writer = _writers(output, extractor, features)
+        keypoint_writer.write(job.image, features.keypoints_px)
+        descriptor_writer.write(job.image, features.descriptors)
+        total += len(features.keypoints_px)
+    return {"images": len(jobs), "keypoints": total}
+
+
+def _jobs(folders: Sequence[KaptureFolder], extractor: LocalFeatureExtractor) -> Iterator[_Job]:
+    named = sorted(
+        ((image, k) for k, folder in enumerate(folders) for image in folder.read().image_names())
+    )
+    for image, k in named:
+        folder = folders[k]
+        yield _Job(
+            extractor=extractor,
+            image=image,
+            image_path=folder.image_path(image),
+            mask_path=folder.root / "sensors" / "masks" / f"{image}.png",
+            camera=folder.read().camera_of(image),
+        )
+
+
+def _writers(
+    output: Path, extractor: LocalFeatureExtractor, features: LocalFeatures
+) -> tuple[FeatureWriter, FeatureWriter]:
+    name = extractor.name
+    keypoints = FeatureConfig(
+        name, np.dtype(features.keypoints_px.dtype), features.keypoints_px.shape[1]
+    )
+    descriptors = FeatureConfig(
+        name,
+        np.dtype(features.descriptors.dtype),
+        features.descriptors.shape[1],
+        keypoints_type=name,
+        metric_type="L2",
+    )
+    return (
+        FeatureWriter(output, "keypoints", name, keypoints, orphan=True),
+        FeatureWriter(output, "descriptors", name, descriptors, orphan=True),
+    )
+
+
+def _extract(job: _Job) -> LocalFeatures:
+    image = read_image_of(job.image_path, job.camera)
+    mask = read_mask(job.mask_path, image.shape[:2])
+    return checked_features(job.extractor, job.extractor.extract(image, mask), job.image)
+
+
+def read_image_of(path: Path, camera: Camera) -> NDArray[np.uint8]:
+    """Read an image and check that it has the size its camera says; uint8 (H, W, 3) RGB."""
+    image = read_image_rgb(path)
+    check_size(image, camera, path)
+    return image
+
+
+def check_size(image: NDArray[np.uint8], camera: Camera, name: Path | str) -> None:
+    """Raise DataError when an image is not of the size its camera says."""
+    height, width = image.shape[:2]
+    if (width, height) != (camera.width, camera.height):
+        raise DataError(
+            f"the image is {width}x{height}, its camera says {camera.width}x{camera.height}",
+            path=name,
+        )
+
+
+def read_mask(path: Path, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
+    """The mask beside an image, True = use; None where there is no such file."""
+    if not path.is_file():
+        return None
+    mask = read_image_rgb(path)[:, :, 0] > 0
+    if mask.shape != tuple(shape):
+        raise DataError(
+            f"the mask is {mask.shape[1]}x{mask.shape[0]}, its image {shape[1]}x{shape[0]}",
+            path=path,
+        )
+    return np.asarray(mask)
+
+
+def checked_features(extractor: LocalFeatureExtractor, features: Any, image: str) -> LocalFeatures:
+    """What a plugin returned, refused with its name where it breaks the protocol."""
+
+    def refuse(what: str) -> PluginError:
+        return PluginError(f"plugin {extractor.name!r} on image {image}: {what}")
+
+    if not isinstance(features, LocalFeatures):
+        raise refuse(f"extract returned {type(features).__name__}, not LocalFeatures")
+    keypoints, descriptors = features.keypoints_px, features.descriptors
+    if keypoints.ndim != 2 or keypoints.shape[1] < 2 or keypoints.dtype != np.float32:
+        raise refuse(f"keypoints are {keypoints.dtype} {keypoints.shape}, not float32 (N, 2)")
+    if descriptors.ndim != 2 or len(descriptors) != len(keypoints):
+        raise refuse(f"{len(keypoints)} keypoints but descriptors of shape {descriptors.shape}")
+    if descriptors.dtype not in (np.float32, np.uint8):
+        raise refuse(f"descriptors are {descriptors.dtype}, not float32 or uint8")
+    if not (np.isfinite(keypoints).all() and np.isfinite(descriptors).all()):
+        raise refuse("values that are not finite")
+    return features

@@ -1,0 +1,227 @@
+"""Stage: match local features of image pairs, verified; stored as kapture matches.
+
+Mapping pairs are verified with their known poses, query pairs by a two-view model.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.geometry.cameras import bearing_rays, focal_px
+from megloc_kapture.io.kapture_store import (
+    FeatureReader,
+    ImagePair,
+    KaptureFolder,
+    MatchesWriter,
+)
+from megloc_kapture.matching.verification import (
+    KnownPoseOptions,
+    TwoViewOptions,
+    verify_two_view,
+    verify_with_poses,
+)
+from megloc_kapture.plugins import Matcher
+from megloc_kapture.stages.parallel import FolderSpec, Track, ordered_map, untracked
+from megloc_kapture.values import Camera, Options
+
+_CACHE_BYTES = 256 << 20  # descriptors kept per process: about a hundred images
+
+
+class NoVerification(Options):
+    """Keep every match."""
+
+    kind: Literal["none"] = "none"
+
+
+Verification = KnownPoseOptions | TwoViewOptions | NoVerification
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """What matching needs of one image: keypoints (N, 2) in pixels, rays (N, 3), descriptors."""
+
+    camera: Camera
+    keypoints_px: NDArray[np.float32]
+    rays: NDArray[np.float64]
+    descriptors: NDArray[Any]
+
+
+@dataclass(frozen=True)
+class _Job:
+    first: FolderSpec
+    second: FolderSpec
+    local_type: str
+    matcher: Matcher
+    verification: Verification
+    image: str
+    others: tuple[str, ...]
+
+
+_PairMatches = tuple[NDArray[np.int64], NDArray[np.float32]]
+
+
+def match_pairs(
+    first: KaptureFolder,
+    second: KaptureFolder,
+    pairs: Sequence[ImagePair],
+    local_type: str,
+    matcher: Matcher,
+    verification: Verification,
+    output: Path,
+    *,
+    executor: Executor | None = None,
+    track: Track = untracked,
+) -> dict[str, int]:
+    """Match each pair (image of ``first``, image of ``second``) and write what is verified.
+
+    A pair without verified matches is written with none, so that it is known to be done.
+
+    Returns
+    -------
+    Counts for the log: pairs, pairs with matches, matches.
+    """
+    specs = [FolderSpec(f.root, f.features_dirs) for f in (first, second)]
+    jobs = []
+    ordered = sorted({(pair.query, pair.map) for pair in pairs})
+    for image, group in groupby(ordered, key=lambda pair: pair[0]):
+        others = tuple(other for _, other in group)
+        jobs.append(_Job(specs[0], specs[1], local_type, matcher, verification, image, others))
+    writer = MatchesWriter(output, local_type, orphan=True)
+    matched = total = 0
+    results = ordered_map(_match, jobs, executor)
+    for job, found in zip(jobs, track(results, len(jobs), "matching"), strict=True):
+        for other, (matches, scores) in zip(job.others, found, strict=True):
+            writer.write(job.image, other, matches, scores)
+            matched += len(matches) > 0
+            total += len(matches)
+    return {"pairs": len(ordered), "pairs_with_matches": matched, "matches": total}
+
+
+def _match(job: _Job) -> list[_PairMatches]:
+    first, second = job.first.open(), job.second.open()
+    features = _cached(job.first, first, job.local_type, job.image)
+    return [
+        match_and_verify(
+            features,
+            _cached(job.second, second, job.local_type, other),
+            job.matcher,
+            _relative_verification(job.verification, first, second, job.image, other),
+        )
+        for other in job.others
+    ]
+
+
+def match_and_verify(a: Features, b: Features, matcher: Matcher, verification: Any) -> _PairMatches:
+    """Match two images; ``verification`` maps (a, b, matches) to a mask of those to keep."""
+    matches, scores = matcher.match(a.descriptors, b.descriptors)
+    if len(matches) == 0:
+        return matches, scores
+    good = verification(a, b, matches)
+    return matches[good], scores[good]
+
+
+def two_view_verification(options: TwoViewOptions) -> Any:
+    """Verification by a two-view model, for :func:`match_and_verify`."""
+
+    def verify(a: Features, b: Features, matches: NDArray[np.int64]) -> NDArray[np.bool_]:
+        return verify_two_view(
+            a.keypoints_px[matches[:, 0], :2],
+            a.camera,
+            b.keypoints_px[matches[:, 1], :2],
+            b.camera,
+            options,
+        )
+
+    return verify
+
+
+def _relative_verification(
+    options: Verification, first: KaptureFolder, second: KaptureFolder, image: str, other: str
+) -> Any:
+    if isinstance(options, TwoViewOptions):
+        return two_view_verification(options)
+    if isinstance(options, NoVerification):
+        return lambda a, b, matches: np.ones(len(matches), dtype=bool)
+    a_from_world = first.read().cam_from_world(image)
+    b_from_world = second.read().cam_from_world(other)
+
+    def verify(a: Features, b: Features, matches: NDArray[np.int64]) -> NDArray[np.bool_]:
+        if a_from_world is None or b_from_world is None:
+            return np.zeros(len(matches), dtype=bool)
+        return verify_with_poses(
+            a.rays[matches[:, 0]],
+            b.rays[matches[:, 1]],
+            b_from_world @ a_from_world.inverse(),
+            focal_px=0.5 * (focal_px(a.camera) + focal_px(b.camera)),
+            options=options,
+        )
+
+    return verify
+
+
+def read_features(
+    keypoints: FeatureReader, descriptors: FeatureReader, camera: Camera, image: str
+) -> Features:
+    """Read what matching needs of one image."""
+    keypoints_px = keypoints.read(image)
+    return Features(
+        camera, keypoints_px, bearing_rays(camera, keypoints_px[:, :2]), descriptors.read(image)
+    )
+
+
+class _Cache:
+    """Features of the images used last, bounded in bytes."""
+
+    def __init__(self) -> None:
+        self.items: OrderedDict[tuple[Any, ...], Features] = OrderedDict()
+        self.bytes = 0
+
+    def get(self, key: tuple[Any, ...], load: Any) -> Features:
+        if key in self.items:
+            self.items.move_to_end(key)
+            return self.items[key]
+        features: Features = load()
+        self.items[key] = features
+        self.bytes += _size(features)
+        while self.bytes > _CACHE_BYTES and len(self.items) > 1:
+            _, old = self.items.popitem(last=False)
+            self.bytes -= _size(old)
+        return features
+
+
+def _size(features: Features) -> int:
+    return features.descriptors.nbytes + features.keypoints_px.nbytes + features.rays.nbytes
+
+
+_cache = _Cache()
+
+
+def _cached(spec: FolderSpec, folder: KaptureFolder, local_type: str, image: str) -> Features:
+    return _cache.get(
+        (*spec.key, local_type, image),
+        lambda: read_features(
+            folder.keypoints(local_type),
+            folder.descriptors(local_type),
+            folder.read().camera_of(image),
+            image,
+        ),
+    )
+
+
+def iterate_candidates(pairs: Sequence[ImagePair]) -> Iterator[tuple[str, list[str]]]:
+    """Queries with their candidates, best first; queries sorted."""
+    candidates: dict[str, list[ImagePair]] = {}
+    for pair in pairs:
+        candidates.setdefault(pair.query, []).append(pair)
+    for query in sorted(candidates):
+        best_first = sorted(candidates[query], key=lambda pair: (-pair.score, pair.map))
+        yield query, [pair.map for pair in best_first]

@@ -1,0 +1,69 @@
+"""Per-image and per-pair work on any executor, in order, with bounded memory."""
+
+from __future__ import annotations
+
+import itertools
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Executor, Future
+from functools import lru_cache
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+from megloc_kapture.io.kapture_store import KaptureFolder
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+_run_ids = itertools.count()
+
+
+class Track(Protocol):
+    """Shows progress: yields the items as they are, one by one."""
+
+    def __call__(self, items: Iterable[Item], total: int, label: str) -> Iterator[Item]: ...
+
+
+def untracked(items: Iterable[Item], total: int, label: str) -> Iterator[Item]:
+    """A :class:`Track` that shows nothing."""
+    return iter(items)
+
+
+def ordered_map(
+    function: Callable[[Item], Result],
+    items: Iterable[Item],
+    executor: Executor | None = None,
+    *,
+    window: int = 32,
+) -> Iterator[Result]:
+    """Like ``map``, on an executor, results in order, at most ``window`` items under way."""
+    if executor is None:
+        yield from map(function, items)
+        return
+    waiting: deque[Future[Result]] = deque()
+    try:
+        for item in items:
+            waiting.append(executor.submit(function, item))
+            if len(waiting) >= window:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        for future in waiting:
+            future.cancel()
+
+
+class FolderSpec:
+    """A kapture folder as work items name it: cheap to send, opened once per process and run."""
+
+    def __init__(self, root: Path, features_dirs: Iterable[Path] = ()) -> None:
+        self.key = (Path(root), tuple(Path(d) for d in features_dirs), next(_run_ids))
+
+    def open(self) -> KaptureFolder:
+        """The folder; the same object for every item of this run in this process."""
+        return _open_folder(*self.key)
+
+
+@lru_cache(maxsize=8)
+def _open_folder(root: Path, features_dirs: tuple[Path, ...], run_id: int) -> KaptureFolder:
+    return KaptureFolder(root, features_dirs=features_dirs)

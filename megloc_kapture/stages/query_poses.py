@@ -1,0 +1,223 @@
+"""Stage: localize the queries from their matches with map images; kapture trajectories out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.io.csv_table import write_csv_table
+from megloc_kapture.io.kapture_store import (
+    ImagePair,
+    KaptureData,
+    KaptureFolder,
+    write_sensors,
+)
+from megloc_kapture.io.links import link_images
+from megloc_kapture.io.status_table import STATUS_FILE, QueryStatus, write_status
+from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions, absolute_pose
+from megloc_kapture.localization.correspondences import Correspondences, resolve
+from megloc_kapture.localization.map_index import MapIndex
+from megloc_kapture.stages.matches import iterate_candidates
+from megloc_kapture.stages.parallel import FolderSpec, Track, ordered_map, untracked
+from megloc_kapture.values import Camera, Failure, Options, Pose, RigidTransform
+
+Fallback = Literal["none", "retrieval"]
+
+
+class LocalizationOptions(Options):
+    """How a query's pose is found from its matches."""
+
+    pose: AbsolutePoseOptions = AbsolutePoseOptions()
+    fallback: Fallback = "none"
+
+
+@dataclass(frozen=True)
+class _Job:
+    map: FolderSpec
+    query: FolderSpec
+    matches: FolderSpec
+    local_type: str
+    image: str
+    candidates: tuple[str, ...]
+    options: AbsolutePoseOptions
+
+
+def index_map(folder: KaptureFolder, local_type: str) -> MapIndex:
+    """Read the points and observations of one keypoints type into an index."""
+    observations = folder.observations()[local_type]
+    return MapIndex.build(
+        folder.points3d()[:, :3],
+        observations.image_names,
+        observations.image_ids,
+        observations.keypoint_ids,
+        observations.point_ids,
+    )
+
+
+def gather_correspondences(
+    index: MapIndex,
+    matches: Iterable[tuple[str, NDArray[np.int64], NDArray[np.floating]]],
+) -> Correspondences:
+    """2D-3D matches from (map image, matches (K, 2) query and map keypoints, scores (K,))."""
+    keypoints, points, scores = [], [], []
+    for image, pairs, similarity in matches:
+        point_ids = index.points_of_keypoints(image, pairs[:, 1])
+        observed = point_ids >= 0
+        keypoints.append(pairs[observed, 0])
+        points.append(point_ids[observed])
+        scores.append(similarity[observed])
+    if not keypoints:
+        empty = np.zeros(0, dtype=np.int64)
+        return resolve(empty, empty, np.zeros(0))
+    return resolve(np.concatenate(keypoints), np.concatenate(points), np.concatenate(scores))
+
+
+def pose_from_matches(
+    index: MapIndex,
+    keypoints_px: NDArray[np.float32],
+    camera: Camera,
+    matches: Sequence[tuple[str, NDArray[np.int64], NDArray[np.floating]]],
+    options: AbsolutePoseOptions,
+) -> Pose | Failure:
+    """Localize one query from its verified matches with map images."""
+    candidates = tuple(image for image, pairs, _ in matches if len(pairs))
+    if not candidates:
+        return Failure("no map image matches")
+    found = gather_correspondences(index, matches)
+    result = absolute_pose(
+        keypoints_px[found.keypoint_ids, :2].astype(np.float64),
+        index.xyz[found.point_ids],
+        camera,
+        options,
+    )
+    return replace(result, candidates=candidates)
+
+
+_indices: dict[object, MapIndex] = {}
+
+
+def _localize(job: _Job) -> tuple[Pose | Failure, float]:
+    started = time.perf_counter()
+    if job.map.key not in _indices:
+        _indices.clear()
+        _indices[job.map.key] = index_map(job.map.open(), job.local_type)
+    index = _indices[job.map.key]
+    query = job.query.open()
+    reader = job.matches.open().matches(job.local_type)
+    matches = [
+        (image, *reader.read(job.image, image))
+        for image in job.candidates
+        if (job.image, image) in reader
+    ]
+    result = pose_from_matches(
+        index,
+        query.keypoints(job.local_type).read(job.image),
+        query.read().camera_of(job.image),
+        matches,
+        job.options,
+    )
+    if isinstance(result, Pose):
+        # the mask is for who asked with arrays; the stage writes none of it
+        result = replace(result, inliers=None)
+    return result, time.perf_counter() - started
+
+
+def localize_from_matches(
+    map_folder: KaptureFolder,
+    query: KaptureFolder,
+    matches: KaptureFolder,
+    pairs: Sequence[ImagePair],
+    local_type: str,
+    options: LocalizationOptions,
+    *,
+    executor: Executor | None = None,
+    track: Track = untracked,
+) -> Iterator[tuple[str, Pose | Failure, float]]:
+    """Localize every query from stored matches: image, result, seconds; in order of names."""
+    specs = [FolderSpec(f.root, f.features_dirs) for f in (map_folder, query, matches)]
+    candidates = dict(iterate_candidates(pairs))
+    jobs = [
+        _Job(
+            *specs,
+            local_type=local_type,
+            image=image,
+            candidates=tuple(candidates.get(image, ())),
+            options=options.pose,
+        )
+        for image in query.read().image_names()
+    ]
+    results = ordered_map(_localize, jobs, executor)
+    tracked = track(results, len(jobs), "localizing")
+    for job, (result, seconds) in zip(jobs, tracked, strict=True):
+        yield job.image, result, seconds
+
+
+def write_localized(
+    output: Path,
+    query: KaptureFolder,
+    results: Iterable[tuple[str, Pose | Failure, float]],
+    *,
+    fallback: Fallback = "none",
+    first_candidates: dict[str, tuple[str, RigidTransform]] | None = None,
+    timing: Path | None = None,
+) -> dict[str, int]:
+    """Write the localized queries as kapture, with ``status.csv`` beside it.
+
+    Parameters
+    ----------
+    first_candidates : query -> (best retrieved map image, its pose), needed for a fallback.
+    timing : where to write seconds per query and step.
+    """
+    data = query.read()
+    poses: dict[tuple[int, str], RigidTransform] = {}
+    statuses = []
+    seconds_of: list[tuple[str, str, str]] = []
+    localized = fallbacks = 0
+    for image, result, seconds in results:
+        seconds_of.append((image, "localization", f"{seconds:.4f}"))
+        best = (first_candidates or {}).get(image)
+        guessed = not result and fallback == "retrieval" and best is not None
+        statuses.append(
+            QueryStatus(
+                image=image,
+                status="localized" if result else "failed",
+                reason="" if isinstance(result, Pose) else result.reason,
+                num_matches=result.num_matches,
+                num_inliers=result.num_inliers,
+                fallback="retrieval" if guessed else "none",
+                candidates=result.candidates,
+            )
+        )
+        if isinstance(result, Pose):
+            poses[data.record_of(image)] = result.cam_from_world
+            localized += 1
+        elif guessed and best is not None:
+            poses[data.record_of(image)] = best[1]
+            fallbacks += 1
+    write_sensors(
+        output,
+        KaptureData(
+            sensors=dict(data.sensors),
+            rigs={},
+            trajectories=poses,
+            records_camera=dict(data.records_camera),
+            records_depth={},
+        ),
+    )
+    link_images(query.root, output)
+    write_status(output / STATUS_FILE, statuses)
+    if timing is not None:
+        write_csv_table(timing, ("image", "step", "seconds"), seconds_of)
+    return {
+        "queries": len(statuses),
+        "localized": localized,
+        "failed": len(statuses) - localized,
+        "fallbacks": fallbacks,
+    }

@@ -1,0 +1,137 @@
+"""Stage: a kapture map: points3d and observations from verified matches and known poses."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.atomic import output_error
+from megloc_kapture.io.colmap import MapImage, TriangulationOptions, triangulate
+from megloc_kapture.io.kapture_store import (
+    KaptureFolder,
+    Observations,
+    write_observations,
+    write_points3d,
+    write_sensors,
+)
+from megloc_kapture.io.links import link_images
+
+
+def triangulate_map(
+    mapping: KaptureFolder,
+    matches: KaptureFolder,
+    local_type: str,
+    output: Path,
+    options: TriangulationOptions,
+    *,
+    num_threads: int = 1,
+) -> dict[str, float]:
+    """Triangulate and write the map: sensors, features of its type, points3d, observations.
+
+    Parameters
+    ----------
+    mapping : images with poses, and their keypoints.
+    matches : where the verified matches of the type are.
+
+    Returns
+    -------
+    Counts for the log.
+
+    Raises
+    ------
+    DataError : no image has a pose.
+    """
+    data = mapping.read()
+    poses = data.poses()
+    images = sorted(poses)
+    if not images:
+        raise DataError("no mapping image has a pose", path=mapping.root)
+    row_of = {image: row for row, image in enumerate(images)}
+    keypoints = mapping.keypoints(local_type)
+    reader = matches.matches(local_type)
+    verified = {}
+    for a, b in reader.pairs:
+        if a in row_of and b in row_of:
+            indices, _ = reader.read(a, b)
+            if len(indices):
+                verified[row_of[a], row_of[b]] = indices
+    map_images = [
+        MapImage(image, data.camera_of(image), poses[image], keypoints.read(image)[:, :2])
+        for image in images
+    ]
+    result = triangulate(map_images, verified, options, num_threads=num_threads)
+    write_sensors(output, data)
+    link_images(mapping.root, output)
+    copy_features(mapping, output, local_type)
+    # kapture keeps a colour per point; black says that nobody looked it up
+    write_points3d(output, np.concatenate([result.xyz, np.zeros_like(result.xyz)], axis=1))
+    write_observations(
+        output,
+        {
+            local_type: Observations(
+                keypoints_type=local_type,
+                image_names=tuple(images),
+                point_ids=result.point_ids,
+                image_ids=result.image_ids.astype(np.int32),
+                keypoint_ids=result.keypoint_ids.astype(np.int32),
+            )
+        },
+    )
+    num_points = len(result.xyz)
+    return {
+        "images": len(images),
+        "pairs": len(verified),
+        "points": num_points,
+        "observations": len(result.point_ids),
+        "mean_track_length": round(len(result.point_ids) / max(num_points, 1), 3),
+        "mean_reprojection_error_px": (
+            round(float(result.errors_px.mean()), 4) if num_points else 0.0
+        ),
+    }
+
+
+def copy_features(source: KaptureFolder, output: Path, local_type: str) -> None:
+    """Put the map images' features of ``source`` into the kapture at ``output``.
+
+    Hard links where the file system has them: a map then stands alone and takes no space twice.
+    """
+    images = source.read().image_names()
+    reconstruction = output / "reconstruction"
+    for kind, suffix, types in (
+        ("keypoints", ".kpt", [local_type]),
+        ("descriptors", ".desc", [local_type]),
+        ("global_features", ".gfeat", source.types("global_features")),
+    ):
+        for type_name in types:
+            place = reconstruction / kind / type_name
+            for features_dir in source.features_dirs:
+                parent = "global_features" if kind == "global_features" else "local_features"
+                found = features_dir / parent / type_name / kind
+                extras = [] if kind != "global_features" else sorted(found.parent.glob("vlad.json"))
+                extras += [] if not extras else sorted(found.parent.glob("vocabulary.npy"))
+                if not (found / f"{kind}.txt").is_file():
+                    continue
+                _link(found / f"{kind}.txt", place / f"{kind}.txt")
+                for extra in extras:
+                    _link(extra, place / extra.name)
+                for image in images:
+                    file = found / f"{image}{suffix}"
+                    if file.is_file():
+                        _link(file, place / f"{image}{suffix}")
+
+
+def _link(source: Path, place: Path) -> None:
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        if place.exists():
+            return
+        try:
+            os.link(source, place)
+        except OSError:  # another file system, or one without hard links
+            shutil.copyfile(source, place)
+    except OSError as error:
+        raise output_error(place, error) from error

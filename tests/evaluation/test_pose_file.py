@@ -1,0 +1,193 @@
+"""Pose files: exact round trip, name rules, and every way a foreign file can be broken."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from megloc_kapture.errors import DataError, OutputError
+from megloc_kapture.evaluation.pose_file import (
+    format_pose_file,
+    names_in_pose_file,
+    poses_by_image,
+    read_pose_file,
+    write_pose_file,
+)
+from megloc_kapture.values import RigidTransform
+
+HERE = RigidTransform.identity()
+GOOD = "a.jpg 1 0 0 0 1.5 -0.2 3\n"
+
+
+def unit(values: list[float]) -> tuple[float, float, float, float]:
+    w, x, y, z = (np.array(values) / np.linalg.norm(values)).tolist()
+    return w, x, y, z
+
+
+finite = st.floats(-1e7, 1e7)
+quats = (
+    st.lists(st.floats(-1, 1), min_size=4, max_size=4)
+    .filter(lambda q: np.linalg.norm(q) > 1e-3)
+    .map(unit)
+)
+poses = st.builds(RigidTransform, quats, st.tuples(finite, finite, finite))
+names = st.text(
+    st.characters(exclude_categories=["Cc", "Cs", "Z"], codec="utf-8"), min_size=1, max_size=10
+).filter(lambda name: name.split() == [name])
+
+
+@given(st.dictionaries(names, poses, max_size=6))
+def test_every_bit_reads_back(
+    tmp_path_factory: pytest.TempPathFactory, written: dict[str, RigidTransform]
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "round_trip.txt"
+    write_pose_file(path, written)
+    assert read_pose_file(path) == written
+    assert list(read_pose_file(path)) == sorted(written)
+
+
+def test_what_a_server_reads() -> None:
+    pose = RigidTransform((1.0, 0.0, 0.0, 0.0), (1.5, -0.2, 3.0))
+    third = RigidTransform((0.5, 0.5, -0.5, 0.5), (1 / 3, -2e-17, 1e6))
+    assert format_pose_file({"q/b.jpg": third, "q/a.jpg": pose}, names="basename") == (
+        "a.jpg 1.0 0.0 0.0 0.0 1.5 -0.2 3.0\n"
+        "b.jpg 0.5 0.5 -0.5 0.5 0.3333333333333333 -2e-17 1000000.0\n"
+    )
+
+
+def test_no_poses_make_an_empty_file(tmp_path: Path) -> None:
+    write_pose_file(tmp_path / "poses.txt", {})
+    assert (tmp_path / "poses.txt").read_bytes() == b""
+    assert read_pose_file(tmp_path / "poses.txt") == {}
+
+
+def test_basenames_that_collide_are_refused_by_both_names() -> None:
+    images = ["query/day/1.jpg", "query/night/1.jpg"]
+    with pytest.raises(DataError, match=r"query/day/1\.jpg.*query/night/1\.jpg"):
+        names_in_pose_file(images, "basename")
+    assert names_in_pose_file(images, "full") == {image: image for image in images}
+
+
+@pytest.mark.parametrize("image", ["a b.jpg", "a\tb.jpg", " a.jpg", "folder/", "a\u00a0b.jpg"])
+def test_names_the_format_cannot_hold(image: str) -> None:
+    with pytest.raises(DataError, match="cannot hold"):
+        names_in_pose_file([image], "basename")
+
+
+@pytest.mark.parametrize(
+    ("pose", "words"),
+    [
+        (RigidTransform((1.0, 0.0, 0.0, 0.0), (math.nan, 0.0, 0.0)), "not finite"),
+        (RigidTransform((1.0, 0.0, 0.0, 0.0), (0.0, math.inf, 0.0)), "not finite"),
+        (RigidTransform((math.nan, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), "not finite"),
+        (RigidTransform((0.9, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), "length 0.9"),
+    ],
+)
+def test_a_pose_that_must_not_be_handed_in(
+    tmp_path: Path, pose: RigidTransform, words: str
+) -> None:
+    with pytest.raises(DataError, match=words):
+        write_pose_file(tmp_path / "poses.txt", {"good.jpg": HERE, "bad.jpg": pose})
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "a.jpg\t1  0 0 0 1.5 -0.2 3 \r\n",
+        "\ufeffa.jpg 1 0 0 0 1.5 -0.2 3\n",
+        "\n\na.jpg 1e0 0 0 0 1.5 -.2 +3\n\n",
+        "a.jpg 1.0009 0 0 0 1.5 -0.2 3\n",
+    ],
+    ids=["tabs and crlf", "byte order mark", "empty lines", "slightly off unit length"],
+)
+def test_foreign_habits_are_taken(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "poses.txt"
+    path.write_text(text, encoding="utf-8", newline="")
+    assert read_pose_file(path) == {
+        "a.jpg": RigidTransform((1.0, 0.0, 0.0, 0.0), (1.5, -0.2, 3.0))
+    }
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("b.jpg 1 0 0 0 1.5 -0.2", "7 columns instead of 8"),
+        ("b.jpg 1 0 0 0 1.5 -0.2 3 4", "9 columns instead of 8"),
+        ("# name qw qx qy qz tx ty tz", "9 columns"),
+        ("b.jpg, 1, 0, 0, 0, 1.5, -0.2, 3", "could not convert"),
+        ("b.jpg 1 0 0 0 1.5 -0.2 x", "could not convert"),
+        ("b.jpg 1 0 0 0 1_5 -0.2 3", "could not convert"),
+        ("b.jpg 1 0 0 0 nan -0.2 3", "not finite"),
+        ("b.jpg 1 0 0 0 inf -0.2 3", "not finite"),
+        ("b.jpg nan 0 0 0 1 -0.2 3", "not finite"),
+        ("b.jpg 1 1 0 0 1 -0.2 3", "length 1.414"),
+        ("b.jpg 0 0 0 0 1 -0.2 3", "length 0"),
+        ("b.jpg 1.0011 0 0 0 1 -0.2 3", "length 1.0011"),
+        ("a.jpg 1 0 0 0 1 -0.2 3", "given twice"),
+    ],
+)
+def test_broken_lines_are_named(tmp_path: Path, line: str, words: str) -> None:
+    path = tmp_path / "poses.txt"
+    path.write_text(f"{GOOD}\n{line}\n")
+    with pytest.raises(DataError, match=words) as caught:
+        read_pose_file(path)
+    assert caught.value.line == 3
+    assert str(caught.value).startswith(f"{path}:3: ")
+
+
+def test_a_file_cut_short_is_not_read(tmp_path: Path) -> None:
+    path = tmp_path / "poses.txt"
+    path.write_text(GOOD + "b.jpg 1 0 0 0 1.5 -0.2 3.14")
+    with pytest.raises(DataError, match="cut short") as caught:
+        read_pose_file(path)
+    assert caught.value.line == 2
+
+
+def test_a_file_that_is_no_text(tmp_path: Path) -> None:
+    path = tmp_path / "poses.txt"
+    path.write_bytes(GOOD.encode() + b"\xff\xfe\n")
+    with pytest.raises(DataError, match="UTF-8") as caught:
+        read_pose_file(path)
+    assert caught.value.line == 2
+    with pytest.raises(DataError, match="cannot read"):
+        read_pose_file(tmp_path / "absent.txt")
+    with pytest.raises(DataError, match="cannot read"):
+        read_pose_file(tmp_path)
+
+
+@given(st.binary(max_size=60), st.integers(0, len(GOOD)))
+def test_random_damage_never_crashes(
+    tmp_path_factory: pytest.TempPathFactory, junk: bytes, place: int
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "damaged.txt"
+    good = 2 * GOOD.encode()
+    path.write_bytes(good[:place] + junk + good[place:])
+    try:
+        found = read_pose_file(path)
+    except DataError as error:
+        assert str(path) in str(error)
+        assert "\n" not in str(error)
+    else:
+        assert all(np.isfinite(pose.translation).all() for pose in found.values())
+
+
+def test_an_unwritable_place_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="file"):
+        write_pose_file(tmp_path / "file" / "poses.txt", {"a.jpg": HERE})
+
+
+def test_short_names_find_their_images() -> None:
+    images = ["q/day/1.jpg", "q/day/2.jpg", "q/night/2.jpg"]
+    found = poses_by_image({"1.jpg": HERE, "q/day/2.jpg": HERE, "9.jpg": HERE}, images)
+    assert list(found) == ["q/day/1.jpg", "q/day/2.jpg", "9.jpg"]
+    with pytest.raises(DataError, match="may be 'q/day/2.jpg' or 'q/night/2.jpg'"):
+        poses_by_image({"2.jpg": HERE}, images)
+    with pytest.raises(DataError, match="in two ways"):
+        poses_by_image({"1.jpg": HERE, "q/day/1.jpg": HERE}, images)

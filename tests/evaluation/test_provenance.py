@@ -1,0 +1,51 @@
+"""The JSON beside a pose file."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+import pytest
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.evaluation.provenance import package_versions, write_provenance
+
+
+def test_holds_what_was_given_and_binds_the_file(tmp_path: Path) -> None:
+    pose_file = tmp_path / "aachen.txt"
+    pose_file.write_text("a.jpg 1 0 0 0 0 0 0\n")
+    options = {"preset": "classic", "options": {"max_error_px": 8.0}}
+    path = write_provenance(pose_file, options, counts={"queries": 2, "poses": 1})
+    assert path == tmp_path / "aachen.txt.json"
+    content = json.loads(path.read_text())
+    assert content["pose_file"] == "aachen.txt"
+    assert content["sha256"] == hashlib.sha256(pose_file.read_bytes()).hexdigest()
+    assert content["counts"] == {"queries": 2, "poses": 1}
+    assert content["preset"] == "classic"
+    assert content["options"] == {"max_error_px": 8.0}
+    assert content["versions"] == package_versions()
+
+
+def test_the_same_run_gives_the_same_bytes(tmp_path: Path) -> None:
+    pose_file = tmp_path / "poses.txt"
+    pose_file.write_text("")
+    first = write_provenance(pose_file, {"seed": 1}, counts={}).read_bytes()
+    assert write_provenance(pose_file, {"seed": 1}, counts={}).read_bytes() == first
+
+
+def test_versions_name_what_is_installed() -> None:
+    import numpy
+
+    assert package_versions()["numpy"] == numpy.__version__
+
+
+def test_refusals(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="cannot read"):
+        write_provenance(tmp_path / "absent.txt", {}, counts={})
+    (tmp_path / "poses.txt").write_text("")
+    with pytest.raises(ValueError, match="already ours: sha256"):
+        write_provenance(tmp_path / "poses.txt", {"sha256": ""}, counts={})
+    with pytest.raises(ValueError, match="JSON"):
+        write_provenance(tmp_path / "poses.txt", {"x": float("nan")}, counts={})
+    assert not (tmp_path / "poses.txt.json").exists()

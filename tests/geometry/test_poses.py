@@ -1,0 +1,151 @@
+"""Pose algebra on arrays against scipy, RigidTransform and hand-made cases."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from megloc_kapture.geometry.poses import (
+    camera_centers,
+    compose,
+    invert,
+    invert_quats,
+    multiply_quats,
+    normalize_quats,
+    rotate,
+    rotation_angles_deg,
+    rotation_matrices,
+    stack_poses,
+    unstack_poses,
+)
+from megloc_kapture.values import RigidTransform
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def random_poses(seed: int, count: int = 5) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return normalize_quats(rng.normal(size=(count, 4))), rng.normal(size=(count, 3)) * 10
+
+
+def scipy_rotation(quats: np.ndarray) -> Rotation:
+    return Rotation.from_quat(quats[:, [1, 2, 3, 0]])
+
+
+def about_x(angle_deg: float) -> np.ndarray:
+    half = np.deg2rad(angle_deg) / 2
+    return np.array([np.cos(half), np.sin(half), 0.0, 0.0])
+
+
+@given(seeds)
+def test_angles_agree_with_scipy(seed: int) -> None:
+    first, _ = random_poses(seed)
+    second, _ = random_poses(seed + 1)
+    expected = (scipy_rotation(first) * scipy_rotation(second).inv()).magnitude()
+    np.testing.assert_allclose(
+        rotation_angles_deg(first, second), np.rad2deg(expected), rtol=0, atol=1e-9
+    )
+
+
+@given(seeds, st.sampled_from([(-1, 1), (1, -1), (-1, -1)]))
+def test_a_quaternion_and_its_negative_are_one_rotation(seed: int, signs: tuple[int, int]) -> None:
+    first, _ = random_poses(seed)
+    second, _ = random_poses(seed + 1)
+    np.testing.assert_array_equal(
+        rotation_angles_deg(signs[0] * first, signs[1] * second),
+        rotation_angles_deg(first, second),
+    )
+
+
+@given(st.floats(-12, 2.2), seeds)
+def test_small_and_large_angles_keep_their_digits(exponent: float, seed: int) -> None:
+    angle_deg = 10.0**exponent
+    base, _ = random_poses(seed, 1)
+    turned = multiply_quats(about_x(angle_deg), base)
+    # an arccos would be off by 1e-6 degrees here
+    assert rotation_angles_deg(turned, base)[0] == pytest.approx(angle_deg, rel=1e-12, abs=5e-14)
+
+
+def test_equal_rotations_are_exactly_zero_apart() -> None:
+    quat = np.array([[0.5, 0.5, 0.5, 0.5]])
+    assert rotation_angles_deg(quat, quat)[0] == 0.0
+    assert rotation_angles_deg(quat, -quat)[0] == 0.0
+
+
+def test_half_a_turn_is_180_degrees() -> None:
+    angle = rotation_angles_deg(about_x(180.0), np.array([1.0, 0, 0, 0]))
+    assert float(angle) == pytest.approx(180.0, abs=1e-12)
+
+
+def test_length_of_quaternions_does_not_matter() -> None:
+    quats, translations = random_poses(3)
+    other, _ = random_poses(4)
+    np.testing.assert_allclose(
+        rotation_angles_deg(1.0005 * quats, 0.9995 * other), rotation_angles_deg(quats, other)
+    )
+    np.testing.assert_allclose(rotation_matrices(1.0005 * quats), rotation_matrices(quats))
+    np.testing.assert_allclose(
+        camera_centers(1.0005 * quats, translations), camera_centers(quats, translations)
+    )
+
+
+@given(seeds)
+def test_matrices_and_rotation_agree_with_scipy(seed: int) -> None:
+    quats, vectors = random_poses(seed)
+    rotation = scipy_rotation(quats)
+    np.testing.assert_allclose(rotation_matrices(quats), rotation.as_matrix(), atol=1e-14)
+    np.testing.assert_allclose(rotate(quats, vectors), rotation.apply(vectors), atol=1e-12)
+
+
+@given(seeds)
+def test_arrays_agree_with_the_value_type(seed: int) -> None:
+    first = unstack_poses(*random_poses(seed))
+    second = unstack_poses(*random_poses(seed + 1))
+    expected = [a @ b for a, b in zip(first, second, strict=True)]
+    quats, translations = compose(*stack_poses(first), *stack_poses(second))
+    np.testing.assert_allclose(quats, stack_poses(expected)[0], atol=1e-14)
+    np.testing.assert_allclose(translations, stack_poses(expected)[1], atol=1e-12)
+    quats, translations = invert(*stack_poses(first))
+    inverse = [pose.inverse() for pose in first]
+    np.testing.assert_allclose(quats, stack_poses(inverse)[0], atol=1e-14)
+    np.testing.assert_allclose(translations, stack_poses(inverse)[1], atol=1e-12)
+    centers = camera_centers(*stack_poses(first))
+    np.testing.assert_allclose(centers, [pose.center() for pose in first], atol=1e-12)
+
+
+@given(seeds)
+def test_inverse_undoes(seed: int) -> None:
+    quats, translations = random_poses(seed)
+    identity, zero = compose(quats, translations, *invert(quats, translations))
+    np.testing.assert_allclose(np.abs(identity[:, 0]), 1.0, atol=1e-14)
+    np.testing.assert_allclose(zero, 0.0, atol=1e-12)
+    np.testing.assert_allclose(
+        multiply_quats(invert_quats(2 * quats), 2 * quats), [[1, 0, 0, 0]] * 5, atol=1e-14
+    )
+
+
+def test_a_centre_is_not_a_translation() -> None:
+    # a camera at (2, 0, 0) that was turned by 90 degrees about y: t = -R C = (0, 0, 2)
+    quat = np.array([[np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0]])
+    centers = camera_centers(quat, np.array([[0.0, 0, 2]]))
+    np.testing.assert_allclose(centers, [[2, 0, 0]], atol=1e-14)
+
+
+def test_no_poses() -> None:
+    quats, translations = stack_poses([])
+    assert quats.shape == (0, 4) and translations.shape == (0, 3)
+    assert camera_centers(quats, translations).shape == (0, 3)
+    assert rotation_angles_deg(quats, quats).shape == (0,)
+    assert unstack_poses(quats, translations) == []
+
+
+def test_stacking_and_back() -> None:
+    poses = [RigidTransform((0.5, 0.5, -0.5, 0.5), (1.0, 2.0, 3.0)), RigidTransform.identity()]
+    assert unstack_poses(*stack_poses(poses)) == poses
+
+
+def test_a_zero_quaternion_has_no_direction() -> None:
+    assert np.isnan(normalize_quats(np.zeros((1, 4)))).all()

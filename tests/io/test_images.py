@@ -1,0 +1,140 @@
+"""Images are read as stored, in RGB, or refused."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from megloc_kapture.errors import DataError, OutputError
+from megloc_kapture.io.images import image_size, read_image_rgb, write_image
+
+RNG = np.random.default_rng(0)
+PIXELS = RNG.integers(0, 256, (40, 60, 3), dtype=np.uint8)
+SMOOTH = cv2.resize(PIXELS[:4, :6], (60, 40), interpolation=cv2.INTER_LINEAR)
+
+
+def test_png_returns_the_same_rgb(tmp_path: Path) -> None:
+    write_image(tmp_path / "a.png", PIXELS)
+    assert np.array_equal(read_image_rgb(tmp_path / "a.png"), PIXELS)
+    assert np.array_equal(np.asarray(Image.open(tmp_path / "a.png")), PIXELS)  # RGB, not BGR
+    assert image_size(tmp_path / "a.png") == (60, 40)
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".JPEG"])
+def test_jpeg_is_close_and_deterministic(tmp_path: Path, suffix: str) -> None:
+    for name in ("a", "b"):
+        write_image(tmp_path / (name + suffix), SMOOTH)
+    read = read_image_rgb(tmp_path / ("a" + suffix)).astype(int)
+    assert abs(read - SMOOTH).mean() < 4
+    assert (tmp_path / ("a" + suffix)).read_bytes() == (tmp_path / ("b" + suffix)).read_bytes()
+
+
+def test_grey_images_get_three_equal_channels(tmp_path: Path) -> None:
+    write_image(tmp_path / "a.png", PIXELS[:, :, 0])
+    assert Image.open(tmp_path / "a.png").mode == "L"
+    read = read_image_rgb(tmp_path / "a.png")
+    assert read.shape == (40, 60, 3)
+    assert np.array_equal(read, np.repeat(PIXELS[:, :, :1], 3, axis=2))
+
+
+def test_sixteen_bit_is_scaled_to_eight(tmp_path: Path) -> None:
+    deep = PIXELS[:, :, 0].astype(np.uint16) * 257
+    Image.fromarray(deep).save(tmp_path / "a.png")
+    assert np.array_equal(read_image_rgb(tmp_path / "a.png")[:, :, 1], PIXELS[:, :, 0])
+
+
+def test_transparency_is_dropped(tmp_path: Path) -> None:
+    alpha = RNG.integers(0, 256, (40, 60, 1), dtype=np.uint8)
+    Image.fromarray(np.concatenate([PIXELS, alpha], axis=2)).save(tmp_path / "a.png")
+    assert np.array_equal(read_image_rgb(tmp_path / "a.png"), PIXELS)
+
+
+def test_exif_orientation_is_ignored(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 6  # "rotate by 90 degrees to view"
+    Image.fromarray(SMOOTH).save(tmp_path / "a.jpg", exif=exif, quality=95)
+    assert read_image_rgb(tmp_path / "a.jpg").shape == (40, 60, 3)
+    assert image_size(tmp_path / "a.jpg") == (60, 40)
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".bmp", ".tif"])
+def test_truncated_images_are_refused(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / ("a" + suffix)
+    Image.fromarray(PIXELS).save(path)
+    content = path.read_bytes()
+    read_image_rgb(path)
+    for part in (0.5, 0.8, 0.99):
+        path.write_bytes(content[: int(len(content) * part)])
+        with pytest.raises(DataError, match=path.name):
+            read_image_rgb(path)
+
+
+def test_a_truncated_jpeg_with_a_thumbnail_is_refused(tmp_path: Path) -> None:
+    Image.fromarray(PIXELS).resize((16, 12)).save(tmp_path / "thumb.jpg")
+    path = tmp_path / "a.jpg"
+    # an APP1 segment that holds a whole JPEG of its own, end mark included
+    Image.fromarray(PIXELS).save(path)
+    content, thumbnail = path.read_bytes(), (tmp_path / "thumb.jpg").read_bytes()
+    segment = b"\xff\xe1" + (len(thumbnail) + 2).to_bytes(2, "big") + thumbnail
+    whole = content[:2] + segment + content[2:]
+    path.write_bytes(whole)
+    assert read_image_rgb(path).shape == (40, 60, 3)
+    path.write_bytes(whole[:-500])
+    with pytest.raises(DataError, match="truncated"):
+        read_image_rgb(path)
+
+
+def test_data_after_the_end_is_fine(tmp_path: Path) -> None:
+    path = tmp_path / "a.jpg"
+    Image.fromarray(PIXELS).save(path)
+    path.write_bytes(path.read_bytes() + b"\xff\xda trailing")
+    assert read_image_rgb(path).shape == (40, 60, 3)
+
+
+def test_things_that_are_no_images_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "text.jpg").write_text("not an image")
+    (tmp_path / "empty.jpg").touch()
+    (tmp_path / "folder.jpg").mkdir()
+    os.mkfifo(tmp_path / "pipe.jpg")  # opening it would wait for ever
+    (tmp_path / "device.jpg").symlink_to("/dev/zero")
+    (tmp_path / "dangling.jpg").symlink_to("/nowhere")
+    names = ["text", "empty", "folder", "pipe", "device", "dangling", "missing", "x" * 300]
+    for name in names:
+        path = tmp_path / f"{name}.jpg"
+        for read in (read_image_rgb, image_size):
+            with pytest.raises(DataError, match=path.name):
+                read(path)
+
+
+@given(
+    st.binary(max_size=200), st.sampled_from([b"", b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"BM"])
+)
+def test_random_bytes_do_no_harm(
+    tmp_path_factory: pytest.TempPathFactory, tail: bytes, head: bytes
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "random.jpg"
+    path.write_bytes(head + tail)
+    for read in (read_image_rgb, image_size):
+        try:
+            read(path)
+        except DataError as error:
+            assert "random.jpg" in str(error)
+
+
+def test_bad_arrays_and_places_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="suffix"):
+        write_image(tmp_path / "a.gif", PIXELS)
+    with pytest.raises(ValueError, match="uint8"):
+        write_image(tmp_path / "a.png", PIXELS.astype(np.float32))  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="channels"):
+        write_image(tmp_path / "a.png", PIXELS[:, :, :2])
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match="file/a.png"):
+        write_image(tmp_path / "file" / "a.png", PIXELS)

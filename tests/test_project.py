@@ -1,0 +1,106 @@
+"""The project's own files agree with each other, and the environment is one that works."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import importlib.util
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
+REQUIREMENTS = [
+    Requirement(text)
+    for texts in (PROJECT["dependencies"], *PROJECT["optional-dependencies"].values())
+    for text in texts
+]
+
+
+def pins() -> dict[str, str]:
+    """Version by canonical name, out of constraints.txt."""
+    lines = (REPOSITORY / "constraints.txt").read_text().splitlines()
+    pairs = (line.split("==") for line in lines if line and not line.startswith("#"))
+    return {canonicalize_name(name): version for name, version in pairs}
+
+
+@pytest.mark.parametrize("requirement", REQUIREMENTS, ids=lambda r: r.name)
+def test_dependency_is_pinned_inside_its_range(requirement: Requirement) -> None:
+    assert requirement.specifier.contains(pins()[canonicalize_name(requirement.name)])
+
+
+@pytest.mark.parametrize("package", ["torchvision", "timm"])
+def test_breaking_package_is_absent(package: str) -> None:
+    # a torchvision that does not fit torch breaks transformers; timm brings torchvision
+    assert importlib.util.find_spec(package) is None
+
+
+def test_one_opencv() -> None:
+    # both distributions write into the same cv2 folder; the last one installed wins
+    names = {canonicalize_name(d.name) for d in importlib.metadata.distributions()}
+    assert {name for name in names if name.startswith("opencv")} == {"opencv-python-headless"}
+
+
+def test_no_top_level_tools() -> None:
+    # a package of that name breaks every console script of kapture 1.1.12
+    assert not (REPOSITORY / "tools").exists()
+
+
+def test_registered_plugins_and_command_exist() -> None:
+    registered = list(importlib.metadata.distribution("megloc-kapture").entry_points)
+    assert "megloc" in {entry.name for entry in registered}
+    for entry in registered:
+        assert callable(entry.load()), entry
+
+
+def test_importing_every_module_has_no_side_effect() -> None:
+    names = sorted(
+        ".".join(path.relative_to(REPOSITORY).with_suffix("").parts)
+        for path in (REPOSITORY / "megloc_kapture").rglob("*.py")
+        if path.stem != "__main__"
+    )
+    names = [name.removesuffix(".__init__") for name in names]
+    code = f"""
+import importlib, logging, threading
+import cv2, torch
+def state():
+    handlers = len(logging.getLogger().handlers)
+    return cv2.getNumThreads(), torch.get_num_threads(), threading.active_count(), handlers
+before = state()
+for name in {names!r}:
+    importlib.import_module(name)
+assert state() == before, (before, state())
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code, "--no-such-option"], capture_output=True, text=True
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_unusable_python_is_refused_in_one_line() -> None:
+    done = subprocess.run(
+        ["sh", "scripts/find_python.sh"],
+        cwd=REPOSITORY,
+        env={"PATH": "/usr/bin:/bin", "PYTHON": "/bin/false"},
+        capture_output=True,
+        text=True,
+    )
+    assert (done.returncode, done.stdout) == (1, "")
+    assert re.fullmatch(r"Python 3\.11 or newer is needed.*\n", done.stderr)
+
+
+def test_help_names_every_target() -> None:
+    makefile = (REPOSITORY / "Makefile").read_text()
+    phony = re.search(r"^\.PHONY: (.*)$", makefile, re.MULTILINE)
+    assert phony is not None
+    shown = subprocess.run(
+        ["make", "--no-print-directory", "help"], cwd=REPOSITORY, capture_output=True, text=True
+    ).stdout
+    for target in set(phony.group(1).split()) - {"help", "venv"}:
+        assert re.search(rf"^make {target} ", shown, re.MULTILINE), target
