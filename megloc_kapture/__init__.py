@@ -1,5 +1,49 @@
-"""Visual localization in kapture: MegLoc's stages as kapture plugins."""
+"""Visual localization in kapture: MegLoc's stages as kapture plugins.
+
+>>> from megloc_kapture import KaptureMap, Localizer
+>>> localizer = Localizer(KaptureMap.open("somebody_elses_map"))   # doctest: +SKIP
+>>> found = localizer.localize("query.jpg", camera)                # doctest: +SKIP
+"""
 
 # pycolmap 4.1.1 to 4.2.1 corrupt the heap when they are imported before zlib; this import
 # must stay the first of the package (tests/test_import_order.py).
 import zlib  # noqa: F401
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from megloc_kapture.errors import DataError, MeglocError, OptionError, OutputError, PluginError
+from megloc_kapture.values import Camera, Failure, LocalFeatures, Pose, RigidTransform
+
+if TYPE_CHECKING:
+    from megloc_kapture.pipeline.kapture_map import KaptureMap
+    from megloc_kapture.pipeline.localizer import Localizer
+    from megloc_kapture.pipeline.queries import Query
+
+__all__ = [
+    "Camera",
+    "DataError",
+    "Failure",
+    "KaptureMap",
+    "LocalFeatures",
+    "Localizer",
+    "MeglocError",
+    "OptionError",
+    "OutputError",
+    "PluginError",
+    "Pose",
+    "Query",
+    "RigidTransform",
+]
+
+# loaded when asked for: the small types above must not cost the import of the solvers
+_LAZY = {
+    "KaptureMap": "megloc_kapture.pipeline.kapture_map",
+    "Localizer": "megloc_kapture.pipeline.localizer",
+    "Query": "megloc_kapture.pipeline.queries",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _LAZY:
+        return getattr(import_module(_LAZY[name]), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

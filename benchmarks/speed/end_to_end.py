@@ -15,26 +15,25 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from timing import table
 
 
-def megloc_command(scene: Path, workspace: Path, arguments: list[str]) -> list[str]:
+def megloc_command(
+    scene: Path, workspace: Path, threads: int, arguments: Sequence[str]
+) -> list[str]:
     """The command line of our run, with the ``megloc`` beside this Python."""
     megloc = Path(sys.executable).with_name("megloc")
-    places = ["--root", str(scene), "--workspace", str(workspace)]
+    places = ["--root", str(scene), "--workspace", str(workspace), "--workers", str(threads)]
     return [str(megloc), "eval", "kapture", *places, *arguments]
-
-
-def megloc_environment(threads: int) -> dict[str, str]:
-    return {**os.environ, "OMP_NUM_THREADS": str(threads)}
 
 
 def stage_seconds(workspace: Path) -> dict[str, float]:
     """Seconds by stage out of the workspace's manifests, in the order the stages ended."""
     manifests = sorted(
-        (workspace / "stages").glob("*.json"), key=lambda path: path.stat().st_mtime_ns
+        (workspace / "stages").glob("[!.]*.json"), key=lambda path: path.stat().st_mtime_ns
     )
     return {path.stem: float(json.loads(path.read_text())["seconds"]) for path in manifests}
 
@@ -57,9 +56,7 @@ def main() -> None:
         workspace = options.workspace or Path(temporary) / "workspace"
         start = time.perf_counter()
         done = subprocess.run(
-            megloc_command(options.scene, workspace, arguments),
-            env=megloc_environment(options.threads),
-            check=False,
+            megloc_command(options.scene, workspace, options.threads, arguments), check=False
         )
         wall_s = time.perf_counter() - start
         if done.returncode != 0:

@@ -18,7 +18,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from end_to_end import megloc_command, megloc_environment, stage_seconds
+from end_to_end import megloc_command, stage_seconds
 from kloc_pipeline import Inputs, KaptureLocalization, Score, evaluate, localize
 from timing import Timed, table, timed_command
 
@@ -81,11 +81,12 @@ def main() -> None:
         print(f"{options.scene.name}, {options.threads} threads, load {os.getloadavg()[0]:.1f}")
         sys.stdout.flush()
         workspace = (options.workspace or folder / "workspace").resolve()
-        command = megloc_command(options.scene.resolve(), workspace, arguments)
-        timed_command(OURS, command, megloc_environment(options.threads), folder / "ours.log")
+        scene = options.scene.resolve()
+        command = megloc_command(scene, workspace, options.threads, arguments)
+        timed_command(OURS, command, os.environ, folder / "ours.log")
         theirs = localize(tools, Inputs.of_workspace(workspace, options.features))
         results = {OURS: workspace / "localized", THEIRS: theirs}
-        scores = evaluate(tools, results, options.scene.resolve() / "query_gt", THRESHOLDS)
+        scores = evaluate(tools, results, scene / "query_gt", THRESHOLDS)
         print(report(stage_seconds(workspace), tools.steps, scores))
 
 

@@ -16,7 +16,7 @@ Output = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 Force = Annotated[bool, tyro.conf.arg(aliases=["-f"])]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Common:
     """Flags of every command."""
 
@@ -35,7 +35,7 @@ class Common:
         return Console(quiet=self.quiet)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Working:
     """Flags of commands with per-image or per-pair work."""
 
@@ -45,7 +45,7 @@ class Working:
     """Number of processes; all cores unless given."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Choosing:
     """Flags that choose options."""
 

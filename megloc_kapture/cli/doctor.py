@@ -22,7 +22,7 @@ _PACKAGES = (
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Doctor(Common):
     """Check the environment: versions, known-bad combinations, GPU."""
 

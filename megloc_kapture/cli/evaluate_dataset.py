@@ -35,7 +35,7 @@ from megloc_kapture.pipeline.workspace import Workspace
 BELOW_RECALL = 3
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Eval(Choosing, Working, Common):
     """Run all stages on a dataset; what is done and still true is kept."""
 

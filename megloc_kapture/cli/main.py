@@ -8,8 +8,20 @@ from typing import Annotated, Any, Protocol
 
 import tyro
 
+from megloc_kapture.cli.datasets import Import, Synth
 from megloc_kapture.cli.doctor import Doctor
 from megloc_kapture.cli.evaluate_dataset import Eval
+from megloc_kapture.cli.info import Info
+from megloc_kapture.cli.localize import Localize
+from megloc_kapture.cli.results import Evaluate, Submit
+from megloc_kapture.cli.stages import (
+    ExtractGlobal,
+    ExtractLocal,
+    Match,
+    PairsMapping,
+    PairsQuery,
+    Triangulate,
+)
 from megloc_kapture.errors import MeglocError
 
 DONE, DEFECT, USER_ERROR, INTERRUPTED = 0, 1, 2, 130
@@ -27,6 +39,18 @@ class Command(Protocol):
 
 COMMANDS: dict[str, type[Any]] = {
     "eval": Eval,
+    "import": Import,
+    "synth": Synth,
+    "extract-local": ExtractLocal,
+    "extract-global": ExtractGlobal,
+    "pairs-mapping": PairsMapping,
+    "pairs-query": PairsQuery,
+    "match": Match,
+    "triangulate": Triangulate,
+    "localize": Localize,
+    "submit": Submit,
+    "evaluate": Evaluate,
+    "info": Info,
     "doctor": Doctor,
 }
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -155,23 +156,20 @@ def map_from_above(
     low, high = _page(np.vstack([mapped_2d, truth_2d]))
     outside = ~((estimated >= low) & (estimated <= high)).all(axis=1)
     guessed = np.array([q.outcome == "fallback" for q in evaluation.queries], dtype=bool)[found]
-    raster = len(mapped) + len(truth) > RASTER_ABOVE
+    look = _Crowd(len(mapped) + len(truth))
     width, height = (high - low).tolist()
     with styled_figure(10.5, float(np.clip(10.0 * height / width, 3.0, 8.0)) + 0.6) as figure:
         axes = figure.subplots()
         if len(mapped_2d):
-            _dots(axes, mapped_2d, "map cameras", s=10, c="#b8c4d0", rasterized=raster)
+            look.dots(axes, mapped_2d, "map cameras", 10, c="#b8c4d0")
         lines = np.stack([truth_2d[found], estimated], axis=1)
         axes.add_collection(LineCollection(list(lines), colors=MISS, linewidths=1.0, alpha=0.8))
-        _dots(axes, truth_2d[found], "truth", s=26, facecolors="none", edgecolors="#009e73",
-              linewidths=1.1, rasterized=raster)  # fmt: skip
-        _dots(axes, estimated[~guessed], "estimated", s=7, c="#0072b2", rasterized=raster)
+        look.dots(axes, truth_2d[found], "truth", 26, facecolors="none", edgecolors="#009e73")
+        look.dots(axes, estimated[~guessed], "estimated", 7, c="#0072b2", linewidths=0)
         if guessed.any():
-            _dots(axes, estimated[guessed], "fallback pose", s=20, c=MISS, marker="x",
-                  linewidths=1.2, rasterized=raster)  # fmt: skip
+            look.dots(axes, estimated[guessed], "fallback pose", 20, c=MISS, marker="x")
         if not found.all():
-            _dots(axes, truth_2d[~found], "truth, no pose", s=30, c=MISS, marker="+",
-                  linewidths=1.4, rasterized=raster)  # fmt: skip
+            look.dots(axes, truth_2d[~found], "truth, no pose", 30, c=MISS, marker="+")
         axes.set_aspect("equal")
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
         axes.set(xlabel=f"{view.labels[0]} (m)", ylabel=f"{view.labels[1]} (m)")
@@ -179,8 +177,18 @@ def map_from_above(
         return to_svg(figure, "above"), int(outside.sum())
 
 
-def _dots(axes: Axes, points: NDArray[np.float64], label: str, **look: object) -> None:
-    axes.scatter(points[:, 0], points[:, 1], label=label, **look)  # type: ignore[arg-type]
+class _Crowd:
+    """How dots are drawn where there are ``count`` of them: smaller, and as pixels, in a crowd."""
+
+    def __init__(self, count: int) -> None:
+        self.shrink = float(np.clip(np.sqrt(800 / max(count, 1)), 0.3, 1.0))
+        self.raster = count > RASTER_ABOVE
+
+    def dots(
+        self, axes: Axes, points: NDArray[np.float64], label: str, size: float, **look: Any
+    ) -> None:
+        look = {"linewidths": 1.3 * self.shrink, "rasterized": self.raster} | look
+        axes.scatter(points[:, 0], points[:, 1], s=size * self.shrink, label=label, **look)
 
 
 def _page(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -52,47 +52,42 @@ class RootSift:
         """
         options = self.options
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-
-        def sift(limit: int) -> cv2.SIFT:
-            # precise upscaling: without it OpenCV shifts the first octave by a quarter pixel
-            return cv2.SIFT.create(
-                limit,
-                3,
-                options.contrast_threshold,
-                options.edge_threshold,
-                options.sigma_px,
-                True,
-            )
-
-        if mask is None:
-            keypoints, descriptors = sift(options.max_keypoints).detectAndCompute(gray, None)
-            keypoints = list(keypoints)
-        else:
-            # OpenCV applies its own mask after the selection of the strongest, hence two steps
-            found = sift(0).detect(gray, None)
-            height, width = gray.shape
-            keypoints = []
-            for keypoint in found:
-                column = min(max(int(keypoint.pt[0] + 0.5), 0), width - 1)
-                row = min(max(int(keypoint.pt[1] + 0.5), 0), height - 1)
-                if mask[row, column]:
-                    keypoints.append(keypoint)
-            keypoints.sort(key=_strongest_first)
-            keypoints = keypoints[: options.max_keypoints]
-            computed, descriptors = sift(0).compute(gray, keypoints)
-            keypoints = list(computed)
-        if descriptors is None or not keypoints:
+        sift = cv2.SIFT.create(
+            # OpenCV applies its own mask after the selection of the strongest, so with a mask it
+            # gets no limit; nor does it describe only what is left, for without a keypoint of the
+            # first octave it builds another pyramid and other descriptors
+            options.max_keypoints if mask is None else 0,
+            3,
+            options.contrast_threshold,
+            options.edge_threshold,
+            options.sigma_px,
+            True,  # precise upscaling: without it the first octave is shifted by a quarter pixel
+        )
+        keypoints, descriptors = sift.detectAndCompute(gray, None)
+        usable = range(len(keypoints))
+        order = sorted(
+            (k for k in usable if mask is None or _is_on(mask, keypoints[k])),
+            key=lambda k: _strongest_first(keypoints[k]),
+        )
+        if descriptors is None or not order:
             return LocalFeatures(
                 np.zeros((0, 2), np.float32),
                 np.zeros(0, np.float32),
                 np.zeros((0, self.descriptor_size), np.float32),
             )
-        order = sorted(range(len(keypoints)), key=lambda k: _strongest_first(keypoints[k]))
         order = order[: options.max_keypoints]
         xy = np.array([keypoints[k].pt for k in order], dtype=np.float32)
         scores = np.array([keypoints[k].response for k in order], dtype=np.float32)
         # OpenCV puts the centre of the first pixel at (0, 0), COLMAP at (0.5, 0.5)
         return LocalFeatures(xy + np.float32(0.5), scores, root_sift(descriptors[order]))
+
+
+def _is_on(mask: NDArray[np.bool_], keypoint: cv2.KeyPoint) -> bool:
+    height, width = mask.shape
+    # the keypoint is still in OpenCV's coordinates, where a pixel's centre is an integer
+    column = min(max(int(keypoint.pt[0] + 0.5), 0), width - 1)
+    row = min(max(int(keypoint.pt[1] + 0.5), 0), height - 1)
+    return bool(mask[row, column])
 
 
 def _strongest_first(

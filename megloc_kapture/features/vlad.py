@@ -58,7 +58,7 @@ def train_vocabulary(
 
     Raises
     ------
-    DataError : fewer distinct descriptors than clusters.
+    DataError : fewer distinct descriptors than clusters, or values that are not finite.
     """
     options = options or VladOptions()
     data = np.ascontiguousarray(descriptors, dtype=np.float32)
@@ -67,6 +67,8 @@ def train_vocabulary(
             f"a vocabulary of {options.num_clusters} clusters needs as many descriptors, the map "
             f"has {len(data)}: use more images or fewer clusters"
         )
+    if not np.isfinite(data).all():
+        raise DataError("the map's descriptors have values that are not finite")
     rng = np.random.default_rng(options.seed)
     centres = _plus_plus(data, options.num_clusters, rng)
     previous = np.full(len(data), -1, dtype=np.int64)

@@ -154,9 +154,9 @@ def read_observations_strictly(path: Path) -> dict[str, Observations]:
 
 def _size(path: Path) -> int:
     try:
-        return path.stat().st_size if path.is_file() else 0
+        return path.stat().st_size if path.is_file() else -1
     except OSError:
-        return 0  # the plain reader says what is wrong with it
+        return -1  # the plain reader says what is wrong with it
 
 
 def _first_row_length(path: Path) -> int:

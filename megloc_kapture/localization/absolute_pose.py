@@ -1,7 +1,9 @@
 """Absolute pose of one camera from 2D-3D matches.
 
-LO-RANSAC over P3P and non-linear refinement by poselib; the same seed gives the same pose. A
-failure is a falsy value with its reason, never an invented pose.
+LO-RANSAC over P3P by poselib, then robust refinement whose scale follows the residuals: a map
+that is good to a tenth of a pixel and one that is good to three need different ones (figures in
+docs/choices.md). The same seed gives the same pose. A failure is a falsy value with its reason,
+never an invented pose.
 """
 
 from __future__ import annotations
@@ -17,6 +19,11 @@ from megloc_kapture.geometry.cameras import bearing_rays, focal_px, px_from_cam
 from megloc_kapture.localization.covariance import pose_covariance
 from megloc_kapture.values import Camera, Failure, Options, Pose, RigidTransform
 
+_REFINEMENTS = 2
+_MIN_SIGMA_PX = 0.1
+# the scale at which the Cauchy loss has 95 % of least squares' efficiency under Gaussian noise
+_CAUCHY_EFFICIENT = 2.385
+
 
 class AbsolutePoseOptions(Options):
     """Options of the pose estimation."""
@@ -26,7 +33,6 @@ class AbsolutePoseOptions(Options):
     min_iterations: int = Field(default=1000, gt=0)
     max_iterations: int = Field(default=20_000, gt=0)
     confidence: float = Field(default=0.9999, gt=0, lt=1)
-    robust_scale_px: float = Field(default=1.0, gt=0, description="of the Cauchy loss")
     seed: int = Field(default=0, ge=0)
 
 
@@ -61,7 +67,8 @@ def absolute_pose(
             num_matches=count,
         )
     # far from the origin (ECEF) float64 loses what a recentred world keeps
-    offset = np.median(points_world, axis=0)
+    finite = np.isfinite(points_world).all(axis=1)
+    offset = np.median(points_world[finite], axis=0) if finite.any() else np.zeros(3)
     local = points_world - offset
     estimate = _estimate(points_px, local, camera, options)
     num_inliers = int(estimate.inliers.sum())
@@ -104,7 +111,10 @@ def _estimate(
     # models is shorter than COLMAP's
     focal = focal_px(camera)
     rays = bearing_rays(camera, points_px)
+    # a camera's distortion cannot be undone everywhere: such rays are NaN
     usable = np.isfinite(rays).all(axis=1) & np.isfinite(points).all(axis=1)
+    if usable.sum() < options.min_inliers:
+        return _Estimate(RigidTransform.identity(), np.zeros(len(usable), dtype=bool))
     pinhole = {
         "model": "PINHOLE",
         "width": 1,
@@ -122,14 +132,44 @@ def _estimate(
             "success_prob": options.confidence,
             "seed": options.seed,
         },
-        {"loss_type": "CAUCHY", "loss_scale": options.robust_scale_px},
+        {"loss_type": "CAUCHY", "loss_scale": 1.0},
     )
+    pose = _rigid(found)
+    errors = np.where(usable, _errors_px(pose, points_px, points, camera), np.inf)
+    for _ in range(_REFINEMENTS):
+        inliers = errors <= options.max_error_px
+        if inliers.sum() < options.min_inliers:
+            break
+        # the median of a Rayleigh distribution is 1.1774 sigma
+        sigma = max(float(np.median(errors[inliers])) / 1.1774, _MIN_SIGMA_PX)
+        found, _ = poselib.refine_absolute_pose(
+            np.ascontiguousarray(rays[inliers, :2] * focal),
+            np.ascontiguousarray(points[inliers]),
+            found,
+            pinhole,
+            {"loss_type": "CAUCHY", "loss_scale": _CAUCHY_EFFICIENT * sigma},
+        )
+        pose = _rigid(found)
+        errors = np.where(usable, _errors_px(pose, points_px, points, camera), np.inf)
+    return _Estimate(pose, errors <= options.max_error_px)
+
+
+def _rigid(found: Any) -> RigidTransform:
     quat = np.asarray(found.q, dtype=np.float64)
     quat = quat / np.linalg.norm(quat)
     t = np.asarray(found.t, dtype=np.float64)
-    pose = RigidTransform(
+    return RigidTransform(
         (float(quat[0]), float(quat[1]), float(quat[2]), float(quat[3])),
         (float(t[0]), float(t[1]), float(t[2])),
     )
-    errors = np.linalg.norm(px_from_cam(camera, pose.apply(points)) - points_px, axis=1)
-    return _Estimate(pose, np.nan_to_num(errors, nan=np.inf) <= options.max_error_px)
+
+
+def _errors_px(
+    pose: RigidTransform,
+    points_px: NDArray[np.floating[Any]],
+    points: NDArray[np.float64],
+    camera: Camera,
+) -> NDArray[np.float64]:
+    """Reprojection errors (N,), infinite behind the camera."""
+    difference = px_from_cam(camera, pose.apply(points)) - points_px
+    return np.asarray(np.nan_to_num(np.linalg.norm(difference, axis=1), nan=np.inf))

@@ -40,7 +40,8 @@ def pairs_by_poses(
     centers = np.array([pose.center() for pose in cams_from_world])
     axes = np.array([pose.rotation_matrix()[2] for pose in cams_from_world])
     min_cosine = np.cos(np.radians(options.max_angle_deg))
-    bound = np.inf if options.max_distance is None else options.max_distance
+    # the tree's own bound is exclusive
+    bound = np.inf if options.max_distance is None else np.nextafter(options.max_distance, np.inf)
     tree = cKDTree(centers)
     found = np.zeros((0, 2), dtype=np.int64)
     waiting = np.arange(count)

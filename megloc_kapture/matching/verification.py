@@ -90,7 +90,8 @@ def in_front_of_both(
     # both depths carry the positive factor 1 / determinant: only the signs matter
     depth_a = along_a - cosine * along_b
     depth_b = cosine * along_a - along_b
-    return np.asarray(((depth_a > 0) & (depth_b > 0)) | (determinant < 1e-10) & (cosine > 0))
+    at_infinity = (determinant < 1e-10) & (cosine > 0)
+    return np.asarray(((depth_a > 0) & (depth_b > 0)) | at_infinity)
 
 
 def verify_with_poses(
@@ -138,13 +139,17 @@ def verify_two_view(
 
     Returns
     -------
-    bool (N,); all False when no model has ``min_matches`` inliers.
+    bool (N,); all False when no model has ``min_matches`` inliers. False where a camera's
+    distortion cannot be undone.
     """
     import poselib
 
     options = options or TwoViewOptions()
     none = np.zeros(len(keypoints_a_px), dtype=bool)
-    if len(keypoints_a_px) < options.min_matches:
+    rays_a = bearing_rays(camera_a, keypoints_a_px)
+    rays_b = bearing_rays(camera_b, keypoints_b_px)
+    usable = np.isfinite(rays_a).all(axis=1) & np.isfinite(rays_b).all(axis=1)
+    if usable.sum() < options.min_matches:
         return none
     # in normalised coordinates poselib needs to know no camera model, and ours knows them all
     focal = 0.5 * (focal_px(camera_a) + focal_px(camera_b))
@@ -155,8 +160,8 @@ def verify_two_view(
         "params": [focal, focal, 0.0, 0.0],
     }
     _, info = poselib.estimate_relative_pose(
-        bearing_rays(camera_a, keypoints_a_px)[:, :2] * focal,
-        bearing_rays(camera_b, keypoints_b_px)[:, :2] * focal,
+        rays_a[usable, :2] * focal,
+        rays_b[usable, :2] * focal,
         pinhole,
         pinhole,
         {
@@ -168,6 +173,8 @@ def verify_two_view(
         },
     )
     inliers = np.asarray(info["inliers"], dtype=bool)
-    if len(inliers) != len(none) or inliers.sum() < options.min_matches:
+    if len(inliers) != usable.sum() or inliers.sum() < options.min_matches:
         return none
-    return inliers
+    good = none.copy()
+    good[usable] = inliers
+    return good

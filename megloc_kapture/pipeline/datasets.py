@@ -8,9 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from megloc_kapture.datasets.kapture_folders import check_root
+from megloc_kapture.datasets.kapture_folders import MAPPING, QUERY, check_root
 from megloc_kapture.datasets.synthetic.options import SyntheticWorldOptions
 from megloc_kapture.errors import OptionError
+from megloc_kapture.io.kapture_store import KaptureFolder
 from megloc_kapture.stages.parallel import Track
 
 DATASETS = ("kapture", "synthetic")
@@ -40,7 +41,9 @@ class DatasetChoice:
         def render(out: Path) -> Mapping[str, float]:
             from megloc_kapture.datasets.synthetic.writing import write_synthetic_kapture
 
-            return write_synthetic_kapture(out / "world", options, executor=executor, track=track)
+            write_synthetic_kapture(out / "world", options, executor=executor, track=track)
+            folders = [KaptureFolder(out / "world" / part) for part in (MAPPING, QUERY)]
+            return {"images": sum(len(folder.read().image_names()) for folder in folders)}
 
         return render
 

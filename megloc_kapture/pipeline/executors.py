@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import threading
 from collections.abc import Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
-from typing import Literal
+from typing import Any, Literal
 
 from megloc_kapture.errors import OptionError
 
@@ -19,17 +20,44 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+class _SingleThread:
+    """Counts who needs one thread per matrix product; the first sets it, the last restores it."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._users = 0
+        self._limits: Any = None
+
+    def enter(self) -> None:
+        from threadpoolctl import threadpool_limits
+
+        with self._lock:
+            if self._users == 0:
+                self._limits = threadpool_limits(limits=1)
+            self._users += 1
+
+    def leave(self) -> None:
+        with self._lock:
+            self._users -= 1
+            if self._users == 0:
+                self._limits.restore_original_limits()
+
+
+_single_thread = _SingleThread()
+
+
 @contextmanager
 def single_threaded() -> Iterator[None]:
-    """One thread per matrix product while the block runs.
+    """One thread per matrix product while the block runs; blocks may overlap in several threads.
 
     A product's last bits may depend on how it is split among threads; parallelism comes from
     the executor, so that results are the same bytes whatever the number of workers.
     """
-    from threadpoolctl import threadpool_limits
-
-    with threadpool_limits(limits=1):
+    _single_thread.enter()
+    try:
         yield
+    finally:
+        _single_thread.leave()
 
 
 def _start_worker() -> None:

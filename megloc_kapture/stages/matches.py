@@ -5,8 +5,9 @@ Mapping pairs are verified with their known poses, query pairs by a two-view mod
 
 from __future__ import annotations
 
+import threading
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from itertools import groupby
@@ -178,23 +179,29 @@ def read_features(
     )
 
 
-class _Cache:
-    """Features of the images used last, bounded in bytes."""
+class FeatureCache:
+    """Features of the images used last, bounded in bytes; shared by threads."""
 
-    def __init__(self) -> None:
-        self.items: OrderedDict[tuple[Any, ...], Features] = OrderedDict()
-        self.bytes = 0
+    def __init__(self, max_bytes: int = _CACHE_BYTES) -> None:
+        self._items: OrderedDict[Hashable, Features] = OrderedDict()
+        self._bytes = 0
+        self._max_bytes = max_bytes
+        self._lock = threading.Lock()
 
-    def get(self, key: tuple[Any, ...], load: Any) -> Features:
-        if key in self.items:
-            self.items.move_to_end(key)
-            return self.items[key]
-        features: Features = load()
-        self.items[key] = features
-        self.bytes += _size(features)
-        while self.bytes > _CACHE_BYTES and len(self.items) > 1:
-            _, old = self.items.popitem(last=False)
-            self.bytes -= _size(old)
+    def get(self, key: Hashable, load: Callable[[], Features]) -> Features:
+        """The features of a key, loaded when they are not there."""
+        with self._lock:
+            if key in self._items:
+                self._items.move_to_end(key)
+                return self._items[key]
+        features = load()
+        with self._lock:
+            if key not in self._items:
+                self._items[key] = features
+                self._bytes += _size(features)
+            while self._bytes > self._max_bytes and len(self._items) > 1:
+                _, old = self._items.popitem(last=False)
+                self._bytes -= _size(old)
         return features
 
 
@@ -202,7 +209,7 @@ def _size(features: Features) -> int:
     return features.descriptors.nbytes + features.keypoints_px.nbytes + features.rays.nbytes
 
 
-_cache = _Cache()
+_cache = FeatureCache()
 
 
 def _cached(spec: FolderSpec, folder: KaptureFolder, local_type: str, image: str) -> Features:

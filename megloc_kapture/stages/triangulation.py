@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.io.atomic import output_error
 from megloc_kapture.io.colmap import MapImage, TriangulationOptions, triangulate
 from megloc_kapture.io.kapture_store import (
+    ImagePair,
     KaptureFolder,
     Observations,
     write_observations,
@@ -28,6 +30,7 @@ def triangulate_map(
     output: Path,
     options: TriangulationOptions,
     *,
+    pairs: Sequence[ImagePair] | None = None,
     num_threads: int = 1,
 ) -> dict[str, float]:
     """Triangulate and write the map: sensors, features of its type, points3d, observations.
@@ -36,6 +39,7 @@ def triangulate_map(
     ----------
     mapping : images with poses, and their keypoints.
     matches : where the verified matches of the type are.
+    pairs : use the matches of these pairs only.
 
     Returns
     -------
@@ -54,7 +58,11 @@ def triangulate_map(
     keypoints = mapping.keypoints(local_type)
     reader = matches.matches(local_type)
     verified = {}
-    for a, b in reader.pairs:
+    wanted = reader.pairs
+    if pairs is not None:
+        asked = {tuple(sorted((pair.query, pair.map))) for pair in pairs}
+        wanted = [pair for pair in wanted if pair in asked]
+    for a, b in wanted:
         if a in row_of and b in row_of:
             indices, _ = reader.read(a, b)
             if len(indices):

@@ -109,9 +109,7 @@ def test_a_pose_that_must_not_be_handed_in(
 def test_foreign_habits_are_taken(tmp_path: Path, text: str) -> None:
     path = tmp_path / "poses.txt"
     path.write_text(text, encoding="utf-8", newline="")
-    assert read_pose_file(path) == {
-        "a.jpg": RigidTransform((1.0, 0.0, 0.0, 0.0), (1.5, -0.2, 3.0))
-    }
+    assert read_pose_file(path) == {"a.jpg": RigidTransform((1.0, 0.0, 0.0, 0.0), (1.5, -0.2, 3.0))}
 
 
 @pytest.mark.parametrize(

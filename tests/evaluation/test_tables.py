@@ -7,11 +7,31 @@ from typing import Any
 import pytest
 
 from megloc_kapture.evaluation.evaluate import evaluate
-from megloc_kapture.evaluation.tables import format_degrees, format_metres, format_percent, recall_table
+from megloc_kapture.evaluation.tables import (
+    format_degrees,
+    format_metres,
+    format_percent,
+    recall_table,
+)
 from megloc_kapture.evaluation.thresholds import Threshold
 from megloc_kapture.values import RigidTransform
 
 HERE = RigidTransform.identity()
+
+TABLE = """\
+aachen
+
+recall (%) at 0.05 m, 5 deg / 0.25 m, 2 deg / 0.5 m, 5 deg / 5 m, 10 deg
+Both errors at or below (<=) the threshold; a query without a pose counts as a miss.
+
+                                                           median error (m, deg)
+condition  queries  localized  recall (%)                  of all         of localized
+---------------------------------------------------------------------------------------
+day              3          3  33.3 / 66.7 / 66.7 / 100.0  0.1000, 0.000  0.1000, 0.000
+night            2          1  0.0 / 0.0 / 50.0 / 50.0     inf            0.4000, 0.000
+---------------------------------------------------------------------------------------
+all              5          4  20.0 / 40.0 / 60.0 / 80.0   0.4000, 0.000  0.2500, 0.000
+"""
 
 
 def moved(metres: float) -> RigidTransform:
@@ -23,17 +43,7 @@ def test_the_whole_table() -> None:
     estimated = {"d1": moved(0.001), "d2": moved(0.1), "d3": moved(2.0), "n1": moved(0.4)}
     conditions = {name: {"d": "day", "n": "night"}[name[0]] for name in truth}
     text = recall_table(evaluate(estimated, truth, conditions=conditions, label="aachen"))
-    assert text == (
-        "aachen\n"
-        "\n"
-        "recall (%) at 0.05 m, 5 deg / 0.25 m, 2 deg / 0.5 m, 5 deg / 5 m, 10 deg\n"
-        "Both errors at or below (<=) the threshold; a query without a pose counts as a miss.\n"
-        "\n"
-        "                                                                 median error (m, deg)\n"
-        "condition  queries  localized  recall (%)                        of all         of localized\n"
-        "--------------------------------------------------------------------------------------------\n"
-        "day              3          3  33.3 / 66.7 / 66.7 / 100.0  0.1000, 0.000  0.1000, 0.000\n"
-    )
+    assert text == TABLE
 
 
 def test_fits_a_terminal_and_is_ascii(world: Any) -> None:
@@ -68,9 +78,7 @@ def test_long_lists_of_strangers_are_cut() -> None:
 
 
 def test_position_only_thresholds() -> None:
-    text = recall_table(
-        evaluate({"a": HERE}, {"a": HERE}, thresholds=[Threshold(position_m=0.1)])
-    )
+    text = recall_table(evaluate({"a": HERE}, {"a": HERE}, thresholds=[Threshold(position_m=0.1)]))
     assert "recall (%) at 0.1 m\nPosition error at or below" in text
 
 

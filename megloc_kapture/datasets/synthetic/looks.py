@@ -84,7 +84,7 @@ def day_look(
         white_balance=_triple(np.exp(rng.normal(0, 0.03, 3))),
         shot_noise=4e-5,
         read_noise=0.002,
-        blur_px=0.35,
+        blur_px=0.5,
         vignetting=0.12,
         noise_seed=noise_seed,
     )
@@ -102,7 +102,7 @@ def night_look(rng: np.random.Generator, *, exposure: float, noise_seed: int) ->
         glow=_triple(np.array([1.0, 0.85, 0.6])),
         sky_colour=(0.006, 0.008, 0.016),
         cloud_shift=float(rng.uniform(0, 2 * np.pi)),
-        exposure=float(exposure * 1.1 * np.exp(rng.normal(0, 0.25))),
+        exposure=float(exposure * 0.9 * np.exp(rng.normal(0, 0.25))),
         white_balance=_triple(np.array([1.0, 0.92, 0.86]) * np.exp(rng.normal(0, 0.05, 3))),
         shot_noise=1.5e-3,
         read_noise=0.006,

@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.datasets.synthetic.looks import Look
+from megloc_kapture.datasets.synthetic.noise import periodic_noise
 from megloc_kapture.datasets.synthetic.options import stream
 from megloc_kapture.datasets.synthetic.render import NO_SURFACE, Visibility
 from megloc_kapture.datasets.synthetic.shadow import ShadowMap
 from megloc_kapture.datasets.synthetic.surfaces import Surfaces
-from megloc_kapture.datasets.synthetic.textures import periodic_noise
 from megloc_kapture.values import RigidTransform
 
 _LAMP_RANGE_M = 14.0

@@ -19,7 +19,7 @@ from megloc_kapture.datasets.synthetic.cameras import (
     rig_cameras,
     rig_geometry,
 )
-from megloc_kapture.datasets.synthetic.covisibility import CoarseView, coarse_view, overlap
+from megloc_kapture.datasets.synthetic.covisibility import CoarseView, coarse_view, overlap, support
 from megloc_kapture.datasets.synthetic.looks import Condition, Look, day_look, night_look
 from megloc_kapture.datasets.synthetic.movers import NUM_CARS, NUM_PEOPLE, Mover
 from megloc_kapture.datasets.synthetic.options import SyntheticWorldOptions, stream
@@ -28,9 +28,8 @@ from megloc_kapture.values import Camera, RigidTransform
 
 RIG_ID = "rig"
 RIG_HEIGHT_M = 1.9
-# queries see this share of what some mapping image sees
-_OVERLAP_RANGE = (0.5, 0.85)
-_SECOND_OVERLAP = 0.35  # and this much at least with another
+_MAX_OVERLAP = 0.85  # no query is a copy of a mapping image
+_MIN_SUPPORT = 0.6  # share of a query's view that the map can tell it
 
 
 @dataclass(frozen=True)
@@ -286,8 +285,8 @@ def _query_pose(
 ) -> tuple[NDArray[np.float64], float, RigidTransform]:
     """Position, yaw and ``cam_from_place`` of a query that shares part of its view with the map.
 
-    Of a few hundred random poses the first that keeps its distance from things and overlaps with
-    a mapping image as much as wanted; failing that, the one nearest to it.
+    Of a few hundred random poses the first that keeps its distance from things and is supported
+    by the map without being a copy of one of its images; failing that, the one nearest to it.
     """
     low, high = place.outline.min(0), place.outline.max(0)
     best: tuple[float, NDArray[np.float64], float, RigidTransform] | None = None
@@ -303,10 +302,8 @@ def _query_pose(
         depth = view.depth[view.depth > 0]
         if np.percentile(depth, 10) < 1.2 or np.median(depth) < 3.5:
             continue
-        *_, second, share = sorted(overlap(view, other) for other in map_views)
-        miss = max(
-            _OVERLAP_RANGE[0] - share, share - _OVERLAP_RANGE[1], _SECOND_OVERLAP - second, 0.0
-        )
+        share = max(overlap(view, other) for other in map_views)
+        miss = max(share - _MAX_OVERLAP, _MIN_SUPPORT - support(view, map_views), 0.0)
         if best is None or miss < best[0]:
             best = (miss, position, yaw, pose)
         if miss == 0.0:

@@ -1,0 +1,126 @@
+"""``megloc info``: what is in a kapture folder, and what is missing to localize in it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from megloc_kapture.cli.common import Common
+from megloc_kapture.cli.console import Console
+from megloc_kapture.cli.stages import FeaturesDirs
+from megloc_kapture.errors import MeglocError
+from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
+
+_COLUMN = 18
+
+
+@dataclass(frozen=True, kw_only=True)
+class Info(Common):
+    """Say what is in a kapture folder, and what a map allows."""
+
+    input: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="KAPTURE")]
+    """Kapture folder."""
+    features_dir: FeaturesDirs = ()
+    """Features folder beside it; may be repeated."""
+    keypoints_type: str | None = None
+    """Which type to look at, where the map has points of several."""
+    pixel_origin: PixelOriginChoice = "auto"
+    """Where the map's intrinsics put the pixel origin; auto finds it out."""
+    deep: bool = False
+    """Read every file, images included."""
+
+    def run(self) -> int:
+        """Print it."""
+        console = self.console()
+        folder = KaptureFolder(self.input, features_dirs=self.features_dir)
+        describe_content(console, folder)
+        folder.validate(deep=self.deep)
+        line(console, "checked", "everything, image by image" if self.deep else "no fault found")
+        if folder.has_points():
+            self._describe_map(console)
+        else:
+            line(console, "localizing", "not possible: no points3d and observations")
+        return 0
+
+    def _describe_map(self, console: Console) -> None:
+        try:
+            opened = KaptureMap.open(
+                self.input,
+                keypoints_type=self.keypoints_type,
+                features_dirs=self.features_dir,
+                pixel_origin=self.pixel_origin,
+            )
+        except MeglocError as error:
+            line(console, "localizing", f"not possible: {error}")
+            return
+        origin = opened.pixel_origin
+        errors = ", ".join(f"{name} {value:.3f} px" for name, value in origin.error_px.items())
+        line(console, "pixel origin", f"{origin.intrinsics}: {origin.reason}")
+        line(console, "", f"median reprojection error by origin: {errors}")
+        extractor = opened.extractor_name()
+        line(console, "localizing with", opened.local_type)
+        line(console, "map descriptors", describe_descriptors(opened, extractor))
+        line(
+            console,
+            "query features",
+            f"extracted by plugin {extractor}, or given in kapture"
+            if extractor
+            else f"must be given in kapture: no extractor for {opened.local_type} is installed",
+        )
+        own = "VLAD over the map's descriptors"
+        types = opened.global_types()
+        line(
+            console,
+            "retrieval",
+            f"{', '.join(types)} where queries bring it, else {own}" if types else own,
+        )
+
+
+def describe_content(console: Console, folder: KaptureFolder) -> None:
+    """Print counts of what a kapture folder has."""
+    data = folder.read()
+    models = Counter(data.camera_of(image).model for image in data.image_names())
+    cameras = ", ".join(f"{count} {model}" for model, count in sorted(models.items()))
+    line(console, "kapture", str(folder.root))
+    line(console, "sensors", f"{len(data.sensors)}, rigs {len(data.rigs)}")
+    images = len(data.image_names())
+    line(console, "images", f"{images} ({cameras}), {len(data.poses())} with a pose")
+    if data.records_depth:
+        line(console, "depth maps", str(len(data.records_depth)))
+    for kind in ("keypoints", "descriptors", "global_features"):
+        for name in folder.types(kind):
+            reader = getattr(folder, kind)(name)
+            config = reader.config
+            line(
+                console,
+                kind.replace("_", " "),
+                f"{name}: {len(reader.names)} images, {config.dtype.name} x {config.dsize}",
+            )
+    for name in folder.types("matches"):
+        line(console, "matches", f"{name}: {len(folder.matches(name).pairs)} pairs")
+    if folder.has_points():
+        points = len(folder.points3d())
+        line(console, "points", str(points))
+        for name, seen in sorted(folder.observations().items()):
+            line(console, "observations", f"{name}: {len(seen.point_ids)}")
+
+
+def describe_descriptors(opened: KaptureMap, extractor: str | None) -> str:
+    """What is known of a map's descriptors, in words."""
+    if opened.has_descriptors():
+        return "there"
+    if extractor is None:
+        return "missing, and no extractor for the type is installed: localizing is not possible"
+    if not opened.has_images():
+        return "missing, and no images to extract them from: localizing is not possible"
+    return f"missing; will be extracted again by plugin {extractor}"
+
+
+def line(console: Console, name: str, text: str) -> None:
+    """One line of the description."""
+    console.result(f"{name:{_COLUMN}s}{text}")

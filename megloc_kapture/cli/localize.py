@@ -1,0 +1,111 @@
+"""``megloc localize``: queries into any kapture map; the map stays as it is."""
+
+from __future__ import annotations
+
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from megloc_kapture.cli.common import Choosing, Common, Force, Input, Output
+from megloc_kapture.cli.stages import FeaturesDirs
+from megloc_kapture.errors import OptionError
+from megloc_kapture.io.kapture_store import KaptureFolder, read_pairs
+from megloc_kapture.io.outputs import staged_output
+from megloc_kapture.pipeline.executors import available_cores
+from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
+from megloc_kapture.pipeline.localizer import Localizer
+from megloc_kapture.pipeline.presets import DEFAULT_PRESET, options_of_preset
+from megloc_kapture.pipeline.queries import Query, queries_of_kapture
+from megloc_kapture.stages.matches import iterate_candidates
+from megloc_kapture.stages.query_poses import write_localized
+from megloc_kapture.values import RigidTransform
+
+LOCALIZED = "localized"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Localize(Choosing, Common):
+    """Localize the images of a kapture folder in a kapture map."""
+
+    input: Input
+    """Kapture map: keypoints, points3d and observations of one type. Read only."""
+    query: Path
+    """Kapture folder with the queries, and their features where the map's cannot be extracted."""
+    output: Output
+    """Kapture folder with the queries' poses, and status.csv."""
+    features_dir: FeaturesDirs = ()
+    """Features folder of map or queries; may be repeated."""
+    pairs: Path | None = None
+    """Candidates of each query, instead of retrieval."""
+    keypoints_type: str | None = None
+    """Needed where the map has points of several types."""
+    pixel_origin: PixelOriginChoice = "auto"
+    """Where the map's intrinsics put the pixel origin; auto finds it out."""
+    workers: int | None = None
+    """Number of threads; all cores unless given."""
+    force: Force = False
+    """Write into a folder that has other things in it."""
+
+    def run(self) -> int:
+        """Run it."""
+        console = self.console()
+        workers = available_cores() if self.workers is None else self.workers
+        if workers < 1:
+            raise OptionError(f"{workers} workers cannot work; give 1 or more")
+        kapture_map = KaptureMap.open(
+            self.input,
+            keypoints_type=self.keypoints_type,
+            features_dirs=self.features_dir,
+            pixel_origin=self.pixel_origin,
+        )
+        options = options_of_preset(self.preset or DEFAULT_PRESET, assignments=self.set)
+        folder = KaptureFolder(self.query, features_dirs=self.features_dir)
+        queries = list(queries_of_kapture(folder, kapture_map))
+        localizer = Localizer(kapture_map, options=options)
+        given = None if self.pairs is None else dict(iterate_candidates(read_pairs(self.pairs)))
+        with staged_output(self.output, kind=LOCALIZED, force=self.force) as out:
+            with ThreadPoolExecutor(workers) as executor:
+                started = time.perf_counter()
+                results = localizer.localize_many(queries, executor, candidates=given)
+                tracked = console.track(results, len(queries), "localizing")
+                named = [
+                    (query.name, result, 0.0)
+                    for query, result in zip(queries, tracked, strict=True)
+                ]
+                seconds = time.perf_counter() - started
+            # candidates of a failed query are in its result only where they match
+            first = (
+                best_candidates(localizer, queries, given)
+                if options.localization.fallback == "retrieval"
+                else None
+            )
+            counts = write_localized(
+                out,
+                folder,
+                named,
+                fallback=options.localization.fallback,
+                first_candidates=first,
+            )
+        how = "as given" if given is not None else localizer.describe_retrieval(queries)
+        console.say(f"candidates: {how}")
+        console.say(f"pixel origin: {kapture_map.pixel_origin.intrinsics}")
+        console.result(
+            f"{counts['localized']} of {counts['queries']} queries localized in {seconds:.1f} s"
+            + (f", {counts['fallbacks']} fallback poses" if counts["fallbacks"] else "")
+        )
+        if counts["queries"] and not counts["localized"]:
+            console.say(f"warning: no query was localized; reasons are in {self.output}/status.csv")
+        return 0
+
+
+def best_candidates(
+    localizer: Localizer, queries: list[Query], given: dict[str, list[str]] | None
+) -> dict[str, tuple[str, RigidTransform]]:
+    """Query to its best candidate and that image's pose."""
+    best = {}
+    for query in queries:
+        images = given.get(query.name, []) if given is not None else localizer.ranked(query)
+        if images:
+            best[query.name] = (images[0], localizer.map.poses[images[0]])
+    return best

@@ -1,0 +1,157 @@
+"""The synthetic world as plain kapture: ``mapping/``, ``query/``, ``query_gt/`` and ``megloc/``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from megloc_kapture.datasets.synthetic.options import SyntheticWorldOptions
+from megloc_kapture.datasets.synthetic.places import build_place
+from megloc_kapture.datasets.synthetic.views import PlacePainter
+from megloc_kapture.datasets.synthetic.world import RIG_ID, Shot, SyntheticWorld, build_world
+from megloc_kapture.io.depth_maps import write_depth_map
+from megloc_kapture.io.images import write_image
+from megloc_kapture.io.kapture_store import KaptureData, Sensor, write_sensors
+from megloc_kapture.io.side_tables import (
+    ImageGroup,
+    Protocol,
+    World,
+    write_groups,
+    write_protocol,
+    write_world,
+)
+from megloc_kapture.stages.parallel import Track, ordered_map, untracked
+
+DATASET = "synthetic"
+_SHOTS_PER_JOB = 13  # painting a place's textures costs about as much as four images
+
+
+@dataclass(frozen=True)
+class _Job:
+    root: Path
+    options: SyntheticWorldOptions
+    shots: tuple[Shot, ...]  # all of one place
+
+
+def write_synthetic_kapture(
+    root: Path,
+    options: SyntheticWorldOptions | None = None,
+    executor: Executor | None = None,
+    *,
+    track: Track = untracked,
+) -> None:
+    """Draw a synthetic world and write it as kapture.
+
+    Below ``root``: ``mapping/`` (images, poses through the rig, depth if asked), ``query/``
+    (images and cameras), ``query_gt/`` (the same cameras with poses, no images) and ``megloc/``
+    (day and night, thresholds). The bytes depend on the options only, not on the executor.
+
+    Parameters
+    ----------
+    executor : shares the drawing among processes that see the same file system.
+    track : shows progress, image by image.
+
+    Raises
+    ------
+    OutputError : something cannot be written.
+    """
+    root = Path(root)
+    world = build_world(options or SyntheticWorldOptions())
+    jobs = list(_jobs(root, world))
+    drawn = (name for names in ordered_map(_draw, jobs, executor) for name in names)
+    for _ in track(drawn, len(world.shots), "draw"):
+        pass
+    write_sensors(root / "mapping", mapping_data(world))
+    write_sensors(root / "query", query_data(world, poses=False))
+    write_sensors(root / "query_gt", query_data(world, poses=True))
+    write_side_tables(root / "megloc", world)
+
+
+def mapping_data(world: SyntheticWorld) -> KaptureData:
+    """The mapping images' records; their poses are those of the rig."""
+    data = KaptureData()
+    members = {}
+    for sensor_id, camera in world.rig_cameras.items():
+        data.sensors[sensor_id] = Sensor.from_camera(camera, name=sensor_id)
+        members[sensor_id] = world.sensor_from_rig[sensor_id]
+        if world.options.depth:
+            depth_id = _depth_sensor(sensor_id)
+            data.sensors[depth_id] = Sensor.from_camera(camera, name=depth_id, sensor_type="depth")
+            members[depth_id] = world.sensor_from_rig[sensor_id]
+    data.rigs[RIG_ID] = members
+    for timestamp, pose in world.rig_from_world.items():
+        data.trajectories[timestamp, RIG_ID] = pose
+    for shot in world.mapping_shots():
+        data.records_camera[shot.timestamp, shot.sensor_id] = shot.name
+        if world.options.depth:
+            record = shot.timestamp, _depth_sensor(shot.sensor_id)
+            data.records_depth[record] = depth_name(shot.name)
+    return data
+
+
+def query_data(world: SyntheticWorld, *, poses: bool) -> KaptureData:
+    """The queries' sensors and records, with their true poses or without."""
+    data = KaptureData()
+    for shot in world.query_shots():
+        data.sensors[shot.sensor_id] = Sensor.from_camera(shot.camera, name=shot.sensor_id)
+        data.records_camera[shot.timestamp, shot.sensor_id] = shot.name
+        if poses:
+            data.trajectories[shot.timestamp, shot.sensor_id] = shot.cam_from_world
+    return data
+
+
+def write_side_tables(folder: Path, world: SyntheticWorld) -> None:
+    """Conditions of the queries, thresholds and frame."""
+    groups = {
+        shot.name: ImageGroup(condition=shot.condition, location=world.places[shot.place].name)
+        for shot in world.query_shots()
+    }
+    write_groups(folder, groups)
+    write_protocol(folder, Protocol(dataset=DATASET, conditions=("day", "night")))
+    write_world(folder, World())
+
+
+def depth_name(image: str) -> str:
+    """Path of an image's depth map below ``records_data``."""
+    return str(PurePosixPath("depth") / PurePosixPath(image).with_suffix(".depth"))
+
+
+def _depth_sensor(sensor_id: str) -> str:
+    return f"{sensor_id}_depth"
+
+
+def _jobs(root: Path, world: SyntheticWorld) -> Iterable[_Job]:
+    for place in world.places:
+        shots = [shot for shot in world.shots if shot.place == place.index]
+        for start in range(0, len(shots), _SHOTS_PER_JOB):
+            yield _Job(root, world.options, tuple(shots[start : start + _SHOTS_PER_JOB]))
+
+
+@lru_cache(maxsize=1)
+def _painter(options: SyntheticWorldOptions, place: int) -> PlacePainter:
+    return PlacePainter(
+        build_place(options, place), seed=options.seed, supersampling=options.supersampling
+    )
+
+
+def _draw(job: _Job) -> list[str]:
+    """Draw and write the shots of a job; returns their names."""
+    options = job.options
+    for shot in job.shots:
+        painter = _painter(options, shot.place)
+        with_depth = options.depth and shot.role == "mapping"
+        view = painter.draw(shot, depth=with_depth)
+        sensors = job.root / shot.role / "sensors"
+        records = sensors / "records_data"
+        write_image(records / shot.name, view.image, jpeg_quality=options.jpeg_quality)
+        if view.depth_m is not None:
+            write_depth_map(records / depth_name(shot.name), view.depth_m)
+        if options.masks and not view.mask.all():
+            mask = np.where(view.mask, 255, 0).astype(np.uint8)
+            write_image(sensors / "masks" / f"{shot.name}.png", mask)
+    return [shot.name for shot in job.shots]

@@ -1,0 +1,93 @@
+"""Pose of a rig of cameras from the 2D-3D matches of all of them (generalized absolute pose)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.geometry.cameras import bearing_rays, focal_px, px_from_cam
+from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions
+from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
+
+
+@dataclass(frozen=True, eq=False)
+class RigView:
+    """One camera of a rig and its matches: pixels (N, 2) and world points (N, 3)."""
+
+    camera: Camera
+    cam_from_rig: RigidTransform
+    points_px: NDArray[np.float64]
+    points_world: NDArray[np.float64]
+
+
+def rig_pose(
+    views: Sequence[RigView], options: AbsolutePoseOptions | None = None
+) -> Pose | Failure:
+    """Estimate ``rig_from_world`` (GP3P in LO-RANSAC); a camera without matches is no harm.
+
+    Returns
+    -------
+    Pose whose ``cam_from_world`` is ``rig_from_world``, or Failure with the reason. The inlier
+    mask runs over the matches of all views, in order.
+    """
+    import poselib
+
+    options = options or AbsolutePoseOptions()
+    count = sum(len(view.points_px) for view in views)
+    if count < options.min_inliers:
+        return Failure(
+            f"{count} 2D-3D matches, at least {options.min_inliers} are needed", num_matches=count
+        )
+    offset = np.median(np.concatenate([view.points_world for view in views]), axis=0)
+    used = [view for view in views if len(view.points_px)]
+    points_2d, points_3d, extrinsics, cameras = [], [], [], []
+    for view in used:
+        focal = focal_px(view.camera)
+        points_2d.append(bearing_rays(view.camera, view.points_px)[:, :2] * focal)
+        points_3d.append(view.points_world - offset)
+        extrinsic = poselib.CameraPose()
+        extrinsic.q = np.array(view.cam_from_rig.quat_wxyz)
+        extrinsic.t = np.array(view.cam_from_rig.translation)
+        extrinsics.append(extrinsic)
+        cameras.append(
+            {"model": "PINHOLE", "width": 1, "height": 1, "params": [focal, focal, 0.0, 0.0]}
+        )
+    found, _ = poselib.estimate_generalized_absolute_pose(
+        points_2d,
+        points_3d,
+        extrinsics,
+        cameras,
+        {
+            "max_reproj_error": options.max_error_px,
+            "min_iterations": options.min_iterations,
+            "max_iterations": options.max_iterations,
+            "success_prob": options.confidence,
+            "seed": options.seed,
+        },
+        {"loss_type": "CAUCHY", "loss_scale": 1.0},
+    )
+    quat = np.asarray(found.q, dtype=np.float64)
+    quat = quat / np.linalg.norm(quat)
+    rotation = RigidTransform(
+        (float(quat[0]), float(quat[1]), float(quat[2]), float(quat[3])), (0.0, 0.0, 0.0)
+    )
+    t = np.asarray(found.t, dtype=np.float64) - rotation.rotation_matrix() @ offset
+    rig_from_world = RigidTransform(rotation.quat_wxyz, (float(t[0]), float(t[1]), float(t[2])))
+    inliers = []
+    for view in views:
+        cam_from_world = view.cam_from_rig @ rig_from_world
+        pixels = px_from_cam(view.camera, cam_from_world.apply(view.points_world))
+        errors = np.linalg.norm(pixels - view.points_px, axis=1)
+        inliers.append(np.nan_to_num(errors, nan=np.inf) <= options.max_error_px)
+    mask = np.concatenate(inliers)
+    if mask.sum() < options.min_inliers:
+        return Failure(
+            f"{mask.sum()} of {count} 2D-3D matches agree, at least {options.min_inliers} "
+            "are needed",
+            num_matches=count,
+            num_inliers=int(mask.sum()),
+        )
+    return Pose(rig_from_world, num_matches=count, num_inliers=int(mask.sum()), inliers=mask)

@@ -1,0 +1,201 @@
+"""A kapture map, of any tool, as the localizer needs it; read-only."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.geometry.cameras import shift_principal_point
+from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.localization.map_index import MapIndex
+from megloc_kapture.mapping.pixel_origin import (
+    ObservedImage,
+    Origin,
+    PixelOrigin,
+    find_pixel_origin,
+)
+from megloc_kapture.plugins import LOCAL_FEATURES, plugin_names
+from megloc_kapture.stages.query_poses import index_map
+from megloc_kapture.values import Camera, RigidTransform
+
+PixelOriginChoice = Literal["auto", "corner", "centre"]
+
+_SAMPLED_IMAGES = 50
+
+
+@dataclass(frozen=True, eq=False)
+class KaptureMap:
+    """A map with keypoints, 3D points and observations of one keypoints type.
+
+    Open one with :meth:`open`. Coordinates leave it in COLMAP's convention, whatever the map's.
+
+    Attributes
+    ----------
+    folder : the kapture folder; nothing is ever written to it.
+    local_type : the keypoints type that is localized with.
+    pixel_origin : where the map puts its pixel origin, and why we think so.
+    """
+
+    folder: KaptureFolder
+    local_type: str
+    pixel_origin: PixelOrigin
+
+    @classmethod
+    def open(
+        cls,
+        path: Path | str,
+        *,
+        keypoints_type: str | None = None,
+        features_dirs: Sequence[Path | str] = (),
+        pixel_origin: PixelOriginChoice = "auto",
+    ) -> KaptureMap:
+        """Open a kapture map.
+
+        Parameters
+        ----------
+        keypoints_type : needed where the map has points of several types.
+        features_dirs : folders with features in the orphan layout beside the map's own.
+        pixel_origin : of the map's intrinsics; "auto" finds it out (see ``.pixel_origin``).
+
+        Raises
+        ------
+        DataError : no map, or broken: names the file.
+        OptionError : a type or pixel origin that is not there.
+        """
+        if pixel_origin not in ("auto", "corner", "centre"):
+            raise OptionError(f"pixel_origin is {pixel_origin!r}; give auto, corner or centre")
+        folder = KaptureFolder(path, features_dirs=features_dirs)
+        folder.read()
+        if not folder.has_points():
+            raise DataError(
+                "no map to localize in: reconstruction/points3d.txt or observations.txt is "
+                "missing; `megloc triangulate` makes one from images with poses",
+                path=folder.root,
+            )
+        types = sorted(t for t, seen in folder.observations().items() if len(seen.point_ids))
+        if not types:
+            raise DataError("the map's points have no observations", path=folder.root)
+        if keypoints_type is None and len(types) > 1:
+            raise OptionError(
+                f"{folder.root}: points of several keypoints types, choose one with "
+                f"--keypoints-type: {', '.join(types)}"
+            )
+        local_type = keypoints_type or types[0]
+        if local_type not in types:
+            raise OptionError(
+                f"{folder.root}: no points of keypoints type {local_type!r}; there are: "
+                f"{', '.join(types)}"
+            )
+        found = _find_origin(folder, local_type)
+        if pixel_origin != "auto":
+            given: Origin = pixel_origin
+            found = replace(found, intrinsics=given, reason="as asked for")
+        return cls(folder, local_type, found)
+
+    @cached_property
+    def index(self) -> MapIndex:
+        """Points and observations as arrays."""
+        return index_map(self.folder, self.local_type)
+
+    @cached_property
+    def poses(self) -> dict[str, RigidTransform]:
+        """``cam_from_world`` of the map images that observe points."""
+        return {
+            image: pose
+            for image, pose in self.folder.read().poses().items()
+            if image in self.index.row_of_image
+        }
+
+    @cached_property
+    def images(self) -> list[str]:
+        """Names of the images a query can be matched with, sorted."""
+        return sorted(self.poses)
+
+    def camera(self, image: str) -> Camera:
+        """Camera of a map image, principal point in COLMAP's convention."""
+        return self.to_colmap(self.folder.read().camera_of(image))
+
+    def to_colmap(self, camera: Camera) -> Camera:
+        """A camera described as the map describes its own, in COLMAP's convention."""
+        shift = self.pixel_origin.intrinsics_shift_px
+        return shift_principal_point(camera, shift) if shift else camera
+
+    def keypoints_px(self, image: str) -> NDArray[np.float32]:
+        """Keypoints (N, 2) float32 of a map image, in COLMAP's convention."""
+        return self.keypoints_to_colmap(self.folder.keypoints(self.local_type).read(image))
+
+    def keypoints_to_colmap(self, keypoints: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Keypoints stored as the map stores its own, in COLMAP's convention; (N, 2)."""
+        shift = np.float32(self.pixel_origin.keypoints_shift_px)
+        return np.asarray(keypoints[:, :2], dtype=np.float32) + shift
+
+    def extractor_name(self) -> str | None:
+        """The extractor plugin that makes this type of features; None where there is none."""
+        return extractor_of(self.folder, self.local_type)
+
+    def has_descriptors(self) -> bool:
+        """Whether every image of the map has descriptors of the type."""
+        if self.local_type not in self.folder.types("descriptors"):
+            return False
+        reader = self.folder.descriptors(self.local_type)
+        return all(image in reader for image in self.images)
+
+    def has_images(self) -> bool:
+        """Whether the map's image files are there."""
+        try:
+            return all(self.folder.image_path(image).is_file() for image in self.images)
+        except DataError:
+            return False
+
+    def global_types(self) -> list[str]:
+        """Global-feature types that all images of the map have."""
+        return [
+            name
+            for name in self.folder.types("global_features")
+            if all(image in self.folder.global_features(name) for image in self.images)
+        ]
+
+
+def extractor_of(folder: KaptureFolder, local_type: str) -> str | None:
+    """The extractor plugin of a keypoints type: by the folder's name, or the name in its file."""
+    known = plugin_names(LOCAL_FEATURES)
+    if local_type in known:
+        return local_type
+    if local_type in folder.types("keypoints"):
+        name = folder.keypoints(local_type).config.name
+        if name in known:
+            return name
+    return None
+
+
+def _find_origin(folder: KaptureFolder, local_type: str) -> PixelOrigin:
+    data = folder.read()
+    poses = data.poses()
+    index = index_map(folder, local_type)
+    images = [image for image in sorted(index.row_of_image) if image in poses]
+    step = max(1, len(images) // _SAMPLED_IMAGES)
+    keypoints = folder.keypoints(local_type)
+    sample = []
+    for image in images[::step]:
+        rows, points = index.observed(image)
+        stored = keypoints.read(image)
+        if len(rows) and rows[-1] >= len(stored):
+            raise DataError(
+                f"observations refer to keypoint {rows[-1]} of {image}, which has "
+                f"{len(stored)} keypoints",
+                path=folder.root / "reconstruction" / "observations.txt",
+            )
+        sample.append(
+            ObservedImage(data.camera_of(image), poses[image], stored[rows, :2], index.xyz[points])
+        )
+    known: Origin | None = "corner" if extractor_of(folder, local_type) else None
+    return find_pixel_origin(
+        sample, cameras=[data.camera_of(image) for image in images], keypoints_at=known
+    )

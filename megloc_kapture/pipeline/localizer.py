@@ -1,0 +1,326 @@
+"""Localize images in a kapture map, from Python: see :class:`Localizer`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.errors import DataError, PluginError
+from megloc_kapture.features.vlad import (
+    Vocabulary,
+    aggregate,
+    sample_rows,
+    train_vocabulary,
+)
+from megloc_kapture.geometry.cameras import bearing_rays
+from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.localization.rig_pose import RigView, rig_pose
+from megloc_kapture.pipeline.executors import single_threaded
+from megloc_kapture.pipeline.kapture_map import KaptureMap
+from megloc_kapture.pipeline.map_descriptors import extract_again
+from megloc_kapture.pipeline.presets import PipelineOptions, options_of_preset
+from megloc_kapture.pipeline.queries import Query, queries_of_kapture
+from megloc_kapture.plugins import LOCAL_FEATURES, LocalFeatureExtractor, load_plugin
+from megloc_kapture.retrieval.search import rank_by_similarity
+from megloc_kapture.stages.global_vlad import VladSettings, read_vocabulary
+from megloc_kapture.stages.image_pairs import read_global_features, unit_rows
+from megloc_kapture.stages.local_features import checked_features
+from megloc_kapture.stages.matches import (
+    FeatureCache,
+    Features,
+    match_and_verify,
+    two_view_verification,
+)
+from megloc_kapture.stages.parallel import ordered_map
+from megloc_kapture.stages.query_poses import gather_correspondences, pose_from_matches
+from megloc_kapture.values import Camera, Failure, LocalFeatures, Pose, RigidTransform
+
+# a map this small is matched whole where nothing can rank its images
+MAX_EXHAUSTIVE_IMAGES = 50
+
+_Matches = list[tuple[str, NDArray[np.int64], NDArray[np.floating]]]
+
+
+class Localizer:
+    """Finds camera poses in a map of any tool.
+
+    Query features come with the query, or are extracted where the map's type has an extractor
+    plugin. Candidates come from global features that map and query both bring, else from VLAD over
+    the map's own descriptors, else, for small maps, from all images.
+
+    Parameters
+    ----------
+    kapture_map : the map.
+    preset : options by name; ``options`` gives them whole instead.
+
+    Raises
+    ------
+    DataError : the map has no descriptors, and they cannot be made again.
+    OptionError, PluginError : the options cannot be used.
+
+    Examples
+    --------
+    >>> localizer = Localizer(KaptureMap.open("map"))             # doctest: +SKIP
+    >>> found = localizer.localize("query.jpg", camera)           # doctest: +SKIP
+    >>> found.cam_from_world if found else found.reason           # doctest: +SKIP
+    """
+
+    def __init__(
+        self,
+        kapture_map: KaptureMap,
+        preset: str = "classic",
+        *,
+        options: PipelineOptions | None = None,
+    ) -> None:
+        self.map = kapture_map
+        self.options = options or options_of_preset(preset)
+        self._matcher = self.options.make_matcher()
+        self._descriptors: dict[str, NDArray[np.generic]] | None = None
+        if not kapture_map.has_descriptors():
+            self._descriptors = extract_again(kapture_map, self._extractor())
+        self._cache = FeatureCache()
+        self._vectors: dict[str, NDArray[np.float32]] = {}
+
+    # ------------------------------------------------------------------ the public calls
+
+    def localize(
+        self,
+        image: Path | str | NDArray[np.uint8],
+        camera: Camera,
+        *,
+        prior: Sequence[str] | None = None,
+    ) -> Pose | Failure:
+        """Localize one image.
+
+        Parameters
+        ----------
+        image : path of an image file, or uint8 (H, W, 3) RGB.
+        camera : its intrinsics, COLMAP's models and pixel origin.
+        prior : names of the map images it may be matched with.
+
+        Returns
+        -------
+        Pose, or Failure, which is falsy and says why.
+
+        Raises
+        ------
+        DataError : the image cannot be read, is not of its camera's size, or its features cannot
+            be extracted because the map's type has no extractor.
+        """
+        name = str(image) if isinstance(image, str | Path) else "query"
+        query = Query(camera, image, name, prior=None if prior is None else tuple(prior))
+        return self.localize_query(query)
+
+    def localize_many(
+        self,
+        queries: Iterable[Query | tuple[Path | str | NDArray[np.uint8], Camera]],
+        executor: Executor | None = None,
+        *,
+        candidates: Mapping[str, Sequence[str]] | None = None,
+    ) -> Iterator[Pose | Failure]:
+        """Localize lazily, results in the order of the queries.
+
+        Parameters
+        ----------
+        executor : a thread pool suits: it shares the map, and the work is done outside Python.
+        candidates : query name to the map images it is matched with, instead of retrieval.
+        """
+        wrapped = (q if isinstance(q, Query) else Query(q[1], q[0], str(q[0])) for q in queries)
+        if candidates is not None:
+            wrapped = (replace(q, prior=tuple(candidates.get(q.name, ()))) for q in wrapped)
+        return ordered_map(self.localize_query, wrapped, executor)
+
+    def localize_kapture(
+        self, folder: KaptureFolder | Path | str, executor: Executor | None = None
+    ) -> Iterator[tuple[str, Pose | Failure]]:
+        """Localize the images of a kapture folder: (name, result), sorted by name."""
+        opened = folder if isinstance(folder, KaptureFolder) else KaptureFolder(folder)
+        queries = list(queries_of_kapture(opened, self.map))
+        results = self.localize_many(queries, executor)
+        return ((query.name, result) for query, result in zip(queries, results, strict=True))
+
+    def localize_query(self, query: Query) -> Pose | Failure:
+        """Localize a query that may bring its features."""
+        with single_threaded():
+            features, matches = self._match(query)
+            return pose_from_matches(
+                self.map.index,
+                features.keypoints_px,
+                query.camera,
+                matches,
+                self.options.localization.pose,
+            )
+
+    def localize_rig(self, views: Sequence[tuple[Query, RigidTransform]]) -> Pose | Failure:
+        """Localize several cameras of a rig at once.
+
+        Parameters
+        ----------
+        views : each camera's query and its ``cam_from_rig``.
+
+        Returns
+        -------
+        Pose whose ``cam_from_world`` is ``rig_from_world``, or Failure.
+        """
+        with single_threaded():
+            rig_views, candidates = [], []
+            for query, cam_from_rig in views:
+                features, matches = self._match(query)
+                found = gather_correspondences(self.map.index, matches)
+                candidates += [image for image, pairs, _ in matches if len(pairs)]
+                rig_views.append(
+                    RigView(
+                        camera=query.camera,
+                        cam_from_rig=cam_from_rig,
+                        points_px=features.keypoints_px[found.keypoint_ids].astype(np.float64),
+                        points_world=self.map.index.xyz[found.point_ids],
+                    )
+                )
+            result = rig_pose(rig_views, self.options.localization.pose)
+            return replace(result, candidates=tuple(dict.fromkeys(candidates)))
+
+    # ------------------------------------------------------------------ the steps
+
+    def candidates(self, query: Query, local: LocalFeatures) -> list[str]:
+        """The map images to match a query with: few as they are, many by retrieval, best first."""
+        permitted = self._permitted(query)
+        options = self.options.query_pairs
+        if options.by == "exhaustive" or len(permitted) <= options.top_k:
+            return permitted
+        return self._rank(query, local, permitted)
+
+    def ranked(self, query: Query) -> list[str]:
+        """The most similar map images of a query, best first, however few there are."""
+        local = query.features or self._extract(query)
+        return self._rank(query, local, self._permitted(query))
+
+    def _permitted(self, query: Query) -> list[str]:
+        if query.prior is None:
+            return self.map.images
+        unknown = sorted(set(query.prior) - set(self.map.images))
+        if unknown:
+            raise DataError(
+                f"query {query.name} is to be matched with {unknown[0]}, which is no map image "
+                "with a pose and points"
+            )
+        return list(dict.fromkeys(query.prior))
+
+    def _rank(self, query: Query, local: LocalFeatures, permitted: Sequence[str]) -> list[str]:
+        mask = np.isin(self.map.images, list(permitted))[None]
+        shared = [name for name in self.map.global_types() if name in query.global_features]
+        if shared:
+            vector = np.asarray(query.global_features[shared[0]], np.float32).reshape(1, -1)
+            database = self._global_vectors(shared[0])
+        else:
+            vocabulary, settings, database = self._vlad
+            vector = aggregate(local.descriptors, vocabulary, settings.options)[None]
+        index, _ = rank_by_similarity(
+            unit_rows(vector), database, self.options.query_pairs.top_k, permitted=mask
+        )
+        return [self.map.images[i] for i in index[0] if i >= 0]
+
+    def describe_retrieval(self, queries: Sequence[Query]) -> str:
+        """How the candidates of these queries are found, for people."""
+        if len(self.map.images) <= self.options.query_pairs.top_k:
+            return f"all {len(self.map.images)} map images, the map is small"
+        brought = set.intersection(*(set(query.global_features) for query in queries))
+        shared = [name for name in self.map.global_types() if name in brought]
+        return f"global features {shared[0]}" if shared else "VLAD over the map's descriptors"
+
+    def _match(self, query: Query) -> tuple[Features, _Matches]:
+        local = query.features or self._extract(query)
+        rays = bearing_rays(query.camera, local.keypoints_px[:, :2])
+        features = Features(query.camera, local.keypoints_px[:, :2], rays, local.descriptors)
+        verification = two_view_verification(self.options.query_verification)
+        if self.options.verification == "none":
+            verification = _keep_all
+        matches = []
+        for image in self.candidates(query, local):
+            pairs, scores = match_and_verify(
+                features, self._map_features(image), self._matcher, verification
+            )
+            matches.append((image, pairs, scores))
+        return features, matches
+
+    def _extract(self, query: Query) -> LocalFeatures:
+        extractor = self._extractor()
+        return checked_features(extractor, extractor.extract(query.read_image()), query.name)
+
+    def _extractor(self) -> LocalFeatureExtractor:
+        name = self.map.extractor_name()
+        if name is None:
+            raise DataError(
+                f"features of type {self.map.local_type!r} are missing and no extractor for them "
+                "is installed; give them with --features-dir, or in the kapture folder",
+                path=self.map.folder.root,
+            )
+        chosen = self.options.local_features
+        options = chosen.options if chosen.name == name else {}
+        extractor: LocalFeatureExtractor = load_plugin(LOCAL_FEATURES, name, options)
+        if not isinstance(extractor, LocalFeatureExtractor):
+            raise PluginError(f"plugin {name!r} is no extractor of local features")
+        return extractor
+
+    def _map_features(self, image: str) -> Features:
+        return self._cache.get(image, lambda: self._load_map_features(image))
+
+    def _load_map_features(self, image: str) -> Features:
+        keypoints = self.map.keypoints_px(image)
+        descriptors = self._map_descriptors(image)
+        if len(keypoints) != len(descriptors):
+            raise DataError(
+                f"{image} has {len(keypoints)} keypoints and {len(descriptors)} descriptors",
+                path=self.map.folder.root,
+            )
+        camera = self.map.camera(image)
+        # only keypoints that observe a point can help a pose, but all take part in the mutual
+        # check: without its rivals a wrong match would look unrivalled
+        return Features(camera, keypoints, bearing_rays(camera, keypoints), descriptors)
+
+    def _map_descriptors(self, image: str) -> NDArray[np.generic]:
+        if self._descriptors is not None:
+            return self._descriptors[image]
+        return self.map.folder.descriptors(self.map.local_type).read(image)
+
+    def _global_vectors(self, global_type: str) -> NDArray[np.float32]:
+        if global_type not in self._vectors:
+            reader = self.map.folder.global_features(global_type)
+            self._vectors[global_type] = read_global_features(reader, self.map.images)
+        return self._vectors[global_type]
+
+    @cached_property
+    def _vlad(self) -> tuple[Vocabulary, VladSettings, NDArray[np.float32]]:
+        """Vocabulary, how it was made, and the map's vectors: the map's own where it has them."""
+        folder = self.map.folder
+        for name in self.map.global_types():
+            stored = read_vocabulary(folder.root / "reconstruction" / "global_features" / name)
+            if stored is not None and stored[1].local_type == self.map.local_type:
+                return *stored, self._global_vectors(name)
+        options = self.options.vlad
+        images = self.map.images
+        rows = sample_rows(
+            [len(self._map_descriptors(image)) for image in images],
+            options.training_descriptors,
+            options.seed,
+        )
+        sampled = [
+            np.asarray(self._map_descriptors(image)[chosen], np.float32)
+            for image, chosen in zip(images, rows, strict=True)
+            if len(chosen)
+        ]
+        if not sampled:
+            raise DataError("the map has no descriptors", path=folder.root)
+        vocabulary = train_vocabulary(np.concatenate(sampled), options)
+        vectors = [aggregate(self._map_descriptors(image), vocabulary, options) for image in images]
+        settings = VladSettings(local_type=self.map.local_type, options=options)
+        return vocabulary, settings, np.stack(vectors)
+
+
+def _keep_all(a: Features, b: Features, matches: NDArray[np.int64]) -> NDArray[np.bool_]:
+    return np.ones(len(matches), dtype=bool)

@@ -1,0 +1,202 @@
+"""kapture and kapture-localization as oracles: the same figures, the same exported poses."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import kapture
+import kapture.io.csv
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from megloc_kapture.evaluation.evaluate import evaluate
+from megloc_kapture.evaluation.folders import evaluate_folders
+from megloc_kapture.evaluation.pose_file import read_pose_file, write_pose_file
+from megloc_kapture.evaluation.thresholds import Threshold, thresholds_from_pairs
+from megloc_kapture.geometry.poses import rotation_angles_deg, stack_poses
+from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.values import RigidTransform
+
+Poses = dict[str, RigidTransform]
+BINS = [(0.05, 5.0), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0)]
+
+
+def kapture_of(poses: Poses, images: list[str]) -> kapture.Kapture:
+    """A kapture of one camera, with all ``images`` recorded and ``poses`` as trajectories."""
+    sensors = kapture.Sensors()
+    sensors["camera0"] = kapture.Camera(
+        kapture.CameraType.SIMPLE_PINHOLE, [640, 480, 500.0, 320.0, 240.0]
+    )
+    records = kapture.RecordsCamera()
+    trajectories = kapture.Trajectories()
+    for timestamp, image in enumerate(sorted(images)):
+        records[timestamp, "camera0"] = image
+        if image in poses:
+            trajectories[timestamp, "camera0"] = kapture.PoseTransform(
+                list(poses[image].quat_wxyz), list(poses[image].translation)
+            )
+    return kapture.Kapture(sensors=sensors, records_camera=records, trajectories=trajectories)
+
+
+def random_pose(rng: np.random.Generator) -> RigidTransform:
+    quat = Rotation.random(rng=rng).as_quat(scalar_first=True)
+    return RigidTransform(tuple(quat.tolist()), tuple((rng.normal(size=3) * 30).tolist()))
+
+
+@pytest.fixture
+def figures_of_kapture() -> Callable[..., Any]:
+    """kapture-localization's statistics of (estimated, truth, thresholds), and its errors."""
+    evaluation = pytest.importorskip(
+        "kapture_localization.evaluation",
+        reason="the oracle: pip install --no-deps kapture-localization==1.1.10",
+    )
+
+    def figures(estimated: Poses, truth: Poses, bins: list[tuple[float, float]]) -> Any:
+        images = sorted(truth)
+        results = evaluation.evaluate(
+            kapture_of(estimated, images), kapture_of(truth, images), images
+        )
+        return evaluation.EvaluationStatistics(results, bins), results
+
+    return figures
+
+
+def assert_equal_figures(
+    estimated: Poses, truth: Poses, bins: list[tuple[float, float]], oracle: Callable[..., Any]
+) -> None:
+    statistics, results = oracle(estimated, truth, bins)
+    found = evaluate(estimated, truth, thresholds=thresholds_from_pairs(bins))
+    row = found.row()
+    assert row.num_queries == statistics.number_of_images
+    assert row.num_localized == statistics.number_of_localized_positions
+    assert [at.num_within for at in row.recall] == [count for _, _, count in statistics.filled_bins]
+    ours = [
+        row.median_position_m,
+        row.median_angle_deg,
+        row.median_localized_position_m,
+        row.median_localized_angle_deg,
+    ]
+    theirs = [
+        statistics.median_all_positions,
+        statistics.median_all_rotations,
+        statistics.median_localized_positions,
+        statistics.median_localized_rotations,
+    ]
+    assert ours == pytest.approx(theirs, abs=1e-9)
+    assert list(found.errors.names) == [name for name, _, _ in results]
+    theirs_by_query = np.nan_to_num([errors for _, *errors in results], nan=np.inf)
+    np.testing.assert_allclose(found.errors.position_m, theirs_by_query[:, 0], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(found.errors.angle_deg, theirs_by_query[:, 1], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("num_missing", [0, 5, 21])
+def test_equal_on_random_poses(
+    num_missing: int,
+    displace: Callable[..., RigidTransform],
+    figures_of_kapture: Callable[..., Any],
+) -> None:
+    rng = np.random.default_rng(num_missing)
+    truth = {f"q/{i:03d}.jpg": random_pose(rng) for i in range(40)}
+    estimated = {
+        name: displace(pose, rng.normal(size=3) * 10 ** rng.normal(-1, 1), rng.exponential(3))
+        for name, pose in list(truth.items())[num_missing:]
+    }
+    assert_equal_figures(estimated, truth, BINS, figures_of_kapture)
+
+
+def test_equal_where_thresholds_are_met_exactly(
+    upright: Callable[..., RigidTransform],
+    figures_of_kapture: Callable[..., Any],
+) -> None:
+    truth, estimated = {}, {}
+    for i, (position_m, angle_deg) in enumerate(BINS):
+        half = np.deg2rad(angle_deg) / 2
+        name = f"{i}.jpg"
+        truth[name] = RigidTransform.identity()
+        estimated[name] = RigidTransform(
+            (float(np.cos(half)), 0.0, 0.0, float(np.sin(half))), (0.0, 0.0, position_m)
+        )
+    statistics, _ = figures_of_kapture(estimated, truth, BINS)
+    # by hand: each query meets its own bounds; (0.05, 5) misses 2 deg, the last one nearly all
+    assert [count for _, _, count in statistics.filled_bins] == [1, 1, 3, 4]
+    assert_equal_figures(estimated, truth, BINS, figures_of_kapture)
+
+
+def test_equal_where_measured_errors_are_the_thresholds(
+    displace: Callable[..., RigidTransform], figures_of_kapture: Callable[..., Any]
+) -> None:
+    # each query's own errors as kapture computes them, to the last bit, are a threshold: a
+    # figure that is off by one rounding loses a query
+    rng = np.random.default_rng(7)
+    truth = {f"{i:03d}.jpg": random_pose(rng) for i in range(60)}
+    estimated = {
+        name: displace(pose, rng.normal(size=3), rng.uniform(0, 20)) for name, pose in truth.items()
+    }
+    _, results = figures_of_kapture(estimated, truth, BINS)
+    bins = [(float(position_m), float(angle_deg)) for _, position_m, angle_deg in results]
+    assert_equal_figures(estimated, truth, bins, figures_of_kapture)
+
+
+def test_a_negative_quaternion_is_the_same_for_both(
+    figures_of_kapture: Callable[..., Any],
+) -> None:
+    rng = np.random.default_rng(3)
+    truth = {f"{i}.jpg": random_pose(rng) for i in range(10)}
+    estimated = {
+        name: RigidTransform(tuple(-q for q in pose.quat_wxyz), pose.translation)
+        for name, pose in truth.items()
+    }
+    assert_equal_figures(estimated, truth, [(1e-9, 1e-4)], figures_of_kapture)
+
+
+def test_nothing_estimated(figures_of_kapture: Callable[..., Any]) -> None:
+    truth = {"a.jpg": RigidTransform.identity()}
+    assert_equal_figures({}, truth, BINS, figures_of_kapture)
+
+
+@pytest.fixture
+def localized(world: Any, tmp_path: Path) -> Path:
+    """A localized kapture folder, written by kapture."""
+    folder = tmp_path / "localized"
+    kapture.io.csv.kapture_to_dir(str(folder), kapture_of(world.estimated, list(world.truth)))
+    return folder
+
+
+@pytest.mark.parametrize(("names", "options"), [("basename", []), ("full", ["--full_file_name"])])
+def test_kaptures_exporter_gives_the_same_poses(
+    names: Any, options: list[str], localized: Path, tmp_path: Path
+) -> None:
+    theirs_path, ours_path = tmp_path / "theirs.txt", tmp_path / "ours.txt"
+    tool = Path(sys.executable).with_name("kapture_export_LTVL2020")
+    subprocess.run(
+        [str(tool), "-i", str(localized), "-o", str(theirs_path), "-f", *options],
+        check=True,
+        capture_output=True,
+    )
+    write_pose_file(ours_path, KaptureFolder(localized).read().poses(), names=names)
+    ours, theirs = read_pose_file(ours_path), read_pose_file(theirs_path)
+    assert len(ours) == 36
+    assert sorted(ours) == sorted(theirs)
+    quats, translations = stack_poses(ours[name] for name in ours)
+    their_quats, their_translations = stack_poses(theirs[name] for name in ours)
+    np.testing.assert_allclose(translations, their_translations, rtol=0, atol=1e-12)
+    assert rotation_angles_deg(quats, their_quats).max() < 1e-10
+
+
+def test_folders_written_by_kapture_are_evaluated(
+    world: Any, localized: Path, tmp_path: Path
+) -> None:
+    truth = tmp_path / "query_gt"
+    kapture.io.csv.kapture_to_dir(str(truth), kapture_of(world.truth, list(world.truth)))
+    found = evaluate_folders(localized, truth)
+    expected = evaluate(world.estimated, world.truth)
+    assert found.row().num_queries == 40
+    np.testing.assert_allclose(
+        found.errors.position_m, expected.errors.position_m, rtol=0, atol=1e-9
+    )
+    assert found.thresholds[1] == Threshold(position_m=0.25, angle_deg=2.0)

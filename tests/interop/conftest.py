@@ -1,0 +1,22 @@
+"""One finished run of ours that the interop tests share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from kloc import megloc
+
+
+@pytest.fixture(scope="session")
+def fountain(shared_data: Path) -> Path:
+    """The scene: mapping/, query/ and query_gt/."""
+    return shared_data / "scenes" / "fountain_p11"
+
+
+@pytest.fixture(scope="session")
+def fountain_workspace(fountain: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Our run of the scene with the default preset; not to be written into."""
+    workspace = tmp_path_factory.mktemp("fountain") / "workspace"
+    megloc("eval", "kapture", "--root", fountain, "--workspace", workspace)
+    return workspace

@@ -1,0 +1,124 @@
+"""kapture-localization's tools on our features and our map, and our stages on its data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from kloc import kloc, merged, needs_kapture_localization, pose_errors, proxy
+
+from megloc_kapture.io.colmap import TriangulationOptions
+from megloc_kapture.io.kapture_store import KaptureFolder, read_pairs
+from megloc_kapture.stages.query_poses import (
+    LocalizationOptions,
+    localize_from_matches,
+    write_localized,
+)
+from megloc_kapture.stages.triangulation import triangulate_map
+
+pytestmark = needs_kapture_localization
+
+LOCAL, GLOBAL = "rootsift", "vlad_rootsift"
+
+
+def assert_all_localized(result: Path, truth: Path) -> None:
+    errors = pose_errors(result, truth)
+    assert len(errors) == 4
+    assert all(metres < 0.05 and degrees < 5 for metres, degrees in errors.values()), errors
+
+
+@dataclass(frozen=True)
+class Theirs:
+    """What kapture-localization made of a workspace's features.
+
+    ``together`` is a kapture of links with map and query images, their matches, and our points;
+    the matches lie in features folders (orphan layout) of their own.
+    """
+
+    workspace: Path
+    mapping_pairs: Path
+    query_pairs: Path
+    mapping_matches: Path
+    query_matches: Path
+    together: Path
+
+
+@pytest.fixture(scope="module")
+def theirs(
+    fountain: Path, fountain_workspace: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Theirs:
+    """Its compute_image_pairs and compute_matches, run on our features."""
+    folder = tmp_path_factory.mktemp("kapture_localization")
+    features = fountain_workspace / "local_features" / LOCAL
+    vlad = fountain_workspace / "global_features" / GLOBAL / "global_features"
+
+    def linked(name: str, sensors_of: Path) -> Path:
+        matches = folder / f"{name}_matches" / "local_features" / LOCAL / "matches"
+        matches.mkdir(parents=True)
+        data = {
+            f"keypoints/{LOCAL}": features / "keypoints",
+            f"descriptors/{LOCAL}": features / "descriptors",
+            f"global_features/{GLOBAL}": vlad,
+            f"matches/{LOCAL}": matches,
+        }
+        return proxy(folder / name, sensors_of, data)
+
+    mapping, query = linked("mapping", fountain / "mapping"), linked("query", fountain / "query")
+    data = ["keypoints", "descriptors", "global_features", "matches"]
+    sensors = merged(folder / "merged", fountain / "mapping", fountain / "query", skip=data)
+    together = linked("together", sensors)
+    for points in ("points3d.txt", "observations.txt"):
+        ours = fountain_workspace / "map" / "reconstruction" / points
+        (together / "reconstruction" / points).symlink_to(ours)
+
+    pairs_of = {}
+    for image_set, matched in ((mapping, mapping), (query, together)):
+        pairs_of[image_set] = pairs = folder / f"{image_set.name}_pairs.txt"
+        both = ["--mapping", mapping, "--query", image_set]
+        kloc("kapture_compute_image_pairs", *both, "--topk", "7", "-o", pairs)
+        kloc("kapture_compute_matches", "-i", matched, "--pairsfile-path", pairs)
+    return Theirs(
+        workspace=fountain_workspace,
+        mapping_pairs=pairs_of[mapping],
+        query_pairs=pairs_of[query],
+        mapping_matches=folder / "mapping_matches",
+        query_matches=folder / "together_matches",
+        together=together,
+    )
+
+
+def test_its_pairs_and_ours_agree(theirs: Theirs, fountain_workspace: Path) -> None:
+    by_query: dict[str, list[str]] = {}
+    for pair in read_pairs(theirs.query_pairs):
+        by_query.setdefault(pair.query, []).append(pair.map)
+    ours: dict[str, list[str]] = {}
+    for pair in read_pairs(fountain_workspace / "pairs" / "query.txt"):
+        ours.setdefault(pair.query, []).append(pair.map)
+    assert by_query == ours
+
+
+def test_its_localizer_localizes_in_our_map(theirs: Theirs, fountain: Path, tmp_path: Path) -> None:
+    result = tmp_path / "localized"
+    places = ["-i", theirs.together, "--query", fountain / "query", "-o", result]
+    kloc("kapture_pycolmap_localize", *places, "--pairsfile-path", theirs.query_pairs)
+    assert_all_localized(result, fountain / "query_gt")
+
+
+def test_our_stages_run_on_its_pairs_and_matches(
+    theirs: Theirs, fountain: Path, tmp_path: Path
+) -> None:
+    # its matches are mutual nearest neighbours without any verification
+    places = [theirs.workspace, theirs.mapping_matches]
+    mapping = KaptureFolder(fountain / "mapping", features_dirs=places)
+    assert len(mapping.matches(LOCAL).pairs) == 21  # all pairs of 7 images
+    our_map, result = tmp_path / "map", tmp_path / "localized"
+    counts = triangulate_map(mapping, mapping, LOCAL, our_map, TriangulationOptions())
+    assert counts["points"] > 1000
+    options = LocalizationOptions()
+    pairs = read_pairs(theirs.query_pairs)
+    places = [theirs.workspace, theirs.query_matches]
+    query = KaptureFolder(fountain / "query", features_dirs=places)
+    found = localize_from_matches(KaptureFolder(our_map), query, query, pairs, LOCAL, options)
+    write_localized(result, query, found)
+    assert_all_localized(result, fountain / "query_gt")
