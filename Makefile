@@ -40,7 +40,8 @@ venv: $(STAMP)
 
 eval: $(STAMP)
 	@$(BIN)/megloc eval '$(DATASET)' $(if $(ROOT),--root '$(ROOT)') $(if $(PRESET),--preset '$(PRESET)') \
-		$(if $(WORKSPACE),--workspace '$(WORKSPACE)') $(ARGS)
+		$(if $(WORKSPACE),--workspace '$(WORKSPACE)') \
+		$(if $(wildcard benchmarks/$(DATASET).toml),--config 'benchmarks/$(DATASET).toml') $(ARGS)
 
 test: $(STAMP)
 	@$(BIN)/python -m pytest $(ARGS)

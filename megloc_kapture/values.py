@@ -26,6 +26,11 @@ CAMERA_MODEL_NUM_PARAMS: dict[str, int] = {
     "THIN_PRISM_FISHEYE": 12,
 }
 
+# these store f, cx, cy first, the others fx, fy, cx, cy
+ONE_FOCAL_MODELS = frozenset(
+    {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
+)
+
 
 class Options(BaseModel):
     """Base of all option models: frozen, validated, unknown keys refused."""
@@ -69,8 +74,9 @@ class Camera:
             raise DataError(f"image size {self.width}x{self.height} is not positive")
         if not np.isfinite(self.params).all():
             raise DataError("camera parameters must be finite")
-        if self.params[0] <= 0:
-            raise DataError(f"focal length {self.params[0]} is not positive")
+        focals = self.params[: 1 if self.model in ONE_FOCAL_MODELS else 2]
+        if min(focals) <= 0:
+            raise DataError(f"focal length {min(focals)} is not positive")
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Fixtures that every test may use."""
+"""Fixtures that every test may use, and hypothesis' settings."""
 
 from __future__ import annotations
 
@@ -6,8 +6,13 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 REPOSITORY = Path(__file__).resolve().parent.parent
+
+# no test depends on how fast the machine is
+settings.register_profile("megloc", deadline=None, print_blob=True)
+settings.load_profile("megloc")
 
 
 @pytest.fixture(scope="session")

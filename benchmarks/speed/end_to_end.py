@@ -21,6 +21,15 @@ from pathlib import Path
 from timing import table
 
 
+def scene_folder(text: str) -> Path:
+    """A command line's scene, resolved; refused where it is none."""
+    scene = Path(text).resolve()
+    for name in ("mapping", "query"):
+        if not (scene / name).is_dir():
+            raise argparse.ArgumentTypeError(f"no folder {scene / name} (make bench SCENE=folder)")
+    return scene
+
+
 def megloc_command(
     scene: Path, workspace: Path, threads: int, arguments: Sequence[str]
 ) -> list[str]:
@@ -45,12 +54,10 @@ def stage_table(seconds: dict[str, float]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--scene", type=Path, required=True)
+    parser.add_argument("--scene", type=scene_folder, required=True)
     parser.add_argument("--workspace", type=Path, help="keep the run here")
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
     options, arguments = parser.parse_known_args()
-    if not (options.scene / "mapping").is_dir():
-        parser.error(f"{options.scene} has no mapping/ folder (SCENE=folder names another scene)")
 
     with tempfile.TemporaryDirectory(prefix="megloc-speed-") as temporary:
         workspace = options.workspace or Path(temporary) / "workspace"

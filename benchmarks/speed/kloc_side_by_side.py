@@ -18,7 +18,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from end_to_end import megloc_command, stage_seconds
+from end_to_end import megloc_command, scene_folder, stage_seconds
 from kloc_pipeline import Inputs, KaptureLocalization, Score, evaluate, localize
 from timing import Timed, table, timed_command
 
@@ -63,14 +63,13 @@ def report(stages: dict[str, float], steps: list[Timed], scores: dict[str, Score
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--kloc-python", type=Path, required=True, help="made by make kloc-env")
-    parser.add_argument("--scene", type=Path, required=True, help="mapping/, query/, query_gt/")
+    parser.add_argument("--scene", type=scene_folder, required=True)
     parser.add_argument("--workspace", type=Path, help="keep our run here, or take the one here")
     parser.add_argument("--features", default="rootsift", help="the type of local features")
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
     options, arguments = parser.parse_known_args()
-    for name in ("mapping", "query", "query_gt"):
-        if not (options.scene / name).is_dir():
-            parser.error(f"{options.scene} has no {name}/ folder")
+    if not (options.scene / "query_gt").is_dir():
+        parser.error(f"{options.scene} has no query_gt/ folder to judge by")
     if not options.kloc_python.exists():
         parser.error(f"no Python at {options.kloc_python}; build it with: make kloc-env")
 
@@ -81,12 +80,11 @@ def main() -> None:
         print(f"{options.scene.name}, {options.threads} threads, load {os.getloadavg()[0]:.1f}")
         sys.stdout.flush()
         workspace = (options.workspace or folder / "workspace").resolve()
-        scene = options.scene.resolve()
-        command = megloc_command(scene, workspace, options.threads, arguments)
+        command = megloc_command(options.scene, workspace, options.threads, arguments)
         timed_command(OURS, command, os.environ, folder / "ours.log")
         theirs = localize(tools, Inputs.of_workspace(workspace, options.features))
         results = {OURS: workspace / "localized", THEIRS: theirs}
-        scores = evaluate(tools, results, scene / "query_gt", THRESHOLDS)
+        scores = evaluate(tools, results, options.scene / "query_gt", THRESHOLDS)
         print(report(stage_seconds(workspace), tools.steps, scores))
 
 

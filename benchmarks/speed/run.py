@@ -10,6 +10,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from end_to_end import scene_folder
+
 HERE = Path(__file__).resolve().parent
 
 
@@ -23,16 +25,15 @@ def run(script: str, *arguments: str) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "--scene", required=True, help="kapture folders mapping/, query/, query_gt/"
-    )
+    parser.add_argument("--scene", type=scene_folder, required=True)
     parser.add_argument("--kloc-python", help="also run kapture-localization, with this Python")
     options, arguments = parser.parse_known_args()
     run("map_reading.py")
-    run("end_to_end.py", "--scene", options.scene, *arguments)
+    scene = ("--scene", str(options.scene))
+    run("end_to_end.py", *scene, *arguments)
     if options.kloc_python:
-        kloc = ("--kloc-python", options.kloc_python, "--scene", options.scene)
-        run("kloc_side_by_side.py", *kloc, *arguments)
+        kloc = ("--kloc-python", options.kloc_python)
+        run("kloc_side_by_side.py", *kloc, *scene, *arguments)
 
 
 if __name__ == "__main__":

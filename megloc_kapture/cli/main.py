@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import operator
 import sys
 from collections.abc import Sequence
 from typing import Annotated, Any, Protocol
@@ -56,11 +58,14 @@ COMMANDS: dict[str, type[Any]] = {
 
 
 def _parser() -> Any:
-    union: Any = None
-    for name, kind in COMMANDS.items():
-        entry = Annotated[kind, tyro.conf.subcommand(name, description=kind.__doc__)]
-        union = entry if union is None else union | entry
-    return tyro.conf.OmitArgPrefixes[union]
+    entries = [
+        Annotated.__class_getitem__(  # type: ignore[attr-defined]
+            (kind, tyro.conf.subcommand(name, description=kind.__doc__))
+        )
+        for name, kind in COMMANDS.items()
+    ]
+    union = functools.reduce(operator.or_, entries)
+    return tyro.conf.OmitArgPrefixes[union]  # type: ignore[misc]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.io.colmap import normalized_from_px, px_from_cam
-from megloc_kapture.values import Camera, RigidTransform
+from megloc_kapture.values import ONE_FOCAL_MODELS, Camera, RigidTransform
 
 __all__ = [
     "bearing_rays",
@@ -21,25 +21,16 @@ __all__ = [
     "shift_principal_point",
 ]
 
-# models with one focal length store the principal point at 1 and 2, the others at 2 and 3
-_ONE_FOCAL = {
-    "SIMPLE_PINHOLE",
-    "SIMPLE_RADIAL",
-    "RADIAL",
-    "SIMPLE_RADIAL_FISHEYE",
-    "RADIAL_FISHEYE",
-}
-
 
 def focal_px(camera: Camera) -> float:
     """Mean focal length in pixels."""
-    if camera.model in _ONE_FOCAL:
+    if camera.model in ONE_FOCAL_MODELS:
         return camera.params[0]
     return 0.5 * (camera.params[0] + camera.params[1])
 
 
 def _principal_point_index(camera: Camera) -> int:
-    return 1 if camera.model in _ONE_FOCAL else 2
+    return 1 if camera.model in ONE_FOCAL_MODELS else 2
 
 
 def principal_point_px(camera: Camera) -> tuple[float, float]:

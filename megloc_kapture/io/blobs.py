@@ -144,7 +144,7 @@ class TarBlobs:
 def index_tar(path: Path, *, repair: bool = False) -> tuple[dict[str, tuple[int, int]], int]:
     """Where each regular file of a tar lies: name -> (offset, size), and the end of the last one.
 
-    An empty file counts as an empty tar (kapture makes tars so). With ``repair`` an incomplete
+    An empty file counts as an empty tar. With ``repair`` an incomplete
     last member is left out, instead of refused.
 
     Raises

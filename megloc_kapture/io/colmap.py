@@ -90,7 +90,6 @@ class TriangulatedPoints:
     Attributes
     ----------
     xyz : float64 (N, 3) in the world frame.
-    rgb : float64 (N, 3), 0..255 (zeros: colours need images).
     errors_px : float64 (N,), mean reprojection error.
     point_ids, image_ids, keypoint_ids : int64 (O,) rows of ``xyz``, indices into the images
         given, rows of their keypoints; sorted by point, then image, then keypoint.

@@ -26,6 +26,7 @@ from megloc_kapture.io.kapture_data import (
 )
 from megloc_kapture.io.paths import (
     check_no_escape,
+    check_output,
     check_relative,
     has_control_characters,
 )
@@ -397,7 +398,8 @@ def write_sensors(root: Path, data: KaptureData) -> None:
     DataError : the data is not valid kapture (ids, names, poses).
     OutputError : a file cannot be written.
     """
-    folder = Path(root) / "sensors"
+    root = Path(root)
+    folder = check_output(root, root / "sensors")
     tables = {
         "sensors.txt": (SENSORS_HEADER, _sensor_rows(data)),
         "rigs.txt": (RIGS_HEADER, _rig_rows(data)),

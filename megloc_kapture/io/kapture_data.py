@@ -206,5 +206,6 @@ def _pixels(text: str) -> int:
 
 
 def _shortest(value: float) -> str:
-    """Shortest text that reads back as the same float64."""
-    return repr(float(value))
+    """Shortest text that reads back as the same float64; whole numbers as kapture has them."""
+    value = float(value)
+    return str(int(value)) if value.is_integer() and abs(value) < 1e15 else repr(value)

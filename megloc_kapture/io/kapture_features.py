@@ -31,7 +31,12 @@ from megloc_kapture.io.blobs import (
     TarBlobWriter,
 )
 from megloc_kapture.io.kapture_csv import format_table, read_rows
-from megloc_kapture.io.paths import check_component, check_no_escape, check_relative
+from megloc_kapture.io.paths import (
+    check_component,
+    check_no_escape,
+    check_output,
+    check_relative,
+)
 
 FeatureKind = Literal["keypoints", "descriptors", "global_features", "matches"]
 ArrayKind = Literal["keypoints", "descriptors", "global_features"]
@@ -304,6 +309,7 @@ class FeatureWriter:
         self.type_name = type_name
         self.config = config
         folder = feature_folder(Path(root), kind, type_name, orphan=orphan)
+        check_output(Path(root), folder)
         path = folder / f"{kind}.txt"
         content = format_config(kind, config)
         if path.exists():

@@ -22,6 +22,7 @@ from megloc_kapture.io.kapture_features import (
     check_field,
     feature_folder,
 )
+from megloc_kapture.io.paths import check_output
 
 _BETWEEN = ".overlapping/"
 _ROW_BYTES = 3 * 8
@@ -134,6 +135,7 @@ class MatchesWriter:
         """
         self.type_name = type_name
         folder = feature_folder(Path(root), "matches", type_name, orphan=orphan)
+        check_output(Path(root), folder)
         try:
             # kapture lists a type by its folder; with no pair at all there must still be one
             folder.mkdir(parents=True, exist_ok=True)

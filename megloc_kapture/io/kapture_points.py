@@ -34,7 +34,7 @@ from megloc_kapture.io.kapture_csv import (
     split_fields,
 )
 from megloc_kapture.io.kapture_features import check_field
-from megloc_kapture.io.paths import check_component, check_relative
+from megloc_kapture.io.paths import check_component, check_output, check_relative
 
 if TYPE_CHECKING:
     from megloc_kapture.io.large_text import ObservationArrays
@@ -275,7 +275,7 @@ def write_points3d(root: Path, points: ArrayLike) -> None:
         raise ValueError("points are not finite")
     # %r is the shortest text that reads back as the same float64
     pattern = ",".join(["%r"] * rows.shape[1]) + "\n"
-    with atomic_write(Path(root) / "reconstruction" / "points3d.txt") as file:
+    with atomic_write(_output(root, "points3d.txt")) as file:
         file.write(f"{FORMAT_LINE}\n{POINTS_HEADERS[rows.shape[1]]}\n".encode())
         for start in range(0, len(rows), _ROWS_AT_ONCE):
             block = rows[start : start + _ROWS_AT_ONCE]
@@ -293,10 +293,15 @@ def write_observations(root: Path, observations: Mapping[str, Observations]) -> 
     """
     for keypoints_type, of_type in observations.items():
         _check_writable(keypoints_type, of_type)
-    with atomic_write(Path(root) / "reconstruction" / "observations.txt") as file:
+    with atomic_write(_output(root, "observations.txt")) as file:
         file.write(f"{FORMAT_LINE}\n{OBSERVATIONS_HEADER}\n".encode())
         for text in _observation_lines(observations):
             file.write(text.encode())
+
+
+def _output(root: Path, name: str) -> Path:
+    folder = Path(root) / "reconstruction"
+    return check_output(Path(root), folder) / name
 
 
 def _observation_lines(observations: Mapping[str, Observations]) -> Iterator[str]:

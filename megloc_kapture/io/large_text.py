@@ -227,7 +227,8 @@ def _check_refused(path: Path, chunk: _Chunk, begin: int, check_line: CheckLine)
         line = text[: text.index(b"\n")].decode("utf-8")
     except UnicodeDecodeError:
         raise DataError("not UTF-8 text", path=path, line=number) from None
-    check_line(line.removesuffix("\r"), number)
+    if line.strip():  # blank with spaces of other scripts, or not blank
+        check_line(line.removesuffix("\r"), number)
 
 
 def _chunks(path: Path, chunk_bytes: int) -> Iterator[_Chunk]:

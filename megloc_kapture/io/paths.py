@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, OutputError
 
 
 def has_control_characters(text: str) -> bool:
@@ -87,3 +87,16 @@ def check_no_escape(root: Path, path: Path) -> Path:
             path=path,
         )
     return path
+
+
+def check_output(root: Path, path: Path) -> Path:
+    """Return ``path`` if writing there stays in ``root``: no link on the way leads out of it.
+
+    Raises
+    ------
+    OutputError : one does; what it leads to is somebody else's.
+    """
+    try:
+        return check_no_escape(root, path)
+    except DataError as error:
+        raise OutputError(f"{path}: not written: lies behind a link that leaves {root}") from error

@@ -41,13 +41,30 @@ def rig_pose(
         return Failure(
             f"{count} 2D-3D matches, at least {options.min_inliers} are needed", num_matches=count
         )
-    offset = np.median(np.concatenate([view.points_world for view in views]), axis=0)
-    used = [view for view in views if len(view.points_px)]
+    # a camera's distortion cannot be undone everywhere: such rays are NaN
+    all_rays = [bearing_rays(view.camera, view.points_px) for view in views]
+    usable = [
+        np.isfinite(rays).all(axis=1) & np.isfinite(view.points_world).all(axis=1)
+        for rays, view in zip(all_rays, views, strict=True)
+    ]
+    num_usable = int(sum(mask.sum() for mask in usable))
+    if num_usable < options.min_inliers:
+        return Failure(
+            f"{num_usable} of {count} 2D-3D matches can be used, at least {options.min_inliers} "
+            "are needed",
+            num_matches=count,
+        )
+    offset = np.median(
+        np.concatenate([view.points_world[mask] for view, mask in zip(views, usable, strict=True)]),
+        axis=0,
+    )
     points_2d, points_3d, extrinsics, cameras = [], [], [], []
-    for view in used:
+    for view, rays, mask in zip(views, all_rays, usable, strict=True):
+        if not mask.any():
+            continue
         focal = focal_px(view.camera)
-        points_2d.append(bearing_rays(view.camera, view.points_px)[:, :2] * focal)
-        points_3d.append(view.points_world - offset)
+        points_2d.append(rays[mask, :2] * focal)
+        points_3d.append(view.points_world[mask] - offset)
         extrinsic = poselib.CameraPose()
         extrinsic.q = np.array(view.cam_from_rig.quat_wxyz)
         extrinsic.t = np.array(view.cam_from_rig.translation)
@@ -77,11 +94,11 @@ def rig_pose(
     t = np.asarray(found.t, dtype=np.float64) - rotation.rotation_matrix() @ offset
     rig_from_world = RigidTransform(rotation.quat_wxyz, (float(t[0]), float(t[1]), float(t[2])))
     inliers = []
-    for view in views:
+    for view, usable_here in zip(views, usable, strict=True):
         cam_from_world = view.cam_from_rig @ rig_from_world
         pixels = px_from_cam(view.camera, cam_from_world.apply(view.points_world))
         errors = np.linalg.norm(pixels - view.points_px, axis=1)
-        inliers.append(np.nan_to_num(errors, nan=np.inf) <= options.max_error_px)
+        inliers.append(usable_here & (np.nan_to_num(errors, nan=np.inf) <= options.max_error_px))
     mask = np.concatenate(inliers)
     if mask.sum() < options.min_inliers:
         return Failure(

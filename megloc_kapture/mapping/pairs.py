@@ -11,6 +11,8 @@ from scipy.spatial import cKDTree
 
 from megloc_kapture.values import Options, RigidTransform
 
+_BLOCK_ELEMENTS = 1 << 20  # distances held at once; each takes about 80 bytes on the way
+
 
 class PairsByPosesOptions(Options):
     """Options of pairs by poses; the distance is per image, so it needs no metric scale."""
@@ -27,7 +29,8 @@ def pairs_by_poses(
 ) -> NDArray[np.int64]:
     """Pairs of images that stand close and look the same way.
 
-    Candidates come from a k-d tree in growing neighbourhoods, never from all pairs.
+    Candidates come from a k-d tree in growing neighbourhoods, block by block: memory does not grow
+    with the number of pairs, even where hardly any two images look the same way.
 
     Returns
     -------
@@ -43,29 +46,30 @@ def pairs_by_poses(
     # the tree's own bound is exclusive
     bound = np.inf if options.max_distance is None else np.nextafter(options.max_distance, np.inf)
     tree = cKDTree(centers)
-    found = np.zeros((0, 2), dtype=np.int64)
+    found = [np.zeros((0, 2), dtype=np.int64)]
     waiting = np.arange(count)
     size = min(count, 4 * options.num_neighbours + 1)
     while len(waiting):
-        distance, index = tree.query(centers[waiting], k=size, distance_upper_bound=bound)
-        distance, index = (
-            distance.reshape(len(waiting), -1),
-            index.reshape(len(waiting), -1),
-        )
-        valid = np.isfinite(distance) & (index != waiting[:, None])
-        other = np.where(valid, index, 0)
-        cosine = np.einsum("nd,nkd->nk", axes[waiting], axes[other])
-        good = valid & (cosine >= min_cosine - 1e-12)
-        rank = np.cumsum(good, axis=1)
-        # an image whose neighbours look elsewhere searches further, until all are seen
-        done = (rank[:, -1] >= options.num_neighbours) | ~np.isfinite(distance[:, -1])
-        done |= size >= count
-        take = good & (rank <= options.num_neighbours) & done[:, None]
-        rows, columns = np.nonzero(take)
-        found = np.concatenate([found, np.stack([waiting[rows], index[rows, columns]], axis=1)])
-        waiting = waiting[~done]
+        unfinished = []
+        block = max(1, _BLOCK_ELEMENTS // size)
+        for start in range(0, len(waiting), block):
+            part = waiting[start : start + block]
+            distance, index = tree.query(centers[part], k=size, distance_upper_bound=bound)
+            valid = np.isfinite(distance) & (index != part[:, None])
+            other = np.where(valid, index, 0)
+            cosine = np.einsum("nd,nkd->nk", axes[part], axes[other])
+            good = valid & (cosine >= min_cosine - 1e-12)
+            rank = np.cumsum(good, axis=1)
+            # an image whose neighbours look elsewhere searches further, until all are seen
+            done = (rank[:, -1] >= options.num_neighbours) | ~np.isfinite(distance[:, -1])
+            done |= size >= count
+            take = good & (rank <= options.num_neighbours) & done[:, None]
+            rows, columns = np.nonzero(take)
+            found.append(np.stack([part[rows], index[rows, columns]], axis=1))
+            unfinished.append(part[~done])
+        waiting = np.concatenate(unfinished)
         size = min(count, 2 * size)
-    return unique_pairs(found)
+    return unique_pairs(np.concatenate(found))
 
 
 def exhaustive_pairs(count: int) -> NDArray[np.int64]:

@@ -7,6 +7,7 @@ from concurrent.futures import Executor
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,7 +82,7 @@ class Localizer:
         self.map = kapture_map
         self.options = options or options_of_preset(preset)
         self._matcher = self.options.make_matcher()
-        self._descriptors: dict[str, NDArray[np.generic]] | None = None
+        self._descriptors: dict[str, NDArray[Any]] | None = None
         if not kapture_map.has_descriptors():
             self._descriptors = extract_again(kapture_map, self._extractor())
         self._cache = FeatureCache()
@@ -283,10 +284,10 @@ class Localizer:
         # check: without its rivals a wrong match would look unrivalled
         return Features(camera, keypoints, bearing_rays(camera, keypoints), descriptors)
 
-    def _map_descriptors(self, image: str) -> NDArray[np.generic]:
+    def _map_descriptors(self, image: str) -> NDArray[Any]:
         if self._descriptors is not None:
             return self._descriptors[image]
-        return self.map.folder.descriptors(self.map.local_type).read(image)
+        return np.asarray(self.map.folder.descriptors(self.map.local_type).read(image))
 
     def _global_vectors(self, global_type: str) -> NDArray[np.float32]:
         if global_type not in self._vectors:

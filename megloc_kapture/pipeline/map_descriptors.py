@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -18,7 +20,7 @@ _MIN_FOUND_AGAIN = 0.5
 
 def extract_again(
     kapture_map: KaptureMap, extractor: LocalFeatureExtractor
-) -> dict[str, NDArray[np.generic]]:
+) -> dict[str, NDArray[Any]]:
     """Descriptors of every map image, one row per stored keypoint; zero where it is not found.
 
     Raises
@@ -32,7 +34,7 @@ def extract_again(
             "extract them from again",
             path=kapture_map.folder.root,
         )
-    found: dict[str, NDArray[np.generic]] = {}
+    found: dict[str, NDArray[Any]] = {}
     again = observed = 0
     for image in kapture_map.images:
         path = kapture_map.folder.image_path(image)

@@ -74,6 +74,7 @@ def pair_map_images(
     poses = data.poses()
     images = sorted(poses)
     scores: dict[tuple[int, int], float] = {}
+    similarities: dict[tuple[int, int], float] = {}
     for method in options.by:
         if method == "exhaustive":
             found = exhaustive_pairs(len(images))
@@ -93,10 +94,11 @@ def pair_map_images(
             for (i, j), score in zip(
                 np.sort(both[keep], axis=1).tolist(), similarity.ravel()[keep].tolist(), strict=True
             ):
-                scores[i, j] = max(score, scores.get((i, j), -1.0))
+                similarities[i, j] = max(score, similarities.get((i, j), -1.0))
             continue
         for i, j in unique_pairs(found).tolist():
-            scores.setdefault((i, j), 1.0)
+            scores[i, j] = 1.0
+    scores.update(similarities)
     return [ImagePair(images[i], images[j], score) for (i, j), score in sorted(scores.items())]
 
 

@@ -141,11 +141,15 @@ def localize_from_matches(
     track: Track = untracked,
 ) -> Iterator[tuple[str, Pose | Failure, float]]:
     """Localize every query from stored matches: image, result, seconds; in order of names."""
-    specs = [FolderSpec(f.root, f.features_dirs) for f in (map_folder, query, matches)]
+    map_spec, query_spec, matches_spec = (
+        FolderSpec(f.root, f.features_dirs) for f in (map_folder, query, matches)
+    )
     candidates = dict(iterate_candidates(pairs))
     jobs = [
         _Job(
-            *specs,
+            map=map_spec,
+            query=query_spec,
+            matches=matches_spec,
             local_type=local_type,
             image=image,
             candidates=tuple(candidates.get(image, ())),

@@ -116,6 +116,6 @@ def test_sensors_return_the_camera_they_were_made_of() -> None:
     assert sensor.camera() == awkward
     assert (sensor.name, sensor.sensor_type) == ("n", "depth")
     of_numpy = Camera("SIMPLE_PINHOLE", np.int64(7), np.int32(5), np.array([1.5, 2, 3]))  # type: ignore[arg-type]
-    assert Sensor.from_camera(of_numpy).params == ("SIMPLE_PINHOLE", "7", "5", "1.5", "2.0", "3.0")
+    assert Sensor.from_camera(of_numpy).params == ("SIMPLE_PINHOLE", "7", "5", "1.5", "2", "3")
     with pytest.raises(DataError, match="'gnss'"):
         Sensor("", "gnss", ()).camera()

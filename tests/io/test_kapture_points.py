@@ -341,7 +341,7 @@ def test_more_types_than_the_compiled_reader_takes(tmp_path: Path) -> None:
 # rows that are nearly right, so that random files reach deep into both readers
 FIELDS = st.sampled_from(
     ["0", "1", "17", " 5 ", "007", "-1", "x", "", "t", "u u", "a.jpg", "b/c d.jpg", "é", "..", "#"]
-    + ["9" * 18, "9" * 19, "\t3", "a\u00a0", "\0", "2147483647", "2147483648"]
+    + ["\u2003", "9" * 18, "9" * 19, "\t3", "a\u00a0", "\0", "2147483647", "2147483648"]
 )
 GOOD = st.builds(
     lambda point, kind, pairs: f"{point}, {kind}" + "".join(f", {i}, {k}" for i, k in pairs),
@@ -352,7 +352,11 @@ GOOD = st.builds(
         max_size=5,
     ),
 )
-ROWS = GOOD | st.lists(FIELDS, max_size=7).map(", ".join) | st.sampled_from(["", "# c", " ", "\r"])
+ROWS = (
+    GOOD
+    | st.lists(FIELDS, max_size=7).map(", ".join)
+    | st.sampled_from(["", "# c", " ", "\r", "\u2003"])
+)
 FILES = st.builds(
     lambda rows, end, tail: end.join(rows) + tail,
     st.lists(ROWS, max_size=12),
@@ -370,9 +374,7 @@ def outcome(read: Callable[..., object], path: Path, large_bytes: int) -> object
 
 
 @given(st.lists(GOOD, min_size=1, max_size=12).map(lambda r: "\n".join(r).encode()) | FILES)
-@settings(
-    suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=500, deadline=None
-)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=500)
 @pytest.mark.usefixtures("small_chunks")
 def test_both_readers_of_observations_agree_on_anything(tmp_path: Path, content: bytes) -> None:
     path = file(tmp_path / "o.txt", content)
@@ -395,9 +397,7 @@ POINT_ROWS = st.lists(NUMBERS, min_size=3, max_size=3) | st.lists(POINT_FIELDS, 
     .map(str.encode)
     | st.binary(max_size=200)
 )
-@settings(
-    suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=500, deadline=None
-)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=500)
 @pytest.mark.usefixtures("small_chunks")
 def test_both_readers_of_points_agree_on_anything(tmp_path: Path, content: bytes) -> None:
     path = file(tmp_path / "p.txt", content)

@@ -30,6 +30,11 @@ class Atlas:
     size: NDArray[np.float32]
 
 
+def _half(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    size = (image.shape[1] + 1) // 2, (image.shape[0] + 1) // 2
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
 def build_atlas(textures: Sequence[NDArray[np.uint8]]) -> Atlas:
     """Pack textures, uint8 (h, w, 3) each, at most ATLAS_WIDTH - 4 wide."""
     levels: list[NDArray[np.uint8]] = []
@@ -37,8 +42,7 @@ def build_atlas(textures: Sequence[NDArray[np.uint8]]) -> Atlas:
         current = texture
         for level in range(NUM_LEVELS):
             if level:
-                half = (max(1, (current.shape[1] + 1) // 2), max(1, (current.shape[0] + 1) // 2))
-                current = cv2.resize(current, half, interpolation=cv2.INTER_AREA)
+                current = _half(current)
             levels.append(current)
     heights = np.array([piece.shape[0] for piece in levels]) + 2 * _BORDER
     widths = np.array([piece.shape[1] for piece in levels]) + 2 * _BORDER

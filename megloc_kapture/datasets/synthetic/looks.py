@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 Triple = tuple[float, float, float]
 Condition = Literal["day", "night"]
@@ -51,7 +52,12 @@ class Look:
     noise_seed: int
 
 
-def _triple(values: np.ndarray) -> Triple:
+def as_array(values: Triple) -> NDArray[np.float32]:
+    """float32 (3,)."""
+    return np.array(values, np.float32)
+
+
+def _triple(values: NDArray[np.float64]) -> Triple:
     r, g, b = (float(v) for v in values)
     return r, g, b
 

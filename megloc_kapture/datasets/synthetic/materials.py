@@ -6,7 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from megloc_kapture.datasets.synthetic.drawing import Picture, shade
+from megloc_kapture.datasets.synthetic.drawing import Colour, Picture, shade
 from megloc_kapture.datasets.synthetic.noise import periodic_noise
 from megloc_kapture.datasets.synthetic.options import stream
 
@@ -16,12 +16,12 @@ TILE = 512  # texels; the period of a material
 def _blocks(
     rng: np.random.Generator,
     *,
-    base: Picture,
+    base: Colour,
     rows: int,
     cols: int,
     spread: float,
     joint: float,
-    joint_colour: Picture,
+    joint_colour: Colour,
 ) -> Picture:
     """Masonry of ``rows`` x ``cols`` blocks per tile, every second row shifted by half a block."""
     y, x = np.mgrid[0:TILE, 0:TILE].astype(np.float32)
@@ -72,7 +72,7 @@ def material_tile(kind: str, seed: int) -> Picture:
     return np.ascontiguousarray(tile, dtype=np.float32)
 
 
-def tiled(kind: str, seed: int, height: int, width: int, shift: tuple[int, int]) -> NDArray:
+def tiled(kind: str, seed: int, height: int, width: int, shift: tuple[int, int]) -> Picture:
     tile = np.roll(material_tile(kind, seed), shift, axis=(0, 1))
     repeats = (-(-height // TILE), -(-width // TILE), 1)
     return np.tile(tile, repeats)[:height, :width]

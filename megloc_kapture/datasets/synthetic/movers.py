@@ -5,6 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.datasets.synthetic.floor_plans import FloorPlan
 from megloc_kapture.datasets.synthetic.options import stream
 from megloc_kapture.datasets.synthetic.surfaces import SurfaceBuilder, Surfaces
 from megloc_kapture.datasets.synthetic.textures import TextureRecipe
@@ -46,6 +50,38 @@ def mover_recipes(seed: int) -> list[TextureRecipe]:
         recipes.append(TextureRecipe("car", 180, 90, number + 100 + i, (("side", 0.0),)))
     recipes.append(TextureRecipe("window", 220, 60, number + 200))
     return recipes
+
+
+def place_movers(
+    plan: FloorPlan,
+    rng: np.random.Generator,
+    count: int,
+    position: NDArray[np.float64],
+    *,
+    yaw: float | None,
+) -> tuple[Mover, ...]:
+    """At most ``count`` people and cars near a position (x, y first; metres, place's frame).
+
+    They stand in front of it where ``yaw`` (radians) is given, else all around.
+    """
+    movers: list[Mover] = []
+    for _ in range(60):
+        if len(movers) >= count:
+            break
+        kind: Literal["person", "car"] = "car" if rng.random() < 0.3 else "person"
+        distance = rng.uniform(4.5, 8.0) if kind == "car" else rng.uniform(2.5, 7.0)
+        angle = rng.uniform(-np.pi, np.pi) if yaw is None else yaw + rng.uniform(-0.5, 0.5)
+        x = float(position[0] + distance * np.cos(angle))
+        y = float(position[1] + distance * np.sin(angle))
+        variant = int(rng.integers(NUM_CARS if kind == "car" else NUM_PEOPLE))
+        mover = Mover(kind, variant, (x, y), float(rng.uniform(-np.pi, np.pi)))
+        apart = all(
+            np.hypot(x - m.position[0], y - m.position[1]) > mover.radius_m + m.radius_m
+            for m in movers
+        )
+        if apart and plan.is_free(x, y, 0.6 * mover.radius_m):
+            movers.append(mover)
+    return tuple(movers)
 
 
 def mover_surfaces(movers: tuple[Mover, ...]) -> Surfaces:

@@ -243,18 +243,20 @@ def sample_colour(seen: Visibility, surfaces: Surfaces, atlas: Atlas) -> Float32
     gx, gy = seen.grid.x.astype(np.float32), seen.grid.y.astype(np.float32)
     forms = np.ascontiguousarray(seen.planes[:, 1:].reshape(len(surfaces), 6), np.float32)
     per_sample = np.take(forms, index, axis=0)
-    z = 1 / inverse
-    u = (per_sample[..., 0] * gx + per_sample[..., 1] * gy + per_sample[..., 2]) * z
-    v = (per_sample[..., 3] * gx + per_sample[..., 4] * gy + per_sample[..., 5]) * z
+    z = (1 / inverse).astype(np.float32)
+    u, v = (
+        (form[..., 0] * gx + form[..., 1] * gy + form[..., 2]) * z
+        for form in (per_sample[..., :3], per_sample[..., 3:])
+    )
     level = _level(seen, surfaces, atlas, index, inverse)
     low = np.minimum(level.astype(np.int32), NUM_LEVELS - 2)
-    weight = (level - low)[..., None]
+    weight = (level - low.astype(np.float32))[..., None]
     table = _lookup_table(surfaces, atlas)
     fine = _lookup(atlas, table, index * NUM_LEVELS + low, u, v)
     coarse = _lookup(atlas, table, index * NUM_LEVELS + low + 1, u, v)
-    colour = fine + weight * (coarse.astype(np.float32) - fine)
+    colour = fine + weight * (coarse - fine)
     colour[~hit] = 0
-    return colour
+    return np.asarray(colour, np.float32)
 
 
 def _level(
@@ -288,8 +290,9 @@ def _lookup_table(surfaces: Surfaces, atlas: Atlas) -> Float32:
 
 def _lookup(
     atlas: Atlas, table: Float32, row: NDArray[np.int32], u: Float32, v: Float32
-) -> NDArray[np.uint8]:
+) -> Float32:
     affine = np.take(table, row, axis=0)
     x = affine[..., 0] + affine[..., 1] * u
     y = affine[..., 2] + affine[..., 3] * v
-    return cv2.remap(atlas.image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    texels = cv2.remap(atlas.image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(texels, np.float32)

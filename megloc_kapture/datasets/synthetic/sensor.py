@@ -8,26 +8,28 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.datasets.synthetic.looks import Look
+from megloc_kapture.datasets.synthetic.looks import Look, as_array
 from megloc_kapture.datasets.synthetic.options import stream
 
 Float32 = NDArray[np.float32]
 
 
-def develop(light: Float32, look: Look, supersampling: int, *, bonnet_seed: int | None) -> NDArray:
+def develop(
+    light: Float32, look: Look, supersampling: int, *, bonnet_seed: int | None
+) -> NDArray[np.uint8]:
     """Image uint8 (H, W, 3) RGB of the samples' light (H * ss, W * ss, 3).
 
     ``bonnet_seed`` puts a car's bonnet in front; None leaves it out.
     """
     height, width = light.shape[0] // supersampling, light.shape[1] // supersampling
     if supersampling > 1:
-        light = cv2.resize(light, (width, height), interpolation=cv2.INTER_AREA)
+        light = np.asarray(cv2.resize(light, (width, height), interpolation=cv2.INTER_AREA))
     if bonnet_seed is not None:
         cover, paint = bonnet(width, height, bonnet_seed)
-        lit = np.float32(look.sky) + np.float32(0.4) * np.float32(look.sun)
-        lit = lit + np.float32(0.04) * np.float32(look.lamps)
+        lit = as_array(look.sky) + np.float32(0.4) * as_array(look.sun)
+        lit = lit + np.float32(0.04) * as_array(look.lamps)
         light = light * (1 - cover[..., None]) + paint * cover[..., None] * lit
-    signal = light * (np.float32(look.white_balance) * np.float32(look.exposure))
+    signal = light * (as_array(look.white_balance) * np.float32(look.exposure))
     signal *= (1 - np.float32(look.vignetting) * _corner_distance(width, height))[..., None]
     if look.condition == "night":  # light that strays around lamps
         small = cv2.resize(
@@ -50,7 +52,7 @@ def _corner_distance(width: int, height: int) -> Float32:
     """Squared distance from the image's middle, 1 in the corners, float32 (height, width)."""
     x = (np.arange(width, dtype=np.float32) + 0.5) / width * 2 - 1
     y = (np.arange(height, dtype=np.float32) + 0.5) / height * 2 - 1
-    return (x[None] ** 2 + y[:, None] ** 2) / 2
+    return ((x[None] ** 2 + y[:, None] ** 2) / 2).astype(np.float32)
 
 
 @lru_cache(maxsize=4)
@@ -63,11 +65,11 @@ def bonnet(width: int, height: int, seed: int) -> tuple[Float32, Float32]:
     y = (np.arange(height, dtype=np.float32) + 0.5) / height
     edge = 0.86 + 0.11 * x**2
     below = y[:, None] - edge[None]
-    cover = np.clip(below * height + 0.5, 0, 1)
+    cover = np.clip(below * height + 0.5, 0, 1).astype(np.float32)
     rng = stream(seed, "bonnet")
     colour = rng.uniform(0.05, 0.35, 3).astype(np.float32)
     gloss = np.exp(-(((below - 0.035) / 0.02) ** 2)) * 0.5 + 0.6 + 1.5 * np.clip(below, 0, None)
-    canvas = np.clip(colour * gloss[..., None], 0, 1)
+    canvas = np.clip(colour * gloss[..., None], 0, 1).astype(np.float32)
     for side in (-0.42, 0.42):
         start = (int((0.5 + side * 0.6) * width), int(0.86 * height))
         stop = (int((0.5 + side) * width), height)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.datasets.synthetic.looks import Look
+from megloc_kapture.datasets.synthetic.looks import Look, as_array
 from megloc_kapture.datasets.synthetic.noise import periodic_noise
 from megloc_kapture.datasets.synthetic.options import stream
 from megloc_kapture.datasets.synthetic.render import NO_SURFACE, Visibility
@@ -51,7 +51,7 @@ def radiance(
     albedo = (colour * np.float32(1 / 255)) ** 2
     normals = surfaces.normals()
     ambient = 0.62 + 0.38 * normals[:, 2]
-    light = np.take(ambient.astype(np.float32), index)[..., None] * np.float32(look.sky)
+    light = np.take(ambient.astype(np.float32), index)[..., None] * as_array(look.sky)
     has_sun, has_lamps = any(look.sun), any(look.lamps) and len(lamps) > 0
     if has_sun or has_lamps:
         x, y, z = _positions(seen, cam_from_place)
@@ -60,12 +60,12 @@ def radiance(
         sun = np.take(facing, index)
         if shadows is not None:
             sun = sun * shadows.lit(x, y, z)
-        light += sun[..., None] * np.float32(look.sun)
+        light += sun[..., None] * as_array(look.sun)
     if has_lamps:
         normal = np.take(normals.astype(np.float32), index, axis=0)
         lamp_light = _lamp_light((x, y, z), normal, lamps.astype(np.float32))
-        light += lamp_light[..., None] * np.float32(look.lamps)
-    light += np.take(surfaces.glow, index)[..., None] * np.float32(look.glow)
+        light += lamp_light[..., None] * as_array(look.lamps)
+    light += np.take(surfaces.glow, index)[..., None] * as_array(look.glow)
     result = albedo * light
     sky = ~hit
     if sky.any():
@@ -115,7 +115,7 @@ def _sky(
     v = np.clip(rise, 0, 3) * np.float32(_CLOUD_SIZE / 3.2)
     shape = (1, -1)
     cover = _lookup_wrapped(clouds, u.reshape(shape), v.reshape(shape)).reshape(-1, 1)
-    base = np.float32(look.sky_colour)
+    base = as_array(look.sky_colour)
     haze = np.exp(-3 * np.clip(rise, 0, None))[:, None] * base.mean() * np.float32(0.5)
     return base * (1 - 0.5 * cover) + cover * base.mean() * np.float32(1.1) + haze
 

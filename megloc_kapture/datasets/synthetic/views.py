@@ -19,7 +19,7 @@ from megloc_kapture.datasets.synthetic.render import (
 from megloc_kapture.datasets.synthetic.sensor import bonnet, develop
 from megloc_kapture.datasets.synthetic.shading import cloud_texture, radiance
 from megloc_kapture.datasets.synthetic.shadow import ShadowMap, add_shadows, cast_shadows
-from megloc_kapture.datasets.synthetic.world import Shot, place_from_world
+from megloc_kapture.datasets.synthetic.shots import Shot
 
 _BONNET_COVERS = 0.5  # share of a pixel from which the mask and the depth leave it out
 
@@ -57,7 +57,7 @@ class PlacePainter:
         place = self._place
         movers = mover_surfaces(shot.movers)
         surfaces = place.surfaces.joined(movers)
-        cam_from_place = shot.cam_from_world @ place_from_world(place).inverse()
+        cam_from_place = shot.cam_from_world @ place.place_from_world.inverse()
         seen = visible_surfaces(
             surfaces, cam_from_place, sample_grid(shot.camera, self._supersampling)
         )

@@ -10,10 +10,12 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from megloc_kapture.datasets.synthetic.mapping_shots import RIG_ID
 from megloc_kapture.datasets.synthetic.options import SyntheticWorldOptions
 from megloc_kapture.datasets.synthetic.places import build_place
+from megloc_kapture.datasets.synthetic.shots import Shot
 from megloc_kapture.datasets.synthetic.views import PlacePainter
-from megloc_kapture.datasets.synthetic.world import RIG_ID, Shot, SyntheticWorld, build_world
+from megloc_kapture.datasets.synthetic.world import SyntheticWorld, build_world
 from megloc_kapture.io.depth_maps import write_depth_map
 from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture_store import KaptureData, Sensor, write_sensors
@@ -44,8 +46,8 @@ def write_synthetic_kapture(
     executor: Executor | None = None,
     *,
     track: Track = untracked,
-) -> None:
-    """Draw a synthetic world and write it as kapture.
+) -> dict[str, int]:
+    """Draw a synthetic world and write it as kapture; returns what it holds.
 
     Below ``root``: ``mapping/`` (images, poses through the rig, depth if asked), ``query/``
     (images and cameras), ``query_gt/`` (the same cameras with poses, no images) and ``megloc/``
@@ -61,15 +63,20 @@ def write_synthetic_kapture(
     OutputError : something cannot be written.
     """
     root = Path(root)
-    world = build_world(options or SyntheticWorldOptions())
+    world = build_world(options)
     jobs = list(_jobs(root, world))
     drawn = (name for names in ordered_map(_draw, jobs, executor) for name in names)
-    for _ in track(drawn, len(world.shots), "draw"):
+    for _ in track(drawn, len(world.shots()), "drawing"):
         pass
     write_sensors(root / "mapping", mapping_data(world))
     write_sensors(root / "query", query_data(world, poses=False))
     write_sensors(root / "query_gt", query_data(world, poses=True))
     write_side_tables(root / "megloc", world)
+    return {
+        "places": len(world.places),
+        "mapping images": len(world.mapping),
+        "query images": len(world.queries),
+    }
 
 
 def mapping_data(world: SyntheticWorld) -> KaptureData:
@@ -86,7 +93,7 @@ def mapping_data(world: SyntheticWorld) -> KaptureData:
     data.rigs[RIG_ID] = members
     for timestamp, pose in world.rig_from_world.items():
         data.trajectories[timestamp, RIG_ID] = pose
-    for shot in world.mapping_shots():
+    for shot in world.mapping:
         data.records_camera[shot.timestamp, shot.sensor_id] = shot.name
         if world.options.depth:
             record = shot.timestamp, _depth_sensor(shot.sensor_id)
@@ -97,7 +104,7 @@ def mapping_data(world: SyntheticWorld) -> KaptureData:
 def query_data(world: SyntheticWorld, *, poses: bool) -> KaptureData:
     """The queries' sensors and records, with their true poses or without."""
     data = KaptureData()
-    for shot in world.query_shots():
+    for shot in world.queries:
         data.sensors[shot.sensor_id] = Sensor.from_camera(shot.camera, name=shot.sensor_id)
         data.records_camera[shot.timestamp, shot.sensor_id] = shot.name
         if poses:
@@ -109,7 +116,7 @@ def write_side_tables(folder: Path, world: SyntheticWorld) -> None:
     """Conditions of the queries, thresholds and frame."""
     groups = {
         shot.name: ImageGroup(condition=shot.condition, location=world.places[shot.place].name)
-        for shot in world.query_shots()
+        for shot in world.queries
     }
     write_groups(folder, groups)
     write_protocol(folder, Protocol(dataset=DATASET, conditions=("day", "night")))
@@ -127,7 +134,7 @@ def _depth_sensor(sensor_id: str) -> str:
 
 def _jobs(root: Path, world: SyntheticWorld) -> Iterable[_Job]:
     for place in world.places:
-        shots = [shot for shot in world.shots if shot.place == place.index]
+        shots = [shot for shot in world.shots() if shot.place == place.index]
         for start in range(0, len(shots), _SHOTS_PER_JOB):
             yield _Job(root, world.options, tuple(shots[start : start + _SHOTS_PER_JOB]))
 

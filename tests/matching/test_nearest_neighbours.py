@@ -1,0 +1,162 @@
+"""Nearest neighbours against loops over all pairs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.matching import nearest_neighbours
+from megloc_kapture.matching.nearest_neighbours import (
+    NearestNeighbourOptions,
+    NearestNeighbours,
+    match_nearest,
+)
+
+
+def by_loops(
+    a: NDArray[Any], b: NDArray[Any], options: NearestNeighbourOptions
+) -> list[tuple[int, int]]:
+    a, b = a.astype(np.float64), b.astype(np.float64)
+    products = [[float(np.dot(x, y)) for y in b] for x in a]
+    matches: list[tuple[int, int]] = []
+    taken: set[int] = set()
+    for i, row in enumerate(products):
+        best = max(range(len(b)), key=lambda j: (row[j], -j))
+        if options.max_ratio is not None and len(b) > 1:
+            distances = sorted(float(np.linalg.norm(a[i] - y)) for y in b)
+            # distances of unit vectors that are equal in truth differ by rounding
+            if distances[0] > options.max_ratio * distances[1] + 1e-7:
+                continue
+        if options.min_similarity is not None and row[best] < options.min_similarity:
+            continue
+        if options.mutual:
+            if row[best] < max(other[best] for other in products) or best in taken:
+                continue
+            taken.add(best)
+        matches.append((i, best))
+    return matches
+
+
+@st.composite
+def descriptors(draw: st.DrawFn) -> tuple[NDArray[Any], NDArray[Any], int]:
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    count_a, count_b = draw(st.integers(1, 30)), draw(st.integers(1, 30))
+    size, block = draw(st.integers(1, 4)), draw(st.integers(1, 40))
+    if draw(st.booleans()):
+        # few values, so that exact ties are everywhere
+        a, b = rng.integers(0, 4, (count_a, size)), rng.integers(0, 4, (count_b, size))
+        return a.astype(np.uint8), b.astype(np.uint8), block
+    a, b = rng.normal(size=(count_a, size)), rng.normal(size=(count_b, size))
+    return a.astype(np.float32), b.astype(np.float32), block
+
+
+@given(descriptors(), st.booleans(), st.sampled_from([None, 2.5]))
+@settings(deadline=None)
+def test_equal_to_loops_over_all_pairs(
+    problem: tuple[NDArray[Any], NDArray[Any], int], mutual: bool, min_similarity: float | None
+) -> None:
+    a, b, block = problem
+    options = NearestNeighbourOptions(mutual=mutual, min_similarity=min_similarity)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(nearest_neighbours, "_BLOCK_ROWS", block)
+        matches, scores = match_nearest(a, b, options)
+    assert matches.dtype == np.int64 and scores.dtype == np.float32
+    if a.dtype == np.uint8:
+        assert [tuple(m) for m in matches.tolist()] == by_loops(a, b, options)
+    else:
+        expected = by_loops(a, b, options)
+        assert len(matches) == len(expected)
+        # two float32 products may tie in float32 only: compare by value
+        found = np.einsum("nd,nd->n", a[matches[:, 0]], b[matches[:, 1]])
+        truth = [float(a[i].astype(np.float64) @ b[j].astype(np.float64)) for i, j in expected]
+        np.testing.assert_allclose(found, truth, atol=1e-5)
+    products = a.astype(np.float64) @ b.astype(np.float64).T
+    np.testing.assert_allclose(scores, products[matches[:, 0], matches[:, 1]], atol=1e-5)
+
+
+@given(descriptors())
+@settings(deadline=None)
+def test_a_mutual_match_uses_every_row_once_and_is_nearest_both_ways(
+    problem: tuple[NDArray[Any], NDArray[Any], int],
+) -> None:
+    a, b, _ = problem
+    matches, scores = match_nearest(a, b)
+    assert len(matches) >= 1  # the best pair of all is always mutual
+    assert len(set(matches[:, 0].tolist())) == len(set(matches[:, 1].tolist())) == len(matches)
+    assert (np.diff(matches[:, 0]) > 0).all()
+    products = a.astype(np.float64) @ b.astype(np.float64).T
+    np.testing.assert_allclose(scores, products[matches[:, 0]].max(axis=1), atol=1e-5)
+    np.testing.assert_allclose(scores, products[:, matches[:, 1]].max(axis=0), atol=1e-5)
+
+
+@pytest.mark.parametrize("max_ratio", [0.6, 0.8, 0.95, 1.0])
+@pytest.mark.parametrize("mutual", [True, False])
+def test_the_ratio_is_of_distances(max_ratio: float, mutual: bool) -> None:
+    rng = np.random.default_rng(3)
+    b = rng.normal(size=(60, 6))
+    a = b[rng.permutation(60)[:50]] + 0.4 * rng.normal(size=(50, 6))
+    a, b = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (a, b))
+    options = NearestNeighbourOptions(max_ratio=max_ratio, mutual=mutual)
+    matches, _ = match_nearest(a, b, options)
+    assert [tuple(m) for m in matches.tolist()] == by_loops(a, b, options)
+    if max_ratio == 0.6:
+        assert 0 < len(matches) < 40  # the test tells ratios apart
+
+
+def test_ratio_with_a_single_candidate_is_no_test() -> None:
+    a, b = np.eye(2, 4, dtype=np.float32), np.eye(1, 4, dtype=np.float32)
+    matches, _ = match_nearest(a, b, NearestNeighbourOptions(max_ratio=0.5))
+    assert matches.tolist() == [[0, 0]]
+
+
+def test_more_rows_than_one_block() -> None:
+    rng = np.random.default_rng(4)
+    b = rng.integers(-3, 4, (40, 5)).astype(np.float32)
+    a = rng.integers(-3, 4, (1300, 5)).astype(np.float32)
+    matches, _ = match_nearest(a, b)
+    assert [tuple(m) for m in matches.tolist()] == by_loops(a, b, NearestNeighbourOptions())
+    assert matches[:, 0].max() > 512  # some come from later blocks
+
+
+def test_ties_go_to_the_smaller_index() -> None:
+    same = np.ones((3, 4), dtype=np.float32)
+    assert match_nearest(same, same)[0].tolist() == [[0, 0]]
+    one_way = match_nearest(same, same, NearestNeighbourOptions(mutual=False))[0]
+    assert one_way.tolist() == [[0, 0], [1, 0], [2, 0]]
+
+
+def test_uint8_descriptors_do_not_wrap_around() -> None:
+    a = np.array([[255, 0], [0, 255]], dtype=np.uint8)
+    b = np.array([[0, 200], [250, 10]], dtype=np.uint8)
+    matches, scores = match_nearest(a, b)
+    assert matches.tolist() == [[0, 1], [1, 0]]
+    assert scores.tolist() == [255.0 * 250, 255.0 * 200]
+
+
+@pytest.mark.parametrize(("count_a", "count_b"), [(0, 3), (3, 0), (0, 0)])
+def test_no_descriptors(count_a: int, count_b: int) -> None:
+    matches, scores = match_nearest(np.zeros((count_a, 8)), np.zeros((count_b, 8)))
+    assert matches.shape == (0, 2) and matches.dtype == np.int64
+    assert scores.shape == (0,) and scores.dtype == np.float32
+
+
+def test_different_dimensions_are_refused() -> None:
+    with pytest.raises(DataError, match="8 and 4 dimensions"):
+        match_nearest(np.zeros((2, 8)), np.zeros((2, 4)))
+
+
+def test_the_plugin_passes_its_options_on() -> None:
+    rng = np.random.default_rng(5)
+    a, b = rng.normal(size=(30, 4)), rng.normal(size=(20, 4))
+    options = NearestNeighbourOptions(mutual=False)
+    np.testing.assert_array_equal(
+        NearestNeighbours(options).match(a, b)[0], match_nearest(a, b, options)[0]
+    )
+    assert len(NearestNeighbours(options).match(a, b)[0]) == 30
+    assert len(NearestNeighbours().match(a, b)[0]) < 30

@@ -1,0 +1,266 @@
+"""Verification against scenes whose poses and true matches are known, and against COLMAP."""
+
+from __future__ import annotations
+
+import numpy as np
+import pycolmap
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from megloc_kapture.geometry.cameras import bearing_rays, project
+from megloc_kapture.matching.verification import (
+    KnownPoseOptions,
+    TwoViewOptions,
+    cross_matrix,
+    essential_matrix,
+    in_front_of_both,
+    sampson_error_px,
+    verify_two_view,
+    verify_with_poses,
+)
+from megloc_kapture.values import Camera, RigidTransform
+
+Array = NDArray[np.float64]
+PINHOLE = Camera("PINHOLE", 640, 480, (520.0, 510.0, 320.5, 239.0))
+DISTORTED = [
+    Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, -0.08)),
+    Camera("OPENCV", 640, 480, (520.0, 510.0, 320.5, 239.0, -0.1, 0.02, 1e-3, -5e-4)),
+    Camera("OPENCV_FISHEYE", 640, 480, (400.0, 400.0, 320.0, 240.0, 0.01, -0.003, 0.0, 0.0)),
+]
+
+
+def pose(rotation_vector: list[float], translation: list[float]) -> RigidTransform:
+    x, y, z, w = Rotation.from_rotvec(rotation_vector).as_quat()
+    tx, ty, tz = translation
+    return RigidTransform((w, x, y, z), (tx, ty, tz))
+
+
+B_FROM_A = pose([0.02, -0.15, 0.05], [-1.0, 0.1, 0.2])
+
+
+def scene(
+    camera_a: Camera, camera_b: Camera, count: int = 200, seed: int = 0
+) -> tuple[Array, Array, Array]:
+    """Points (N, 3) in a's frame that both cameras see, and their pixels in both."""
+    rng = np.random.default_rng(seed)
+    points = np.stack(
+        [rng.uniform(-3, 3, 8 * count), rng.uniform(-2, 2, 8 * count), rng.uniform(4, 9, 8 * count)],
+        axis=1,
+    )
+    in_a = project(camera_a, RigidTransform.identity(), points)
+    in_b = project(camera_b, B_FROM_A, points)
+    seen = np.ones(len(points), dtype=bool)
+    for camera, pixels in ((camera_a, in_a), (camera_b, in_b)):
+        seen &= (pixels > 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
+    assert seen.sum() >= count
+    return points[seen][:count], in_a[seen][:count], in_b[seen][:count]
+
+
+@given(st.lists(st.floats(-10, 10), min_size=6, max_size=6))
+def test_cross_matrix_is_the_cross_product(values: list[float]) -> None:
+    a, b = np.array(values[:3]), np.array(values[3:])
+    np.testing.assert_allclose(cross_matrix(a) @ b, np.cross(a, b), atol=1e-12)
+
+
+def test_essential_matrix_is_colmaps() -> None:
+    w, x, y, z = B_FROM_A.quat_wxyz
+    rigid = pycolmap.Rigid3d(
+        pycolmap.Rotation3d(np.array([x, y, z, w])), np.array(B_FROM_A.translation)
+    )
+    ours = essential_matrix(B_FROM_A)
+    theirs = pycolmap.essential_matrix_from_pose(rigid)
+    # COLMAP's has the translation at unit length
+    np.testing.assert_allclose(
+        ours / np.linalg.norm(ours), theirs / np.linalg.norm(theirs), atol=1e-14
+    )
+
+
+def test_the_sampson_distance_is_colmaps() -> None:
+    rng = np.random.default_rng(1)
+    a, b = rng.normal(size=(50, 2)), rng.normal(size=(50, 2))
+    expected = pycolmap.compute_squared_sampson_error(a, b, essential_matrix(B_FROM_A))
+    ours = sampson_error_px(
+        np.column_stack([a, np.ones(50)]),
+        np.column_stack([b, np.ones(50)]),
+        B_FROM_A,
+        focal_px=500.0,
+    )
+    np.testing.assert_allclose((ours / 500.0) ** 2, expected, rtol=1e-9)
+    assert np.median(ours) > 10  # random matches are far from the epipolar lines
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(deadline=None)
+def test_the_sampson_distance_is_the_smallest_correction_to_first_order(seed: int) -> None:
+    """Moved off its epipolar line by a little, a match has that distance shared by both images."""
+    points, in_a, in_b = scene(PINHOLE, PINHOLE, count=20, seed=seed)
+    rays_a, rays_b = bearing_rays(PINHOLE, in_a), bearing_rays(PINHOLE, in_b)
+    line_b = rays_a @ essential_matrix(B_FROM_A).T
+    line_a = rays_b @ essential_matrix(B_FROM_A)
+    normal_b = line_b[:, :2] / np.linalg.norm(line_b[:, :2], axis=1, keepdims=True)
+    moved = rays_b.copy()
+    moved[:, :2] += 1e-4 * normal_b
+    ours = sampson_error_px(rays_a, moved, B_FROM_A, focal_px=1.0)
+    share = np.linalg.norm(line_b[:, :2], axis=1) / np.hypot(
+        np.linalg.norm(line_a[:, :2], axis=1), np.linalg.norm(line_b[:, :2], axis=1)
+    )
+    np.testing.assert_allclose(ours, 1e-4 * share, rtol=1e-2)
+
+
+@pytest.mark.parametrize("camera", [PINHOLE, *DISTORTED], ids=lambda c: c.model)
+def test_exact_matches_pass_and_others_do_not(camera: Camera) -> None:
+    points, in_a, in_b = scene(camera, camera)
+    rays_a, rays_b = bearing_rays(camera, in_a), bearing_rays(camera, in_b)
+    assert verify_with_poses(rays_a, rays_b, B_FROM_A, focal_px=500.0).all()
+    # the same matches under another pose do not
+    wrong = pose([0.02, -0.05, 0.05], [-1.0, 0.9, 0.2])
+    assert not verify_with_poses(rays_a, rays_b, wrong, focal_px=500.0).any()
+
+
+def test_only_errors_across_the_epipolar_line_count() -> None:
+    points, in_a, in_b = scene(PINHOLE, PINHOLE, count=100)
+    rays_a, rays_b = bearing_rays(PINHOLE, in_a), bearing_rays(PINHOLE, in_b)
+    line = rays_a @ essential_matrix(B_FROM_A).T
+    focal = np.array([520.0, 510.0])
+    normal = line[:, :2] / focal
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    along = np.stack([-normal[:, 1], normal[:, 0]], axis=1)
+
+    def verified(shift_px: Array) -> NDArray[np.bool_]:
+        rays = bearing_rays(PINHOLE, in_b + shift_px)
+        return verify_with_poses(rays_a, rays, B_FROM_A, focal_px=515.0)
+
+    # the distance is shared by both images: sqrt(2) of a shift of one where both lines are alike
+    assert verified(3.0 * normal).all()
+    assert not verified(9.0 * normal).any()
+    assert verified(9.0 * along).all()
+
+
+def test_points_behind_a_camera_do_not_pass() -> None:
+    points, in_a, in_b = scene(PINHOLE, PINHOLE, count=100)
+    behind = points.copy()
+    behind[:50] *= -1  # the same ray in a, behind it
+    rays_a = np.column_stack([behind[:, :2] / behind[:, 2:], np.ones(100)])
+    in_b_frame = B_FROM_A.apply(behind)
+    rays_b = np.column_stack([in_b_frame[:, :2] / in_b_frame[:, 2:], np.ones(100)])
+    # all of them lie on their epipolar lines exactly
+    assert sampson_error_px(rays_a, rays_b, B_FROM_A, focal_px=500.0).max() < 1e-9
+    expected = (behind[:, 2] > 0) & (in_b_frame[:, 2] > 0)
+    np.testing.assert_array_equal(in_front_of_both(rays_a, rays_b, B_FROM_A), expected)
+    np.testing.assert_array_equal(
+        verify_with_poses(rays_a, rays_b, B_FROM_A, focal_px=500.0), expected
+    )
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(deadline=None)
+def test_in_front_agrees_with_the_sign_of_both_depths(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    b_from_a = pose((0.5 * rng.normal(size=3)).tolist(), rng.normal(size=3).tolist())
+    points = 5 * rng.normal(size=(40, 3))
+    in_b = b_from_a.apply(points)
+    clear = (np.abs(points[:, 2]) > 0.1) & (np.abs(in_b[:, 2]) > 0.1)
+    # rays that are nearly parallel say nothing about depth
+    a = points / np.linalg.norm(points, axis=1, keepdims=True)
+    b = (in_b / np.linalg.norm(in_b, axis=1, keepdims=True)) @ b_from_a.rotation_matrix()
+    clear &= np.linalg.norm(np.cross(a, b), axis=1) > 1e-3
+    points, in_b = points[clear], in_b[clear]
+    np.testing.assert_array_equal(
+        in_front_of_both(points / points[:, 2:], in_b / in_b[:, 2:], b_from_a),
+        (points[:, 2] > 0) & (in_b[:, 2] > 0),
+    )
+
+
+def test_a_point_at_infinity_passes() -> None:
+    direction = np.array([[0.1, -0.2, 1.0]])
+    in_b = direction @ B_FROM_A.rotation_matrix().T
+    assert in_front_of_both(direction, in_b / in_b[:, 2:], B_FROM_A).all()
+
+
+def test_cameras_at_one_place_verify_nothing() -> None:
+    # no baseline: no epipolar line, and nothing that could be triangulated
+    rays = bearing_rays(PINHOLE, np.random.default_rng(0).uniform(0, 480, (50, 2)))
+    turned = pose([0.1, 0.0, 0.0], [0.0, 0.0, 0.0])
+    seen = rays @ turned.rotation_matrix().T
+    good = verify_with_poses(rays, seen / seen[:, 2:], turned, focal_px=500.0)
+    assert not good.any()
+
+
+def test_too_few_good_matches_are_none() -> None:
+    points, in_a, in_b = scene(PINHOLE, PINHOLE, count=40)
+    in_b[10:] += (0.0, 60.0)
+    rays_a, rays_b = bearing_rays(PINHOLE, in_a), bearing_rays(PINHOLE, in_b)
+    for min_matches, expected in ((10, 10), (11, 0)):
+        options = KnownPoseOptions(min_matches=min_matches)
+        good = verify_with_poses(rays_a, rays_b, B_FROM_A, focal_px=515.0, options=options)
+        assert good.sum() == expected
+    none = np.zeros((0, 3))
+    assert verify_with_poses(none, none, B_FROM_A, focal_px=515.0).shape == (0,)
+
+
+def test_rays_that_do_not_exist_do_not_pass() -> None:
+    points, in_a, in_b = scene(PINHOLE, PINHOLE, count=40)
+    rays_a, rays_b = bearing_rays(PINHOLE, in_a), bearing_rays(PINHOLE, in_b)
+    rays_a[3] = np.nan
+    good = verify_with_poses(rays_a, rays_b, B_FROM_A, focal_px=515.0)
+    assert not good[3] and good.sum() == 39
+
+
+@pytest.mark.parametrize("camera", [PINHOLE, *DISTORTED], ids=lambda c: c.model)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_two_views_keep_the_inliers_among_as_many_outliers(camera: Camera, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points, in_a, in_b = scene(camera, PINHOLE, count=300, seed=seed)
+    in_a, in_b = in_a + 0.5 * rng.normal(size=in_a.shape), in_b + 0.5 * rng.normal(size=in_b.shape)
+    outlier = np.arange(300) % 2 == 1
+    in_b[outlier] = rng.uniform((0, 0), (640, 480), (150, 2))
+    good = verify_two_view(in_a, camera, in_b, PINHOLE)
+    assert good[~outlier].mean() > 0.95
+    # an outlier passes where it falls on its epipolar line: a band of 8 px in 480, with cheirality
+    assert good[outlier].mean() < 0.06
+
+
+def test_two_views_of_a_plane() -> None:
+    rng = np.random.default_rng(2)
+    points = np.column_stack([rng.uniform(-2, 2, 100), rng.uniform(-1.5, 1.5, 100), np.full(100, 6)])
+    in_a = project(PINHOLE, RigidTransform.identity(), points)
+    in_b = project(PINHOLE, B_FROM_A, points)
+    assert verify_two_view(in_a, PINHOLE, in_b, PINHOLE).mean() > 0.95
+
+
+def test_two_views_with_the_same_seed_agree() -> None:
+    rng = np.random.default_rng(3)
+    points, in_a, in_b = scene(PINHOLE, PINHOLE, count=200)
+    in_b[::2] = rng.uniform(0, 480, (100, 2))
+    first = verify_two_view(in_a, PINHOLE, in_b, PINHOLE)
+    np.testing.assert_array_equal(first, verify_two_view(in_a, PINHOLE, in_b, PINHOLE))
+
+
+def test_two_views_without_anything_in_common() -> None:
+    rng = np.random.default_rng(4)
+    a, b = rng.uniform(0, 480, (60, 2)), rng.uniform(0, 480, (60, 2))
+    options = TwoViewOptions(min_matches=30)
+    good = verify_two_view(a, PINHOLE, b, PINHOLE, options)
+    assert good.shape == (60,) and not good.any()
+
+
+@pytest.mark.parametrize("count", [0, 4, 14])
+def test_two_views_with_few_matches(count: int) -> None:
+    points, in_a, in_b = scene(PINHOLE, PINHOLE, count=20)
+    good = verify_two_view(in_a[:count], PINHOLE, in_b[:count], PINHOLE)
+    assert good.shape == (count,) and not good.any()
+
+
+def test_two_views_leave_out_pixels_whose_distortion_cannot_be_undone() -> None:
+    strong = Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, -0.3))
+    corner = np.array([[0.0, 0.0], [640.0, 480.0]])
+    assert np.isnan(bearing_rays(strong, corner)).any(axis=1).all()
+    points, in_a, in_b = scene(strong, PINHOLE, count=100)
+    in_a = np.concatenate([corner[:1], in_a, corner[1:]])
+    in_b = np.concatenate([in_b[:1], in_b, in_b[-1:]])
+    good = verify_two_view(in_a, strong, in_b, PINHOLE)
+    assert not good[0] and not good[-1]
+    assert good[1:-1].mean() > 0.95
