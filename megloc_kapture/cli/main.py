@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import functools
 import operator
+import os
 import sys
+import traceback
 from collections.abc import Sequence
 from typing import Annotated, Any, Protocol
 
 import tyro
 
+from megloc_kapture.cli.arguments import one_line_errors
 from megloc_kapture.cli.datasets import Import, Synth
 from megloc_kapture.cli.doctor import Doctor
 from megloc_kapture.cli.evaluate_dataset import Eval
@@ -70,17 +73,22 @@ def _parser() -> Any:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the console script; exits with 0, 1 (defect), 2 (user's error) or 3."""
-    command: Command = tyro.cli(_parser(), args=arguments, prog="megloc", config=())
+    given = sys.argv[1:] if arguments is None else arguments
+    with one_line_errors(given):
+        command: Command = tyro.cli(_parser(), args=given, prog="megloc", config=())
     try:
         status = command.run()
+        sys.stdout.flush()
     except MeglocError as error:
         if command.debug:
-            raise
-        print(f"megloc: {error}", file=sys.stderr)
+            traceback.print_exc()
+        print(f"megloc: {' '.join(str(error).split())}", file=sys.stderr)
         status = USER_ERROR
     except KeyboardInterrupt:
         print("megloc: interrupted; run the same command again to go on", file=sys.stderr)
         status = INTERRUPTED
     except BrokenPipeError:
+        # who reads our output has gone; the flush at exit must not complain about it
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         status = DONE
     sys.exit(status)

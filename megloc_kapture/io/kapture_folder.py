@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.images import read_image_rgb
-from megloc_kapture.io.kapture_csv import read_kapture_data
 from megloc_kapture.io.kapture_data import KaptureData
 from megloc_kapture.io.kapture_features import (
     ArrayKind,
@@ -27,6 +26,7 @@ from megloc_kapture.io.kapture_points import (
     read_observations,
     read_points3d,
 )
+from megloc_kapture.io.kapture_sensors import read_kapture_data
 from megloc_kapture.io.paths import check_no_escape, safe_join
 
 _ARRAY_KINDS: tuple[ArrayKind, ...] = ("keypoints", "descriptors", "global_features")

@@ -10,7 +10,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from megloc_kapture.io.kapture_csv import write_sensors
 from megloc_kapture.io.kapture_data import KaptureData, Sensor
 from megloc_kapture.io.kapture_features import (
     FeatureConfig,
@@ -25,6 +24,7 @@ from megloc_kapture.io.kapture_points import (
     write_observations,
     write_points3d,
 )
+from megloc_kapture.io.kapture_sensors import write_sensors
 from megloc_kapture.io.pairs import ImagePair, read_pairs, write_pairs
 
 if TYPE_CHECKING:

@@ -227,7 +227,8 @@ def _check_refused(path: Path, chunk: _Chunk, begin: int, check_line: CheckLine)
         line = text[: text.index(b"\n")].decode("utf-8")
     except UnicodeDecodeError:
         raise DataError("not UTF-8 text", path=path, line=number) from None
-    if line.strip():  # blank with spaces of other scripts, or not blank
+    # a comment in another script, or a line blank but for its spaces, is no row
+    if line.strip() and not line.startswith("#"):
         check_line(line.removesuffix("\r"), number)
 
 

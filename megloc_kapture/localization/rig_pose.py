@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -72,6 +73,8 @@ def rig_pose(
         cameras.append(
             {"model": "PINHOLE", "width": 1, "height": 1, "params": [focal, focal, 0.0, 0.0]}
         )
+    # its minimal solver draws from C's rand() whatever its own seed is: the last digits differ
+    ctypes.CDLL(None).srand(ctypes.c_uint(options.seed))
     found, _ = poselib.estimate_generalized_absolute_pose(
         points_2d,
         points_3d,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -27,7 +28,7 @@ from megloc_kapture.io.side_tables import Protocol, read_protocol, read_world
 from megloc_kapture.pipeline.manifests import FileHashes
 from megloc_kapture.pipeline.plan import Stage
 from megloc_kapture.pipeline.presets import PipelineOptions
-from megloc_kapture.pipeline.workspace import Workspace
+from megloc_kapture.pipeline.workspace import HASHES, Workspace
 from megloc_kapture.stages.global_vlad import extract_vlad, vlad_type
 from megloc_kapture.stages.image_pairs import pair_map_images, pair_queries
 from megloc_kapture.stages.local_features import extract_local_features
@@ -204,20 +205,12 @@ def _dataset_stages(run: Run) -> list[Stage]:
     if run.root is None:
         raise ValueError("a run needs a root or something that renders one")
     root = check_root(run.root).resolve()
-    hashes = FileHashes(run.workspace.path("stages/.hashes.json"))
+    remembered = run.workspace.path(HASHES)
+    hashes = FileHashes(remembered)
     content = hashes.of_files(root, input_files(root))
-    write_bytes(
-        run.workspace.path("stages/.hashes.json"),
-        _json_bytes(hashes.content()),
-    )
+    write_bytes(remembered, (json.dumps(hashes.content()) + "\n").encode())
     external = {"dataset files": content, "dataset root": str(root)}
     return [Stage("import", 1, settings, (), outputs, import_from(root), external)]
-
-
-def _json_bytes(content: Any) -> bytes:
-    import json
-
-    return (json.dumps(content) + "\n").encode()
 
 
 def _local_features(run: Run, out: Path) -> dict[str, int]:

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 import threading
 from collections.abc import Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from multiprocessing.connection import wait
 from typing import Any, Literal
 
-from megloc_kapture.errors import OptionError
+from megloc_kapture.errors import MeglocError, OptionError
 
 ExecutorKind = Literal["inline", "processes"]
 
@@ -65,8 +68,19 @@ def _start_worker() -> None:
     import numpy  # noqa: F401  its thread pool must be there to be limited
     from threadpoolctl import threadpool_limits
 
+    # a Ctrl-C reaches every process of the terminal; the run itself ends its workers
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     threadpool_limits(limits=1)
     cv2.setNumThreads(1)
+
+
+def _end_with_parent() -> None:
+    """A worker waits for work forever; when the run was killed, none will come."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        wait([parent.sentinel])
+        os._exit(1)
 
 
 @contextmanager
@@ -76,6 +90,7 @@ def open_executor(kind: ExecutorKind, workers: int | None = None) -> Iterator[Ex
     Raises
     ------
     OptionError : no worker at all.
+    MeglocError : a worker process was killed while the block ran.
     """
     count = available_cores() if workers is None else workers
     if count < 1:
@@ -89,5 +104,9 @@ def open_executor(kind: ExecutorKind, workers: int | None = None) -> Iterator[Ex
     pool = ProcessPoolExecutor(count, mp_context=context, initializer=_start_worker)
     try:
         yield pool
+    except BrokenProcessPool as error:
+        raise MeglocError(
+            "a worker process died, perhaps for want of memory; try fewer with --workers"
+        ) from error
     finally:
         pool.shutdown(wait=True, cancel_futures=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -67,7 +68,8 @@ def run_plan(
 
     Parameters
     ----------
-    first : stages before it are taken as they are, and it is run again in any case.
+    first : stages before it are taken as they are; it and all that reads its output, directly or
+        not, is run again in any case.
     last : stages behind it are left out.
     dry_run : say what would run, run nothing.
 
@@ -83,24 +85,26 @@ def run_plan(
     reports = []
     start = names.index(first) if first else 0
     stop = names.index(last) + 1 if last else len(names)
+    if stop <= start:
+        raise OptionError(f"--until {last} stands before --from {first}")
+    asked = _with_followers(stages, first) if first else {}
+    _check_done(stages[:start], workspace, first)
+    if not dry_run:
+        # whatever stops this run, the next one has to do what was asked for
+        for name in asked:
+            workspace.manifest_path(name).unlink(missing_ok=True)
     for number, stage in enumerate(stages[:stop]):
         inputs = {name: fingerprints[name] for name in stage.after} | dict(stage.external)
         mark = fingerprint(stage.name, stage.version, stage.options, inputs)
         manifest = read_manifest(workspace.manifest_path(stage.name))
-        if number < start:
-            if manifest is None:
-                raise OptionError(
-                    f"--from {first} needs stage {stage.name}, which has not run; leave --from out"
-                )
+        if number < start and manifest is not None:
             fingerprints[stage.name] = manifest.fingerprint
             report = StageReport(stage.name, "skipped", manifest.seconds, manifest.counts, "--from")
             reports.append(report)
             on_report(report)
             continue
         fingerprints[stage.name] = mark
-        why = _why(stage, manifest, mark, inputs, workspace)
-        if first and number == start and not why:
-            why = "asked for"
+        why = asked.get(stage.name) or _why(stage, manifest, mark, inputs, workspace)
         if not why and manifest is not None:
             report = StageReport(stage.name, "kept", manifest.seconds, manifest.counts, "")
         elif dry_run:
@@ -111,6 +115,23 @@ def run_plan(
         reports.append(report)
         on_report(report)
     return reports
+
+
+def _with_followers(stages: Sequence[Stage], first: str) -> dict[str, str]:
+    """A stage and those that read its output, directly or not, each with why it is run again."""
+    found = {first: "asked for"}
+    for stage in stages:
+        if not found.keys().isdisjoint(stage.after):
+            found[stage.name] = f"follows {first}"
+    return found
+
+
+def _check_done(stages: Iterable[Stage], workspace: Workspace, first: str | None) -> None:
+    for stage in stages:
+        if read_manifest(workspace.manifest_path(stage.name)) is None:
+            raise OptionError(
+                f"--from {first} needs stage {stage.name}, which has not run; leave --from out"
+            )
 
 
 def _why(
@@ -135,7 +156,8 @@ def _why(
     ) or sorted(set(manifest.inputs) - set(inputs))
     if changed:
         return f"{changed[0]} changed"
-    return f"options changed: {', '.join(_differences(manifest.options, stage.options)[:3])}"
+    options = json.loads(json.dumps(stage.options))  # a manifest knows no tuples
+    return f"options changed: {', '.join(_differences(manifest.options, options)[:3])}"
 
 
 def _differences(old: Any, new: Any, prefix: str = "") -> list[str]:

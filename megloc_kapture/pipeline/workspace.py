@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import os
 import shutil
@@ -15,6 +16,8 @@ from megloc_kapture.io.kapture_store import KaptureFolder
 from megloc_kapture.io.outputs import claim_folder
 
 PARTIAL = ".partial"
+LOCK = ".lock"
+HASHES = "stages/.hashes.json"
 
 
 class Workspace:
@@ -27,7 +30,8 @@ class Workspace:
 
     def __init__(self, root: Path, *, force: bool = False) -> None:
         self.root = Path(root).absolute()
-        claim_folder(self.root, kind="workspace", force=force)
+        self._claim = claim_folder(self.root, kind="workspace", force=force)
+        self._published = False
 
     def path(self, relative: str) -> Path:
         """A path below the workspace."""
@@ -44,7 +48,7 @@ class Workspace:
     @contextmanager
     def lock(self) -> Iterator[None]:
         """Hold the workspace against a second run; the system lets go when the process dies."""
-        path = self.root / ".lock"
+        path = self.root / LOCK
         try:
             handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
         except OSError as error:
@@ -52,14 +56,35 @@ class Workspace:
         try:
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
+                # a run that has just taken its unused workspace away holds nothing any more
+                held = os.path.samestat(os.fstat(handle), os.stat(path))
+            except OSError:
+                held = False
+            if not held:
                 raise OutputError(
                     f"{self.root}: another run is using this workspace; wait for it or give "
                     "another --workspace"
-                ) from error
+                )
             yield
         finally:
             os.close(handle)
+
+    def release_if_unused(self) -> None:
+        """Take the workspace away again when no stage has been run in it; to be called locked.
+
+        A run that is refused, or a dry run, leaves nothing behind.
+        """
+        stages = self.root / "stages"
+        with contextlib.suppress(OSError):
+            manifests = (path for path in stages.glob("*.json") if path.name[0] != ".")
+            if self._published or any(manifests):
+                return
+            for path in (self.path(HASHES), self.root / LOCK):
+                path.unlink(missing_ok=True)
+            for folder in (stages, self.root / PARTIAL):
+                with contextlib.suppress(OSError):
+                    folder.rmdir()
+            self._claim.undo()
 
     @contextmanager
     def staging(self, stage: str) -> Iterator[Path]:
@@ -78,6 +103,7 @@ class Workspace:
 
     def publish(self, staging: Path, outputs: tuple[str, ...]) -> None:
         """Move what a stage wrote to its places; outputs it did not write are taken away."""
+        self._published = True
         for output in outputs:
             new, place = staging / output, self.root / output
             try:

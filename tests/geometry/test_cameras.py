@@ -126,5 +126,6 @@ def test_pixels_that_cannot_be_undistorted_are_nan() -> None:
 
 def test_the_models_number_of_parameters_is_colmaps() -> None:
     for model, count in CAMERA_MODEL_NUM_PARAMS.items():
-        made = pycolmap.Camera.create(1, getattr(pycolmap.CameraModelId, model), 500.0, 640, 480)
-        assert len(made.params) == count
+        made = pycolmap.Camera(model=model, width=640, height=480, params=[0.0] * count)
+        assert made.verify_params()
+        assert not pycolmap.Camera(model=model, params=[0.0] * (count + 1)).verify_params()

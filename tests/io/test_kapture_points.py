@@ -355,7 +355,7 @@ GOOD = st.builds(
 ROWS = (
     GOOD
     | st.lists(FIELDS, max_size=7).map(", ".join)
-    | st.sampled_from(["", "# c", " ", "\r", "\u2003"])
+    | st.sampled_from(["", "# c", "#é", " ", "\r", "\u2003"])
 )
 FILES = st.builds(
     lambda rows, end, tail: end.join(rows) + tail,
@@ -374,7 +374,7 @@ def outcome(read: Callable[..., object], path: Path, large_bytes: int) -> object
 
 
 @given(st.lists(GOOD, min_size=1, max_size=12).map(lambda r: "\n".join(r).encode()) | FILES)
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=500)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=300)
 @pytest.mark.usefixtures("small_chunks")
 def test_both_readers_of_observations_agree_on_anything(tmp_path: Path, content: bytes) -> None:
     path = file(tmp_path / "o.txt", content)
@@ -392,12 +392,14 @@ POINT_ROWS = st.lists(NUMBERS, min_size=3, max_size=3) | st.lists(POINT_FIELDS, 
 
 
 @given(
-    st.lists(POINT_ROWS.map(",".join) | st.sampled_from(["", "# c", "\r"]), max_size=10)
+    st.lists(
+        POINT_ROWS.map(",".join) | st.sampled_from(["", "# c", "#é", "\u2003", "\r"]), max_size=10
+    )
     .map("\n".join)
     .map(str.encode)
     | st.binary(max_size=200)
 )
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=500)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=300)
 @pytest.mark.usefixtures("small_chunks")
 def test_both_readers_of_points_agree_on_anything(tmp_path: Path, content: bytes) -> None:
     path = file(tmp_path / "p.txt", content)

@@ -108,7 +108,7 @@ def night_look(rng: np.random.Generator, *, exposure: float, noise_seed: int) ->
         glow=_triple(np.array([1.0, 0.85, 0.6])),
         sky_colour=(0.006, 0.008, 0.016),
         cloud_shift=float(rng.uniform(0, 2 * np.pi)),
-        exposure=float(exposure * 0.9 * np.exp(rng.normal(0, 0.25))),
+        exposure=float(exposure * 0.75 * np.exp(rng.normal(0, 0.25))),
         white_balance=_triple(np.array([1.0, 0.92, 0.86]) * np.exp(rng.normal(0, 0.05, 3))),
         shot_noise=1.5e-3,
         read_noise=0.006,

@@ -29,7 +29,7 @@ class SyntheticWorldOptions(Options):
     height: int = Field(default=480, ge=48, description="image height in px")
     supersampling: int = Field(default=2, ge=1, le=4, description="samples per px and axis")
     repetition: float = Field(
-        default=0.7,
+        default=0.6,
         ge=0,
         le=1,
         description="share of posters, doors and windows that every place has in common",

@@ -11,8 +11,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.kapture_csv import read_kapture_data, write_sensors
 from megloc_kapture.io.kapture_data import KaptureData, Sensor
+from megloc_kapture.io.kapture_sensors import read_kapture_data, write_sensors
 from megloc_kapture.values import Camera, RigidTransform
 
 VERSION = "# kapture format: 1.1\n"

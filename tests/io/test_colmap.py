@@ -1,0 +1,234 @@
+"""Triangulation of rendered points whose places are known."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.colmap import (
+    MapImage,
+    TriangulatedPoints,
+    TriangulationOptions,
+    px_from_cam,
+    triangulate,
+)
+from megloc_kapture.values import Camera, RigidTransform
+
+Array = NDArray[np.float64]
+Matches = dict[tuple[int, int], NDArray[np.int64]]
+CAMERAS = {
+    "PINHOLE": Camera("PINHOLE", 640, 480, (500.0, 510.0, 320.5, 239.0)),
+    "SIMPLE_RADIAL": Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, -0.08)),
+    "OPENCV_FISHEYE": Camera(
+        "OPENCV_FISHEYE", 640, 480, (400.0, 410.0, 320.0, 240.0, 0.02, -0.01, 0.0, 0.0)
+    ),
+}
+
+
+def scene(
+    camera: Camera, *, num_images: int = 5, num_points: int = 60, offset: Array | float = 0.0
+) -> tuple[Array, list[MapImage], Matches]:
+    """World points, images around them with keypoints in mixed order, and all true matches."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform((-2, -1.5, -1), (2, 1.5, 1), (num_points, 3))
+    images, row_of_point = [], []
+    for k in range(num_images):
+        rotation = Rotation.from_rotvec([0.05 * k, 0.12 * (k - num_images / 2), 0.1]).as_matrix()
+        near = RigidTransform.from_matrix(rotation, np.array([0.6 * (k - 2), 0.1 * k, 8.0]))
+        pixels = px_from_cam(camera, near.apply(points))
+        assert (pixels > 0).all() and (pixels < (camera.width, camera.height)).all()
+        order = rng.permutation(num_points)
+        row_of_point.append(np.argsort(order))
+        cam_from_world = near @ RigidTransform(
+            (1.0, 0, 0, 0), tuple((np.zeros(3) - offset).tolist())  # type: ignore[arg-type]
+        )
+        images.append(
+            MapImage(f"{k}.jpg", camera, cam_from_world, pixels[order].astype(np.float32))
+        )
+    matches = {
+        (i, j): np.stack([row_of_point[i], row_of_point[j]], axis=1)
+        for i, j in combinations(range(num_images), 2)
+    }
+    return points + offset, images, matches
+
+
+def assert_recovered(result: TriangulatedPoints, points: Array, within: float) -> None:
+    distance = np.linalg.norm(result.xyz[:, None] - points, axis=2)
+    assert sorted(distance.argmin(axis=1).tolist()) == list(range(len(points)))
+    assert distance.min(axis=1).max() < within
+
+
+def equal(a: TriangulatedPoints, b: TriangulatedPoints) -> bool:
+    names = ("xyz", "errors_px", "point_ids", "image_ids", "keypoint_ids")
+    return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in names)
+
+
+@pytest.mark.parametrize("model", CAMERAS)
+def test_points_are_where_they_were(model: str) -> None:
+    points, images, matches = scene(CAMERAS[model])
+    result = triangulate(images, matches)
+    assert_recovered(result, points, within=1e-3)
+    assert result.errors_px.shape == (60,) and result.errors_px.max() < 1e-3
+
+
+def test_earth_centred_coordinates_lose_nothing() -> None:
+    offset = np.array([4.2e6, 1.7e5, 4.78e6])
+    points, images, matches = scene(CAMERAS["PINHOLE"], offset=offset)
+    result = triangulate(images, matches)
+    assert_recovered(result, points, within=1e-3)
+    near_points, near_images, _ = scene(CAMERAS["PINHOLE"])
+    near = triangulate(near_images, matches)
+    np.testing.assert_allclose(result.xyz - offset, near.xyz, atol=1e-5)
+    np.testing.assert_array_equal(result.keypoint_ids, near.keypoint_ids)
+
+
+def test_observations_are_the_matches_put_together() -> None:
+    points, images, matches = scene(CAMERAS["PINHOLE"])
+    result = triangulate(images, matches)
+    assert len(result.point_ids) == 5 * 60  # every point is seen in every image
+    nearest = np.linalg.norm(result.xyz[:, None] - points, axis=2).argmin(axis=1)
+    for point, image, keypoint in zip(
+        result.point_ids, result.image_ids, result.keypoint_ids, strict=True
+    ):
+        entry = images[image]
+        in_cam = entry.cam_from_world.apply(points[nearest[point]][None])
+        pixel = px_from_cam(entry.camera, in_cam)[0]
+        np.testing.assert_allclose(entry.keypoints_px[keypoint], pixel, atol=1e-3)
+    rows = np.stack([result.point_ids, result.image_ids, result.keypoint_ids], axis=1)
+    np.testing.assert_array_equal(rows, rows[np.lexsort(rows.T[::-1])])  # sorted
+
+
+def test_the_same_call_gives_the_same_bits_whatever_the_threads() -> None:
+    rng = np.random.default_rng(1)
+    _, images, matches = scene(CAMERAS["SIMPLE_RADIAL"])
+    noisy = [
+        MapImage(
+            image.name,
+            image.camera,
+            image.cam_from_world,
+            image.keypoints_px + rng.normal(0, 0.7, image.keypoints_px.shape).astype(np.float32),
+        )
+        for image in images
+    ]
+    first = triangulate(noisy, matches)
+    assert len(first.xyz) > 40
+    assert equal(first, triangulate(noisy, matches))
+    assert equal(first, triangulate(noisy, matches, num_threads=2))
+
+
+def test_poses_and_cameras_are_not_adjusted() -> None:
+    """A wrong pose must show as error, not be moved to fit."""
+    points, images, matches = scene(CAMERAS["PINHOLE"])
+    turned = images[2].cam_from_world
+    wrong = RigidTransform(turned.quat_wxyz, (turned.translation[0] + 1.0, *turned.translation[1:]))
+    images[2] = MapImage("2.jpg", images[2].camera, wrong, images[2].keypoints_px)
+    result = triangulate(images, matches)
+    assert_recovered(result, points, within=1e-3)
+    assert 2 not in result.image_ids
+    assert len(result.point_ids) == 4 * 60
+
+
+def test_two_images_only_give_points_if_asked_for() -> None:
+    points, images, matches = scene(CAMERAS["PINHOLE"])
+    two = {(1, 3): matches[1, 3]}
+    assert len(triangulate(images, two).xyz) == 0
+    kept = triangulate(images, two, TriangulationOptions(two_view_tracks=True))
+    assert_recovered(kept, points, within=1e-3)
+    assert set(kept.image_ids.tolist()) == {1, 3}
+
+
+def test_the_reprojection_error_is_bounded() -> None:
+    points, images, matches = scene(CAMERAS["PINHOLE"])
+    keypoints = images[0].keypoints_px.copy()
+    shift = np.zeros(len(keypoints), dtype=bool)
+    shift[::2] = True
+    keypoints[shift] += (0.0, 6.0)  # across the epipolar lines
+    images[0] = MapImage("0.jpg", images[0].camera, images[0].cam_from_world, keypoints)
+    strict = triangulate(images, matches, TriangulationOptions(max_reprojection_error_px=2.0))
+    rows = strict.keypoint_ids[strict.image_ids == 0]
+    assert not shift[rows].any() and len(rows) == 30
+    loose = triangulate(images, matches, TriangulationOptions(max_reprojection_error_px=12.0))
+    assert shift[loose.keypoint_ids[loose.image_ids == 0]].any()
+
+
+def test_rays_that_are_nearly_parallel_give_no_point() -> None:
+    points, images, matches = scene(CAMERAS["PINHOLE"], num_images=3)
+    # three cameras within about eight degrees
+    assert len(triangulate(images, matches, TriangulationOptions(min_angle_deg=1.5)).xyz) == 60
+    assert len(triangulate(images, matches, TriangulationOptions(min_angle_deg=30.0)).xyz) == 0
+
+
+def test_several_cameras_in_one_map() -> None:
+    points, images, matches = scene(CAMERAS["PINHOLE"])
+    for k, model in ((1, "SIMPLE_RADIAL"), (3, "OPENCV_FISHEYE")):
+        _, others, other_matches = scene(CAMERAS[model])
+        images[k] = others[k]  # the same seed: the same rows
+    np.testing.assert_array_equal(other_matches[0, 1], matches[0, 1])
+    result = triangulate(images, matches)
+    assert_recovered(result, points, within=1e-3)
+    assert len(result.point_ids) == 5 * 60
+
+
+def test_keypoints_may_have_more_columns_and_images_none() -> None:
+    points, images, matches = scene(CAMERAS["PINHOLE"], num_images=4)
+    wide = [
+        MapImage(
+            image.name,
+            image.camera,
+            image.cam_from_world,
+            np.concatenate([image.keypoints_px, np.ones((60, 2), np.float32)], axis=1),
+        )
+        for image in images
+    ]
+    wide.append(
+        MapImage("empty.jpg", images[0].camera, images[0].cam_from_world, np.zeros((0, 2), np.float32))
+    )
+    result = triangulate(wide, {**matches, (0, 4): np.zeros((0, 2), np.int64)})
+    assert equal(result, triangulate(images, matches)) or len(result.xyz) == 60
+    assert_recovered(result, points, within=1e-3)
+
+
+def test_nothing_to_triangulate() -> None:
+    _, images, _ = scene(CAMERAS["PINHOLE"])
+    for result in (triangulate([], {}), triangulate(images, {})):
+        assert result.xyz.shape == (0, 3) and result.errors_px.shape == (0,)
+        assert len(result.point_ids) == len(result.image_ids) == len(result.keypoint_ids) == 0
+
+
+@pytest.mark.parametrize("row", [[60, 0], [0, 60], [-1, 0]])
+def test_matches_past_the_keypoints_are_refused(row: list[int]) -> None:
+    _, images, matches = scene(CAMERAS["PINHOLE"])
+    matches[1, 2] = np.concatenate([matches[1, 2], [row]])
+    with pytest.raises(DataError, match=r"between 1.jpg and 2.jpg .* do not have \(60 and 60\)"):
+        triangulate(images, matches)
+
+
+def test_colmap_says_nothing_and_leaves_nothing_behind(tmp_path: Path) -> None:
+    script = Path(__file__).with_name("triangulate_once.py")
+    code = (
+        "import importlib.util, sys\n"
+        f"spec = importlib.util.spec_from_file_location('scene', {str(Path(__file__))!r})\n"
+        "module = importlib.util.module_from_spec(spec)\n"
+        "spec.loader.exec_module(module)\n"
+        "points, images, matches = module.scene(module.CAMERAS['PINHOLE'])\n"
+        "print(len(module.triangulate(images, matches).xyz))\n"
+        "print('still here', file=sys.stderr)\n"
+    )
+    assert not script.exists()
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    environment.pop("MEGLOC_COLMAP_LOG", None)
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "60\n"
+    assert done.stderr == "still here\n"  # and the error stream is whole again
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,266 @@
+"""The pose of one camera from matches whose truth is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from megloc_kapture.geometry.cameras import bearing_rays, project
+from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions, absolute_pose
+from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, Failure, Pose, RigidTransform
+
+Array = NDArray[np.float64]
+PINHOLE = Camera("PINHOLE", 640, 480, (500.0, 510.0, 320.5, 239.0))
+F, CX, CY = 500.0, 321.0, 238.5
+CAMERAS = {
+    "SIMPLE_PINHOLE": (F, CX, CY),
+    "PINHOLE": (F, 510.0, CX, CY),
+    "SIMPLE_RADIAL": (F, CX, CY, -0.05),
+    "RADIAL": (F, CX, CY, -0.05, 0.01),
+    "OPENCV": (F, 510.0, CX, CY, -0.05, 0.01, 1e-3, -2e-3),
+    "OPENCV_FISHEYE": (F, 510.0, CX, CY, 0.02, -0.01, 3e-3, -1e-3),
+    "FULL_OPENCV": (F, 510.0, CX, CY, -0.05, 0.01, 1e-3, -2e-3, 1e-3, 0.02, -0.01, 1e-3),
+    "FOV": (F, 510.0, CX, CY, 0.9),
+    "SIMPLE_RADIAL_FISHEYE": (F, CX, CY, 0.02),
+    "RADIAL_FISHEYE": (F, CX, CY, 0.02, -0.01),
+    "THIN_PRISM_FISHEYE": (F, 510.0, CX, CY, 0.02, -0.01, 1e-3, -1e-3, 1e-3, 0.0, 1e-3, -1e-3),
+}
+
+
+def random_pose(rng: np.random.Generator) -> RigidTransform:
+    x, y, z, w = Rotation.random(rng=rng).as_quat()
+    tx, ty, tz = (5 * rng.normal(size=3)).tolist()
+    return RigidTransform((float(w), float(x), float(y), float(z)), (tx, ty, tz))
+
+
+def scene(
+    camera: Camera, pose: RigidTransform, rng: np.random.Generator, count: int = 100
+) -> tuple[Array, Array]:
+    """Pixels (N, 2) and world points (N, 3)."""
+    in_cam = rng.uniform((-2, -1.5, 4), (2, 1.5, 9), (count, 3))
+    world = pose.inverse().apply(in_cam)
+    return project(camera, pose, world), world
+
+
+def difference(found: RigidTransform, truth: RigidTransform) -> tuple[float, float]:
+    """Distance of the centres, and angle in radians."""
+    relative = Rotation.from_matrix(found.rotation_matrix() @ truth.rotation_matrix().T)
+    return float(np.linalg.norm(found.center() - truth.center())), float(relative.magnitude())
+
+
+def located(result: Pose | Failure) -> Pose:
+    assert isinstance(result, Pose), result
+    return result
+
+
+def test_every_model_that_a_camera_can_have_is_tested() -> None:
+    assert set(CAMERAS) == set(CAMERA_MODEL_NUM_PARAMS)
+
+
+@pytest.mark.parametrize("model", CAMERAS)
+def test_exact_matches_give_the_exact_pose(model: str) -> None:
+    rng = np.random.default_rng(0)
+    camera, truth = Camera(model, 640, 480, CAMERAS[model]), random_pose(rng)
+    pixels, world = scene(camera, truth, rng)
+    pose = located(absolute_pose(pixels, world, camera))
+    distance, angle = difference(pose.cam_from_world, truth)
+    assert distance < 1e-7 and angle < 1e-8  # as good as COLMAP undoes a distortion
+    if "PINHOLE" in model:
+        assert distance < 1e-9 and angle < 1e-10
+    assert pose.num_matches == pose.num_inliers == 100
+    assert pose.inliers is not None and pose.inliers.all()
+
+
+@pytest.mark.parametrize("model", CAMERAS)
+def test_half_of_the_matches_may_be_wrong(model: str) -> None:
+    rng = np.random.default_rng(1)
+    camera, truth = Camera(model, 640, 480, CAMERAS[model]), random_pose(rng)
+    pixels, world = scene(camera, truth, rng, count=200)
+    pixels += 0.5 * rng.normal(size=pixels.shape)
+    wrong = np.arange(200) % 2 == 0
+    world[wrong] = rng.permutation(world[wrong])
+    pose = located(absolute_pose(pixels, world, camera))
+    distance, angle = difference(pose.cam_from_world, truth)
+    assert distance < 0.02 and np.degrees(angle) < 0.15
+    errors = np.linalg.norm(project(camera, truth, world) - pixels, axis=1)
+    assert pose.inliers is not None
+    # the mask is that of the truth, but for matches next to the threshold
+    clear = np.abs(errors - AbsolutePoseOptions().max_error_px) > 1.0
+    np.testing.assert_array_equal(
+        pose.inliers[clear], (errors <= AbsolutePoseOptions().max_error_px)[clear]
+    )
+    assert pose.num_inliers == pose.inliers.sum() and pose.num_matches == 200
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=20)
+def test_any_pose_is_found(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    truth = random_pose(rng)
+    pixels, world = scene(PINHOLE, truth, rng, count=40)
+    distance, angle = difference(
+        located(absolute_pose(pixels, world, PINHOLE)).cam_from_world, truth
+    )
+    assert distance < 1e-7 and angle < 1e-8
+
+
+def test_points_in_a_plane() -> None:
+    rng = np.random.default_rng(2)
+    truth = random_pose(rng)
+    in_cam = rng.uniform((-2, -1.5, 0), (2, 1.5, 0), (60, 3)) + (0, 0, 6.0)
+    in_cam[:, 2] += 0.4 * in_cam[:, 0]
+    world = truth.inverse().apply(in_cam)
+    pose = located(absolute_pose(project(PINHOLE, truth, world), world, PINHOLE))
+    distance, angle = difference(pose.cam_from_world, truth)
+    assert distance < 1e-8 and angle < 1e-9
+
+
+def test_a_world_far_from_its_origin_loses_no_accuracy() -> None:
+    rng = np.random.default_rng(3)
+    near = random_pose(rng)
+    pixels, world = scene(PINHOLE, near, rng, count=100)
+    pixels += 0.3 * rng.normal(size=pixels.shape)
+    far_from_near = RigidTransform((1.0, 0, 0, 0), (4.2e6, 1.7e5, 4.78e6))  # as ECEF
+    first = located(absolute_pose(pixels, world, PINHOLE))
+    second = located(absolute_pose(pixels, far_from_near.apply(world), PINHOLE))
+    distance, angle = difference(second.cam_from_world @ far_from_near, first.cam_from_world)
+    assert distance < 1e-6 and angle < 1e-8
+    np.testing.assert_allclose(second.covariance, first.covariance, rtol=1e-4, atol=1e-14)
+    assert first.num_inliers == second.num_inliers
+
+
+def test_the_same_seed_gives_the_same_bits() -> None:
+    rng = np.random.default_rng(4)
+    pixels, world = scene(PINHOLE, random_pose(rng), rng, count=120)
+    pixels += rng.normal(size=pixels.shape)
+    world[::2] = rng.permutation(world[::2])
+    first = located(absolute_pose(pixels, world, PINHOLE))
+    again = located(absolute_pose(pixels.copy(), world.copy(), PINHOLE))
+    assert first.cam_from_world == again.cam_from_world
+    np.testing.assert_array_equal(first.inliers, again.inliers)
+    np.testing.assert_array_equal(first.covariance, again.covariance)
+
+
+@pytest.mark.parametrize("count", [0, 3, 11])
+def test_too_few_matches_fail_and_say_so(count: int) -> None:
+    rng = np.random.default_rng(5)
+    pixels, world = scene(PINHOLE, random_pose(rng), rng, count=count)
+    result = absolute_pose(pixels, world, PINHOLE)
+    assert not result and isinstance(result, Failure)
+    assert result.reason == f"{count} 2D-3D matches, at least 12 are needed"
+    assert result.num_matches == count and result.num_inliers == 0
+
+
+def test_matches_without_a_common_pose_fail_and_say_so() -> None:
+    rng = np.random.default_rng(6)
+    pixels, world = scene(PINHOLE, random_pose(rng), rng, count=60)
+    result = absolute_pose(rng.permutation(pixels), world, PINHOLE)
+    assert isinstance(result, Failure)
+    assert "of 60 2D-3D matches agree, at least 12 are needed" in result.reason
+    assert result.num_matches == 60 and 0 < result.num_inliers < 12
+
+
+def test_points_on_a_line_determine_no_pose() -> None:
+    rng = np.random.default_rng(7)
+    truth = random_pose(rng)
+    along = rng.uniform(-2, 2, (50, 1))
+    in_cam = np.array([0.2, -0.3, 6.0]) + along * np.array([0.8, 0.3, 0.5])
+    world = truth.inverse().apply(in_cam)
+    result = absolute_pose(project(PINHOLE, truth, world), world, PINHOLE)
+    # the camera may turn about the line: whatever comes back must not claim to know the pose
+    assert isinstance(result, Failure)
+
+
+def test_copies_of_one_point_determine_no_pose() -> None:
+    rng = np.random.default_rng(8)
+    truth = random_pose(rng)
+    world = np.repeat(truth.inverse().apply(np.array([[0.3, 0.2, 5.0]])), 30, axis=0)
+    assert isinstance(absolute_pose(project(PINHOLE, truth, world), world, PINHOLE), Failure)
+
+
+def test_points_behind_the_camera_are_no_inliers() -> None:
+    rng = np.random.default_rng(9)
+    truth = random_pose(rng)
+    pixels, world = scene(PINHOLE, truth, rng, count=60)
+    mirrored = truth.apply(world)
+    mirrored[40:] *= -1  # same pixels by the pinhole's formula, behind the camera
+    world = truth.inverse().apply(mirrored)
+    pose = located(absolute_pose(pixels, world, PINHOLE))
+    assert pose.inliers is not None
+    np.testing.assert_array_equal(pose.inliers, np.arange(60) < 40)
+
+
+def test_values_that_are_not_finite_are_left_out() -> None:
+    rng = np.random.default_rng(10)
+    truth = random_pose(rng)
+    pixels, world = scene(PINHOLE, truth, rng, count=60)
+    world[3, 1] = np.nan
+    world[4, 2] = np.inf
+    pixels[5, 0] = np.nan
+    pose = located(absolute_pose(pixels, world, PINHOLE))
+    distance, angle = difference(pose.cam_from_world, truth)
+    assert distance < 1e-8 and angle < 1e-9
+    assert pose.inliers is not None
+    assert np.flatnonzero(~pose.inliers).tolist() == [3, 4, 5]
+    assert isinstance(absolute_pose(pixels, np.full_like(world, np.nan), PINHOLE), Failure)
+
+
+def test_pixels_whose_distortion_cannot_be_undone_are_left_out() -> None:
+    strong = Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, -0.3))
+    rng = np.random.default_rng(11)
+    truth = random_pose(rng)
+    pixels, world = scene(strong, truth, rng, count=80)
+    pixels[:20] = rng.uniform(0, 20, (20, 2))
+    assert np.isnan(bearing_rays(strong, pixels[:20])).any(axis=1).all()
+    pose = located(absolute_pose(pixels, world, strong))
+    assert difference(pose.cam_from_world, truth)[0] < 1e-7
+    assert pose.inliers is not None and not pose.inliers[:20].any() and pose.inliers[20:].all()
+
+
+def test_options_are_used() -> None:
+    rng = np.random.default_rng(12)
+    truth = random_pose(rng)
+    pixels, world = scene(PINHOLE, truth, rng, count=100)
+    pixels[:50] += 6.0 * np.sign(rng.normal(size=(50, 2)))  # 8.5 px off
+    loose = located(absolute_pose(pixels, world, PINHOLE, AbsolutePoseOptions(max_error_px=12)))
+    tight = located(absolute_pose(pixels, world, PINHOLE, AbsolutePoseOptions(max_error_px=3)))
+    assert loose.num_inliers > 90 and 50 <= tight.num_inliers < 60
+    strict = AbsolutePoseOptions(max_error_px=3, min_inliers=70)
+    assert isinstance(absolute_pose(pixels, world, PINHOLE, strict), Failure)
+
+
+@pytest.mark.parametrize("sigma_px", [0.4, 2.0])
+def test_the_covariance_is_that_of_repeated_estimates(sigma_px: float) -> None:
+    """Errors over their covariance follow chi-squared with six degrees of freedom."""
+    rng = np.random.default_rng(13)
+    truth = random_pose(rng)
+    pixels, world = scene(PINHOLE, truth, rng, count=80)
+    options = AbsolutePoseOptions(min_iterations=10, max_iterations=50)
+    runs, squared = 150, []
+    for _ in range(runs):
+        noisy = pixels + sigma_px * rng.normal(size=pixels.shape)
+        pose = located(absolute_pose(noisy, world, PINHOLE, options))
+        assert pose.covariance is not None
+        true_from_found = truth @ pose.cam_from_world.inverse()
+        vector = Rotation.from_matrix(true_from_found.rotation_matrix()).as_rotvec()
+        error = np.concatenate([vector, true_from_found.translation])
+        squared.append(float(error @ np.linalg.solve(pose.covariance, error)))
+    # the robust loss has 95 % efficiency: 6.3 is expected
+    assert 5.2 < np.mean(squared) < 7.4
+    assert (np.array(squared) < chi2.ppf(0.95, 6)).mean() > 0.88
+
+
+def test_the_camera_of_the_query_is_used_not_one_like_it() -> None:
+    rng = np.random.default_rng(14)
+    truth = random_pose(rng)
+    pixels, world = scene(PINHOLE, truth, rng)
+    zoomed = replace(PINHOLE, params=(600.0, 612.0, 320.5, 239.0))
+    other = located(absolute_pose(pixels, world, zoomed))
+    assert difference(other.cam_from_world, truth)[0] > 0.5

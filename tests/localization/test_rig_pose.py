@@ -1,0 +1,131 @@
+"""The pose of a rig from the matches of all its cameras."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from megloc_kapture.geometry.cameras import project
+from megloc_kapture.localization.rig_pose import RigView, rig_pose
+from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
+
+PINHOLE = Camera("PINHOLE", 640, 480, (500.0, 510.0, 320.5, 239.0))
+FISHEYE = Camera("OPENCV_FISHEYE", 640, 480, (400.0, 410.0, 320.0, 240.0, 0.02, -0.01, 0.0, 0.0))
+STRONG = Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, -0.3))
+
+
+def transform(vector: list[float], translation: list[float]) -> RigidTransform:
+    return RigidTransform.from_matrix(
+        Rotation.from_rotvec(vector).as_matrix(), np.array(translation)
+    )
+
+
+def rig(count: int, seed: int = 0, shift: float = 0.0) -> tuple[RigidTransform, list[RigView]]:
+    """``rig_from_world`` and three different cameras that look to different sides."""
+    rng = np.random.default_rng(seed)
+    rig_from_world = transform([0.3, -1.2, 0.4], [3.0, -2.0, 1.0]) @ RigidTransform(
+        (1.0, 0.0, 0.0, 0.0), (-shift, -shift, shift)
+    )
+    views = []
+    for k, camera in enumerate((PINHOLE, FISHEYE, STRONG)):
+        cam_from_rig = transform([0.05 * k, 1.5 * k, 0.1], [0.4 * k, 0.1, -0.2 * k])
+        in_cam = rng.uniform((-2, -1.5, 4), (2, 1.5, 9), (count, 3))
+        cam_from_world = cam_from_rig @ rig_from_world
+        world = cam_from_world.inverse().apply(in_cam)
+        views.append(RigView(camera, cam_from_rig, project(camera, cam_from_world, world), world))
+    return rig_from_world, views
+
+
+def located(result: Pose | Failure) -> Pose:
+    assert isinstance(result, Pose), result
+    return result
+
+
+def difference(found: Pose | Failure, truth: RigidTransform) -> tuple[float, float]:
+    pose = located(found).cam_from_world
+    angle = Rotation.from_matrix((pose @ truth.inverse()).rotation_matrix()).magnitude()
+    centers = pose.center() - truth.center()
+    return float(np.linalg.norm(centers)), float(angle)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_exact_matches_give_the_exact_pose(seed: int) -> None:
+    truth, views = rig(30, seed)
+    found = rig_pose(views)
+    distance, angle = difference(found, truth)
+    assert distance < 1e-7 and angle < 1e-8
+    assert found.num_inliers == found.num_matches == 90
+
+
+def test_cameras_that_could_not_be_located_alone_help_each_other() -> None:
+    truth, views = rig(8)  # each below the twelve inliers that are needed
+    distance, angle = difference(rig_pose(views), truth)
+    assert distance < 1e-7 and angle < 1e-8
+
+
+def test_half_of_the_matches_may_be_wrong() -> None:
+    rng = np.random.default_rng(1)
+    truth, views = rig(80)
+    for view in views:
+        view.points_px[::2] = rng.uniform((0, 0), (640, 480), (40, 2))
+        view.points_px[1::2] += 0.5 * rng.normal(size=(40, 2))
+    found = rig_pose(views)
+    distance, angle = difference(found, truth)
+    assert distance < 0.03 and np.degrees(angle) < 0.2
+    assert isinstance(found, Pose) and found.inliers is not None
+    good = found.inliers.reshape(3, 80)
+    assert good[:, 1::2].mean() > 0.98 and good[:, ::2].mean() < 0.05
+
+
+@pytest.mark.parametrize("used", [0, 1, 2])
+def test_one_camera_with_matches_is_enough(used: int) -> None:
+    truth, views = rig(30)
+    for k, view in enumerate(views):
+        if k != used:
+            views[k] = RigView(view.camera, view.cam_from_rig, np.zeros((0, 2)), np.zeros((0, 3)))
+    distance, angle = difference(rig_pose(views), truth)
+    assert distance < 1e-7 and angle < 1e-8
+
+
+def test_a_world_far_from_its_origin() -> None:
+    truth, views = rig(30, shift=4.5e6)
+    distance, angle = difference(rig_pose(views), truth)
+    assert distance < 1e-5 and angle < 1e-8
+
+
+def test_values_that_cannot_be_used_are_left_out() -> None:
+    truth, views = rig(30)
+    views[0].points_world[2] = np.nan
+    views[2].points_px[5] = (0.0, 0.0)  # no ray under this distortion
+    found = rig_pose(views)
+    distance, angle = difference(found, truth)
+    assert distance < 1e-7 and angle < 1e-8
+    assert isinstance(found, Pose) and found.inliers is not None
+    assert np.flatnonzero(~found.inliers).tolist() == [2, 65]
+
+
+def test_failures_say_why() -> None:
+    truth, views = rig(3)
+    few = rig_pose(views)
+    assert isinstance(few, Failure) and few.reason == "9 2D-3D matches, at least 12 are needed"
+    assert isinstance(rig_pose([]), Failure)
+    truth, views = rig(30)
+    rng = np.random.default_rng(2)
+    mixed = [
+        RigView(v.camera, v.cam_from_rig, rng.permutation(v.points_px), v.points_world)
+        for v in views
+    ]
+    failed = rig_pose(mixed)
+    assert isinstance(failed, Failure) and "of 90 2D-3D matches agree" in failed.reason
+    broken = [RigView(v.camera, v.cam_from_rig, v.points_px, np.nan * v.points_world) for v in views]
+    assert isinstance(rig_pose(broken), Failure)
+
+
+def test_the_same_seed_gives_the_same_bits() -> None:
+    _, views = rig(40)
+    rng = np.random.default_rng(3)
+    for view in views:
+        view.points_px[::2] = rng.uniform(0, 480, (20, 2))
+    poses = {located(rig_pose(views)).cam_from_world for _ in range(5)}
+    assert len(poses) == 1

@@ -1,0 +1,231 @@
+"""A corner of a room, rendered exactly: two textured walls, five map images and two queries."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
+from megloc_kapture.features.vlad import VladOptions
+from megloc_kapture.io.colmap import TriangulationOptions
+from megloc_kapture.io.images import write_image
+from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, Sensor, write_sensors
+from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
+from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
+from megloc_kapture.pipeline.executors import open_executor, single_threaded
+from megloc_kapture.stages.global_vlad import extract_vlad
+from megloc_kapture.stages.image_pairs import (
+    MappingPairsOptions,
+    QueryPairsOptions,
+    pair_map_images,
+    pair_queries,
+)
+from megloc_kapture.stages.local_features import extract_local_features
+from megloc_kapture.stages.matches import match_pairs
+from megloc_kapture.stages.triangulation import triangulate_map
+from megloc_kapture.values import Camera, RigidTransform
+
+CAMERA = Camera("PINHOLE", 400, 300, (300.0, 302.0, 200.0, 150.0))
+TEXTURE_PX_PER_M = 50
+# origin, unit vector of the texture's columns, width and height in metres; rows go down (+y)
+WALLS = (
+    (np.array([-6.0, -4.0, 6.0]), np.array([1.0, 0.0, 0.0]), 8, 8),
+    (np.array([2.0, -4.0, 6.0]), np.array([0.6, 0.0, -0.8]), 4, 8),
+)
+EXTRACTOR = RootSift(RootSiftOptions(max_keypoints=800))
+VLAD = VladOptions(num_clusters=8, training_descriptors=2000)
+
+
+def _texture(width: int, height: int, seed: int) -> NDArray[np.uint8]:
+    rng = np.random.default_rng(seed)
+    image = np.zeros((height, width, 3))
+    for sigma in (1.5, 4.0, 12.0):
+        layer = cv2.GaussianBlur(rng.normal(size=(height, width, 3)), (0, 0), sigma)
+        image += layer / layer.std()
+    return np.clip(128 + 30 * image, 0, 255).astype(np.uint8)
+
+
+def render(cam_from_world: RigidTransform) -> NDArray[np.uint8]:
+    """The image (H, W, 3) that the camera sees; exact but for bilinear sampling."""
+    fx, fy, cx, cy = CAMERA.params
+    # OpenCV's warp has pixel centres at integers, in the texture and in the image
+    calibration = np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]])
+    centre = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
+    size = (CAMERA.width, CAMERA.height)
+    image = np.full((CAMERA.height, CAMERA.width, 3), 128, dtype=np.uint8)
+    for seed, (origin, along, width, height) in enumerate(WALLS):
+        texture = _texture(width * TEXTURE_PX_PER_M, height * TEXTURE_PX_PER_M, seed)
+        world_from_texture = np.column_stack(
+            [along / TEXTURE_PX_PER_M, [0, 1 / TEXTURE_PX_PER_M, 0], origin]
+        )
+        in_cam = cam_from_world.rotation_matrix() @ world_from_texture
+        in_cam[:, 2] += cam_from_world.translation
+        homography = calibration @ in_cam @ centre
+        seen = cv2.warpPerspective(texture, homography, size, flags=cv2.INTER_LINEAR)
+        inside = cv2.warpPerspective(np.full_like(texture, 255), homography, size) == 255
+        image = np.where(inside.all(axis=2, keepdims=True), seen, image)
+    return image
+
+
+def pose_at(center: tuple[float, float, float], yaw_deg: float, pitch_deg: float) -> RigidTransform:
+    rotation = Rotation.from_euler("xy", [pitch_deg, yaw_deg], degrees=True).as_matrix()
+    return RigidTransform.from_matrix(rotation, -rotation @ np.array(center))
+
+
+MAP_POSES = {
+    "left/0.png": pose_at((-1.5, 0.0, 0.0), -4, 1),
+    "left/1.png": pose_at((-0.8, 0.2, 0.4), -2, -2),
+    "right/2.png": pose_at((0.0, -0.2, 0.1), 0, 2),
+    "right/3.png": pose_at((0.7, 0.1, 0.3), 3, 0),
+    "right/4.png": pose_at((1.4, -0.1, 0.0), 5, -1),
+}
+QUERY_POSES = {
+    "query/a.png": pose_at((-0.4, 0.05, 0.2), -1, 1),
+    "query/b.png": pose_at((0.5, -0.1, 0.6), 2, -1),
+}
+
+
+def write_kapture(root: Path, poses: dict[str, RigidTransform], *, with_poses: bool) -> None:
+    """Write rendered images as a kapture."""
+    data = KaptureData(sensors={"cam": Sensor.from_camera(CAMERA)})
+    for timestamp, (image, pose) in enumerate(poses.items()):
+        data.records_camera[timestamp, "cam"] = image
+        if with_poses:
+            data.trajectories[timestamp, "cam"] = pose
+        path = root / "sensors" / "records_data" / image
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_image(path, render(pose))
+    write_sensors(root, data)
+
+
+@dataclass(frozen=True)
+class World:
+    """Where everything of the small world is."""
+
+    root: Path
+    map_poses: dict[str, RigidTransform]
+    query_poses: dict[str, RigidTransform]
+
+    @property
+    def features_dir(self) -> Path:
+        return self.root / "features"
+
+    def mapping(self) -> KaptureFolder:
+        return KaptureFolder(self.root / "mapping", features_dirs=[self.features_dir])
+
+    def query(self) -> KaptureFolder:
+        return KaptureFolder(self.root / "query", features_dirs=[self.features_dir])
+
+    def map(self) -> KaptureFolder:
+        return KaptureFolder(self.root / "map", features_dirs=[self.features_dir])
+
+    def with_matches(self, kind: str) -> KaptureFolder:
+        return KaptureFolder(self.root / "mapping", features_dirs=[self.root / "matches" / kind])
+
+
+@pytest.fixture(scope="session")
+def images_only(tmp_path_factory: pytest.TempPathFactory) -> World:
+    """The two kapture folders, with images only."""
+    root = tmp_path_factory.mktemp("corner")
+    write_kapture(root / "mapping", MAP_POSES, with_poses=True)
+    write_kapture(root / "query", QUERY_POSES, with_poses=False)
+    return World(root, MAP_POSES, QUERY_POSES)
+
+
+@pytest.fixture(scope="session")
+def world(images_only: World) -> World:
+    """The world with everything that the stages make of it, each by its own stage."""
+    it = images_only
+    with single_threaded():
+        extract_local_features([it.mapping(), it.query()], EXTRACTOR, it.features_dir)
+        extract_vlad(it.mapping(), [it.mapping(), it.query()], "rootsift", it.features_dir, VLAD)
+        map_pairs = pair_map_images(
+            it.mapping(), MappingPairsOptions(), global_type="vlad_rootsift"
+        )
+        query_pairs = pair_queries(
+            it.mapping(), it.query(), QueryPairsOptions(), global_type="vlad_rootsift"
+        )
+        matcher = NearestNeighbours()
+        match_pairs(
+            it.mapping(), it.mapping(), map_pairs, "rootsift", matcher, KnownPoseOptions(),
+            it.root / "matches" / "mapping",
+        )  # fmt: skip
+        match_pairs(
+            it.query(), it.mapping(), query_pairs, "rootsift", matcher, TwoViewOptions(),
+            it.root / "matches" / "query",
+        )  # fmt: skip
+        triangulate_map(
+            it.mapping(), it.with_matches("mapping"), "rootsift", it.root / "map",
+            TriangulationOptions(),
+        )  # fmt: skip
+    return it
+
+
+@pytest.fixture(scope="session")
+def two_processes() -> Iterator[Executor]:
+    """Two worker processes, as a run has them."""
+    with open_executor("processes", 2) as executor:
+        assert executor is not None
+        yield executor
+
+
+@pytest.fixture(scope="session")
+def folder_bytes() -> Callable[[Path], dict[str, bytes]]:
+    """Every file below a folder, by relative path."""
+
+    def read(folder: Path) -> dict[str, bytes]:
+        files = sorted(path for path in folder.rglob("*") if path.is_file())
+        return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+    return read
+
+
+@pytest.fixture(scope="session")
+def distance_to_walls() -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+    """Distance in metres of points (N, 3) to the nearer wall's plane, the truth of the map."""
+
+    def measure(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        distances = []
+        for origin, along, _, _ in WALLS:
+            normal = np.cross(along, [0.0, 1.0, 0.0])
+            distances.append(np.abs((points - origin) @ normal))
+        return np.asarray(np.min(distances, axis=0))
+
+    return measure
+
+
+@pytest.fixture
+def small_kapture(tmp_path: Path) -> Callable[..., KaptureFolder]:
+    """Makes a kapture of images given as arrays."""
+
+    def make(
+        images: dict[str, NDArray[np.uint8]],
+        *,
+        name: str = "small",
+        poses: dict[str, RigidTransform] | None = None,
+        camera: Camera | None = None,
+    ) -> KaptureFolder:
+        root = tmp_path / name
+        data = KaptureData()
+        for timestamp, (image, pixels) in enumerate(images.items()):
+            height, width = pixels.shape[:2]
+            own = camera or Camera("SIMPLE_PINHOLE", width, height, (300.0, width / 2, height / 2))
+            data.sensors[f"cam{timestamp}"] = Sensor.from_camera(own)
+            data.records_camera[timestamp, f"cam{timestamp}"] = image
+            if poses and image in poses:
+                data.trajectories[timestamp, f"cam{timestamp}"] = poses[image]
+            path = root / "sensors" / "records_data" / image
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_image(path, pixels)
+        write_sensors(root, data)
+        return KaptureFolder(root, features_dirs=[tmp_path / "features"])
+
+    return make

@@ -1,0 +1,203 @@
+"""Local features as a stage: what it writes, what it refuses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Executor
+from pathlib import Path
+from typing import Any
+
+import kapture.io.csv
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from megloc_kapture.errors import DataError, PluginError
+from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
+from megloc_kapture.io.images import read_image_rgb, write_image
+from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.stages.local_features import extract_local_features
+from megloc_kapture.values import Camera, LocalFeatures
+
+Image = NDArray[np.uint8]
+EXTRACTOR = RootSift(RootSiftOptions(max_keypoints=800))
+
+
+def noise(height: int = 120, width: int = 160, seed: int = 0) -> Image:
+    coarse = np.random.default_rng(seed).integers(0, 256, (height // 8, width // 8, 3))
+    return np.repeat(np.repeat(coarse, 8, axis=0), 8, axis=1).astype(np.uint8)
+
+
+def test_what_is_stored_is_what_was_extracted(world: Any) -> None:
+    for folder, poses in ((world.mapping(), world.map_poses), (world.query(), world.query_poses)):
+        for image in poses:
+            expected = EXTRACTOR.extract(read_image_rgb(folder.image_path(image)))
+            np.testing.assert_array_equal(
+                folder.keypoints("rootsift").read(image), expected.keypoints_px
+            )
+            np.testing.assert_array_equal(
+                folder.descriptors("rootsift").read(image), expected.descriptors
+            )
+            assert len(expected.scores) > 300
+
+
+def test_kapture_reads_it(world: Any, tmp_path: Path) -> None:
+    """The orphan layout is kapture's own once it is linked to its place, as its tools do."""
+    proxy = tmp_path / "proxy"
+    (proxy / "sensors").mkdir(parents=True)
+    for name in ("sensors.txt", "records_camera.txt", "trajectories.txt"):
+        (proxy / "sensors" / name).symlink_to(world.root / "mapping" / "sensors" / name)
+    (proxy / "sensors" / "records_data").symlink_to(world.mapping().root / "sensors/records_data")
+    for kind in ("keypoints", "descriptors"):
+        (proxy / "reconstruction" / kind).mkdir(parents=True)
+        place = world.features_dir / "local_features" / "rootsift" / kind
+        (proxy / "reconstruction" / kind / "rootsift").symlink_to(place)
+    theirs = kapture.io.csv.kapture_from_dir(str(proxy))
+    keypoints = theirs.keypoints["rootsift"]
+    assert set(keypoints) == set(world.map_poses)
+    assert (keypoints.type_name, keypoints.dtype, keypoints.dsize) == ("rootsift", np.float32, 2)
+    descriptors = theirs.descriptors["rootsift"]
+    assert (descriptors.dsize, descriptors.keypoints_type, descriptors.metric_type) == (
+        128,
+        "rootsift",
+        "L2",
+    )
+
+
+def test_workers_write_the_same_bytes(
+    images_only: Any,
+    world: Any,
+    two_processes: Executor,
+    tmp_path: Path,
+    folder_bytes: Callable[[Path], dict[str, bytes]],
+) -> None:
+    folders = [images_only.mapping(), images_only.query()]
+    counts = extract_local_features(folders, EXTRACTOR, tmp_path, executor=two_processes)
+    assert counts["images"] == 7
+    ours = folder_bytes(tmp_path / "local_features")
+    assert len(ours) == 2 * 7 + 2
+    assert ours == folder_bytes(world.features_dir / "local_features")
+
+
+def test_masks_beside_the_images_are_obeyed(
+    small_kapture: Callable[..., KaptureFolder], tmp_path: Path
+) -> None:
+    folder = small_kapture({"a.png": noise(), "b.png": noise()})
+    mask = np.zeros((120, 160, 3), dtype=np.uint8)
+    mask[:, 80:] = 255
+    (folder.root / "sensors" / "masks").mkdir()
+    write_image(folder.root / "sensors" / "masks" / "a.png.png", mask)
+    extract_local_features([folder], EXTRACTOR, tmp_path / "features")
+    masked = folder.keypoints("rootsift").read("a.png")
+    free = folder.keypoints("rootsift").read("b.png")
+    assert len(masked) > 10 and masked[:, 0].min() >= 79.5
+    assert free[:, 0].min() < 40
+
+
+def test_a_mask_of_another_size_is_refused(
+    small_kapture: Callable[..., KaptureFolder], tmp_path: Path
+) -> None:
+    folder = small_kapture({"a.png": noise()})
+    (folder.root / "sensors" / "masks").mkdir()
+    place = folder.root / "sensors" / "masks" / "a.png.png"
+    write_image(place, np.zeros((60, 80, 3), dtype=np.uint8))
+    with pytest.raises(DataError, match="mask is 80x60, its image 160x120") as caught:
+        extract_local_features([folder], EXTRACTOR, tmp_path / "features")
+    assert caught.value.path == place
+
+
+def test_an_image_of_another_size_than_its_camera_is_refused(
+    small_kapture: Callable[..., KaptureFolder], tmp_path: Path
+) -> None:
+    camera = Camera("SIMPLE_PINHOLE", 320, 240, (300.0, 160.0, 120.0))
+    folder = small_kapture({"a.png": noise()}, camera=camera)
+    with pytest.raises(DataError, match=r"a.png: the image is 160x120, its camera says 320x240"):
+        extract_local_features([folder], EXTRACTOR, tmp_path / "features")
+
+
+def test_an_image_that_is_none_is_refused(
+    small_kapture: Callable[..., KaptureFolder], tmp_path: Path
+) -> None:
+    folder = small_kapture({"a.png": noise()})
+    folder.image_path("a.png").write_text("no image")
+    with pytest.raises(DataError, match=r"a\.png"):
+        extract_local_features([folder], EXTRACTOR, tmp_path / "features")
+    folder.image_path("a.png").unlink()
+    with pytest.raises(DataError, match=r"a\.png"):
+        extract_local_features([folder], EXTRACTOR, tmp_path / "features")
+
+
+def test_one_name_in_two_folders_is_refused(
+    small_kapture: Callable[..., KaptureFolder], tmp_path: Path
+) -> None:
+    folders = [small_kapture({"a.png": noise()}, name=name) for name in ("one", "two")]
+    with pytest.raises(DataError, match=r"image a\.png stands in two kapture folders"):
+        extract_local_features(folders, EXTRACTOR, tmp_path / "features")
+    assert not (tmp_path / "features").exists()
+
+
+def test_an_image_without_features_is_stored_as_having_none(
+    small_kapture: Callable[..., KaptureFolder], tmp_path: Path
+) -> None:
+    gray = np.full((120, 160, 3), 90, dtype=np.uint8)
+    folder = small_kapture({"a.png": gray, "b.png": noise()})
+    extract_local_features([folder], EXTRACTOR, tmp_path / "features")
+    assert folder.keypoints("rootsift").read("a.png").shape == (0, 2)
+    assert folder.descriptors("rootsift").read("a.png").shape == (0, 128)
+    assert folder.keypoints("rootsift").length("b.png") > 0
+
+
+def features(count: int = 3, **changes: Any) -> LocalFeatures:
+    values = {
+        "keypoints_px": np.ones((count, 2), np.float32),
+        "scores": np.ones(count, np.float32),
+        "descriptors": np.ones((count, 4), np.float32),
+    }
+    return LocalFeatures(**{**values, **changes})
+
+
+class Returning:
+    """An extractor that returns whatever it was given."""
+
+    name = "returning"
+
+    def __init__(self, value: Any) -> None:
+        self.value = value
+
+    def extract(self, image: Image, mask: NDArray[np.bool_] | None = None) -> Any:
+        return self.value
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (None, "extract returned NoneType, not LocalFeatures"),
+        (features(keypoints_px=np.ones((3, 2))), "keypoints are float64"),
+        (features(keypoints_px=np.ones((3, 1), np.float32)), r"float32 \(3, 1\), not"),
+        (features(descriptors=np.ones((2, 4), np.float32)), "3 keypoints but descriptors of shape"),
+        (features(descriptors=np.ones((3, 4))), "descriptors are float64, not float32 or uint8"),
+        (features(keypoints_px=np.full((3, 2), np.nan, np.float32)), "not finite"),
+        (features(descriptors=np.full((3, 4), np.inf, np.float32)), "not finite"),
+    ],
+)
+def test_what_a_plugin_must_not_return(
+    small_kapture: Callable[..., KaptureFolder], tmp_path: Path, value: Any, message: str
+) -> None:
+    folder = small_kapture({"a.png": noise()})
+    with pytest.raises(PluginError, match=rf"plugin 'returning' on image a\.png: .*{message}"):
+        extract_local_features([folder], Returning(value), tmp_path / "features")
+
+
+def test_a_plugins_own_dtypes_and_columns_are_kept(
+    small_kapture: Callable[..., KaptureFolder], tmp_path: Path
+) -> None:
+    folder = small_kapture({"a.png": noise()})
+    value = features(
+        keypoints_px=np.arange(12, dtype=np.float32).reshape(3, 4),
+        descriptors=np.arange(96, dtype=np.uint8).reshape(3, 32),
+    )
+    extract_local_features([folder], Returning(value), tmp_path / "features")
+    np.testing.assert_array_equal(folder.keypoints("returning").read("a.png"), value.keypoints_px)
+    stored = folder.descriptors("returning").read("a.png")
+    np.testing.assert_array_equal(stored, value.descriptors)
+    assert stored.dtype == np.uint8

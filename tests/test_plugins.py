@@ -1,0 +1,182 @@
+"""Plugins are found by entry point in any installed package, and refused by name with a reason."""
+
+from __future__ import annotations
+
+import sys
+import textwrap
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from megloc_kapture.errors import PluginError
+from megloc_kapture.features.rootsift import RootSift
+from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
+from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS, load_plugin, plugin_names
+from megloc_kapture.values import LocalFeatures
+
+MODULE = """
+    import numpy as np
+    from megloc_kapture.values import LocalFeatures, Options
+
+    class GridOptions(Options):
+        step: int = 50
+
+    class Grid:
+        name = "grid"
+        Options = GridOptions
+
+        def __init__(self, options=None):
+            self.options = options or GridOptions()
+
+        def extract(self, image, mask=None):
+            y, x = np.mgrid[: image.shape[0] : self.options.step, : image.shape[1] : self.options.step]
+            xy = np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float32) + np.float32(0.5)
+            return LocalFeatures(xy, np.ones(len(xy), np.float32), np.ones((len(xy), 4), np.float32))
+
+    class Plain:
+        name = "plain"
+
+        def extract(self, image, mask=None):
+            raise NotImplementedError
+
+    class Nameless:
+        def extract(self, image, mask=None):
+            raise NotImplementedError
+
+    class Deaf:
+        name = "deaf"
+
+    def function(image):
+        return None
+
+    class Moody:
+        name = "moody"
+
+        def __init__(self):
+            raise ValueError("not today")
+
+        def extract(self, image, mask=None):
+            raise NotImplementedError
+"""
+ENTRY_POINTS = """
+    [megloc_kapture.local_features]
+    grid = outside_plugin:Grid
+    plain = outside_plugin:Plain
+    nameless = outside_plugin:Nameless
+    deaf = outside_plugin:Deaf
+    function = outside_plugin:function
+    moody = outside_plugin:Moody
+    absent = outside_plugin:Absent
+    no-module = outside_plugin_that_is_not_there:Grid
+    broken = outside_plugin_broken:Grid
+"""
+
+
+def install(folder: Path, distribution: str, modules: dict[str, str], entry_points: str) -> None:
+    """What pip leaves behind: modules, and a folder of metadata beside them."""
+    for name, text in modules.items():
+        (folder / f"{name}.py").write_text(textwrap.dedent(text))
+    metadata = folder / f"{distribution}-1.0.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {distribution}\nVersion: 1.0\n")
+    (metadata / "entry_points.txt").write_text(textwrap.dedent(entry_points))
+
+
+@pytest.fixture
+def outside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    install(
+        tmp_path,
+        "outside_plugin",
+        {"outside_plugin": MODULE, "outside_plugin_broken": "raise RuntimeError('no licence')"},
+        ENTRY_POINTS,
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    for module in ("outside_plugin", "outside_plugin_broken"):
+        monkeypatch.delitem(sys.modules, module, raising=False)
+    return tmp_path
+
+
+def test_our_own_are_registered_in_the_same_way() -> None:
+    assert isinstance(load_plugin(LOCAL_FEATURES, "rootsift"), RootSift)
+    assert isinstance(load_plugin(MATCHERS, "nn"), NearestNeighbours)
+    limited = load_plugin(LOCAL_FEATURES, "rootsift", {"max_keypoints": 7})
+    assert limited.options.max_keypoints == 7
+
+
+def test_a_plugin_of_another_package_is_found_and_works(outside: Path) -> None:
+    assert {"grid", "plain", "rootsift"} <= set(plugin_names(LOCAL_FEATURES))
+    assert plugin_names(LOCAL_FEATURES) == sorted(plugin_names(LOCAL_FEATURES))
+    grid = load_plugin(LOCAL_FEATURES, "grid", {"step": 20})
+    features = grid.extract(np.zeros((40, 60, 3), np.uint8))
+    assert isinstance(features, LocalFeatures)
+    assert len(features.keypoints_px) == 6
+
+
+def test_a_plugin_needs_no_options(outside: Path) -> None:
+    assert load_plugin(LOCAL_FEATURES, "plain").name == "plain"
+    assert load_plugin(LOCAL_FEATURES, "plain", {}).name == "plain"
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("nameless", r"'nameless' \(outside_plugin:Nameless\) does not fulfil Loc.*: it lacks name"),
+        ("deaf", r"'deaf' \(outside_plugin:Deaf\) does not fulfil LocalFeatureE.* lacks extract"),
+        ("function", r"'function' .* does not fulfil LocalFeatureExtractor: it is no class"),
+        ("absent", r"'absent' \(outside_plugin:Absent\) cannot be loaded: .*Absent"),
+        ("no-module", r"'no-module' .* cannot be loaded: No module named"),
+        ("broken", r"'broken' \(outside_plugin_broken:Grid\) cannot be loaded: no licence"),
+        ("moody", r"'moody' refuses its options: not today"),
+        ("missing", r"no plugin 'missing' in megloc_kapture.local_features; registered: .*rootsift"),
+    ],
+)
+def test_a_wrong_plugin_is_refused_by_name_with_the_reason(
+    outside: Path, name: str, message: str
+) -> None:
+    with pytest.raises(PluginError, match=message) as caught:
+        load_plugin(LOCAL_FEATURES, name)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("grid", {"step": "wide"}, r"'grid' refuses its options: .*step.* valid integer"),
+        ("grid", {"steps": 3}, r"'grid' refuses its options: .*steps.* not permitted"),
+        ("plain", {"step": 3}, r"'plain' refuses its options: it takes no options, got \['step'\]"),
+    ],
+)
+def test_wrong_options_are_refused(
+    outside: Path, name: str, options: dict[str, object], message: str
+) -> None:
+    with pytest.raises(PluginError, match=message):
+        load_plugin(LOCAL_FEATURES, name, options)
+
+
+def test_two_packages_with_one_name_are_refused(
+    outside: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rival = tmp_path_factory.mktemp("rival")
+    install(
+        rival,
+        "rival_plugin",
+        {"rival_plugin": MODULE},
+        "[megloc_kapture.local_features]\ngrid = rival_plugin:Grid\n",
+    )
+    monkeypatch.syspath_prepend(rival)
+    with pytest.raises(PluginError, match="registered twice.*outside_plugin:Grid.*rival_plugin"):
+        load_plugin(LOCAL_FEATURES, "grid")
+
+
+def test_a_matcher_is_no_extractor(outside: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    crossed = tmp_path_factory.mktemp("crossed")
+    install(
+        crossed,
+        "crossed_plugin",
+        {},
+        "[megloc_kapture.matchers]\ncrossed = megloc_kapture.features.rootsift:RootSift\n",
+    )
+    monkeypatch.syspath_prepend(crossed)
+    with pytest.raises(PluginError, match="does not fulfil Matcher: it lacks match"):
+        load_plugin(MATCHERS, "crossed")

@@ -1,0 +1,138 @@
+"""The value types against scipy, and what they refuse."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+from scipy.spatial.transform import Rotation
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.values import (
+    CAMERA_MODEL_NUM_PARAMS,
+    Camera,
+    Failure,
+    Options,
+    Pose,
+    RigidTransform,
+)
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def random_transform(rng: np.random.Generator) -> RigidTransform:
+    x, y, z, w = Rotation.random(rng=rng).as_quat().tolist()
+    tx, ty, tz = (10 * rng.normal(size=3)).tolist()
+    return RigidTransform((w, x, y, z), (tx, ty, tz))
+
+
+def homogeneous(transform: RigidTransform) -> np.ndarray:
+    w, x, y, z = transform.quat_wxyz
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
+    matrix[:3, 3] = transform.translation
+    return matrix
+
+
+@given(seeds)
+def test_transforms_are_their_matrices(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    a, b = random_transform(rng), random_transform(rng)
+    np.testing.assert_allclose(a.rotation_matrix(), homogeneous(a)[:3, :3], atol=1e-14)
+    np.testing.assert_allclose(homogeneous(a @ b), homogeneous(a) @ homogeneous(b), atol=1e-12)
+    np.testing.assert_allclose(homogeneous(a.inverse()), np.linalg.inv(homogeneous(a)), atol=1e-12)
+    points = rng.normal(size=(7, 3))
+    expected = (np.column_stack([points, np.ones(7)]) @ homogeneous(a).T)[:, :3]
+    np.testing.assert_allclose(a.apply(points), expected, atol=1e-12)
+    np.testing.assert_allclose(a.apply(a.center()[None]), np.zeros((1, 3)), atol=1e-12)
+
+
+# rotations by (nearly) 180 degrees about every axis: where the trace formula loses all digits
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1.0, np.pi - 1e-9, np.pi])
+@pytest.mark.parametrize("axis", [[1, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, -0.8, 0], [-0.48, 0.6, 0.64]])
+def test_from_matrix_is_stable_everywhere(axis: list[float], angle: float) -> None:
+    matrix = Rotation.from_rotvec(angle * np.array(axis)).as_matrix()
+    transform = RigidTransform.from_matrix(matrix, np.array([1.0, 2, 3]))
+    np.testing.assert_allclose(transform.rotation_matrix(), matrix, atol=1e-14)
+    assert abs(np.linalg.norm(transform.quat_wxyz) - 1) < 1e-15
+    assert transform.quat_wxyz[0] >= 0
+    assert transform.translation == (1.0, 2.0, 3.0)
+
+
+@given(seeds)
+def test_from_matrix_gives_scipys_quaternion(seed: int) -> None:
+    transform = random_transform(np.random.default_rng(seed))
+    found = RigidTransform.from_matrix(transform.rotation_matrix(), np.zeros(3)).quat_wxyz
+    sign = 1 if np.dot(found, transform.quat_wxyz) > 0 else -1
+    np.testing.assert_allclose(np.array(found) * sign, transform.quat_wxyz, atol=1e-14)
+
+
+def test_composition_of_many_stays_at_unit_length() -> None:
+    turn = RigidTransform.from_matrix(
+        Rotation.from_rotvec([0.1, 0.2, 0.3]).as_matrix(), np.array([0.1, 0, 0])
+    )
+    product = RigidTransform.identity()
+    for _ in range(1000):
+        product = turn @ product
+    assert abs(np.linalg.norm(product.quat_wxyz) - 1) < 1e-14
+
+
+def test_a_camera_takes_numbers_of_any_kind() -> None:
+    camera = Camera("PINHOLE", 640, 480, tuple(np.array([500, 510, 320, 240])))  # type: ignore[arg-type]
+    assert camera.params == (500.0, 510.0, 320.0, 240.0)
+    assert all(type(p) is float for p in camera.params)
+    assert hash(camera) == hash(Camera("PINHOLE", 640, 480, (500.0, 510.0, 320.0, 240.0)))
+
+
+@pytest.mark.parametrize(
+    ("model", "width", "height", "params", "message"),
+    [
+        ("KANNALA", 640, 480, (500, 320, 240), "unknown camera model 'KANNALA'; known: SIMPLE_"),
+        ("PINHOLE", 640, 480, (500, 320, 240), "PINHOLE takes 4 parameters, got 3"),
+        ("PINHOLE", 0, 480, (500, 500, 320, 240), "image size 0x480 is not positive"),
+        ("PINHOLE", 640, -1, (500, 500, 320, 240), "image size 640x-1 is not positive"),
+        ("PINHOLE", 640, 480, (500, 500, np.nan, 240), "must be finite"),
+        ("PINHOLE", 640, 480, (np.inf, 500, 320, 240), "must be finite"),
+        ("PINHOLE", 640, 480, (0, 500, 320, 240), "focal length 0.0 is not positive"),
+        ("PINHOLE", 640, 480, (500, -500, 320, 240), "focal length -500.0 is not positive"),
+        ("OPENCV_FISHEYE", 640, 480, (500, 0, 320, 240, 0, 0, 0, 0), "focal length 0.0"),
+    ],
+)
+def test_cameras_that_cannot_be(
+    model: str, width: int, height: int, params: tuple[float, ...], message: str
+) -> None:
+    with pytest.raises(DataError, match=message):
+        Camera(model, width, height, params)
+
+
+@pytest.mark.parametrize("model", ["SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"])
+def test_a_principal_point_may_be_anywhere(model: str) -> None:
+    count = CAMERA_MODEL_NUM_PARAMS[model] - 3
+    assert Camera(model, 640, 480, (500.0, -20.0, 0.0) + (0.0,) * count).params[1] == -20.0
+
+
+def test_a_failure_is_falsy_and_a_pose_is_not() -> None:
+    assert not Failure("no map image matches")
+    assert Pose(RigidTransform.identity(), num_matches=0, num_inliers=0)
+
+
+def test_values_travel_between_processes() -> None:
+    pose = random_transform(np.random.default_rng(0))
+    camera = Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, 0.1))
+    for value in (pose, camera, Failure("why", 3, 1, ("a.jpg",))):
+        assert pickle.loads(pickle.dumps(value)) == value
+
+
+class _Example(Options):
+    size: int = 3
+
+
+def test_options_are_frozen_and_refuse_unknown_keys() -> None:
+    with pytest.raises(ValidationError, match="extra_forbidden|Extra inputs"):
+        _Example.model_validate({"sizes": 4})
+    with pytest.raises(ValidationError, match="frozen"):
+        _Example().size = 4  # type: ignore[misc]
