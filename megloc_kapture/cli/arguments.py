@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 _RULE = re.compile(r"[─\s]+")
 # what the box says besides: where help is found, and the help itself
-_BESIDES = ("For full helptext", "Argument helptext", "Perhaps you meant")
+_BESIDES = ("For full helptext", "Argument helptext", "Perhaps you meant", "Got errors")
 # help of a flag stands two steps in, its name one
 _HELP_INDENT = " " * 8
 
@@ -47,19 +47,21 @@ def summary(drawn: str) -> str:
             title = line.strip("╭─╮ ")
             continue
         text = line.removeprefix("│ ").removesuffix("│").rstrip()
-        if line.startswith("╰") or not text or text.startswith(_HELP_INDENT):
+        if line.startswith("╰") or text.startswith(_HELP_INDENT):
             continue
-        if _RULE.fullmatch(text):
+        if not text or _RULE.fullmatch(text):
             sections.append([])
         else:
             sections[-1].append(text)
     told = [_joined(s) for s in sections if s and not s[0].startswith(_BESIDES)]
     if not told:
         return " ".join(drawn.split()) or "the arguments cannot be used"
-    prog = re.search(r"megloc(?: [a-z-]+)? --help", drawn)
-    if not told[0].startswith(title):
+    helped = re.search(r"megloc(?: [a-z-]+)? --help", drawn)
+    if not told[0].startswith((title, "Missing", "Error", "invalid")):
         told[0] = f"{title}: {told[0]}"
-    return "; ".join(text.rstrip(".") for text in told) + f"; see {prog[0] if prog else 'megloc -h'}"
+    return (
+        "; ".join(text.rstrip(".") for text in told) + f"; see {prog[0] if prog else 'megloc -h'}"
+    )
 
 
 def _joined(lines: list[str]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -13,7 +14,6 @@ from megloc_kapture.cli.console import Console
 from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.outputs import RECALL_JSON, RECALL_TEXT, REPORT_HTML
 from megloc_kapture.evaluation.thresholds import Threshold
-from megloc_kapture.io.outputs import release_if_empty
 from megloc_kapture.io.status_table import STATUS_FILE, read_status
 from megloc_kapture.pipeline.datasets import DatasetChoice, choose_dataset
 from megloc_kapture.pipeline.evaluation_plan import (
@@ -58,7 +58,7 @@ class Eval(Choosing, Working, Common):
     dry_run: bool = False
     """Say which stages would run, and why."""
     fail_below: float | None = None
-    """Exit with 3 when the share of queries at the coarsest threshold is lower (0 to 1)."""
+    """Exit with 3 when the share of queries at the last threshold is lower (0 to 1)."""
     force: Force = False
     """Use a workspace folder that has other things in it."""
 
@@ -81,39 +81,37 @@ class Eval(Choosing, Working, Common):
             parsed = [Threshold.parse(text) for text in self.thresholds]
             thresholds = tuple((t.position_m, t.angle_deg) for t in parsed)
         choice.check()
+        self._check_judging(choice)
         place = self.workspace or Path("runs") / f"{self.dataset}-{preset}"
         workspace = Workspace(place, force=self.force)
-        try:
-            with (
-                workspace.lock(),
-                single_threaded(),
-                open_executor(self.executor, self.workers) as executor,
-            ):
-                run = Run(
-                    dataset=self.dataset,
-                    preset=preset,
-                    options=options,
-                    workspace=workspace,
-                    root=choice.root,
-                    render=choice.renderer(executor, console.track),
-                    render_options=choice.render_options(),
-                    query_prefix=self.query_prefix,
-                    thresholds=thresholds,
-                    executor=executor,
-                    track=console.track,
-                    num_threads=self.workers or available_cores(),
-                )
-                reports = run_plan(
-                    plan_evaluation(run),
-                    workspace,
-                    first=self.from_stage,
-                    last=self.until,
-                    dry_run=self.dry_run,
-                    on_start=lambda name, why: console.say(f"{name}: {why}"),
-                    on_report=lambda report: console.say(describe(report)),
-                )
-        finally:
-            release_if_empty(workspace.root)
+        with (
+            workspace.lock(),
+            single_threaded(),
+            open_executor(self.executor, self.workers) as executor,
+        ):
+            run = Run(
+                dataset=self.dataset,
+                preset=preset,
+                options=options,
+                workspace=workspace,
+                root=choice.root,
+                render=choice.renderer(executor, console.track),
+                render_options=choice.render_options(),
+                query_prefix=self.query_prefix,
+                thresholds=thresholds,
+                executor=executor,
+                track=console.track,
+                num_threads=self.workers or available_cores(),
+            )
+            reports = run_plan(
+                plan_evaluation(run),
+                workspace,
+                first=self.from_stage,
+                last=self.until,
+                dry_run=self.dry_run,
+                on_start=lambda name, why: console.say(f"{name}: {why}"),
+                on_report=lambda report: console.say(describe(report)),
+            )
         if self.dry_run:
             return 0
         if all_kept(reports):
@@ -121,6 +119,16 @@ class Eval(Choosing, Working, Common):
         if not any(report.name == "evaluation" for report in reports):
             return 0
         return self._conclude(console, workspace, run.pose_file)
+
+    def _check_judging(self, choice: DatasetChoice) -> None:
+        if self.fail_below is None:
+            return
+        if not 0.0 <= self.fail_below <= 1.0:
+            raise OptionError(f"--fail-below is a share between 0 and 1, got {self.fail_below:g}")
+        if self.until not in (None, "evaluation"):
+            raise OptionError(f"--fail-below needs stage evaluation; --until {self.until} skips it")
+        if not choice.has_truth():
+            raise OptionError(f"--fail-below needs true poses: {choice.root}/query_gt is missing")
 
     def _conclude(self, console: Console, workspace: Workspace, pose_file: str) -> int:
         evaluation = workspace.path(EVALUATION)
@@ -142,10 +150,6 @@ class Eval(Choosing, Working, Common):
         return 0
 
     def _judge(self, console: Console, evaluation: Path) -> int:
-        import json
-
-        if not (evaluation / RECALL_JSON).is_file():
-            raise OptionError("--fail-below needs true poses (query_gt/)")
         rows = json.loads((evaluation / RECALL_JSON).read_text(encoding="utf-8"))["rows"]
         recall = next(row for row in rows if row["name"] == "all")["recall"][-1]["recall"]
         if self.fail_below is not None and recall < self.fail_below:

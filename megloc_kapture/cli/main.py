@@ -74,13 +74,15 @@ def _parser() -> Any:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the console script; exits with 0, 1 (defect), 2 (user's error) or 3."""
     given = sys.argv[1:] if arguments is None else arguments
-    with one_line_errors(given):
-        command: Command = tyro.cli(_parser(), args=given, prog="megloc", config=())
+    debug = False
     try:
+        with one_line_errors(given):
+            command: Command = tyro.cli(_parser(), args=given, prog="megloc", config=())
+        debug = command.debug
         status = command.run()
         sys.stdout.flush()
     except MeglocError as error:
-        if command.debug:
+        if debug:
             traceback.print_exc()
         print(f"megloc: {' '.join(str(error).split())}", file=sys.stderr)
         status = USER_ERROR

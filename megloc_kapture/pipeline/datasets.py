@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from megloc_kapture.datasets.kapture_folders import MAPPING, QUERY, check_root
+from megloc_kapture.datasets.kapture_folders import MAPPING, QUERY, QUERY_GT, check_root
 from megloc_kapture.datasets.synthetic.options import SyntheticWorldOptions
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.kapture_store import KaptureFolder
@@ -31,6 +31,12 @@ class DatasetChoice:
         """Raise DataError when the folder cannot be the dataset's, before anything is written."""
         if self.root is not None:
             check_root(self.root)
+
+    def has_truth(self) -> bool:
+        """Whether the true poses of the queries are known."""
+        if self.root is None:
+            return True
+        return (self.root / QUERY_GT / "sensors" / "sensors.txt").is_file()
 
     def renderer(self, executor: Executor | None, track: Track) -> Renderer | None:
         """Writes the world below the folder it is given; None for a dataset with a root."""

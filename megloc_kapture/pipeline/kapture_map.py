@@ -6,14 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.geometry.cameras import shift_principal_point
-from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.kapture_store import FeatureReader, KaptureFolder
 from megloc_kapture.localization.map_index import MapIndex
 from megloc_kapture.mapping.pixel_origin import (
     ObservedImage,
@@ -129,7 +129,11 @@ class KaptureMap:
 
     def keypoints_px(self, image: str) -> NDArray[np.float32]:
         """Keypoints (N, 2) float32 of a map image, in COLMAP's convention."""
-        return self.keypoints_to_colmap(self.folder.keypoints(self.local_type).read(image))
+        return self.keypoints_to_colmap(self._keypoints.read(image))
+
+    def descriptors(self, image: str) -> NDArray[Any]:
+        """Descriptors (N, D) of a map image, as stored."""
+        return np.asarray(self._descriptors.read(image))
 
     def keypoints_to_colmap(self, keypoints: NDArray[np.floating]) -> NDArray[np.float32]:
         """Keypoints stored as the map stores its own, in COLMAP's convention; (N, 2)."""
@@ -144,8 +148,7 @@ class KaptureMap:
         """Whether every image of the map has descriptors of the type."""
         if self.local_type not in self.folder.types("descriptors"):
             return False
-        reader = self.folder.descriptors(self.local_type)
-        return all(image in reader for image in self.images)
+        return all(image in self._descriptors for image in self.images)
 
     def has_images(self) -> bool:
         """Whether the map's image files are there."""
@@ -156,11 +159,51 @@ class KaptureMap:
 
     def global_types(self) -> list[str]:
         """Global-feature types that all images of the map have."""
-        return [
+        return list(self._global_types)
+
+    def check(self) -> None:
+        """Compare the sizes of all feature files that localizing reads; reads none of them.
+
+        Observations are compared with keypoints when they are read, which :meth:`open` does.
+
+        Raises
+        ------
+        DataError : a truncated file, or keypoints and descriptors of different length.
+        """
+        if self.has_descriptors():
+            for image in self.images:
+                check_lengths(self._keypoints, self._descriptors, image)
+        for name in self._global_types:
+            vectors = self.folder.global_features(name)
+            for image in self.images:
+                vectors.length(image)
+
+    # readers are kept: opening one means listing folders, or the members of a tar
+    @cached_property
+    def _keypoints(self) -> FeatureReader:
+        return self.folder.keypoints(self.local_type)
+
+    @cached_property
+    def _descriptors(self) -> FeatureReader:
+        return self.folder.descriptors(self.local_type)
+
+    @cached_property
+    def _global_types(self) -> tuple[str, ...]:
+        readers = {t: self.folder.global_features(t) for t in self.folder.types("global_features")}
+        return tuple(
             name
-            for name in self.folder.types("global_features")
-            if all(image in self.folder.global_features(name) for image in self.images)
-        ]
+            for name, reader in readers.items()
+            if all(image in reader for image in self.images)
+        )
+
+
+def check_lengths(keypoints: FeatureReader, descriptors: FeatureReader, image: str) -> None:
+    """Raise DataError when an image has not as many descriptors as keypoints; reads sizes only."""
+    expected, found = keypoints.length(image), descriptors.length(image)
+    if found != expected:
+        raise DataError(
+            f"{found} descriptors for {expected} keypoints", path=descriptors.where(image)
+        )
 
 
 def extractor_of(folder: KaptureFolder, local_type: str) -> str | None:

@@ -47,7 +47,11 @@ class Workspace:
 
     @contextmanager
     def lock(self) -> Iterator[None]:
-        """Hold the workspace against a second run; the system lets go when the process dies."""
+        """Hold the workspace against a second run; the system lets go when the process dies.
+
+        A workspace that no stage has been run in by the end of the block is taken away again: a
+        run that is refused, or a dry run, leaves nothing behind.
+        """
         path = self.root / LOCK
         try:
             handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
@@ -65,15 +69,14 @@ class Workspace:
                     f"{self.root}: another run is using this workspace; wait for it or give "
                     "another --workspace"
                 )
-            yield
+            try:
+                yield
+            finally:
+                self._release_if_unused()
         finally:
             os.close(handle)
 
-    def release_if_unused(self) -> None:
-        """Take the workspace away again when no stage has been run in it; to be called locked.
-
-        A run that is refused, or a dry run, leaves nothing behind.
-        """
+    def _release_if_unused(self) -> None:
         stages = self.root / "stages"
         with contextlib.suppress(OSError):
             manifests = (path for path in stages.glob("*.json") if path.name[0] != ".")

@@ -1,0 +1,105 @@
+"""Work on executors: in order, bounded, and errors come through."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from concurrent.futures import Executor, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.stages.parallel import FolderSpec, ordered_map, untracked
+
+
+def fail_at_three(value: int) -> int:
+    if value == 3:
+        raise DataError("the third is broken", path="some/file", line=7)
+    return value * value
+
+
+def test_results_come_in_order_whatever_finishes_first() -> None:
+    first_may_end = threading.Event()
+
+    def work(value: int) -> int:
+        if value == 0:
+            assert first_may_end.wait(timeout=30)
+        if value == 5:
+            first_may_end.set()
+        return value
+
+    with ThreadPoolExecutor(3) as executor:
+        assert list(ordered_map(work, range(20), executor, window=8)) == list(range(20))
+
+
+def test_inline_is_lazy_and_in_order() -> None:
+    done = []
+    results = ordered_map(lambda value: done.append(value) or value, [3, 1, 2])
+    assert done == []
+    assert next(iter(results)) == 3
+    assert done == [3]
+    assert list(results) == [1, 2]
+
+
+def test_at_most_a_window_of_items_is_taken_ahead() -> None:
+    taken = 0
+
+    def items() -> Iterator[int]:
+        nonlocal taken
+        for value in range(100):
+            taken += 1
+            yield value
+
+    with ThreadPoolExecutor(2) as executor:
+        results = ordered_map(int, items(), executor, window=5)
+        for count, _ in enumerate(results, start=1):
+            assert taken <= count + 5
+
+
+def test_an_error_of_a_worker_comes_through_with_its_place(two_processes: Executor) -> None:
+    results = ordered_map(abs, [1, -2, 3], two_processes)
+    assert list(results) == [1, 2, 3]
+    with ThreadPoolExecutor(2) as executor:
+        found = ordered_map(fail_at_three, range(50), executor, window=4)
+        seen = []
+        with pytest.raises(DataError, match="some/file:7: the third is broken"):
+            for value in found:
+                seen.append(value)
+    assert seen == [0, 1, 4]
+
+
+def test_an_error_in_another_process_keeps_file_and_line(
+    two_processes: Executor, tmp_path: Path
+) -> None:
+    (tmp_path / "sensors").mkdir()
+    broken = tmp_path / "sensors" / "sensors.txt"
+    broken.write_text("# kapture format: 1.1\ncam, , camera, PINHOLE, 640\n")
+    (tmp_path / "sensors" / "records_camera.txt").write_text("# kapture format: 1.1\n")
+    with pytest.raises(DataError) as here:
+        KaptureFolder(tmp_path).read()
+    with pytest.raises(DataError) as there:
+        list(ordered_map(KaptureFolder.read, [KaptureFolder(tmp_path)], two_processes))
+    assert str(there.value) == str(here.value)
+    assert (there.value.path, there.value.line) == (here.value.path, here.value.line)
+
+
+def test_no_items(two_processes: Executor) -> None:
+    assert list(ordered_map(abs, [], two_processes)) == []
+    assert list(ordered_map(abs, [])) == []
+
+
+def test_a_folder_is_opened_once_per_run(world: Any) -> None:
+    spec = FolderSpec(world.mapping().root, [world.features_dir])
+    assert spec.open() is spec.open()
+    # another run sees what was written since
+    other = FolderSpec(world.mapping().root, [world.features_dir])
+    assert other.open() is not spec.open()
+    assert other.open().root == world.mapping().root
+    assert other.open().features_dirs == (world.features_dir,)
+
+
+def test_an_untracked_run_changes_nothing() -> None:
+    assert list(untracked([1, 2], 2, "label")) == [1, 2]
