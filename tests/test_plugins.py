@@ -30,9 +30,11 @@ MODULE = """
             self.options = options or GridOptions()
 
         def extract(self, image, mask=None):
-            y, x = np.mgrid[: image.shape[0] : self.options.step, : image.shape[1] : self.options.step]
+            height, width = image.shape[:2]
+            y, x = np.mgrid[: height : self.options.step, : width : self.options.step]
             xy = np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float32) + np.float32(0.5)
-            return LocalFeatures(xy, np.ones(len(xy), np.float32), np.ones((len(xy), 4), np.float32))
+            ones = np.ones((len(xy), 4), np.float32)
+            return LocalFeatures(xy, ones[:, 0], ones)
 
     class Plain:
         name = "plain"
@@ -50,6 +52,8 @@ MODULE = """
     def function(image):
         return None
 
+    instance = Plain()
+
     class Moody:
         name = "moody"
 
@@ -66,6 +70,7 @@ ENTRY_POINTS = """
     nameless = outside_plugin:Nameless
     deaf = outside_plugin:Deaf
     function = outside_plugin:function
+    instance = outside_plugin:instance
     moody = outside_plugin:Moody
     absent = outside_plugin:Absent
     no-module = outside_plugin_that_is_not_there:Grid
@@ -79,7 +84,9 @@ def install(folder: Path, distribution: str, modules: dict[str, str], entry_poin
         (folder / f"{name}.py").write_text(textwrap.dedent(text))
     metadata = folder / f"{distribution}-1.0.dist-info"
     metadata.mkdir()
-    (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {distribution}\nVersion: 1.0\n")
+    (metadata / "METADATA").write_text(
+        f"Metadata-Version: 2.1\nName: {distribution}\nVersion: 1.0\n"
+    )
     (metadata / "entry_points.txt").write_text(textwrap.dedent(entry_points))
 
 
@@ -121,14 +128,21 @@ def test_a_plugin_needs_no_options(outside: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("nameless", r"'nameless' \(outside_plugin:Nameless\) does not fulfil Loc.*: it lacks name"),
+        (
+            "nameless",
+            r"'nameless' \(outside_plugin:Nameless\) does not fulfil Loc.*: it lacks name",
+        ),
         ("deaf", r"'deaf' \(outside_plugin:Deaf\) does not fulfil LocalFeatureE.* lacks extract"),
         ("function", r"'function' .* does not fulfil LocalFeatureExtractor: it is no class"),
+        ("instance", r"'instance' .* does not fulfil LocalFeatureExtractor: it is no class"),
         ("absent", r"'absent' \(outside_plugin:Absent\) cannot be loaded: .*Absent"),
         ("no-module", r"'no-module' .* cannot be loaded: No module named"),
         ("broken", r"'broken' \(outside_plugin_broken:Grid\) cannot be loaded: no licence"),
         ("moody", r"'moody' refuses its options: not today"),
-        ("missing", r"no plugin 'missing' in megloc_kapture.local_features; registered: .*rootsift"),
+        (
+            "missing",
+            r"no plugin 'missing' in megloc_kapture.local_features; registered: .*rootsift",
+        ),
     ],
 )
 def test_a_wrong_plugin_is_refused_by_name_with_the_reason(
@@ -169,7 +183,9 @@ def test_two_packages_with_one_name_are_refused(
         load_plugin(LOCAL_FEATURES, "grid")
 
 
-def test_a_matcher_is_no_extractor(outside: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_matcher_is_no_extractor(
+    outside: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
     crossed = tmp_path_factory.mktemp("crossed")
     install(
         crossed,

@@ -53,7 +53,9 @@ def test_transforms_are_their_matrices(seed: int) -> None:
 
 # rotations by (nearly) 180 degrees about every axis: where the trace formula loses all digits
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1.0, np.pi - 1e-9, np.pi])
-@pytest.mark.parametrize("axis", [[1, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, -0.8, 0], [-0.48, 0.6, 0.64]])
+@pytest.mark.parametrize(
+    "axis", [[1, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, -0.8, 0], [-0.48, 0.6, 0.64]]
+)
 def test_from_matrix_is_stable_everywhere(axis: list[float], angle: float) -> None:
     matrix = Rotation.from_rotvec(angle * np.array(axis)).as_matrix()
     transform = RigidTransform.from_matrix(matrix, np.array([1.0, 2, 3]))

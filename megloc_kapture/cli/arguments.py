@@ -59,9 +59,8 @@ def summary(drawn: str) -> str:
     helped = re.search(r"megloc(?: [a-z-]+)? --help", drawn)
     if not told[0].startswith((title, "Missing", "Error", "invalid")):
         told[0] = f"{title}: {told[0]}"
-    return (
-        "; ".join(text.rstrip(".") for text in told) + f"; see {prog[0] if prog else 'megloc -h'}"
-    )
+    told.append(f"see {helped[0] if helped else 'megloc --help'}")
+    return "; ".join(text.rstrip(".") for text in told)
 
 
 def _joined(lines: list[str]) -> str:

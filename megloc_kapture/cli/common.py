@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -9,11 +10,20 @@ from typing import Annotated, Literal
 import tyro
 
 from megloc_kapture.cli.console import Console, configure_logging
+from megloc_kapture.errors import DataError
 from megloc_kapture.pipeline.executors import ExecutorKind
 
 Input = Annotated[Path, tyro.conf.arg(aliases=["-i"])]
 Output = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 Force = Annotated[bool, tyro.conf.arg(aliases=["-f"])]
+
+
+def existing(folders: Sequence[Path]) -> tuple[Path, ...]:
+    """The folders; raises DataError when one is not there, which would be as if not given."""
+    for folder in folders:
+        if not folder.is_dir():
+            raise DataError("no such folder", path=folder)
+    return tuple(folders)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from megloc_kapture.cli.common import Common
+from megloc_kapture.cli.common import Common, existing
 from megloc_kapture.cli.console import Console
 from megloc_kapture.cli.stages import FeaturesDirs
 from megloc_kapture.errors import MeglocError
@@ -37,7 +37,7 @@ class Info(Common):
     def run(self) -> int:
         """Print it."""
         console = self.console()
-        folder = KaptureFolder(self.input, features_dirs=self.features_dir)
+        folder = KaptureFolder(self.input, features_dirs=existing(self.features_dir))
         describe_content(console, folder)
         folder.validate(deep=self.deep)
         line(console, "checked", "everything, image by image" if self.deep else "no fault found")
@@ -52,7 +52,7 @@ class Info(Common):
             opened = KaptureMap.open(
                 self.input,
                 keypoints_type=self.keypoints_type,
-                features_dirs=self.features_dir,
+                features_dirs=existing(self.features_dir),
                 pixel_origin=self.pixel_origin,
             )
         except MeglocError as error:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from megloc_kapture.cli.common import Choosing, Common, Force, Input, Output
+from megloc_kapture.cli.common import Choosing, Common, Force, Input, Output, existing
 from megloc_kapture.cli.stages import FeaturesDirs
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.kapture_store import KaptureFolder, read_pairs
@@ -16,7 +17,7 @@ from megloc_kapture.pipeline.executors import available_cores
 from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, options_of_preset
-from megloc_kapture.pipeline.queries import Query, queries_of_kapture
+from megloc_kapture.pipeline.queries import KaptureQueries, Query
 from megloc_kapture.stages.matches import iterate_candidates
 from megloc_kapture.stages.query_poses import write_localized
 from megloc_kapture.values import RigidTransform
@@ -56,38 +57,39 @@ class Localize(Choosing, Common):
         kapture_map = KaptureMap.open(
             self.input,
             keypoints_type=self.keypoints_type,
-            features_dirs=self.features_dir,
+            features_dirs=existing(self.features_dir),
             pixel_origin=self.pixel_origin,
         )
         options = options_of_preset(self.preset or DEFAULT_PRESET, assignments=self.set)
-        folder = KaptureFolder(self.query, features_dirs=self.features_dir)
-        queries = list(queries_of_kapture(folder, kapture_map))
-        localizer = Localizer(kapture_map, options=options)
+        folder = KaptureFolder(self.query, features_dirs=existing(self.features_dir))
+        queries = KaptureQueries(folder, kapture_map)
         given = None if self.pairs is None else dict(iterate_candidates(read_pairs(self.pairs)))
+        # what is wrong is found before the first query, and before anything is written
+        kapture_map.check()
+        queries.check()
         with staged_output(self.output, kind=LOCALIZED, force=self.force) as out:
+            localizer = Localizer(kapture_map, options=options)
             with ThreadPoolExecutor(workers) as executor:
                 started = time.perf_counter()
                 results = localizer.localize_many(queries, executor, candidates=given)
-                tracked = console.track(results, len(queries), "localizing")
-                named = [
-                    (query.name, result, 0.0)
-                    for query, result in zip(queries, tracked, strict=True)
-                ]
+                tracked = console.track(results, len(queries.names), "localizing")
+                named = list(zip(queries.names, tracked, strict=True))
                 seconds = time.perf_counter() - started
-            # candidates of a failed query are in its result only where they match
-            first = (
-                best_candidates(localizer, queries, given)
-                if options.localization.fallback == "retrieval"
-                else None
-            )
+            fallback = options.localization.fallback
+            best = {}
+            if fallback == "retrieval":
+                failed = [name for name, result in named if not result]
+                best = best_candidates(localizer, map(queries.query, failed), given)
             counts = write_localized(
                 out,
                 folder,
-                named,
-                fallback=options.localization.fallback,
-                first_candidates=first,
+                ((name, result, 0.0) for name, result in named),
+                fallback=fallback,
+                first_candidates=best,
             )
-        how = "as given" if given is not None else localizer.describe_retrieval(queries)
+        how = "as given"
+        if given is None:
+            how = localizer.describe_retrieval(queries.types_of_all())
         console.say(f"candidates: {how}")
         console.say(f"pixel origin: {kapture_map.pixel_origin.intrinsics}")
         console.result(
@@ -100,12 +102,16 @@ class Localize(Choosing, Common):
 
 
 def best_candidates(
-    localizer: Localizer, queries: list[Query], given: dict[str, list[str]] | None
+    localizer: Localizer,
+    queries: Iterable[Query],
+    given: Mapping[str, Sequence[str]] | None,
 ) -> dict[str, tuple[str, RigidTransform]]:
-    """Query to its best candidate and that image's pose."""
+    """Query to its best candidate and that image's pose; nothing for a query without any."""
+    poses = localizer.map.poses
     best = {}
     for query in queries:
-        images = given.get(query.name, []) if given is not None else localizer.ranked(query)
-        if images:
-            best[query.name] = (images[0], localizer.map.poses[images[0]])
+        ranked = localizer.ranked(query) if given is None else given.get(query.name, ())
+        first = next((image for image in ranked if image in poses), None)
+        if first is not None:
+            best[query.name] = (first, poses[first])
     return best

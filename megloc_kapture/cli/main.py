@@ -67,8 +67,7 @@ def _parser() -> Any:
         )
         for name, kind in COMMANDS.items()
     ]
-    union = functools.reduce(operator.or_, entries)
-    return tyro.conf.OmitArgPrefixes[union]  # type: ignore[misc]
+    return functools.reduce(operator.or_, entries)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -77,7 +76,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     debug = False
     try:
         with one_line_errors(given):
-            command: Command = tyro.cli(_parser(), args=given, prog="megloc", config=())
+            command: Command = tyro.cli(
+                _parser(), args=given, prog="megloc", config=(tyro.conf.OmitArgPrefixes,)
+            )
         debug = command.debug
         status = command.run()
         sys.stdout.flush()

@@ -9,7 +9,15 @@ from typing import Annotated
 
 import tyro
 
-from megloc_kapture.cli.common import Choosing, Common, Force, Input, Output, Working
+from megloc_kapture.cli.common import (
+    Choosing,
+    Common,
+    Force,
+    Input,
+    Output,
+    Working,
+    existing,
+)
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder, read_pairs, write_pairs
 from megloc_kapture.io.outputs import staged_output
@@ -99,8 +107,8 @@ class ExtractGlobal(_StageCommand):
         unknown = sorted(set(self.features) - {"vlad"})
         if unknown:
             raise OptionError(f"unknown global features {unknown[0]!r}; known: vlad")
-        mapping = KaptureFolder(self.input, features_dirs=self.features_dir)
-        queries = [KaptureFolder(q, features_dirs=self.features_dir) for q in self.query]
+        mapping = KaptureFolder(self.input, features_dirs=existing(self.features_dir))
+        queries = [KaptureFolder(q, features_dirs=existing(self.features_dir)) for q in self.query]
         local_type = _only_type(mapping, "descriptors", self.local_type)
         with (
             single_threaded(),
@@ -141,7 +149,7 @@ class PairsMapping(_StageCommand):
 
     def run(self) -> int:
         """Run it."""
-        mapping = KaptureFolder(self.input, features_dirs=self.features_dir)
+        mapping = KaptureFolder(self.input, features_dirs=existing(self.features_dir))
         changes: dict[str, object] = {"by": self.by}
         if self.topk is not None:
             changes["top_k"] = self.topk
@@ -179,8 +187,8 @@ class PairsQuery(_StageCommand):
 
     def run(self) -> int:
         """Run it."""
-        mapping = KaptureFolder(self.input, features_dirs=self.features_dir)
-        query = KaptureFolder(self.query, features_dirs=self.features_dir)
+        mapping = KaptureFolder(self.input, features_dirs=existing(self.features_dir))
+        query = KaptureFolder(self.query, features_dirs=existing(self.features_dir))
         changes: dict[str, object] = {"by": "exhaustive" if self.exhaustive else "retrieval"}
         if self.topk is not None:
             changes["top_k"] = self.topk
@@ -219,13 +227,13 @@ class Match(_StageCommand):
     def run(self) -> int:
         """Run it."""
         console = self.console()
-        mapping = KaptureFolder(self.input, features_dirs=self.features_dir)
+        mapping = KaptureFolder(self.input, features_dirs=existing(self.features_dir))
         local_type = _only_type(mapping, "descriptors", self.features)
         changes: dict[str, object] = {"matching": {"name": self.matcher}} if self.matcher else {}
         options = self.options(changes)
         first, verification = mapping, options.verify_mapping()
         if self.query is not None:
-            first = KaptureFolder(self.query, features_dirs=self.features_dir)
+            first = KaptureFolder(self.query, features_dirs=existing(self.features_dir))
             verification = options.verify_queries()
         pairs = read_pairs(self.pairs)
         _check_images_of(pairs, first, mapping, self.pairs)
@@ -269,7 +277,7 @@ class Triangulate(_StageCommand):
     def run(self) -> int:
         """Run it."""
         console = self.console()
-        mapping = KaptureFolder(self.input, features_dirs=self.features_dir)
+        mapping = KaptureFolder(self.input, features_dirs=existing(self.features_dir))
         local_type = _only_type(mapping, "matches", self.features)
         pairs = None if self.pairs is None else read_pairs(self.pairs)
         if pairs is not None and self.pairs is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -20,9 +19,13 @@ from megloc_kapture.io.side_tables import (
     ImageGroup,
     Protocol,
     read_groups,
+    read_priors,
     read_protocol,
+    read_world,
     write_groups,
+    write_priors,
     write_protocol,
+    write_world,
 )
 
 MAPPING, QUERY, QUERY_GT, SIDE_TABLES = "mapping", "query", "query_gt", "megloc"
@@ -119,7 +122,7 @@ def import_kapture_folders(
         truth_data = KaptureFolder(root / QUERY_GT).read()
         truth = len(truth_data.poses())
         write_sensors(output / QUERY_GT, _renamed(truth_data, rename, keep_poses=True))
-    _copy_side_tables(root, output, rename, query_data.image_names(), protocol_change)
+    _write_side_tables(root, output, rename, map_data, query_data, protocol_change)
     return {
         "map_images": len(map_data.image_names()),
         "map_images_with_pose": len(poses),
@@ -135,16 +138,24 @@ def check_images(folder: KaptureFolder) -> None:
     ------
     DataError : names the first that is not.
     """
-    data = folder.read()
-    for image in data.image_names():
-        path = folder.image_path(image)
-        camera = data.camera_of(image)
-        if image_size(path) != (camera.width, camera.height):
-            width, height = image_size(path)
-            raise DataError(
-                f"the image is {width}x{height}, its camera says {camera.width}x{camera.height}",
-                path=path,
-            )
+    for image in folder.read().image_names():
+        check_image(folder, image)
+
+
+def check_image(folder: KaptureFolder, image: str) -> None:
+    """The image is there, is an image, and has the size its camera says; its header only.
+
+    Raises
+    ------
+    DataError : it is not; names its file.
+    """
+    path, camera = folder.image_path(image), folder.read().camera_of(image)
+    width, height = image_size(path)
+    if (width, height) != (camera.width, camera.height):
+        raise DataError(
+            f"the image is {width}x{height}, its camera says {camera.width}x{camera.height}",
+            path=path,
+        )
 
 
 def prefixed(prefix: str) -> Callable[[str], str]:
@@ -181,23 +192,29 @@ def _link_queries(source: Path, output: Path, prefix: str) -> None:
             raise output_error(place, error) from error
 
 
-def _copy_side_tables(
+def _write_side_tables(
     root: Path,
     output: Path,
     rename: Callable[[str], str],
-    queries: list[str],
+    map_data: KaptureData,
+    query_data: KaptureData,
     protocol_change: Callable[[Protocol], Protocol] | None,
 ) -> None:
     source, place = root / SIDE_TABLES, output / SIDE_TABLES
-    names = set(queries)
-    groups: dict[str, ImageGroup] = read_groups(source)
+    of_map, of_query = set(map_data.image_names()), set(query_data.image_names())
+    groups: dict[str, ImageGroup] = {}
+    for name, group in read_groups(source).items():
+        if name in of_query:
+            groups[rename(name)] = group
+        # a name that both have says the same of both
+        if name in of_map or name not in of_query:
+            groups[name] = group
     if groups:
-        write_groups(place, {rename(n) if n in names else n: group for n, group in groups.items()})
+        write_groups(place, groups)
+    priors = read_priors(source)
+    if priors:
+        write_priors(place, {rename(query): permitted for query, permitted in priors.items()})
     protocol = read_protocol(source)
     write_protocol(place, protocol_change(protocol) if protocol_change else protocol)
-    for name in (PRIORS_FILE, WORLD_FILE):
-        if (source / name).is_file():
-            try:
-                shutil.copyfile(source / name, place / name)
-            except OSError as error:
-                raise output_error(place / name, error) from error
+    if (source / WORLD_FILE).is_file():
+        write_world(place, read_world(source))

@@ -79,7 +79,8 @@ class RootSift:
         xy = np.array([keypoints[k].pt for k in order], dtype=np.float32)
         scores = np.array([keypoints[k].response for k in order], dtype=np.float32)
         # OpenCV puts the centre of the first pixel at (0, 0), COLMAP at (0.5, 0.5)
-        return LocalFeatures(xy + np.float32(0.5), scores, root_sift(descriptors[order]))
+        values = np.asarray(descriptors[order], dtype=np.float32)
+        return LocalFeatures(xy + np.float32(0.5), scores, root_sift(values))
 
 
 def _is_on(mask: NDArray[np.bool_], keypoint: cv2.KeyPoint) -> bool:

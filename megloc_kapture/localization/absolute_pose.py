@@ -112,9 +112,9 @@ def _estimate(
     focal = focal_px(camera)
     rays = bearing_rays(camera, points_px)
     # a camera's distortion cannot be undone everywhere: such rays are NaN
-    usable = np.isfinite(rays).all(axis=1) & np.isfinite(points).all(axis=1)
+    usable = np.asarray(np.isfinite(rays).all(axis=1) & np.isfinite(points).all(axis=1))
     if usable.sum() < options.min_inliers:
-        return _Estimate(RigidTransform.identity(), np.zeros(len(usable), dtype=bool))
+        return _Estimate(RigidTransform.identity(), np.zeros(len(usable), dtype=np.bool_))
     pinhole = {
         "model": "PINHOLE",
         "width": 1,

@@ -41,7 +41,8 @@ def match_nearest(
 
     Parameters
     ----------
-    descriptors_a, descriptors_b : (N, D) and (M, D), any real type; unit rows for a ratio test.
+    descriptors_a, descriptors_b : (N, D) and (M, D), any real type; rows of about one length, for
+        which the largest product is the smallest distance.
 
     Returns
     -------
@@ -62,7 +63,8 @@ def match_nearest(
     best, similarity, column_best, second = _search(a, b, with_second=options.max_ratio is not None)
     keep = np.ones(len(a), dtype=bool)
     if options.max_ratio is not None and len(b) > 1:
-        keep &= _passes_ratio(similarity, second, options.max_ratio)
+        to_best, to_second = _squared_distance(a, b, best), _squared_distance(a, b, second)
+        keep &= to_best <= options.max_ratio**2 * to_second
     if options.min_similarity is not None:
         keep &= similarity >= options.min_similarity
     if options.mutual:
@@ -77,11 +79,11 @@ def match_nearest(
 
 def _search(
     a: NDArray[np.float32], b: NDArray[np.float32], *, with_second: bool
-) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Best column and its value per row, best value per column, second-best value per row."""
+) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32], NDArray[np.int64]]:
+    """Best column and its value per row, best value per column, second-best column per row."""
     best = np.empty(len(a), dtype=np.int64)
     similarity = np.empty(len(a), dtype=np.float32)
-    second = np.full(len(a), -np.inf, dtype=np.float32)
+    second = np.zeros(len(a), dtype=np.int64)
     column_best = np.full(len(b), -np.inf, dtype=np.float32)
     buffer = np.empty((min(_BLOCK_ROWS, len(a)), len(b)), dtype=np.float32)
     transposed = b.T
@@ -95,17 +97,16 @@ def _search(
         np.maximum(column_best, block.max(axis=0), out=column_best)
         if with_second and len(b) > 1:
             block[rows, index] = -np.inf
-            second[start:stop] = block.max(axis=1)
+            second[start:stop] = block.argmax(axis=1)
     return best, similarity, column_best, second
 
 
-def _passes_ratio(
-    best: NDArray[np.float32], second: NDArray[np.float32], max_ratio: float
-) -> NDArray[np.bool_]:
-    # squared distance of unit vectors is 2 - 2 s
-    distance = np.maximum(2.0 - 2.0 * best.astype(np.float64), 0.0)
-    other = np.maximum(2.0 - 2.0 * second.astype(np.float64), 0.0)
-    return np.asarray(distance <= max_ratio**2 * other)
+def _squared_distance(
+    a: NDArray[np.float32], b: NDArray[np.float32], partner: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Squared distance of each row of a to its partner in b, (N,); right for any length of rows."""
+    difference = a - b[partner]
+    return np.asarray(np.einsum("nd,nd->n", difference, difference), dtype=np.float64)
 
 
 class NearestNeighbours:

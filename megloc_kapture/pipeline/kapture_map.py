@@ -223,18 +223,18 @@ def _find_origin(folder: KaptureFolder, local_type: str) -> PixelOrigin:
     poses = data.poses()
     index = index_map(folder, local_type)
     images = [image for image in sorted(index.row_of_image) if image in poses]
-    step = max(1, len(images) // _SAMPLED_IMAGES)
     keypoints = folder.keypoints(local_type)
+    for image in images:
+        if image not in keypoints:
+            raise DataError(
+                f"points are observed in {image!r}, which has no keypoints of type {local_type!r}",
+                path=folder.root / "reconstruction" / "observations.txt",
+            )
+    step = max(1, len(images) // _SAMPLED_IMAGES)
     sample = []
     for image in images[::step]:
         rows, points = index.observed(image)
         stored = keypoints.read(image)
-        if len(rows) and rows[-1] >= len(stored):
-            raise DataError(
-                f"observations refer to keypoint {rows[-1]} of {image}, which has "
-                f"{len(stored)} keypoints",
-                path=folder.root / "reconstruction" / "observations.txt",
-            )
         sample.append(
             ObservedImage(data.camera_of(image), poses[image], stored[rows, :2], index.xyz[points])
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from functools import cached_property
@@ -26,7 +26,7 @@ from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.map_descriptors import extract_again
 from megloc_kapture.pipeline.presets import PipelineOptions, options_of_preset
-from megloc_kapture.pipeline.queries import Query, queries_of_kapture
+from megloc_kapture.pipeline.queries import KaptureQueries, Query
 from megloc_kapture.plugins import LOCAL_FEATURES, LocalFeatureExtractor, load_plugin
 from megloc_kapture.retrieval.search import rank_by_similarity
 from megloc_kapture.stages.global_vlad import VladSettings, read_vocabulary
@@ -114,9 +114,8 @@ class Localizer:
         DataError : the image cannot be read, is not of its camera's size, or its features cannot
             be extracted because the map's type has no extractor.
         """
-        name = str(image) if isinstance(image, str | Path) else "query"
-        query = Query(camera, image, name, prior=None if prior is None else tuple(prior))
-        return self.localize_query(query)
+        permitted = None if prior is None else tuple(prior)
+        return self.localize_query(replace(_query_of(image, camera), prior=permitted))
 
     def localize_many(
         self,
@@ -132,9 +131,9 @@ class Localizer:
         executor : a thread pool suits: it shares the map, and the work is done outside Python.
         candidates : query name to the map images it is matched with, instead of retrieval.
         """
-        wrapped = (q if isinstance(q, Query) else Query(q[1], q[0], str(q[0])) for q in queries)
+        wrapped = (q if isinstance(q, Query) else _query_of(*q) for q in queries)
         if candidates is not None:
-            wrapped = (replace(q, prior=tuple(candidates.get(q.name, ()))) for q in wrapped)
+            wrapped = (replace(q, candidates=tuple(candidates.get(q.name, ()))) for q in wrapped)
         return ordered_map(self.localize_query, wrapped, executor)
 
     def localize_kapture(
@@ -142,9 +141,9 @@ class Localizer:
     ) -> Iterator[tuple[str, Pose | Failure]]:
         """Localize the images of a kapture folder: (name, result), sorted by name."""
         opened = folder if isinstance(folder, KaptureFolder) else KaptureFolder(folder)
-        queries = list(queries_of_kapture(opened, self.map))
+        queries = KaptureQueries(opened, self.map)
         results = self.localize_many(queries, executor)
-        return ((query.name, result) for query, result in zip(queries, results, strict=True))
+        return zip(queries.names, results, strict=True)
 
     def localize_query(self, query: Query) -> Pose | Failure:
         """Localize a query that may bring its features."""
@@ -190,6 +189,8 @@ class Localizer:
 
     def candidates(self, query: Query, local: LocalFeatures) -> list[str]:
         """The map images to match a query with: few as they are, many by retrieval, best first."""
+        if query.candidates is not None:
+            return self._usable(query, query.candidates)
         permitted = self._permitted(query)
         options = self.options.query_pairs
         if options.by == "exhaustive" or len(permitted) <= options.top_k:
@@ -204,13 +205,22 @@ class Localizer:
     def _permitted(self, query: Query) -> list[str]:
         if query.prior is None:
             return self.map.images
-        unknown = sorted(set(query.prior) - set(self.map.images))
+        return self._usable(query, query.prior)
+
+    def _usable(self, query: Query, images: Sequence[str]) -> list[str]:
+        """Those of the images that have a pose and see points; the others cannot help."""
+        unknown = set(images) - self._known_images
         if unknown:
             raise DataError(
-                f"query {query.name} is to be matched with {unknown[0]}, which is no map image "
-                "with a pose and points"
+                f"query {query.name} is to be matched with {min(unknown)}, which is no image of "
+                "the map",
+                path=self.map.folder.root,
             )
-        return list(dict.fromkeys(query.prior))
+        return [image for image in dict.fromkeys(images) if image in self.map.poses]
+
+    @cached_property
+    def _known_images(self) -> frozenset[str]:
+        return frozenset(self.map.folder.read().image_names())
 
     def _rank(self, query: Query, local: LocalFeatures, permitted: Sequence[str]) -> list[str]:
         mask = np.isin(self.map.images, list(permitted))[None]
@@ -226,12 +236,12 @@ class Localizer:
         )
         return [self.map.images[i] for i in index[0] if i >= 0]
 
-    def describe_retrieval(self, queries: Sequence[Query]) -> str:
-        """How the candidates of these queries are found, for people."""
-        if len(self.map.images) <= self.options.query_pairs.top_k:
-            return f"all {len(self.map.images)} map images, the map is small"
-        brought = set.intersection(*(set(query.global_features) for query in queries))
-        shared = [name for name in self.map.global_types() if name in brought]
+    def describe_retrieval(self, global_types: Collection[str]) -> str:
+        """How the candidates of queries that bring these global features are found, for people."""
+        options = self.options.query_pairs
+        if options.by == "exhaustive" or len(self.map.images) <= options.top_k:
+            return f"all {len(self.map.images)} map images"
+        shared = [name for name in self.map.global_types() if name in global_types]
         return f"global features {shared[0]}" if shared else "VLAD over the map's descriptors"
 
     def _match(self, query: Query) -> tuple[Features, _Matches]:
@@ -251,7 +261,8 @@ class Localizer:
 
     def _extract(self, query: Query) -> LocalFeatures:
         extractor = self._extractor()
-        return checked_features(extractor, extractor.extract(query.read_image()), query.name)
+        features = extractor.extract(query.read_image(), query.read_mask())
+        return checked_features(extractor, features, query.name)
 
     def _extractor(self) -> LocalFeatureExtractor:
         name = self.map.extractor_name()
@@ -287,7 +298,7 @@ class Localizer:
     def _map_descriptors(self, image: str) -> NDArray[Any]:
         if self._descriptors is not None:
             return self._descriptors[image]
-        return np.asarray(self.map.folder.descriptors(self.map.local_type).read(image))
+        return self.map.descriptors(image)
 
     def _global_vectors(self, global_type: str) -> NDArray[np.float32]:
         if global_type not in self._vectors:
@@ -321,6 +332,10 @@ class Localizer:
         vectors = [aggregate(self._map_descriptors(image), vocabulary, options) for image in images]
         settings = VladSettings(local_type=self.map.local_type, options=options)
         return vocabulary, settings, np.stack(vectors)
+
+
+def _query_of(image: Path | str | NDArray[np.uint8], camera: Camera) -> Query:
+    return Query(camera, image, str(image) if isinstance(image, str | Path) else "query")
 
 
 def _keep_all(a: Features, b: Features, matches: NDArray[np.int64]) -> NDArray[np.bool_]:

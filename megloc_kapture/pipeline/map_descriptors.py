@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from megloc_kapture.errors import DataError
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.plugins import LocalFeatureExtractor
-from megloc_kapture.stages.local_features import checked_features, read_image_of
+from megloc_kapture.stages.local_features import checked_features, read_image_of, read_mask
 
 # a keypoint that is found again is found at the same place but for rounding
 _SAME_PLACE_PX = 0.1
@@ -36,12 +36,11 @@ def extract_again(
         )
     found: dict[str, NDArray[Any]] = {}
     again = observed = 0
+    folder = kapture_map.folder
     for image in kapture_map.images:
-        path = kapture_map.folder.image_path(image)
-        camera = kapture_map.folder.read().camera_of(image)
-        features = checked_features(
-            extractor, extractor.extract(read_image_of(path, camera)), image
-        )
+        pixels = read_image_of(folder.image_path(image), folder.read().camera_of(image))
+        mask = read_mask(folder.root / "sensors" / "masks" / f"{image}.png", pixels.shape[:2])
+        features = checked_features(extractor, extractor.extract(pixels, mask), image)
         stored = kapture_map.keypoints_px(image)
         rows = rows_found_again(stored, features.keypoints_px[:, :2])
         descriptors = np.zeros((len(stored), features.descriptors.shape[1]), np.float32)

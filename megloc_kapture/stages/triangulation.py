@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,10 @@ import numpy as np
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.atomic import output_error
 from megloc_kapture.io.colmap import MapImage, TriangulationOptions, triangulate
+from megloc_kapture.io.kapture_features import ArrayKind
 from megloc_kapture.io.kapture_store import (
+    FeatureReader,
+    FeatureWriter,
     ImagePair,
     KaptureFolder,
     Observations,
@@ -102,34 +106,63 @@ def triangulate_map(
     }
 
 
+_SUFFIXES: dict[ArrayKind, str] = {
+    "keypoints": ".kpt",
+    "descriptors": ".desc",
+    "global_features": ".gfeat",
+}
+_VOCABULARY_FILES = ("vlad.json", "vocabulary.npy")
+
+
 def copy_features(source: KaptureFolder, output: Path, local_type: str) -> None:
     """Put the map images' features of ``source`` into the kapture at ``output``.
 
-    Hard links where the file system has them: a map then stands alone and takes no space twice.
+    Files of features folders are hard links where the file system has them: a map then stands
+    alone and takes no space twice. The kapture's own features, which come first as everywhere, are
+    somebody's data and copied; so is what comes out of a tar.
     """
-    images = source.read().image_names()
-    reconstruction = output / "reconstruction"
-    for kind, suffix, types in (
-        ("keypoints", ".kpt", [local_type]),
-        ("descriptors", ".desc", [local_type]),
-        ("global_features", ".gfeat", source.types("global_features")),
-    ):
+    own = KaptureFolder(source.root)
+    for kind in _SUFFIXES:
+        types = source.types(kind) if kind == "global_features" else [local_type]
         for type_name in types:
-            place = reconstruction / kind / type_name
-            for features_dir in source.features_dirs:
-                parent = "global_features" if kind == "global_features" else "local_features"
-                found = features_dir / parent / type_name / kind
-                extras = [] if kind != "global_features" else sorted(found.parent.glob("vlad.json"))
-                extras += [] if not extras else sorted(found.parent.glob("vocabulary.npy"))
-                if not (found / f"{kind}.txt").is_file():
-                    continue
-                _link(found / f"{kind}.txt", place / f"{kind}.txt")
-                for extra in extras:
-                    _link(extra, place / extra.name)
-                for image in images:
-                    file = found / f"{image}{suffix}"
-                    if file.is_file():
-                        _link(file, place / f"{image}{suffix}")
+            if type_name in source.types(kind):
+                _copy_type(source, own, output, kind, type_name)
+
+
+def _copy_type(
+    source: KaptureFolder, own: KaptureFolder, output: Path, kind: ArrayKind, type_name: str
+) -> None:
+    place = output / "reconstruction" / kind / type_name
+    images = source.read().image_names()
+    kept = set(_reader(own, kind, type_name).names) if type_name in own.types(kind) else set()
+    parent = "global_features" if kind == "global_features" else "local_features"
+    beside = [source.root / "reconstruction" / kind / type_name]
+    for features_dir in source.features_dirs:
+        found = features_dir / parent / type_name / kind
+        beside.append(found.parent)
+        for image in images:
+            file = found / f"{image}{_SUFFIXES[kind]}"
+            if image not in kept and file.is_file():
+                _link(file, place / f"{image}{_SUFFIXES[kind]}")
+    if kind == "global_features":
+        for folder, name in product(beside, _VOCABULARY_FILES):
+            if (folder / name).is_file():
+                _link(folder / name, place / name)
+    reader = _reader(source, kind, type_name)
+    with FeatureWriter(output, kind, type_name, reader.config) as writer:
+        for image in images:
+            if image not in writer and image in reader:
+                writer.write(image, reader.read(image))
+
+
+def _reader(folder: KaptureFolder, kind: ArrayKind, type_name: str) -> FeatureReader:
+    if kind == "keypoints":
+        return folder.keypoints(type_name)
+    return (
+        folder.descriptors(type_name)
+        if kind == "descriptors"
+        else folder.global_features(type_name)
+    )
 
 
 def _link(source: Path, place: Path) -> None:

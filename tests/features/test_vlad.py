@@ -216,9 +216,7 @@ def test_training_refuses_values_that_are_not_finite() -> None:
         train_vocabulary(data, VladOptions(num_clusters=4))
 
 
-@given(
-    st.lists(st.integers(0, 300), max_size=20), st.integers(1, 500), st.integers(0, 2**32 - 1)
-)
+@given(st.lists(st.integers(0, 300), max_size=20), st.integers(1, 500), st.integers(0, 2**32 - 1))
 def test_sampled_rows_are_a_share_of_every_image(counts: list[int], total: int, seed: int) -> None:
     rows = sample_rows(counts, total, seed)
     assert len(rows) == len(counts)

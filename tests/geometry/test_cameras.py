@@ -86,7 +86,9 @@ def test_projection_agrees_with_opencv(model: str) -> None:
     matrix = np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]])
     zero = np.zeros(3)
     function = cv2.fisheye.projectPoints if model == "OPENCV_FISHEYE" else cv2.projectPoints
-    pixels, _ = function(POINTS.reshape(-1, 1, 3), zero, zero, matrix, np.array(distortion or [0.0] * 4))
+    pixels, _ = function(
+        POINTS.reshape(-1, 1, 3), zero, zero, matrix, np.array(distortion or [0.0] * 4)
+    )
     np.testing.assert_allclose(
         px_from_cam(camera(model), POINTS), pixels.reshape(-1, 2) + 0.5, atol=1e-8
     )
@@ -103,7 +105,9 @@ def test_project_applies_the_pose() -> None:
 def test_behind_the_camera_is_nan() -> None:
     pixels = px_from_cam(camera("PINHOLE"), np.array([[0.1, 0.1, -1.0], [0, 0, 0], [0.1, 0, 1]]))
     assert np.isnan(pixels[:2]).all() and np.isfinite(pixels[2]).all()
-    assert np.isnan(px_from_cam(camera("OPENCV"), np.array([[np.nan, 0, 1.0], [0, 0, np.nan]]))).all()
+    assert np.isnan(
+        px_from_cam(camera("OPENCV"), np.array([[np.nan, 0, 1.0], [0, 0, np.nan]]))
+    ).all()
 
 
 @pytest.mark.parametrize("model", CAMERAS)

@@ -224,6 +224,23 @@ def test_pixels_whose_distortion_cannot_be_undone_are_left_out() -> None:
     assert pose.inliers is not None and not pose.inliers[:20].any() and pose.inliers[20:].all()
 
 
+def test_pixels_just_past_what_the_distortion_reaches_are_left_out() -> None:
+    # radius r goes to r (1 - 0.3 r^2) and reaches 0.703 at most, 351 px; these are at 356
+    strong = Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, -0.3))
+    rng = np.random.default_rng(15)
+    truth = random_pose(rng)
+    pixels, world = scene(strong, truth, rng, count=60)
+    sides = np.array([[0.8, 0.6], [-0.8, 0.6], [0.8, -0.6]])
+    world[:3] = truth.inverse().apply(5.0 * np.column_stack([1.05 * sides, np.ones(3)]))
+    pixels[:3] = 356.0 * sides + (320.0, 240.0)
+    assert np.linalg.norm(project(strong, truth, world) - pixels, axis=1)[:3].max() < 6
+    assert np.isnan(bearing_rays(strong, pixels[:3])).any(axis=1).all()
+    pose = located(absolute_pose(pixels, world, strong))
+    assert difference(pose.cam_from_world, truth)[0] < 1e-7
+    assert pose.inliers is not None
+    np.testing.assert_array_equal(pose.inliers, np.arange(60) >= 3)
+
+
 def test_options_are_used() -> None:
     rng = np.random.default_rng(12)
     truth = random_pose(rng)

@@ -69,9 +69,7 @@ def test_then_the_most_similar_wins() -> None:
 
 
 def test_a_loser_gets_its_second_choice() -> None:
-    found = resolve(
-        np.array([1, 1, 2, 2]), np.array([5, 5, 5, 6]), np.array([0.9, 0.9, 0.8, 0.2])
-    )
+    found = resolve(np.array([1, 1, 2, 2]), np.array([5, 5, 5, 6]), np.array([0.9, 0.9, 0.8, 0.2]))
     assert (found.keypoint_ids.tolist(), found.point_ids.tolist()) == ([1, 2], [5, 6])
 
 

@@ -97,12 +97,16 @@ def test_a_world_far_from_its_origin() -> None:
 def test_values_that_cannot_be_used_are_left_out() -> None:
     truth, views = rig(30)
     views[0].points_world[2] = np.nan
-    views[2].points_px[5] = (0.0, 0.0)  # no ray under this distortion
+    # no rays under this distortion: the second one is 5 px past the last that has one
+    views[2].points_px[5] = (0.0, 0.0)
+    cam_from_world = views[2].cam_from_rig @ truth
+    views[2].points_px[6] = (320 + 0.8 * 356, 240 + 0.6 * 356)
+    views[2].points_world[6] = cam_from_world.inverse().apply(np.array([[4.2, 3.15, 5.0]]))[0]
     found = rig_pose(views)
     distance, angle = difference(found, truth)
     assert distance < 1e-7 and angle < 1e-8
     assert isinstance(found, Pose) and found.inliers is not None
-    assert np.flatnonzero(~found.inliers).tolist() == [2, 65]
+    assert np.flatnonzero(~found.inliers).tolist() == [2, 65, 66]
 
 
 def test_failures_say_why() -> None:
@@ -118,7 +122,9 @@ def test_failures_say_why() -> None:
     ]
     failed = rig_pose(mixed)
     assert isinstance(failed, Failure) and "of 90 2D-3D matches agree" in failed.reason
-    broken = [RigView(v.camera, v.cam_from_rig, v.points_px, np.nan * v.points_world) for v in views]
+    broken = [
+        RigView(v.camera, v.cam_from_rig, v.points_px, np.nan * v.points_world) for v in views
+    ]
     assert isinstance(rig_pose(broken), Failure)
 
 

@@ -34,12 +34,12 @@ def random_cameras(count: int, seed: int, turn: float = 3.0) -> list[RigidTransf
     ]
 
 
-def by_loops(
-    cameras: list[RigidTransform], options: PairsByPosesOptions
-) -> list[list[int]]:
+def by_loops(cameras: list[RigidTransform], options: PairsByPosesOptions) -> list[list[int]]:
     centers = [camera.center() for camera in cameras]
     # the optical axis in the world: where the camera frame's z axis points
-    axes = [camera.inverse().apply(np.array([[0.0, 0, 1]]))[0] - camera.center() for camera in cameras]
+    axes = [
+        camera.inverse().apply(np.array([[0.0, 0, 1]]))[0] - camera.center() for camera in cameras
+    ]
     found = set()
     for i in range(len(cameras)):
         candidates = []

@@ -109,6 +109,28 @@ def test_the_ratio_is_of_distances(max_ratio: float, mutual: bool) -> None:
         assert 0 < len(matches) < 40  # the test tells ratios apart
 
 
+@pytest.mark.parametrize("max_ratio", [0.7, 0.9])
+def test_the_ratio_of_uint8_descriptors_is_of_distances_too(max_ratio: float) -> None:
+    # as COLMAP's SIFT: 512 times a unit vector, rounded
+    rng = np.random.default_rng(6)
+    b = np.abs(rng.normal(size=(60, 128)))
+    a = b[:50] + np.linspace(0.1, 1.5, 50)[:, None] * rng.normal(size=(50, 128))
+    a, b = (
+        np.round(512 * np.abs(x) / np.linalg.norm(x, axis=1, keepdims=True)).astype(np.uint8)
+        for x in (a, b)
+    )
+    options = NearestNeighbourOptions(max_ratio=max_ratio, mutual=False)
+    products = a.astype(np.float64) @ b.astype(np.float64).T
+    expected = []
+    for i, order in enumerate(np.argsort(-products, axis=1)):
+        distances = [float(np.linalg.norm(a[i].astype(float) - b[j])) for j in order[:2]]
+        if distances[0] <= max_ratio * distances[1]:
+            expected.append([i, int(order[0])])
+    matches = match_nearest(a, b, options)[0].tolist()
+    assert matches == expected
+    assert 5 < len(matches) < 45
+
+
 def test_ratio_with_a_single_candidate_is_no_test() -> None:
     a, b = np.eye(2, 4, dtype=np.float32), np.eye(1, 4, dtype=np.float32)
     matches, _ = match_nearest(a, b, NearestNeighbourOptions(max_ratio=0.5))

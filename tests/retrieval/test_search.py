@@ -22,9 +22,7 @@ def full_sort(
     indices, scores = [], []
     for row, query in enumerate(queries):
         products = [float(np.dot(query, other)) for other in database]
-        allowed = [
-            k for k in range(len(database)) if permitted is None or bool(permitted[row, k])
-        ]
+        allowed = [k for k in range(len(database)) if permitted is None or bool(permitted[row, k])]
         best = sorted(allowed, key=lambda k: (-products[k], k))[:top_k]
         width = min(top_k, len(database))
         indices.append(best + [-1] * (width - len(best)))
@@ -39,8 +37,12 @@ def problems(draw: st.DrawFn) -> tuple[NDArray[np.float64], NDArray[np.float64],
     size = draw(st.integers(1, 3))
     queries = rng.integers(-2, 3, (draw(st.integers(1, 12)), size)).astype(np.float64)
     database = rng.integers(-2, 3, (draw(st.integers(1, 40)), size)).astype(np.float64)
-    return queries, database, draw(st.integers(1, 45)), draw(st.integers(1, 60)), draw(
-        st.booleans()
+    return (
+        queries,
+        database,
+        draw(st.integers(1, 45)),
+        draw(st.integers(1, 60)),
+        draw(st.booleans()),
     )
 
 

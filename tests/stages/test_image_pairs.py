@@ -67,7 +67,9 @@ def test_map_pairs_by_retrieval(
             expected[key] = float(np.dot(unit(VECTORS[key[0]]), unit(VECTORS[key[1]])))
     found = pair_map_images(folders[0], MappingPairsOptions(top_k=top_k), global_type="toy")
     assert names(found) == sorted(expected)
-    np.testing.assert_allclose([p.score for p in found], [expected[k] for k in sorted(expected)], atol=1e-6)
+    np.testing.assert_allclose(
+        [p.score for p in found], [expected[k] for k in sorted(expected)], atol=1e-6
+    )
 
 
 def test_an_image_is_never_paired_with_itself_even_among_copies(
@@ -76,6 +78,18 @@ def test_an_image_is_never_paired_with_itself_even_among_copies(
     found = pair_map_images(folders[0], MappingPairsOptions(top_k=1), global_type="toy")
     assert ("left/0.png", "left/1.png") in names(found)
     assert all(pair.query < pair.map for pair in found)
+
+
+def test_copies_do_not_take_more_places_than_there_are(world: Any, tmp_path: Path) -> None:
+    config = FeatureConfig("toy", np.dtype("float32"), 3, None, "L2")
+    with FeatureWriter(tmp_path, "global_features", "toy", config, orphan=True) as writer:
+        for image in world.map_poses:
+            writer.write(image, np.ones(3, dtype=np.float32))
+    folder = KaptureFolder(world.mapping().root, features_dirs=[tmp_path])
+    first, *others = sorted(world.map_poses)
+    found = pair_map_images(folder, MappingPairsOptions(top_k=1), global_type="toy")
+    # each has one partner, the first of the others
+    assert names(found) == [(first, other) for other in others]
 
 
 def test_map_pairs_by_poses_and_exhaustively(world: Any) -> None:
@@ -141,7 +155,9 @@ def test_vlad_ranks_the_nearest_view_first(world: Any) -> None:
     for query, pose in world.query_poses.items():
         ranked = [pair.map for pair in found if pair.query == query]
         assert len(ranked) == 5
-        distance = {m: np.linalg.norm(p.center() - pose.center()) for m, p in world.map_poses.items()}
+        distance = {
+            m: np.linalg.norm(p.center() - pose.center()) for m, p in world.map_poses.items()
+        }
         assert ranked[0] in sorted(distance, key=lambda m: float(distance[m]))[:2]
 
 

@@ -39,7 +39,12 @@ def localize(world: Any, pairs: list[ImagePair] | None = None, **more: Any) -> R
     options = more.pop("options", LocalizationOptions())
     return list(
         localize_from_matches(
-            world.map(), world.query(), world.with_matches("query"), pairs, "rootsift", options,
+            world.map(),
+            world.query(),
+            world.with_matches("query"),
+            pairs,
+            "rootsift",
+            options,
             **more,
         )  # fmt: skip
     )
@@ -245,12 +250,16 @@ def fountain(
         query = KaptureFolder(scene / "query", features_dirs=[root / "features"])
         extractor, matcher = RootSift(RootSiftOptions(max_keypoints=1500)), NearestNeighbours()
         extract_local_features([mapping, query], extractor, root / "features")
-        map_pairs = pair_map_images(
-            mapping, MappingPairsOptions(by=("poses",)), global_type=None
-        )
+        map_pairs = pair_map_images(mapping, MappingPairsOptions(by=("poses",)), global_type=None)
         pairs = pair_queries(mapping, query, QueryPairsOptions(by="exhaustive"), global_type=None)
         match_pairs(
-            mapping, mapping, map_pairs, "rootsift", matcher, KnownPoseOptions(), root / "map_matches"
+            mapping,
+            mapping,
+            map_pairs,
+            "rootsift",
+            matcher,
+            KnownPoseOptions(),
+            root / "map_matches",
         )
         match_pairs(
             query, mapping, pairs, "rootsift", matcher, TwoViewOptions(), root / "query_matches"

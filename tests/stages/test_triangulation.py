@@ -11,9 +11,14 @@ import numpy as np
 import pytest
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.colmap import TriangulationOptions
-from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder
 from megloc_kapture.geometry.cameras import project
+from megloc_kapture.io.colmap import TriangulationOptions
+from megloc_kapture.io.kapture_store import (
+    FeatureWriter,
+    ImagePair,
+    KaptureFolder,
+    write_sensors,
+)
 from megloc_kapture.stages.triangulation import triangulate_map
 
 
@@ -30,7 +35,9 @@ def test_observations_are_of_these_points(world: Any) -> None:
     xyz = folder.points3d()[:, :3]
     observations = folder.observations()["rootsift"]
     assert observations.image_names == tuple(sorted(world.map_poses))
-    assert np.bincount(observations.point_ids, minlength=len(xyz)).min() >= 3
+    # COLMAP makes points of three images at least, and may take one of them out again
+    lengths = np.bincount(observations.point_ids, minlength=len(xyz))
+    assert lengths.min() >= 2 and (lengths >= 3).mean() > 0.95
     for image_id, image in enumerate(observations.image_names):
         here = observations.image_ids == image_id
         keypoints = folder.keypoints("rootsift").read(image)
@@ -106,7 +113,10 @@ def test_two_runs_write_the_same_bytes(
 
 
 def test_only_the_pairs_asked_for_are_used(world: Any, tmp_path: Path) -> None:
-    pairs = [ImagePair("right/2.png", "left/0.png", 1.0), ImagePair("left/0.png", "left/1.png", 1.0)]
+    pairs = [
+        ImagePair("right/2.png", "left/0.png", 1.0),
+        ImagePair("left/0.png", "left/1.png", 1.0),
+    ]
     counts = triangulate_map(
         world.mapping(), world.with_matches("mapping"), "rootsift", tmp_path,
         TriangulationOptions(two_view_tracks=True), pairs=pairs,
@@ -128,15 +138,59 @@ def test_a_map_without_poses_is_refused(world: Any, tmp_path: Path) -> None:
     assert not any(tmp_path.iterdir())
 
 
-def test_features_of_the_mapping_itself_are_copied_too(world: Any, tmp_path: Path) -> None:
-    """A mapping that brings its own features has them in ``reconstruction/``."""
-    whole = KaptureFolder(world.root / "map")  # a kapture with features of its own
-    counts = triangulate_map(
-        whole, world.with_matches("mapping"), "rootsift", tmp_path, TriangulationOptions()
-    )
-    assert counts["points"] == len(world.map().points3d())
-    again = KaptureFolder(tmp_path)
-    again.validate(deep=True)
+@pytest.mark.parametrize("tar", [False, True])
+def test_features_of_the_mapping_itself_are_copied_too(
+    world: Any, tmp_path: Path, tar: bool
+) -> None:
+    """A mapping that brings its own features has them in ``reconstruction/``, perhaps as tar."""
+    whole = tmp_path / "whole"
+    source = world.mapping()
+    write_sensors(whole, source.read())
+    (whole / "sensors" / "records_data").symlink_to(source.root / "sensors" / "records_data")
     for kind in ("keypoints", "descriptors"):
-        assert getattr(again, kind)("rootsift").names == sorted(world.map_poses)
-    assert again.global_features("vlad_rootsift").names == sorted(world.map_poses)
+        reader = getattr(source, kind)("rootsift")
+        with FeatureWriter(whole, kind, "rootsift", reader.config, tar=tar) as writer:  # type: ignore[arg-type]
+            for image in world.map_poses:
+                writer.write(image, reader.read(image))
+    counts = triangulate_map(
+        KaptureFolder(whole), world.with_matches("mapping"), "rootsift", tmp_path / "map",
+        TriangulationOptions(),
+    )  # fmt: skip
+    assert counts["points"] == len(world.map().points3d())
+    found = KaptureFolder(tmp_path / "map")
+    found.validate(deep=True)
+    for kind in ("keypoints", "descriptors"):
+        reader = getattr(found, kind)("rootsift")
+        assert reader.names == sorted(world.map_poses)
+        for image in reader.names:
+            np.testing.assert_array_equal(
+                reader.read(image), getattr(source, kind)("rootsift").read(image)
+            )
+    assert found.types("global_features") == []
+
+
+def test_the_kaptures_own_features_come_before_those_beside_it(world: Any, tmp_path: Path) -> None:
+    """Observations index what was triangulated, so the map must hold the same keypoints."""
+    mapping = tmp_path / "mapping"
+    source = world.mapping()
+    write_sensors(mapping, source.read())
+    (mapping / "sensors" / "records_data").symlink_to(source.root / "sensors" / "records_data")
+    config = source.keypoints("rootsift").config
+    image = "right/2.png"
+    own = source.keypoints("rootsift").read(image)[::-1].copy()
+    with FeatureWriter(mapping, "keypoints", "rootsift", config) as writer:
+        writer.write(image, own)
+    both = KaptureFolder(mapping, features_dirs=[world.features_dir])
+    triangulate_map(
+        both, world.with_matches("mapping"), "rootsift", tmp_path / "map", TriangulationOptions()
+    )
+    found = KaptureFolder(tmp_path / "map").keypoints("rootsift")
+    np.testing.assert_array_equal(found.read(image), own)
+    others = found.read("left/0.png")
+    np.testing.assert_array_equal(others, source.keypoints("rootsift").read("left/0.png"))
+
+
+def test_features_are_linked_and_not_written_twice(world: Any) -> None:
+    kind = "local_features/rootsift/keypoints/left/0.png.kpt"
+    linked = world.root / "map/reconstruction/keypoints/rootsift/left/0.png.kpt"
+    assert linked.samefile(world.features_dir / kind)

@@ -84,12 +84,11 @@ def paint_ground(
         box = np.round(cv2.boxPoints(rect) * 16).astype(np.int32)
         tone = float(rng.uniform(60, 130))
         cv2.fillPoly(image, [box], (tone, tone, tone + 3), cv2.LINE_AA, 4)
-    manhole = stream(int(material_seed), "manhole")
     for _ in range(2 + int(area_m2 / 60)):
         size = int(0.7 * density)
         x, y = int(rng.uniform(0, width - size)), int(rng.uniform(0, height - size))
-        image[y : y + size, x : x + size] = _manhole(manhole, size)
-        manhole = stream(int(material_seed), "manhole")
+        # all of one kind, like the paving
+        image[y : y + size, x : x + size] = _manhole(stream(int(material_seed), "manhole"), size)
     for _ in range(int(area_m2 / 50)):
         start = rng.uniform((0, 0), (width, height))
         angle = rng.choice([0, np.pi / 2, rng.uniform(0, np.pi)])

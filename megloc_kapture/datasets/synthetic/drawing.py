@@ -15,21 +15,24 @@ Picture = NDArray[np.float32]  # (H, W, 3), 0..255
 
 def random_colour(
     rng: np.random.Generator, low: float = 30, high: float = 225, *, chroma: float = 0.75
-) -> NDArray[np.float32]:
+) -> Colour:
     """A random colour; ``chroma`` 0 is grey, 1 as strong as its channels' range allows."""
     channels = rng.uniform(low, high, 3)
     return (channels.mean() + chroma * (channels - channels.mean())).astype(np.float32)
 
 
-def to_rgb(image: NDArray[np.float32]) -> Rgb:
+def to_rgb(image: Picture) -> Rgb:
+    """Round to uint8, cutting off what is below 0 or above 255."""
     return np.clip(image + 0.5, 0, 255).astype(np.uint8)
 
 
-def shade(image: NDArray[np.float32], factor: Field2D) -> NDArray[np.float32]:
+def shade(image: Picture, factor: Field2D) -> Picture:
+    """The picture times a field (H, W)."""
     return image * factor[..., None]
 
 
-def cv_colour(colour: NDArray[np.float32]) -> tuple[float, float, float]:
+def cv_colour(colour: Colour) -> tuple[float, float, float]:
+    """A colour as OpenCV's drawing functions take it."""
     return float(colour[0]), float(colour[1]), float(colour[2])
 
 
@@ -37,7 +40,7 @@ def draw_glyphs(
     rng: np.random.Generator,
     image: Rgb,
     box: tuple[int, int, int, int],
-    colour: NDArray[np.float32],
+    colour: Colour,
     *,
     rows: int,
 ) -> None:
@@ -107,6 +110,7 @@ def draw_shapes(rng: np.random.Generator, image: Rgb, count: int) -> None:
 
 
 def draw_cracks(rng: np.random.Generator, image: Rgb, count: int) -> None:
+    """Draw thin dark wandering lines over the image, in place."""
     height, width = image.shape[:2]
     for _ in range(count):
         steps = rng.normal(0, 5, (int(rng.integers(10, 40)), 2)) + rng.normal(0, 3, 2)

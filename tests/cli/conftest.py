@@ -1,0 +1,144 @@
+"""A small scene, a finished run of it, and the command as its users meet it."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import pytest
+
+from megloc_kapture.cli.main import main
+from megloc_kapture.io.images import read_image_rgb, write_image
+from megloc_kapture.io.kapture_store import KaptureFolder, Sensor, write_sensors
+
+# enough to localize all queries of the small scene
+SMALL = ("--set", "local_features.options.max_keypoints=800")
+
+
+@dataclass(frozen=True)
+class Done:
+    """How a command ended, and what it printed."""
+
+    status: int
+    out: str
+    err: str
+
+    def refused(self, *patterns: str) -> str:
+        """Check that it is a user's error, told in one line that has all the patterns in it."""
+        assert self.status == 2, self
+        assert self.out == "", self.out
+        lines = self.err.splitlines()
+        assert len(lines) == 1, self.err
+        assert lines[0].startswith("megloc: ")
+        for pattern in patterns:
+            assert re.search(pattern, lines[0]), f"{pattern!r} is not in {lines[0]!r}"
+        return lines[0]
+
+
+Command = Callable[..., Done]
+
+
+@pytest.fixture
+def megloc(capsys: pytest.CaptureFixture[str]) -> Command:
+    """Runs our command in this process."""
+
+    def run(*arguments: str | Path) -> Done:
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as end:
+            main([str(argument) for argument in arguments])
+        out, err = capsys.readouterr()
+        assert isinstance(end.value.code, int)
+        return Done(end.value.code, out, err)
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def scene(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """fountain_p11 at half its size: mapping/, query/ and query_gt/; not to be written into."""
+    root = tmp_path_factory.mktemp("scene")
+    for part in ("mapping", "query", "query_gt"):
+        folder = KaptureFolder(shared_data / "scenes" / "fountain_p11" / part)
+        data = folder.read()
+        halved = {}
+        for name, sensor in data.sensors.items():
+            camera = sensor.camera()
+            fx, fy, cx, cy = camera.params
+            half = replace(
+                camera,
+                width=camera.width // 2,
+                height=camera.height // 2,
+                params=(fx / 2, fy / 2, cx / 2, cy / 2),
+            )
+            halved[name] = Sensor.from_camera(half)
+        write_sensors(root / part, replace(data, sensors=halved))
+        for image in () if part == "query_gt" else data.image_names():
+            pixels = read_image_rgb(folder.image_path(image))
+            small = cv2.resize(pixels, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+            write_image(root / part / "sensors" / "records_data" / image, small)
+    return root
+
+
+@pytest.fixture(scope="session")
+def finished(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Workspace of a finished, undisturbed run on one core; not to be written into."""
+    workspace = tmp_path_factory.mktemp("finished") / "workspace"
+    places = ["--root", str(scene), "--workspace", str(workspace)]
+    with pytest.raises(SystemExit) as end:
+        main(["eval", "kapture", *places, *SMALL, "--executor", "inline", "--quiet"])
+    assert end.value.code == 0
+    return workspace
+
+
+@pytest.fixture
+def dataset(scene: Path, tmp_path: Path) -> Path:
+    """A copy of the scene, to be spoilt."""
+    return copy_of(scene, tmp_path / "dataset")
+
+
+@pytest.fixture
+def workspace(finished: Path, tmp_path: Path) -> Path:
+    """A copy of the finished workspace, to be worked on."""
+    return copy_of(finished, tmp_path / "workspace")
+
+
+@pytest.fixture
+def gallery(shared_data: Path, tmp_path: Path) -> Path:
+    """A copy of the foreign map and its queries whose images are links; to be spoilt."""
+    original = shared_data / "foreign_maps" / "virtual_gallery"
+    for part in ("map", "query", "query_gt"):
+        shutil.copytree(
+            original / part,
+            tmp_path / "gallery" / part,
+            ignore=shutil.ignore_patterns("records_data"),
+        )
+        images = original / part / "sensors" / "records_data"
+        if images.is_dir():
+            (tmp_path / "gallery" / part / "sensors" / "records_data").symlink_to(images.resolve())
+    return tmp_path / "gallery"
+
+
+def copy_of(folder: Path, place: Path) -> Path:
+    """A copy in which links stay links."""
+    shutil.copytree(folder, place, symlinks=True)
+    return place
+
+
+@pytest.fixture(scope="session")
+def contents() -> Callable[[Path], dict[str, bytes]]:
+    """Function: path below a folder -> bytes, of all files and of what links say."""
+
+    def read(root: Path) -> dict[str, bytes]:
+        found = {}
+        for path in sorted(root.rglob("*")):
+            if path.is_symlink():
+                found[str(path.relative_to(root))] = bytes(path.readlink())
+            elif path.is_file():
+                found[str(path.relative_to(root))] = path.read_bytes()
+        return found
+
+    return read

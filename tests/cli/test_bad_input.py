@@ -1,0 +1,383 @@
+"""Bad input: one line that names the file, exit status 2, nothing written, nothing changed."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from megloc_kapture.io.images import write_image
+
+Contents = Callable[[Path], dict[str, bytes]]
+Spoil = Callable[[Path], Any]
+
+TIMES = "sensors/trajectories.txt"
+RECORDS = "sensors/records_camera.txt"
+FIRST = "training/gallery_light1_loop1/frames/rgb/camera_0/rgb_00223.jpg"
+QUERY = "testing/gallery_light1_occlusion1/frames/rgb/camera_0/rgb_00267.jpg"
+KEYPOINTS, DESCRIPTORS = "reconstruction/keypoints/r2d2_500", "reconstruction/descriptors/r2d2_500"
+GLOBAL = "reconstruction/global_features/AP-GeM-LM18"
+
+
+def cut(name: str, size: int = -2) -> Spoil:
+    """Leave only so many bytes of a file."""
+    return lambda root: (root / name).write_bytes((root / name).read_bytes()[:size])
+
+
+def remove(name: str) -> Spoil:
+    return lambda root: (root / name).unlink()
+
+
+def line(name: str, number: int, change: Callable[[str], str]) -> Spoil:
+    """Change one line of a text file, counted from 1."""
+
+    def spoil(root: Path) -> None:
+        lines = (root / name).read_text().splitlines(keepends=True)
+        lines[number - 1] = change(lines[number - 1])
+        (root / name).write_text("".join(lines))
+
+    return spoil
+
+
+def fields(change: Callable[[list[str]], list[str]]) -> Callable[[str], str]:
+    return lambda text: ", ".join(change([f.strip() for f in text.split(",")])) + "\n"
+
+
+def quaternion_times(factor: float) -> Callable[[str], str]:
+    return fields(lambda f: [*f[:2], *(repr(factor * float(q)) for q in f[2:6]), *f[6:]])
+
+
+def again(number: int) -> Callable[[Path], Any]:
+    """Repeat a line of the trajectories."""
+    return line(TIMES, number, lambda text: text + text)
+
+
+NO_COLUMN = fields(lambda f: f[:-1])
+NAN = fields(lambda f: [*f[:-1], "nan"])
+UPWARDS = fields(lambda f: [*f[:2], "../../" + f[2]])
+PAST = fields(lambda f: [*f[:-1], "500"])
+NO_POINT = fields(lambda f: ["630", *f[1:]])
+
+# of the map: how to spoil it, and what the message has to say
+MAPS: dict[str, tuple[Spoil, str]] = {
+    "no sensors.txt": (remove("sensors/sensors.txt"), r"map/sensors/sensors\.txt: "),
+    "keypoints cut": (cut(f"{KEYPOINTS}/{FIRST}.kpt"), r"rgb_00223\.jpg\.kpt: .*truncated"),
+    "keypoints missing": (
+        remove(f"{KEYPOINTS}/{FIRST}.kpt"),
+        r"observations\.txt: points are observed in '.*rgb_00223\.jpg', which has no keypoints",
+    ),
+    "descriptors cut": (cut(f"{DESCRIPTORS}/{FIRST}.desc"), r"rgb_00223\.jpg\.desc: .*truncated"),
+    "global cut": (cut(f"{GLOBAL}/{FIRST}.gfeat"), r"rgb_00223\.jpg\.gfeat: .*truncated"),
+    "lengths differ": (
+        cut(f"{DESCRIPTORS}/{FIRST}.desc", 128 * 4 * 499),
+        r"rgb_00223\.jpg\.desc: 499 descriptors for 500 keypoints",
+    ),
+    "sensor column": (line("sensors/sensors.txt", 3, NO_COLUMN), r"sensors\.txt:3: "),
+    "pose column": (line(TIMES, 4, NO_COLUMN), r"trajectories\.txt:4: .*columns"),
+    "record column": (line(RECORDS, 5, NO_COLUMN), r"records_camera\.txt:5: .*columns"),
+    "point column": (
+        line("reconstruction/points3d.txt", 10, NO_COLUMN),
+        r"points3d\.txt:10: .*columns",
+    ),
+    "observation column": (
+        line("reconstruction/observations.txt", 7, NO_COLUMN),
+        r"observations\.txt:7: ",
+    ),
+    "config column": (line(f"{KEYPOINTS}/keypoints.txt", 3, NO_COLUMN), r"keypoints\.txt:3: "),
+    "pose of nan": (line(TIMES, 3, NAN), r"trajectories\.txt:3: .*nan"),
+    "pose not unit": (
+        line(TIMES, 3, quaternion_times(1.002)),
+        r"trajectories\.txt:3: .*unit quaternion",
+    ),
+    "pose twice": (again(4), r"trajectories\.txt:5: .*listed twice, first in line 4"),
+    "record twice": (
+        line(RECORDS, 4, lambda text: text + text.replace(".jpg", "_b.jpg")),
+        r"records_camera\.txt:5: timestamp .*listed twice, first in line 4",
+    ),
+    "path upwards": (line(RECORDS, 3, UPWARDS), r"records_camera\.txt:3: .*'\.\.'"),
+    "keypoint past the end": (
+        line("reconstruction/observations.txt", 9, PAST),
+        r"observations\.txt:9: keypoint id 500, but .* has 500 keypoints",
+    ),
+    "point past the end": (
+        line("reconstruction/observations.txt", 9, NO_POINT),
+        r"observations\.txt:9: point id 630, but there are 630 points",
+    ),
+}
+
+
+def localize(gallery: Path) -> list[str | Path]:
+    places: list[str | Path] = ["-i", gallery / "map", "--query", gallery / "query"]
+    return ["localize", *places, "-o", gallery.parent / "new" / "localized"]
+
+
+@pytest.mark.parametrize(("spoil", "message"), MAPS.values(), ids=MAPS)
+def test_localize_refuses_a_bad_map(
+    megloc: Any, gallery: Path, contents: Contents, spoil: Spoil, message: str
+) -> None:
+    spoil(gallery / "map")
+    before = contents(gallery)
+    megloc(*localize(gallery)).refused(message)
+    assert not (gallery.parent / "new").exists()
+    assert contents(gallery) == before
+
+
+@pytest.mark.parametrize(("spoil", "message"), MAPS.values(), ids=MAPS)
+def test_info_finds_the_same_faults(megloc: Any, gallery: Path, spoil: Spoil, message: str) -> None:
+    spoil(gallery / "map")
+    done = megloc("info", gallery / "map")
+    assert done.status == 2
+    if "no keypoints" in message:
+        message = r"rgb_00223\.jpg\.desc: image .* has descriptors but no keypoints"
+    assert re.fullmatch(f"megloc: .*{message}.*\n", done.err)
+
+
+QUERIES: dict[str, tuple[Spoil, str]] = {
+    "no records": (remove(RECORDS), r"query: there are no query images"),
+    "keypoints cut": (cut(f"{KEYPOINTS}/{QUERY}.kpt"), r"rgb_00267\.jpg\.kpt: .*truncated"),
+    "descriptors cut": (cut(f"{DESCRIPTORS}/{QUERY}.desc"), r"rgb_00267\.jpg\.desc: .*truncated"),
+    "global cut": (cut(f"{GLOBAL}/{QUERY}.gfeat"), r"rgb_00267\.jpg\.gfeat: .*truncated"),
+    "lengths differ": (
+        cut(f"{KEYPOINTS}/{QUERY}.kpt", 3 * 4 * 400),
+        r"rgb_00267\.jpg\.desc: 500 descriptors for 400 keypoints",
+    ),
+    "no features of one": (
+        remove(f"{KEYPOINTS}/{QUERY}.kpt"),
+        r"query: image '.*rgb_00267\.jpg' has no features of type 'r2d2_500'.*no extractor",
+    ),
+    "other descriptors": (
+        line(f"{DESCRIPTORS}/descriptors.txt", 3, lambda text: text.replace("128", "64")),
+        r"rgb_00\d+\.jpg\.desc: .*descriptors for|64 values, the map's 128",
+    ),
+    "path upwards": (line(RECORDS, 3, UPWARDS), r"records_camera\.txt:3: .*'\.\.'"),
+    "camera": (line("sensors/sensors.txt", 4, NO_COLUMN), r"sensors\.txt:4: "),
+}
+
+
+@pytest.mark.parametrize(("spoil", "message"), QUERIES.values(), ids=QUERIES)
+def test_localize_refuses_bad_queries(
+    megloc: Any, gallery: Path, spoil: Spoil, message: str
+) -> None:
+    spoil(gallery / "query")
+    megloc(*localize(gallery)).refused(message)
+    assert not (gallery.parent / "new").exists()
+
+
+def without_descriptors(root: Path) -> None:
+    for path in (root / DESCRIPTORS).rglob("*.*"):
+        if path.is_file():
+            path.unlink()
+
+
+def test_descriptors_that_nobody_can_extract_again(megloc: Any, gallery: Path) -> None:
+    without_descriptors(gallery / "map")
+    megloc(*localize(gallery)).refused(r"/map: .*'r2d2_500'", "no extractor")
+    assert not (gallery.parent / "new").exists()
+    told = megloc("info", gallery / "map").out
+    assert re.search("map descriptors .*no extractor .*not possible", told)
+
+
+def test_quaternions_almost_of_unit_length_are_normalised(
+    megloc: Any, gallery: Path, contents: Contents
+) -> None:
+    megloc(*localize(gallery))
+    place = gallery.parent / "new" / "localized"
+    expected = contents(place / "sensors")["trajectories.txt"]
+    line(TIMES, 3, quaternion_times(1.0009))(gallery / "map")
+    assert megloc(*localize(gallery)).status == 0
+    assert contents(place / "sensors")["trajectories.txt"] == expected
+
+
+SPECIAL: dict[str, tuple[list[str], str]] = {
+    "no map": (["-i", "{}/nowhere"], r"/nowhere: no such kapture folder"),
+    "no queries": (["--query", "{}/nowhere"], r"/nowhere: no such kapture folder"),
+    "no features folder": (["--features-dir", "{}/nowhere"], r"/nowhere: no such folder"),
+    "no pairs": (["--pairs", "{}/nowhere"], r"/nowhere: "),
+    "not a map": (["-i", "{}/query"], r"/query: no map to localize in"),
+    "no such type": (["--keypoints-type", "sift"], r"'sift'; there are: r2d2_500"),
+    "no such option": (["--set", "localisation.x=1"], r"option localisation"),
+    "bad value": (["--set", "localization.fallback=guess"], r"option localization\.fallback"),
+    "no value": (["--set", "localization"], r"--set takes key=value"),
+    "no such preset": (["--preset", "best"], r"unknown preset 'best'; known: classic"),
+    "no workers": (["--workers", "0"], r"0 workers"),
+}
+
+
+@pytest.mark.parametrize(("change", "message"), SPECIAL.values(), ids=SPECIAL)
+def test_arguments_that_cannot_be(
+    megloc: Any, gallery: Path, change: list[str], message: str
+) -> None:
+    megloc(*localize(gallery), *(text.format(gallery) for text in change)).refused(message)
+    assert not (gallery.parent / "new").exists()
+
+
+def test_pairs_with_an_image_that_is_not_in_the_map(megloc: Any, gallery: Path) -> None:
+    pairs = gallery.parent / "pairs.txt"
+    pairs.write_text(f"# query_image, map_image, score\n{QUERY}, nowhere.jpg, 1.0\n")
+    message = r"nowhere\.jpg, which is no image of the map"
+    megloc(*localize(gallery), "--pairs", pairs).refused(message)
+    assert not (gallery.parent / "new").exists()
+
+
+@pytest.mark.parametrize("kind", ["file", "folder"])
+def test_localize_leaves_what_others_wrote(megloc: Any, gallery: Path, kind: str) -> None:
+    place = gallery.parent / "new" / "localized"
+    place.parent.mkdir()
+    if kind == "file":
+        place.write_text("mine")
+    else:
+        place.mkdir()
+        (place / "thesis.txt").write_text("mine")
+    megloc(*localize(gallery)).refused(str(place))
+    left = [str(p.relative_to(place.parent)) for p in place.parent.rglob("*")]
+    assert left == (["localized"] if kind == "file" else ["localized", "localized/thesis.txt"])
+
+
+# ------------------------------------------------------------------ megloc eval kapture
+
+
+def not_an_image(root: Path) -> None:
+    (root / "query/sensors/records_data/0004.jpg").write_text("GIF? no.\n")
+
+
+def other_size(root: Path) -> None:
+    place = root / "query/sensors/records_data/0004.jpg"
+    write_image(place, np.zeros((100, 200, 3), np.uint8))
+
+
+def no_poses(root: Path) -> None:
+    (root / "mapping" / TIMES).unlink()
+
+
+DATASETS: dict[str, tuple[Spoil, str]] = {
+    "no query": (remove("query/sensors/sensors.txt"), r"dataset: query/sensors/sensors\.txt"),
+    "image missing": (
+        remove("mapping/sensors/records_data/0005.jpg"),
+        r"mapping/sensors/records_data/0005\.jpg: ",
+    ),
+    "not an image": (not_an_image, r"records_data/0004\.jpg: not an image"),
+    "other size": (other_size, r"records_data/0004\.jpg: .*200x100.*768x512"),
+    "pose column": (line(f"mapping/{TIMES}", 4, NO_COLUMN), r"mapping/.*trajectories\.txt:4: "),
+    "true pose column": (line(f"query_gt/{TIMES}", 4, NO_COLUMN), r"query_gt/.*txt:4: "),
+    "pose of nan": (line(f"mapping/{TIMES}", 3, NAN), r"mapping/.*trajectories\.txt:3: .*nan"),
+    "pose not unit": (
+        line(f"mapping/{TIMES}", 3, quaternion_times(0.998)),
+        r"trajectories\.txt:3: .*unit quaternion",
+    ),
+    "record twice": (
+        line(f"mapping/{RECORDS}", 4, lambda text: text + text.replace(".jpg", "_b.jpg")),
+        r"records_camera\.txt:5: timestamp .*listed twice, first in line 4",
+    ),
+    "path upwards": (
+        line(f"query/{RECORDS}", 3, fields(lambda f: [*f[:2], "a/../../" + f[2]])),
+        r"records_camera\.txt:3: .*'\.\.'",
+    ),
+    "no poses": (no_poses, r"mapping: no mapping image has a pose"),
+}
+
+
+@pytest.mark.parametrize(("spoil", "message"), DATASETS.values(), ids=DATASETS)
+@pytest.mark.parametrize("command", ["eval", "import"])
+def test_a_bad_dataset_is_refused(
+    megloc: Any, dataset: Path, contents: Contents, command: str, spoil: Spoil, message: str
+) -> None:
+    spoil(dataset)
+    before = contents(dataset)
+    new = dataset.parent / "new"
+    arguments = {
+        "eval": ["eval", "kapture", "--root", dataset, "--workspace", new / "run", "--quiet"],
+        "import": ["import", "kapture", dataset, "-o", new / "imported"],
+    }[command]
+    megloc(*arguments).refused(message)
+    assert not new.exists()
+    assert contents(dataset) == before
+
+
+def test_a_truncated_image_stops_the_run_where_it_is_read(megloc: Any, dataset: Path) -> None:
+    cut("query/sensors/records_data/0004.jpg", 20_000)(dataset)
+    run = dataset.parent / "run"
+    done = megloc(
+        *("eval", "kapture", "--root", dataset, "--workspace", run),
+        *("--executor", "inline", "--quiet"),
+    )
+    done.refused(r"records_data/0004\.jpg: .*(broken|truncated)")
+    assert not (run / "local_features").exists()
+    assert [path.name for path in (run / "stages").glob("[a-z]*.json")] == ["import.json"]
+
+
+EVALUATION: dict[str, tuple[list[str], str]] = {
+    "no root": (["eval", "kapture"], r"dataset kapture needs --root"),
+    "no such root": (["eval", "kapture", "--root", "{}/nowhere"], r"/nowhere: no such folder"),
+    "no such dataset": (["eval", "venice"], r"unknown dataset 'venice'; known: kapture"),
+    "no such stage": (["eval", "kapture", "--root", "{}", "--from", "lunch"], r"no stage 'lunch'"),
+    "not done": (
+        ["eval", "kapture", "--root", "{}", "--from", "localization"],
+        r"needs stage import, which has not run",
+    ),
+    "backwards": (
+        ["eval", "kapture", "--root", "{}", "--from", "localization", "--until", "import"],
+        r"--until import stands before --from localization",
+    ),
+    "no such plugin": (
+        ["eval", "kapture", "--root", "{}", "--set", "local_features.name=orb"],
+        r"no plugin 'orb' .*registered: .*rootsift",
+    ),
+    "plugin's option": (
+        ["eval", "kapture", "--root", "{}", "--set", "local_features.options.max_keypoints=many"],
+        r"'rootsift' refuses its options: .*max_keypoints",
+    ),
+    "no config": (["eval", "kapture", "--root", "{}", "--config", "{}/x"], r"/x: "),
+    "threshold": (["eval", "kapture", "--root", "{}", "--thresholds", "near"], r"'near'"),
+    "share": (["eval", "kapture", "--root", "{}", "--fail-below", "60"], r"between 0 and 1"),
+    "never judged": (
+        ["eval", "kapture", "--root", "{}", "--fail-below", "0.5", "--until", "import"],
+        r"--fail-below needs stage evaluation",
+    ),
+    "prefix": (["eval", "kapture", "--root", "{}", "--query-prefix", "../up"], r"'\.\.'"),
+    "workers": (["eval", "kapture", "--root", "{}", "--workers", "-1"], r"-1 workers"),
+}
+
+
+@pytest.mark.parametrize(("arguments", "message"), EVALUATION.values(), ids=EVALUATION)
+def test_eval_that_cannot_be(
+    megloc: Any, scene: Path, tmp_path: Path, arguments: list[str], message: str
+) -> None:
+    given = [argument.format(scene) for argument in arguments]
+    megloc(*given, "--workspace", tmp_path / "a" / "b", "--quiet").refused(message)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_fail_below_without_truth_is_refused_before_the_work(megloc: Any, dataset: Path) -> None:
+    shutil.rmtree(dataset / "query_gt")
+    run = dataset.parent / "run"
+    arguments = ["--root", dataset, "--workspace", run, "--fail-below", "0.5"]
+    megloc("eval", "kapture", *arguments).refused(r"dataset/query_gt is missing")
+    assert not run.exists()
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["evaluate", "--gt", "{}/nowhere", "-i", "{}/query_gt"],
+        ["evaluate", "--gt", "{}/query_gt", "-i", "{}/nowhere"],
+        ["submit", "kapture", "-i", "{}/nowhere", "-o", "{}/new/poses.txt"],
+        ["extract-local", "-i", "{}/nowhere", "-o", "{}/new"],
+        ["extract-global", "-i", "{}/nowhere", "-o", "{}/new"],
+        ["pairs-mapping", "-i", "{}/nowhere", "-o", "{}/new/pairs.txt"],
+        ["pairs-query", "-i", "{}/mapping", "--query", "{}/nowhere", "-o", "{}/new/pairs.txt"],
+        ["match", "-i", "{}/nowhere", "--pairs", "{}/pairs.txt", "-o", "{}/new"],
+        ["triangulate", "-i", "{}/nowhere", "-o", "{}/new"],
+        ["info", "{}/nowhere"],
+    ],
+    ids=lambda arguments: arguments[0],
+)
+def test_every_command_names_what_is_missing(
+    megloc: Any, dataset: Path, arguments: list[str]
+) -> None:
+    megloc(*(argument.format(dataset) for argument in arguments)).refused("/nowhere|/mapping")
+    assert not (dataset / "new").exists()
