@@ -11,8 +11,9 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
-from megloc_kapture.errors import PluginError
+from megloc_kapture.errors import MeglocError, PluginError
 from megloc_kapture.values import LocalFeatures
 
 LOCAL_FEATURES = "megloc_kapture.local_features"
@@ -87,7 +88,15 @@ def load_plugin(group: str, name: str, options: dict[str, Any] | None = None) ->
                 raise ValueError(f"it takes no options, got {sorted(options)}")
             return kind()
         return kind(model(**(options or {})))
-    except (TypeError, ValueError) as error:
+    except MeglocError:
+        raise
+    except ValidationError as error:
+        first = error.errors()[0]
+        option = ".".join(str(part) for part in first["loc"])
+        raise PluginError(
+            f"plugin {name!r} refuses its options: {option}: {first['msg']}"
+        ) from error
+    except Exception as error:  # whatever a foreign constructor raises
         reason = " ".join(str(error).split())
         raise PluginError(f"plugin {name!r} refuses its options: {reason}") from error
 

@@ -54,7 +54,9 @@ def pycolmap_sift(max_keypoints: int) -> Extract:
     extractor = pycolmap.Sift(options)
 
     def extract(image: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        keypoints, descriptors = extractor.extract(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+        gray = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+        found: tuple[NDArray[np.float32], NDArray[np.float32]] = extractor.extract(gray)
+        keypoints, descriptors = found
         descriptors = np.asarray(descriptors, dtype=np.float32)
         # sorted by scale; it keeps whole octaves, so that the number must be cut by hand
         order = np.argsort(-np.asarray(keypoints)[:, 2], kind="stable")[:max_keypoints]

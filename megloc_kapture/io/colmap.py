@@ -153,6 +153,10 @@ def triangulate(
     if not images:
         return TriangulatedPoints(np.zeros((0, 3)), np.zeros(0), empty, empty, empty)
     for (i, j), pairs in matches.items():
+        if i == j or (j, i) in matches:
+            raise DataError(
+                f"images {images[i].name} and {images[j].name} are matched twice or are the same"
+            )
         sizes = np.array([len(images[i].keypoints_px), len(images[j].keypoints_px)])
         if len(pairs) and ((np.asarray(pairs) >= sizes).any() or (np.asarray(pairs) < 0).any()):
             raise DataError(

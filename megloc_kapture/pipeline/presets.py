@@ -101,7 +101,20 @@ def options_of_preset(
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
+        if first["type"] == "extra_forbidden":
+            raise OptionError(f"unknown option {where}; known here: {_known(where)}") from error
         raise OptionError(f"option {where}: {first['msg']}") from error
+
+
+def _known(path: str) -> str:
+    """The options beside one that does not exist."""
+    model: Any = PipelineOptions
+    for part in path.split(".")[:-1]:
+        annotation = model.model_fields[part].annotation if part in model.model_fields else None
+        if not (isinstance(annotation, type) and issubclass(annotation, Options)):
+            break
+        model = annotation
+    return ", ".join(sorted(model.model_fields))
 
 
 def _merge(tree: dict[str, Any], changes: dict[str, Any]) -> None:

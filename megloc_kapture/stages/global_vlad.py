@@ -62,7 +62,7 @@ def vlad_type(local_type: str) -> str:
 def train_on_map(
     descriptors: FeatureReader, images: Sequence[str], options: VladOptions
 ) -> Vocabulary:
-    """Train the vocabulary on the map images' descriptors, the same number from each image."""
+    """Train the vocabulary on the map images' descriptors, the same share of each image's."""
     counts = [descriptors.length(image) for image in images]
     rows = sample_rows(counts, options.training_descriptors, options.seed)
     sampled = [

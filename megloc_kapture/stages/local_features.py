@@ -55,6 +55,8 @@ def extract_local_features(
     )
     if duplicates:
         raise DataError(f"image {duplicates[0]} stands in two kapture folders at once")
+    if not jobs:
+        raise DataError("there are no images to extract features from")
     total = 0
     keypoint_writer: FeatureWriter | None = None
     descriptor_writer: FeatureWriter | None = None
@@ -96,7 +98,7 @@ def _writers(
         np.dtype(features.descriptors.dtype),
         features.descriptors.shape[1],
         keypoints_type=name,
-        metric_type="L2",
+        metric_type=getattr(extractor, "metric", "L2"),
     )
     return (
         FeatureWriter(output, "keypoints", name, keypoints, orphan=True),

@@ -92,7 +92,16 @@ def match_pairs(
     """
     specs = [FolderSpec(f.root, f.features_dirs) for f in (first, second)]
     jobs = []
-    ordered = sorted({(pair.query, pair.map) for pair in pairs})
+    within_one = first.root == second.root
+    ordered = sorted(
+        {
+            # within a map (a, b) and (b, a) are one pair, kept in one file
+            (min(pair.query, pair.map), max(pair.query, pair.map))
+            if within_one
+            else (pair.query, pair.map)
+            for pair in pairs
+        }
+    )
     for image, group in groupby(ordered, key=lambda pair: pair[0]):
         others = tuple(other for _, other in group)
         jobs.append(_Job(specs[0], specs[1], local_type, matcher, verification, image, others))

@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from megloc_kapture.errors import DataError
 from megloc_kapture.io.csv_table import write_csv_table
 from megloc_kapture.io.kapture_store import (
     ImagePair,
@@ -50,8 +51,16 @@ class _Job:
 
 
 def index_map(folder: KaptureFolder, local_type: str) -> MapIndex:
-    """Read the points and observations of one keypoints type into an index."""
-    observations = folder.observations()[local_type]
+    """Read the points and observations of one keypoints type into an index.
+
+    Raises
+    ------
+    DataError : no observations of the type.
+    """
+    seen = folder.observations()
+    if local_type not in seen:
+        raise DataError(f"the map has no observations of type {local_type!r}", path=folder.root)
+    observations = seen[local_type]
     return MapIndex.build(
         folder.points3d()[:, :3],
         observations.image_names,

@@ -1,0 +1,89 @@
+"""A full disk: one line, exit status 2, nothing half-written, and room for another try."""
+
+from __future__ import annotations
+
+import resource
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+PROGRAM = str(Path(sys.executable).with_name("megloc"))
+
+
+def mounted(place: Path, size: str, *options: str) -> None:
+    place.mkdir(exist_ok=True)
+    flags = ",".join([f"size={size}", *options])
+    subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", flags, "tmpfs", str(place)], check=True, capture_output=True
+    )
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Callable[..., Path]]:
+    """Function that makes a disk of a size, and changes it; needs the right to mount."""
+    place = tmp_path / "disk"
+
+    def make(size: str, *options: str) -> Path:
+        try:
+            mounted(place, size, *options)
+        except (OSError, subprocess.CalledProcessError) as error:
+            pytest.skip(f"no right to mount a small disk: {error}")
+        return place
+
+    yield make
+    subprocess.run(["umount", str(place)], check=False, capture_output=True)
+
+
+def test_eval_stops_cleanly_and_goes_on(
+    megloc: Any, scene: Path, finished: Path, small_disk: Callable[..., Path]
+) -> None:
+    workspace = small_disk("1m") / "workspace"
+    arguments = ["--root", scene, "--workspace", workspace, "--quiet", "--executor", "inline"]
+    arguments += ["--set", "local_features.options.max_keypoints=800"]
+    done = megloc("eval", "kapture", *arguments)
+    done.refused(r"/workspace/\.partial/local_features/.*: cannot write: No space left on device")
+    assert not (workspace / "local_features").exists()
+    assert list((workspace / ".partial").iterdir()) == []
+    assert (workspace / "stages" / "import.json").is_file()
+    small_disk("100m", "remount")
+    assert megloc("eval", "kapture", *arguments).status == 0
+    name = "submissions/kapture_eval_megloc-classic.txt"
+    assert (workspace / name).read_bytes() == (finished / name).read_bytes()
+
+
+@pytest.mark.parametrize("pages", [1, 2, 4])
+def test_localize_leaves_nothing(
+    megloc: Any, gallery: Path, small_disk: Callable[..., Path], pages: int
+) -> None:
+    disk = small_disk(f"{4 * pages}k")
+    done = megloc(
+        *("localize", "-i", gallery / "map", "--query", gallery / "query"),
+        *("-o", disk / "new" / "localized"),
+    )
+    done.refused(f"{disk}/new/localized.*: cannot write: No space left on device")
+    assert list(disk.iterdir()) == []
+
+
+def test_localize_leaves_nothing_where_files_may_not_grow(gallery: Path, tmp_path: Path) -> None:
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (200, 200))
+
+    done = subprocess.run(
+        [
+            *(PROGRAM, "localize", "-i", str(gallery / "map"), "--query", str(gallery / "query")),
+            *("-o", str(tmp_path / "new" / "localized"), "--quiet"),
+        ],
+        preexec_fn=limit,
+        capture_output=True,
+        text=True,
+    )
+    assert (done.returncode, done.stdout) == (2, "")
+    lines = done.stderr.splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith(f"megloc: {tmp_path}/new/localized/")
+    assert "cannot write" in lines[0]
+    assert not (tmp_path / "new").exists()

@@ -1,0 +1,96 @@
+"""The command as such: help, errors of the command line, tracebacks, pipes."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from megloc_kapture.cli.arguments import summary
+from megloc_kapture.cli.main import COMMANDS
+
+BAD_ARGUMENTS = {
+    "no command": ([], r"Missing subcommand: Expected one of \{eval, import"),
+    "unknown command": (["evil"], r"Unrecognized options: evil; Available subcommands: eval, "),
+    "missing flags": (
+        ["localize", "-i", "map"],
+        r"Missing from megloc localize: --query PATH, -o PATH, --output PATH; see megloc localize",
+    ),
+    "unknown flag": (["eval", "kapture", "--roots", "x"], r"Unrecognized options: --roots, x; see"),
+    "unknown long flag": (["eval", "--" + 100 * "x"], r"Unrecognized options: --x{100}; see"),
+    "no value": (["eval", "--set"], r"Missing value for argument '--set'"),
+    "not a number": (["eval", "--workers", "two"], r"Error parsing --workers: .*'two'.*; see"),
+    "not a choice": (["eval", "-v", "loud"], r"invalid choice 'loud' .*'debug', 'info'"),
+    "too many": (["info", "a", "b"], r"Unrecognized options: b; see megloc"),
+}
+
+
+@pytest.mark.parametrize(("arguments", "message"), BAD_ARGUMENTS.values(), ids=BAD_ARGUMENTS)
+def test_argument_errors_are_one_line(megloc: Any, arguments: list[str], message: str) -> None:
+    line = megloc(*arguments).refused(message)
+    assert "megloc" in line and "--help" in line
+    assert not set("│╭╰─") & set(line)
+
+
+def test_a_wrapped_box_becomes_one_line() -> None:
+    drawn = (
+        "\x1b[31m╭─\x1b[0m \x1b[31m\x1b[1mRequired options\x1b[0m ──────╮\n"
+        "│ Missing from megloc submit: │\n"
+        "│     -i PATH, --input PATH   │\n"
+        "│         Localized kapture   │\n"
+        "│         folder. (required)  │\n"
+        "│     -o PATH, --output PATH  │\n"
+        "│         Pose file.          │\n"
+        "│ ─────────────────────────── │\n"
+        "│ For full helptext, run:     │\n"
+        "│     megloc submit --help    │\n"
+        "╰─────────────────────────────╯\n"
+    )
+    assert summary(drawn) == (
+        "Missing from megloc submit: -i PATH, --input PATH, -o PATH, --output PATH; "
+        "see megloc submit --help"
+    )
+    assert summary("something else\nentirely\n") == "something else entirely; see megloc --help"
+
+
+@pytest.mark.parametrize("flag", ["-h", "--help"])
+@pytest.mark.parametrize("command", [None, *COMMANDS])
+def test_help(megloc: Any, command: str | None, flag: str) -> None:
+    done = megloc(*([command] if command else []), flag)
+    assert (done.status, done.err) == (0, "")
+    if command is None:
+        assert all(name in done.out for name in COMMANDS)
+    else:
+        assert done.out.startswith(f"usage: megloc {command} ")
+
+
+def test_the_traceback_is_shown_with_debug_only(megloc: Any, tmp_path: Path) -> None:
+    place = tmp_path / "nowhere"
+    told = f"megloc: {place}: no such kapture folder\n"
+    assert megloc("info", place).err == told
+    done = megloc("info", place, "--debug")
+    assert done.status == 2
+    assert done.err.startswith("Traceback (most recent call last):\n")
+    assert "\nmegloc_kapture.errors.DataError: " in done.err
+    assert done.err.endswith(told)
+
+
+def test_who_stops_reading_gets_no_complaint(gallery: Path) -> None:
+    program = str(Path(sys.executable).with_name("megloc"))
+    for arguments in (["info", str(gallery / "map")], ["eval", "--help"]):
+        command = subprocess.Popen(
+            [program, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, bufsize=0
+        )
+        assert command.stdout is not None and command.stderr is not None
+        command.stdout.close()
+        assert command.stderr.read() == b""
+        assert command.wait() == 0
+
+
+def test_doctor_finds_no_problem_here(megloc: Any) -> None:
+    done = megloc("doctor")
+    assert (done.status, done.err) == (0, "")
+    assert "pycolmap" in done.out and done.out.endswith("no problem found\n")
