@@ -10,7 +10,7 @@ import sys
 from collections.abc import Iterator, Sequence
 
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
-_RULE = re.compile(r"[─\s]+")
+_RULE = re.compile(r"[─-]{3,}")
 # what the box says besides: where help is found, and the help itself
 _BESIDES = ("For full helptext", "Argument helptext", "Perhaps you meant", "Got errors")
 # help of a flag stands two steps in, its name one
@@ -40,22 +40,20 @@ def one_line_errors(arguments: Sequence[str]) -> Iterator[None]:
 
 def summary(drawn: str) -> str:
     """The text of a drawn box without its frame and what stands in it besides, on one line."""
-    title = ""
+    first, *lines = _COLOUR.sub("", drawn).splitlines() or [""]
+    # where standard output knows no more than ASCII, the frame is of blanks, with a rule
+    if not (first.startswith("╭") or (lines and _RULE.fullmatch(lines[0].strip()))):
+        return " ".join(drawn.split()) or "the arguments cannot be used"
+    title = first.strip("╭─╮ ")
     sections: list[list[str]] = [[]]
-    for line in _COLOUR.sub("", drawn).splitlines():
-        if line.startswith("╭"):
-            title = line.strip("╭─╮ ")
-            continue
-        text = line.removeprefix("│ ").removesuffix("│").rstrip()
-        if line.startswith("╰") or text.startswith(_HELP_INDENT):
-            continue
+    for line in lines:
+        text = line[2:].rstrip(" │╯")
         if not text or _RULE.fullmatch(text):
             sections.append([])
-        else:
+        elif not text.startswith(_HELP_INDENT):
             sections[-1].append(text)
     told = [_joined(s) for s in sections if s and not s[0].startswith(_BESIDES)]
-    if not told:
-        return " ".join(drawn.split()) or "the arguments cannot be used"
+    told = told or [title]
     helped = re.search(r"megloc(?: [a-z-]+)? --help", drawn)
     if not told[0].startswith((title, "Missing", "Error", "invalid")):
         told[0] = f"{title}: {told[0]}"

@@ -17,10 +17,12 @@ def link_images(source_root: Path, output_root: Path) -> None:
     for name in ("records_data", "masks"):
         source = Path(source_root).resolve() / "sensors" / name
         place = Path(output_root) / "sensors" / name
-        if not source.exists() or place.is_symlink():
+        if not source.exists():
             continue
         try:
             place.parent.mkdir(parents=True, exist_ok=True)
+            if place.is_symlink():
+                place.unlink()
             place.symlink_to(source.resolve(), target_is_directory=True)
         except OSError as error:
             raise output_error(place, error) from error

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from megloc_kapture.datasets.kapture_folders import MAPPING, QUERY, QUERY_GT, check_root
-from megloc_kapture.datasets.synthetic.options import SyntheticWorldOptions
+from megloc_kapture.datasets.kapture_folders import QUERY_GT, check_root
+from megloc_kapture.datasets.synthetic.options import SYNTHETIC_VERSION, SyntheticWorldOptions
 from megloc_kapture.errors import OptionError
-from megloc_kapture.io.kapture_store import KaptureFolder
 from megloc_kapture.stages.parallel import Track
 
 DATASETS = ("kapture", "synthetic")
@@ -47,15 +46,15 @@ class DatasetChoice:
         def render(out: Path) -> Mapping[str, float]:
             from megloc_kapture.datasets.synthetic.writing import write_synthetic_kapture
 
-            write_synthetic_kapture(out / "world", options, executor=executor, track=track)
-            folders = [KaptureFolder(out / "world" / part) for part in (MAPPING, QUERY)]
-            return {"images": sum(len(folder.read().image_names()) for folder in folders)}
+            return write_synthetic_kapture(out / "world", options, executor=executor, track=track)
 
         return render
 
     def render_options(self) -> dict[str, Any]:
         """What determines the rendered world."""
-        return {} if self.world is None else self.world.model_dump(mode="json")
+        if self.world is None:
+            return {}
+        return {"version": SYNTHETIC_VERSION, "world": self.world.model_dump(mode="json")}
 
 
 def choose_dataset(name: str, root: Path | None) -> DatasetChoice:

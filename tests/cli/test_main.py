@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -35,25 +36,59 @@ def test_argument_errors_are_one_line(megloc: Any, arguments: list[str], message
     assert not set("│╭╰─") & set(line)
 
 
-def test_a_wrapped_box_becomes_one_line() -> None:
-    drawn = (
-        "\x1b[31m╭─\x1b[0m \x1b[31m\x1b[1mRequired options\x1b[0m ──────╮\n"
-        "│ Missing from megloc submit: │\n"
-        "│     -i PATH, --input PATH   │\n"
-        "│         Localized kapture   │\n"
-        "│         folder. (required)  │\n"
-        "│     -o PATH, --output PATH  │\n"
-        "│         Pose file.          │\n"
-        "│ ─────────────────────────── │\n"
-        "│ For full helptext, run:     │\n"
-        "│     megloc submit --help    │\n"
-        "╰─────────────────────────────╯\n"
-    )
+COLOURED = (
+    "\x1b[31m╭─\x1b[0m \x1b[31m\x1b[1mRequired options\x1b[0m ──────╮\n"
+    "│ Missing from megloc submit: │\n"
+    "│     -i PATH, --input PATH   │\n"
+    "│         Localized kapture   │\n"
+    "│         folder. (required)  │\n"
+    "│     -o PATH, --output PATH  │\n"
+    "│         Pose file.          │\n"
+    "│ ─────────────────────────── │\n"
+    "│ For full helptext, run:     │\n"
+    "│     megloc submit --help    │\n"
+    "╰─────────────────────────────╯\n"
+)
+ASCII = (
+    " Required options              \n"
+    " ----------------------------- \n"
+    "  Missing from megloc submit:  \n"
+    "      -i PATH, --input PATH    \n"
+    "          Localized kapture    \n"
+    "          folder. (required)   \n"
+    "      -o PATH, --output PATH   \n"
+    "          Pose file.           \n"
+    "  ---------------------------  \n"
+    "  For full helptext, run:      \n"
+    "      megloc submit --help     \n"
+    "                               \n"
+)
+
+
+@pytest.mark.parametrize("drawn", [COLOURED, ASCII], ids=["coloured", "ascii"])
+def test_a_drawn_box_becomes_one_line(drawn: str) -> None:
     assert summary(drawn) == (
         "Missing from megloc submit: -i PATH, --input PATH, -o PATH, --output PATH; "
         "see megloc submit --help"
     )
-    assert summary("something else\nentirely\n") == "something else entirely; see megloc --help"
+
+
+def test_what_is_no_box_is_told_as_it_is() -> None:
+    assert summary("something\n\nelse entirely\n") == "something else entirely"
+    assert summary("") == "the arguments cannot be used"
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "utf-8"])
+def test_argument_errors_are_one_line_in_a_terminal_of_any_width(encoding: str) -> None:
+    program = str(Path(sys.executable).with_name("megloc"))
+    done = subprocess.run(
+        [program, "triangulate", "--input", "x"],
+        env=os.environ | {"PYTHONIOENCODING": encoding, "COLUMNS": "40"},
+        capture_output=True,
+        text=True,
+    )
+    told = "megloc: Missing from megloc triangulate: -o PATH, --output PATH; see megloc "
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", told + "triangulate --help\n")
 
 
 @pytest.mark.parametrize("flag", ["-h", "--help"])

@@ -10,6 +10,9 @@ from pydantic import Field
 
 from megloc_kapture.values import Options
 
+# raise when the same options draw other pixels or other files than before
+SYNTHETIC_VERSION = 1
+
 
 class SyntheticWorldOptions(Options):
     """What the synthetic world contains and how its images are taken.

@@ -8,12 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from megloc_kapture.datasets.synthetic import cache
-from megloc_kapture.datasets.synthetic.cache import cached_synthetic_kapture, fingerprint
 from megloc_kapture.datasets.synthetic.options import SyntheticWorldOptions
 from megloc_kapture.datasets.synthetic.world import SyntheticWorld, build_world
 from megloc_kapture.datasets.synthetic.writing import depth_name, write_synthetic_kapture
-from megloc_kapture.errors import OutputError
 from megloc_kapture.io.depth_maps import read_depth_map
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture_store import KaptureFolder, to_kapture
@@ -128,56 +125,6 @@ def test_processes_write_the_same_bytes(root: Path, tmp_path: Path) -> None:
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as executor:
         write_synthetic_kapture(tmp_path, SMALL, executor)
     assert hashes(tmp_path) == hashes(root)
-
-
-TINY = SMALL.model_copy(
-    update={
-        "num_places": 1,
-        "stations_per_place": 3,
-        "night_queries": 0,
-        "width": 64,
-        "height": 48,
-        "depth": False,
-        "masks": False,
-        "image_format": "png",
-    }
-)
-
-
-def test_the_cache_draws_once(tmp_path: Path) -> None:
-    first = cached_synthetic_kapture(tmp_path, TINY)
-    assert first == tmp_path / f"synthetic-{fingerprint(TINY)}"
-    before = {p: p.stat().st_mtime_ns for p in first.rglob("*")}
-    assert cached_synthetic_kapture(tmp_path, TINY) == first
-    assert {p: p.stat().st_mtime_ns for p in first.rglob("*")} == before
-    assert any(p.suffix == ".png" for p in before)
-    assert [p.name for p in tmp_path.iterdir() if p.is_dir()] == [first.name]
-
-
-def test_an_unfinished_world_is_not_used(tmp_path: Path) -> None:
-    # as a killed run leaves it
-    unfinished = tmp_path / f".synthetic-{fingerprint(TINY)}.unfinished"
-    (unfinished / "mapping").mkdir(parents=True)
-    (unfinished / "mapping" / "stale.txt").write_text("stale")
-    place = cached_synthetic_kapture(tmp_path, TINY)
-    assert not (place / "mapping" / "stale.txt").exists()
-    assert not unfinished.exists()
-    KaptureFolder(place / "mapping").validate()
-
-
-def test_a_run_that_fails_leaves_no_world(tmp_path: Path) -> None:
-    blocked = tmp_path / "file"
-    blocked.write_text("")
-    with pytest.raises(OutputError, match="file"):
-        cached_synthetic_kapture(blocked / "cache", TINY)
-
-
-def test_the_fingerprint_depends_on_options_and_version(monkeypatch: pytest.MonkeyPatch) -> None:
-    plain = fingerprint(TINY)
-    assert fingerprint(TINY.model_copy(update={"seed": 1})) != plain
-    assert fingerprint(TINY.model_copy(update={"jpeg_quality": 50})) != plain
-    monkeypatch.setattr(cache, "SYNTHETIC_VERSION", -1)
-    assert fingerprint(TINY) != plain
 
 
 @pytest.mark.parametrize(

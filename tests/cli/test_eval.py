@@ -1,0 +1,431 @@
+"""``megloc eval``: what runs again and what does not, and that the result is always the same."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from megloc_kapture.io.images import write_image
+from megloc_kapture.io.kapture_store import KaptureFolder, read_pairs
+from megloc_kapture.io.status_table import read_status
+from megloc_kapture.pipeline.workspace import Workspace
+
+Contents = Callable[[Path], dict[str, bytes]]
+
+STAGES = (
+    "import",
+    "local_features",
+    "global_features",
+    "mapping_pairs",
+    "mapping_matches",
+    "triangulation",
+    "query_pairs",
+    "query_matches",
+    "localization",
+    "submission",
+    "evaluation",
+)
+POSES = "submissions/kapture_eval_megloc-classic.txt"
+# dates and durations stand in these, and nowhere else
+DATED = ("stages/", "timing.csv")
+
+
+@pytest.fixture
+def evaluate(megloc: Any) -> Callable[..., Any]:
+    """Runs ``megloc eval kapture`` as the finished run was."""
+
+    def run(root: Path, workspace: Path, *arguments: str, status: int = 0) -> Any:
+        done = megloc(
+            *("eval", "kapture", "--root", root, "--workspace", workspace),
+            *("--set", "local_features.options.max_keypoints=800"),
+            *(() if "--executor" in arguments else ("--executor", "inline")),
+            *arguments,
+        )
+        assert done.status == status, done.err
+        return done
+
+    return run
+
+
+def states(err: str) -> dict[str, str]:
+    """Stage -> what the last line about it says, of those that have one."""
+    told = dict(line.split(": ", 1) for line in err.splitlines() if ": " in line)
+    return {stage: told[stage] for stage in STAGES if stage in told}
+
+
+def ran(err: str) -> list[str]:
+    """The stages that have been run."""
+    return [stage for stage, told in states(err).items() if told.endswith(" s")]
+
+
+def reasons(err: str) -> dict[str, str]:
+    """Why a stage was run, as told before it was."""
+    found: dict[str, str] = {}
+    for line in err.splitlines():
+        stage, _, told = line.partition(": ")
+        if stage in STAGES:
+            found.setdefault(stage, told)
+    return found
+
+
+def lasting(found: dict[str, bytes], *but: str) -> dict[str, bytes]:
+    """What has to be the same in every run."""
+    return {n: c for n, c in found.items() if not n.startswith((*DATED, *but))}
+
+
+# ------------------------------------------------------------------ what is there at the end
+
+
+def test_the_workspace_has_what_is_promised(finished: Path) -> None:
+    for place in (
+        *("mapping", "query", "query_gt", "megloc/protocol.json", "map", "localized"),
+        *("local_features/rootsift/keypoints/keypoints.txt", "pairs/mapping.txt"),
+        *("local_features/rootsift/descriptors/descriptors.txt", "pairs/query.txt"),
+        "global_features/vlad_rootsift/global_features/global_features.txt",
+        "matches/mapping/local_features/rootsift/matches",
+        "matches/query/local_features/rootsift/matches",
+        *("map/reconstruction/points3d.txt", "map/reconstruction/observations.txt"),
+        *("localized/sensors/trajectories.txt", "localized/status.csv", "timing.csv"),
+        *(POSES, POSES + ".json"),
+        *("evaluation/recall.json", "evaluation/recall.txt", "evaluation/report.html"),
+        *(f"stages/{stage}.json" for stage in STAGES),
+    ):
+        assert (finished / place).exists(), place
+    assert list((finished / ".partial").iterdir()) == []
+
+
+def test_images_are_links_to_the_dataset(finished: Path, scene: Path) -> None:
+    for part in ("mapping", "query"):
+        link = finished / part / "sensors" / "records_data"
+        assert link.readlink() == scene.resolve() / part / "sensors" / "records_data"
+    images = [p for p in finished.rglob("*.jpg") if not p.is_symlink() and p.is_file()]
+    assert images == []
+
+
+def test_all_queries_are_localized_well(finished: Path) -> None:
+    rows = json.loads((finished / "evaluation" / "recall.json").read_text())["rows"]
+    (row,) = (row for row in rows if row["name"] == "all")
+    assert [at["recall"] for at in row["recall"]] == [1.0] * 4
+    statuses = read_status(finished / "localized" / "status.csv")
+    assert len(statuses) == 4
+    assert all(s.status == "localized" and s.fallback == "none" for s in statuses.values())
+
+
+def test_a_manifest_says_what_was_done(finished: Path) -> None:
+    manifest = json.loads((finished / "stages" / "local_features.json").read_text())
+    assert manifest["options"]["local_features"] == {
+        "name": "rootsift",
+        "options": {"max_keypoints": 800},
+    }
+    assert manifest["counts"]["images"] == 11
+    assert set(manifest["inputs"]) == {"import"}
+    assert manifest["seconds"] > 0 and manifest["versions"]["pycolmap"]
+
+
+def test_where_query_poses_are_given_no_stage_sees_them(
+    evaluate: Any, dataset: Path, finished: Path
+) -> None:
+    shutil.copyfile(
+        dataset / "query_gt/sensors/trajectories.txt", dataset / "query/sensors/trajectories.txt"
+    )
+    evaluate(dataset, dataset.parent / "run", "--until", "import")
+    assert KaptureFolder(dataset.parent / "run" / "query").read().poses() == {}
+
+
+# ------------------------------------------------------------------ again
+
+
+def test_the_second_run_does_nothing_and_says_so(
+    evaluate: Any, scene: Path, workspace: Path, contents: Contents
+) -> None:
+    def times() -> dict[str, int]:
+        paths = (path for path in workspace.rglob("*") if not path.is_symlink())
+        # what is known of the dataset's files is written down anew
+        return {str(p): p.stat().st_mtime_ns for p in paths if ".hashes" not in p.name}
+
+    before, files = times(), contents(workspace)
+    del before[str(workspace / "stages")]
+    done = evaluate(scene, workspace)
+    assert states(done.err) == dict.fromkeys(STAGES, "up to date")
+    assert "nothing to do: every stage is up to date" in done.err
+    assert "pose file" in done.out and "100.0" in done.out
+    after = times()
+    del after[str(workspace / "stages")]
+    assert after == before
+    assert contents(workspace) == files
+
+
+def test_an_option_of_localization_reruns_what_follows_only(
+    evaluate: Any, scene: Path, workspace: Path
+) -> None:
+    done = evaluate(scene, workspace, "--set", "localization.pose.max_error_px=6")
+    assert ran(done.err) == ["localization", "submission", "evaluation"]
+    assert reasons(done.err)["localization"] == ("options changed: localization.pose.max_error_px")
+    assert reasons(done.err)["evaluation"] == "localization changed"
+    # and back again
+    assert ran(evaluate(scene, workspace).err) == ["localization", "submission", "evaluation"]
+
+
+def test_thresholds_are_an_option_of_the_import(
+    evaluate: Any, scene: Path, workspace: Path
+) -> None:
+    done = evaluate(scene, workspace, "--thresholds", "0.001,1", "0.5,5", "--until", "import")
+    assert reasons(done.err) == {"import": "options changed: thresholds"}
+
+
+def test_a_changed_image_reruns_everything(evaluate: Any, dataset: Path) -> None:
+    run = dataset.parent / "run"
+    evaluate(dataset, run)
+    with open(dataset / "mapping/sensors/records_data/0005.jpg", "ab") as file:
+        file.write(b"\0")
+    done = evaluate(dataset, run)
+    assert ran(done.err) == list(STAGES)
+    assert reasons(done.err)["import"] == "dataset files changed"
+    # its pixels are the same
+    assert "100.0 / 100.0 / 100.0 / 100.0" in done.out
+
+
+def test_a_touched_image_reruns_nothing(evaluate: Any, dataset: Path) -> None:
+    run = dataset.parent / "run"
+    evaluate(dataset, run, "--until", "import")
+    (dataset / "mapping/sensors/records_data/0005.jpg").touch()
+    assert "nothing to do" in evaluate(dataset, run, "--until", "import").err
+
+
+@pytest.mark.parametrize(
+    ("output", "stage"),
+    [
+        ("map", "triangulation"),
+        ("pairs/query.txt", "query_pairs"),
+        ("localized", "localization"),
+        ("submissions", "submission"),
+        ("evaluation", "evaluation"),
+    ],
+)
+def test_a_deleted_output_is_made_again(
+    evaluate: Any, scene: Path, workspace: Path, contents: Contents, output: str, stage: str
+) -> None:
+    before = contents(workspace)
+    place = workspace / output
+    shutil.rmtree(place) if place.is_dir() else place.unlink()
+    done = evaluate(scene, workspace)
+    assert ran(done.err) == [stage]
+    assert reasons(done.err)[stage] == f"{output} is gone"
+    assert lasting(contents(workspace)) == lasting(before)
+
+
+def test_a_broken_manifest_counts_as_none(evaluate: Any, scene: Path, workspace: Path) -> None:
+    (workspace / "stages" / "submission.json").write_text('{"stage": "submi')
+    done = evaluate(scene, workspace)
+    assert ran(done.err) == ["submission"]
+    assert reasons(done.err)["submission"] == "not done yet"
+
+
+# ------------------------------------------------------------------ parts of a run
+
+
+def test_a_dry_run_says_what_would_run_and_why(
+    evaluate: Any, scene: Path, workspace: Path, contents: Contents
+) -> None:
+    before = contents(workspace)
+    done = evaluate(scene, workspace, "--dry-run", "--set", "query_pairs.top_k=3")
+    assert done.out == ""
+    told = states(done.err)
+    assert told["triangulation"] == "up to date"
+    assert told["query_pairs"] == "would run (options changed: query_pairs.top_k)"
+    assert told["localization"].startswith("would run (")
+    assert contents(workspace) == before
+
+
+def test_until_stops_behind_a_stage(evaluate: Any, scene: Path, tmp_path: Path) -> None:
+    done = evaluate(scene, tmp_path / "run", "--until", "mapping_pairs")
+    assert ran(done.err) == list(STAGES[:4])
+    assert not (tmp_path / "run" / "map").exists()
+    assert done.out == ""
+    assert ran(evaluate(scene, tmp_path / "run", "--until", "mapping_matches").err) == [STAGES[4]]
+
+
+def test_from_runs_a_stage_and_what_reads_its_output(
+    evaluate: Any, scene: Path, workspace: Path, contents: Contents
+) -> None:
+    before = contents(workspace)
+    done = evaluate(scene, workspace, "--from", "query_pairs")
+    assert ran(done.err) == list(STAGES[6:])
+    assert set(map(states(done.err).get, STAGES[:6])) == {"taken as it is"}
+    assert reasons(done.err)["query_pairs"] == "asked for"
+    assert reasons(done.err)["query_matches"] == "follows query_pairs"
+    assert lasting(contents(workspace)) == lasting(before)
+
+
+def test_from_takes_what_another_tool_put_there(
+    evaluate: Any, scene: Path, workspace: Path
+) -> None:
+    pairs = read_pairs(workspace / "pairs" / "query.txt")
+    nearest = {pair.query: pair.map for pair in reversed(pairs)}
+    rows = [f"{query}, {image}, 1.0\n" for query, image in sorted(nearest.items())]
+    (workspace / "pairs" / "query.txt").write_text("".join(rows))
+    done = evaluate(scene, workspace, "--from", "query_matches")
+    assert ran(done.err) == list(STAGES[7:])
+    statuses = read_status(workspace / "localized" / "status.csv")
+    assert {q: s.candidates for q, s in statuses.items()} == {
+        query: (image,) for query, image in nearest.items()
+    }
+
+
+def test_from_is_not_forgotten_when_it_is_cut_short(
+    evaluate: Any, scene: Path, workspace: Path
+) -> None:
+    evaluate(scene, workspace, "--from", "query_pairs", "--until", "query_pairs")
+    assert ran(evaluate(scene, workspace).err) == list(STAGES[7:])
+
+
+# ------------------------------------------------------------------ whose workspace it is
+
+
+def test_a_folder_of_somebody_else_is_refused_and_untouched(
+    megloc: Any, evaluate: Any, scene: Path, tmp_path: Path
+) -> None:
+    place = tmp_path / "home"
+    place.mkdir()
+    (place / "thesis.txt").write_text("mine")
+    megloc("eval", "kapture", "--root", scene, "--workspace", place).refused(f"{place}: .*-f")
+    assert [path.name for path in tmp_path.rglob("*")] == ["home", "thesis.txt"]
+    evaluate(scene, place, "--until", "import", "--force")
+    assert (place / "thesis.txt").read_text() == "mine"
+    assert (place / "mapping").is_dir()
+    evaluate(scene, place, "--until", "import")
+
+
+def test_a_refused_run_does_not_make_a_folder_ours(
+    megloc: Any, dataset: Path, tmp_path: Path
+) -> None:
+    place = tmp_path / "home"
+    place.mkdir()
+    (place / "thesis.txt").write_text("mine")
+    (dataset / "mapping/sensors/records_data/0005.jpg").unlink()
+    megloc("eval", "kapture", "--root", dataset, "--workspace", place, "-f").refused("0005")
+    assert [path.name for path in place.iterdir()] == ["thesis.txt"]
+
+
+def test_two_runs_at_once_are_refused(
+    megloc: Any, scene: Path, workspace: Path, contents: Contents
+) -> None:
+    before = contents(workspace)
+    with Workspace(workspace).lock():
+        megloc("eval", "kapture", "--root", scene, "--workspace", workspace).refused(
+            f"{workspace}: another run is using this workspace"
+        )
+    assert contents(workspace) == before
+
+
+# ------------------------------------------------------------------ the same bytes
+
+
+def test_processes_give_the_same_bytes(
+    evaluate: Any, scene: Path, finished: Path, tmp_path: Path, contents: Contents
+) -> None:
+    evaluate(scene, tmp_path / "run", "--executor", "processes", "--workers", "2")
+    expected, found = lasting(contents(finished)), lasting(contents(tmp_path / "run"))
+    for folder in ("local_features", "map", "localized", "submissions", "evaluation"):
+        assert any(name.startswith(f"{folder}/") for name in expected)
+    assert found == expected
+
+
+# ------------------------------------------------------------------ results
+
+
+@pytest.mark.parametrize("share", ["0", "1"])
+def test_recall_that_is_high_enough(
+    evaluate: Any, scene: Path, workspace: Path, share: str
+) -> None:
+    evaluate(scene, workspace, "--fail-below", share, status=0)
+
+
+def blacken(dataset: Path, names: Sequence[str]) -> None:
+    for name in names:
+        place = dataset / "query/sensors/records_data" / name
+        write_image(place, np.zeros((512, 768, 3), np.uint8))
+
+
+def test_low_recall_fails_when_asked_for(evaluate: Any, dataset: Path, finished: Path) -> None:
+    blacken(dataset, ["0004.jpg"])
+    run = dataset.parent / "run"
+    done = evaluate(dataset, run, "--fail-below", "0.8", status=3)
+    assert "recall 0.750 is below 0.800" in done.err
+    assert evaluate(dataset, run, "--fail-below", "0.75").status == 0
+    statuses = read_status(run / "localized" / "status.csv")
+    assert statuses["0004.jpg"].status == "failed"
+    assert statuses["0004.jpg"].reason == "no map image matches"
+    # it is not in the pose file, and the others do not mind
+    expected = (finished / POSES).read_text().splitlines(keepends=True)
+    assert (run / POSES).read_text() == "".join(r for r in expected if "0004" not in r)
+
+
+def test_no_query_localized_is_no_error(evaluate: Any, dataset: Path) -> None:
+    blacken(dataset, ["0001.jpg", "0004.jpg", "0007.jpg", "0010.jpg"])
+    run = dataset.parent / "run"
+    done = evaluate(dataset, run)
+    assert "warning: no query was localized; reasons are in localized/status.csv" in done.err
+    assert (run / POSES).read_text() == ""
+    rows = json.loads((run / "evaluation" / "recall.json").read_text())["rows"]
+    assert [at["recall"] for at in rows[-1]["recall"]] == [0.0] * 4
+    # no fallback unless it is asked for, and then it is marked
+    done = evaluate(dataset, run, "--set", "localization.fallback=retrieval")
+    assert ran(done.err) == ["localization", "submission", "evaluation"]
+    statuses = read_status(run / "localized" / "status.csv")
+    assert {s.status for s in statuses.values()} == {"failed"}
+    assert {s.fallback for s in statuses.values()} == {"retrieval"}
+    poses = KaptureFolder(run / "localized").read().poses()
+    map_poses = list(KaptureFolder(run / "map").read().poses().values())
+    assert len(poses) == 4 and all(pose in map_poses for pose in poses.values())
+    assert json.loads((run / f"{POSES}.json").read_text())["counts"]["fallbacks"] == 4
+
+
+def rename_queries(dataset: Path) -> dict[str, str]:
+    """Give the queries names that map images have: new name to old."""
+    names = dict(
+        zip(("0000.jpg", "0002.jpg", "0003.jpg", "0005.jpg"), _queries(dataset), strict=True)
+    )
+    for part in ("query", "query_gt"):
+        records = dataset / part / "sensors" / "records_camera.txt"
+        text = records.read_text()
+        for new, old in names.items():
+            text = text.replace(f" {old}", f" <{new}")
+        records.write_text(text.replace("<", ""))
+    images = dataset / "query" / "sensors" / "records_data"
+    for old in names.values():
+        (images / old).rename(images / f"x{old}")
+    for new, old in names.items():
+        (images / f"x{old}").rename(images / new)
+    return names
+
+
+def _queries(dataset: Path) -> list[str]:
+    return KaptureFolder(dataset / "query").read().image_names()
+
+
+def test_equal_names_in_map_and_query(
+    megloc: Any, evaluate: Any, dataset: Path, finished: Path
+) -> None:
+    names = rename_queries(dataset)
+    run = dataset.parent / "run"
+    megloc("eval", "kapture", "--root", dataset, "--workspace", run, "--quiet").refused(
+        r"4 images have the same name in map and query, .*0000\.jpg.*--query-prefix"
+    )
+    assert not run.exists()
+    evaluate(dataset, run, "--query-prefix", "queries")
+    found = dict(row.split(" ", 1) for row in (run / POSES).read_text().splitlines())
+    expected = dict(row.split(" ", 1) for row in (finished / POSES).read_text().splitlines())
+    # the pairs are another order of the same, and so the draws of the solver
+    assert set(found) == {f"queries/{new}" for new in names}
+    for new, old in names.items():
+        pose = np.array(found[f"queries/{new}"].split(), float)
+        np.testing.assert_allclose(pose, np.array(expected[old].split(), float), atol=2e-2)
+    rows = json.loads((run / "evaluation" / "recall.json").read_text())["rows"]
+    assert [at["recall"] for at in rows[-1]["recall"]] == [1.0] * 4

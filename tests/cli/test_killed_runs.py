@@ -1,0 +1,103 @@
+"""Runs that are killed: the next one goes on, and ends as if nothing had happened."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+Contents = Callable[[Path], dict[str, bytes]]
+
+KILLS = 5
+# the dates of these tell nothing about poses
+DATED = ("stages/", "timing.csv")
+
+
+def start(scene: Path, workspace: Path) -> subprocess.Popen[str]:
+    """Start a run with two worker processes in a session of its own."""
+    return subprocess.Popen(
+        [
+            *(str(Path(sys.executable).with_name("megloc")), "eval", "kapture"),
+            *("--root", str(scene), "--workspace", str(workspace), "--workers", "2"),
+            *("--set", "local_features.options.max_keypoints=800"),
+        ],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def wait_for(run: subprocess.Popen[str], text: str) -> None:
+    """Read what a run tells until a line has the text in it."""
+    assert run.stderr is not None
+    told = []
+    for line in run.stderr:
+        told.append(line)
+        if text in line:
+            return
+    pytest.fail(f"the run ended before {text!r}: {''.join(told)}")
+
+
+def processes_of(session: int) -> list[int]:
+    """Ids of the running processes of a session, zombies left out."""
+    found = []
+    for place in Path("/proc").glob("[0-9]*"):
+        try:
+            state, _, _, of_session = (place / "stat").read_text().rpartition(")")[2].split()[:4]
+        except OSError:
+            continue
+        if int(of_session) == session and state != "Z":
+            found.append(int(place.name))
+    return found
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
+def test_workers_end_with_a_killed_run(scene: Path, tmp_path: Path) -> None:
+    run = start(scene, tmp_path / "run")
+    wait_for(run, "local_features: not done yet")
+    while len(processes_of(run.pid)) < 4:  # the run, the fork server, two workers
+        time.sleep(0.02)
+        assert run.poll() is None
+    os.kill(run.pid, signal.SIGKILL)
+    run.wait()
+    patience = time.monotonic() + 30
+    while left := processes_of(run.pid):
+        assert time.monotonic() < patience, f"left behind: {left}"
+        time.sleep(0.05)
+
+
+def test_runs_killed_at_random_moments_end_in_the_same_bytes(
+    scene: Path, finished: Path, tmp_path: Path, contents: Contents
+) -> None:
+    # seeded: which stages, and how long after they have begun
+    draw = random.Random(20)
+    stages = [path.stem for path in finished.glob("stages/[a-z]*.json")]
+    order = {stage: (finished / "stages" / f"{stage}.json").stat().st_mtime_ns for stage in stages}
+    unlucky = sorted(draw.sample(sorted(stages), KILLS), key=order.__getitem__)
+    workspace = tmp_path / "run"
+    ends = []
+    for stage in unlucky:
+        run = start(scene, workspace)
+        wait_for(run, f"{stage}: ")
+        time.sleep(draw.uniform(0.0, 0.05))
+        os.killpg(run.pid, signal.SIGKILL)
+        ends.append(run.wait())
+    # the last stage may have been faster
+    assert ends.count(-signal.SIGKILL) >= KILLS - 1
+    last = start(scene, workspace)
+    _, told = last.communicate()
+    assert last.returncode == 0, told
+    expected, found = contents(finished), contents(workspace)
+    for dated in DATED:
+        expected = {n: c for n, c in expected.items() if not n.startswith(dated)}
+        found = {n: c for n, c in found.items() if not n.startswith(dated)}
+    assert found == expected
+    assert any(name.startswith("submissions/") for name in found)

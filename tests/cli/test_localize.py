@@ -1,0 +1,213 @@
+"""``megloc localize`` and ``megloc info``: queries into a map of any tool, which stays as it is."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from kapture.io.csv import kapture_from_dir
+
+from megloc_kapture.evaluation.folders import evaluate_folders
+from megloc_kapture.io.images import write_image
+from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder, write_pairs
+from megloc_kapture.io.status_table import read_status
+
+IMAGES = "training/gallery_light1_loop1/frames/rgb/camera_0/rgb_00"
+
+
+def medians(result: Path, truth: Path) -> tuple[float, float, float]:
+    """Share of localized queries, and their median errors in metres and degrees."""
+    row = evaluate_folders(result, truth, side_tables=None).row()
+    assert row.median_position_m is not None and row.median_angle_deg is not None
+    return row.num_localized / row.num_queries, row.median_position_m, row.median_angle_deg
+
+
+def state(root: Path) -> dict[str, tuple[str, int]]:
+    """SHA-256 and time of change of every file."""
+    return {
+        str(path.relative_to(root)): (
+            hashlib.sha256(path.read_bytes()).hexdigest(),
+            path.stat().st_mtime_ns,
+        )
+        for path in sorted(root.rglob("*"))
+        if path.is_file()
+    }
+
+
+def test_the_foreign_map(megloc: Any, shared_data: Path, tmp_path: Path) -> None:
+    place = shared_data / "foreign_maps" / "virtual_gallery"
+    before = state(place)
+    result = tmp_path / "localized"
+    done = megloc("localize", "-i", place / "map", "--query", place / "query", "-o", result)
+    assert done.status == 0
+    assert done.out.startswith("4 of 4 queries localized in ")
+    assert "pixel origin: centre" in done.err
+    share, median_m, median_deg = medians(result, place / "query_gt")
+    assert share == 1.0
+    assert median_m <= 0.010 and median_deg <= 0.16
+    assert state(place) == before
+    # what is written is kapture
+    theirs = kapture_from_dir(str(result))
+    ours = KaptureFolder(result).read()
+    assert len(theirs.records_camera.data_list()) == 4
+    poses = {
+        (timestamp, device): theirs.trajectories[timestamp, device]
+        for timestamp, device in theirs.trajectories.key_pairs()
+    }
+    assert poses.keys() == ours.trajectories.keys()
+    for key, pose in poses.items():
+        np.testing.assert_allclose(pose.t_raw, ours.trajectories[key].translation, atol=1e-12)
+    statuses = read_status(result / "status.csv")
+    assert list(statuses) == ours.image_names()
+    assert all(s.status == "localized" and s.num_inliers > 50 for s in statuses.values())
+
+
+def test_our_own_output_is_written_anew(megloc: Any, gallery: Path, contents: Any) -> None:
+    places = ["-i", gallery / "map", "--query", gallery / "query", "-o", gallery / "localized"]
+    assert megloc("localize", *places).status == 0
+    expected = contents(gallery / "localized")
+    assert megloc("localize", *places, "--workers", "1").status == 0
+    assert contents(gallery / "localized") == expected
+
+
+def test_given_pairs_take_the_place_of_retrieval(megloc: Any, gallery: Path) -> None:
+    names = KaptureFolder(gallery / "query").read().image_names()
+    chosen = [f"{IMAGES}{n}.jpg" for n in (226, 224, 223)]
+    pairs = [
+        ImagePair(query, image, 1.0 - 0.1 * rank)
+        for query in names[1:]
+        for rank, image in enumerate(chosen)
+    ]
+    write_pairs(gallery / "pairs.txt", pairs)
+    places = ["-i", gallery / "map", "--query", gallery / "query", "-o", gallery / "localized"]
+    # of a longer list than retrieval would give nothing may be cut off
+    options = ["--pairs", gallery / "pairs.txt", "--set", "query_pairs.top_k=1"]
+    assert megloc("localize", *places, *options).status == 0
+    statuses = read_status(gallery / "localized" / "status.csv")
+    assert statuses[names[0]].reason == "no map image matches"
+    for name in names[1:]:
+        assert set(statuses[name].candidates) <= set(chosen)
+    assert max(len(s.candidates) for s in statuses.values()) > 1
+
+
+def test_pairs_may_name_map_images_without_a_pose(megloc: Any, gallery: Path) -> None:
+    trajectories = gallery / "map" / "sensors" / "trajectories.txt"
+    rows = trajectories.read_text().splitlines(keepends=True)
+    trajectories.write_text("".join(row for row in rows if not re.match(r" *1, cam_00001", row)))
+    names = KaptureFolder(gallery / "query").read().image_names()
+    images = KaptureFolder(gallery / "map").read().image_names()
+    pairs = [ImagePair(query, image, 1.0) for query in names for image in images]
+    write_pairs(gallery / "pairs.txt", pairs)
+    places = ["-i", gallery / "map", "--query", gallery / "query", "-o", gallery / "localized"]
+    assert megloc("localize", *places, "--pairs", gallery / "pairs.txt").out.startswith("4 of 4")
+    used = {
+        image
+        for status in read_status(gallery / "localized" / "status.csv").values()
+        for image in status.candidates
+    }
+    assert used == set(images) - {f"{IMAGES}223.jpg"}
+
+
+@pytest.mark.parametrize("by", ["AP-GeM-LM18", "VLAD over the map's descriptors"])
+def test_retrieval_by_what_both_bring_else_by_our_own(megloc: Any, gallery: Path, by: str) -> None:
+    if by.startswith("VLAD"):
+        shutil.rmtree(gallery / "query" / "reconstruction" / "global_features")
+    places = ["-i", gallery / "map", "--query", gallery / "query", "-o", gallery / "localized"]
+    done = megloc("localize", *places, "--set", "query_pairs.top_k=5")
+    assert done.out.startswith("4 of 4")
+    assert re.search(rf"^candidates: (global features )?{by}$", done.err, re.MULTILINE)
+    statuses = read_status(gallery / "localized" / "status.csv")
+    assert {len(s.candidates) for s in statuses.values()} == {5}
+
+
+def test_features_are_extracted_where_there_is_an_extractor(
+    megloc: Any, finished: Path, scene: Path, tmp_path: Path
+) -> None:
+    options = ["--set", "local_features.options.max_keypoints=800"]
+    places = ["-i", finished / "map", "--query", scene / "query", "-o", tmp_path / "localized"]
+    done = megloc("localize", *places, *options)
+    assert done.out.startswith("4 of 4"), done
+    share, median_m, median_deg = medians(tmp_path / "localized", scene / "query_gt")
+    assert median_m < 0.01 and median_deg < 0.05
+
+
+def test_map_images_localize_in_their_own_map(
+    megloc: Any, finished: Path, scene: Path, tmp_path: Path
+) -> None:
+    # equal names in map and query do no harm here: results are named by query alone
+    places = ["-i", finished / "map", "--query", scene / "mapping", "-o", tmp_path / "localized"]
+    done = megloc("localize", *places, "--features-dir", finished)
+    assert done.out.startswith("7 of 7"), done
+    _, median_m, _ = medians(tmp_path / "localized", scene / "mapping")
+    assert median_m < 0.01
+
+
+def test_no_query_localized_is_no_error_and_a_fallback_is_marked(
+    megloc: Any, finished: Path, dataset: Path, tmp_path: Path
+) -> None:
+    for place in (dataset / "query/sensors/records_data").iterdir():
+        write_image(place, np.zeros((512, 768, 3), np.uint8))
+    places = ["-i", finished / "map", "--query", dataset / "query", "-o", tmp_path / "localized"]
+    done = megloc("localize", *places)
+    assert done.status == 0
+    assert done.out.startswith("0 of 4 queries localized in ")
+    assert "warning: no query was localized; reasons are in" in done.err
+    assert KaptureFolder(tmp_path / "localized").read().poses() == {}
+    done = megloc("localize", *places, "--set", "localization.fallback=retrieval")
+    assert done.out.rstrip().endswith(", 4 fallback poses")
+    statuses = read_status(tmp_path / "localized" / "status.csv").values()
+    assert {(s.status, s.fallback) for s in statuses} == {("failed", "retrieval")}
+    map_poses = list(KaptureFolder(finished / "map").read().poses().values())
+    poses = KaptureFolder(tmp_path / "localized").read().poses()
+    assert len(poses) == 4 and all(pose in map_poses for pose in poses.values())
+
+
+# ------------------------------------------------------------------ megloc info
+
+
+def described(out: str) -> dict[str, str]:
+    """First column to the rest, of the lines that have one."""
+    return dict(re.findall(r"^(\w[\w ]*?)  +(.*)$", out, re.MULTILINE))
+
+
+def test_info_says_what_the_foreign_map_allows(megloc: Any, shared_data: Path) -> None:
+    done = megloc("info", shared_data / "foreign_maps" / "virtual_gallery" / "map")
+    assert (done.status, done.err) == (0, "")
+    told = described(done.out)
+    assert told["images"] == "12 (12 PINHOLE), 12 with a pose"
+    assert told["points"] == "630"
+    assert told["pixel origin"].startswith("centre: ")
+    assert told["map descriptors"] == "there"
+    assert told["query features"].startswith("must be given in kapture: no extractor for r2d2_500")
+    assert told["retrieval"].startswith("AP-GeM-LM18 where queries bring it, else VLAD")
+    errors = re.search(r"origin: corner ([\d.]+) px, centre ([\d.]+) px", done.out)
+    assert errors is not None
+    assert float(errors[2]) < 0.9 * float(errors[1])
+
+
+def test_info_of_our_own_map(megloc: Any, finished: Path) -> None:
+    told = described(megloc("info", finished / "map", "--deep").out)
+    assert told["checked"] == "everything, image by image"
+    assert told["pixel origin"].startswith("corner: ")
+    assert told["query features"].startswith("extracted by plugin rootsift")
+    assert told["map descriptors"] == "there"
+
+
+def test_info_of_a_folder_that_is_no_map(megloc: Any, scene: Path) -> None:
+    told = described(megloc("info", scene / "query").out)
+    assert told["images"] == "4 (4 PINHOLE), 0 with a pose"
+    assert told["localizing"] == "not possible: no points3d and observations"
+
+
+def test_info_of_a_map_whose_descriptors_are_missing(megloc: Any, gallery: Path) -> None:
+    shutil.rmtree(gallery / "map" / "reconstruction" / "descriptors")
+    told = described(megloc("info", gallery / "map").out)
+    assert (
+        "no extractor for the type is installed: localizing is not possible"
+        in (told["map descriptors"])
+    )

@@ -1,0 +1,177 @@
+"""The stages one by one make what ``megloc eval`` makes; and import, evaluate and submit."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from megloc_kapture.io.kapture_store import KaptureFolder, read_pairs
+
+Contents = Callable[[Path], dict[str, bytes]]
+
+OPTIONS = ("--set", "local_features.options.max_keypoints=800")
+INLINE = ("--executor", "inline")
+
+
+@dataclass(frozen=True)
+class Made:
+    """What the chain of single stages wrote."""
+
+    features: Path
+    vlad: Path
+    mapping_pairs: Path
+    query_pairs: Path
+    mapping_matches: Path
+    query_matches: Path
+    map: Path
+
+
+@pytest.fixture
+def made(megloc: Any, scene: Path, tmp_path: Path) -> Made:
+    """Every stage up to the map and the matches of the queries, each by its own command."""
+    features, vlad = tmp_path / "features", tmp_path / "vlad"
+    mapping_pairs, query_pairs = tmp_path / "pairs" / "mapping.txt", tmp_path / "query.txt"
+    mapping_matches, query_matches = tmp_path / "mapping_matches", tmp_path / "query_matches"
+    mapping, query, result = scene / "mapping", scene / "query", tmp_path / "map"
+    local, both = ["--features-dir", features], ["--features-dir", features, "--features-dir", vlad]
+    for command in (
+        ["extract-local", "-i", mapping, "-i", query, "-o", features, *OPTIONS, *INLINE],
+        ["extract-global", "-i", mapping, "--query", query, "-o", vlad, *local, *INLINE],
+        ["pairs-mapping", "-i", mapping, "-o", mapping_pairs, *both],
+        ["pairs-query", "-i", mapping, "--query", query, "-o", query_pairs, *both],
+        ["match", "-i", mapping, "--pairs", mapping_pairs, "-o", mapping_matches, *local, *INLINE],
+        [
+            *("match", "-i", mapping, "--query", query, "--pairs", query_pairs),
+            *("-o", query_matches, *local, *INLINE),
+        ],
+        [
+            *("triangulate", "-i", mapping, "--pairs", mapping_pairs, "-o", result, *both),
+            *("--features-dir", mapping_matches),
+        ],
+    ):
+        done = megloc(*command, "--quiet")
+        assert (done.status, done.err) == (0, ""), command[0]
+    return Made(features, vlad, mapping_pairs, query_pairs, mapping_matches, query_matches, result)
+
+
+def test_stages_one_by_one_make_the_same_bytes(
+    made: Made, finished: Path, contents: Contents
+) -> None:
+    def without_marks(folder: Path) -> dict[str, bytes]:
+        return {n: c for n, c in contents(folder).items() if not n.endswith(".megloc")}
+
+    expected = contents(finished)
+
+    def part(*prefixes: str) -> dict[str, bytes]:
+        return {n: c for n, c in expected.items() if n.startswith(prefixes)}
+
+    assert without_marks(made.features) == part("local_features/")
+    assert without_marks(made.vlad) == part("global_features/")
+    assert made.mapping_pairs.read_bytes() == expected["pairs/mapping.txt"]
+    assert made.query_pairs.read_bytes() == expected["pairs/query.txt"]
+    for place, name in ((made.mapping_matches, "mapping"), (made.query_matches, "query")):
+        prefix = f"matches/{name}/"
+        found = without_marks(place)
+        assert found and found == {n.removeprefix(prefix): c for n, c in part(prefix).items()}
+    for name in ("points3d.txt", "observations.txt"):
+        ours = (made.map / "reconstruction" / name).read_bytes()
+        assert ours == expected[f"map/reconstruction/{name}"]
+
+
+def test_and_the_map_they_make_is_one_to_localize_in(
+    megloc: Any, made: Made, scene: Path, tmp_path: Path
+) -> None:
+    result = tmp_path / "localized"
+    done = megloc(
+        *("localize", "-i", made.map, "--query", scene / "query", "-o", result),
+        *("--pairs", made.query_pairs, "--features-dir", made.features),
+    )
+    assert done.out.startswith("4 of 4"), done
+    report = tmp_path / "evaluation"
+    done = megloc("evaluate", "-i", result, "--gt", scene / "query_gt", "-o", report)
+    assert done.status == 0 and "100.0 / 100.0 / 100.0 / 100.0" in done.out
+    rows = json.loads((report / "recall.json").read_text())["rows"]
+    assert rows[-1]["recall"][0]["recall"] == 1.0
+    poses = tmp_path / "new" / "poses.txt"
+    done = megloc("submit", "kapture", "-i", result, "-o", poses)
+    assert done.out == f"4 poses of 4 queries: {poses}\n"
+    assert poses.with_name("poses.txt.json").is_file()
+    # the pose file is as good as the folder it comes from
+    again = megloc("evaluate", "-i", poses, "--gt", scene / "query_gt")
+    assert "100.0 / 100.0 / 100.0 / 100.0" in again.out
+    megloc("submit", "kapture", "-i", result, "-o", poses).refused(r"poses\.txt exists; -f")
+    assert megloc("submit", "kapture", "-i", result, "-o", poses, "-f").status == 0
+
+
+def test_output_of_another_kind_is_refused(megloc: Any, made: Made, scene: Path) -> None:
+    # features where a map is
+    command = ["extract-local", "-i", scene / "query", "-o", made.map, *OPTIONS, *INLINE]
+    megloc(*command, "-q").refused(f"{made.map}: is not empty and not a features of megloc")
+    # more features beside ours
+    command[4] = made.vlad
+    assert megloc(*command, "-q").status == 0
+    assert KaptureFolder(scene / "query", features_dirs=[made.vlad]).types("keypoints")
+
+
+def test_the_same_image_twice_is_refused(megloc: Any, scene: Path, tmp_path: Path) -> None:
+    command = ["extract-local", "-i", scene / "query", "-i", scene / "query"]
+    done = megloc(*command, "-o", tmp_path / "features", "-q")
+    done.refused(r"image 0001\.jpg stands in two kapture folders at once")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_ways_to_pair(megloc: Any, finished: Path, tmp_path: Path) -> None:
+    mapping, pairs = finished / "mapping", tmp_path / "pairs.txt"
+
+    def count(*arguments: str | Path) -> int:
+        done = megloc("pairs-mapping", "-i", mapping, "-o", pairs, "-f", "-q", *arguments)
+        assert done.status == 0, done.err
+        return len(read_pairs(pairs))
+
+    assert count("--by", "exhaustive") == 21
+    nearest = count("--by", "retrieval", "--topk", "1", "--features-dir", finished)
+    assert 4 <= nearest <= 7
+    both = count(
+        *("--by", "retrieval", "poses", "--topk", "1", "--features-dir", finished),
+    )
+    assert nearest <= both <= 21
+    done = megloc("pairs-mapping", "-i", mapping, "-o", pairs, "--by", "exhaustive")
+    done.refused(r"pairs\.txt exists; -f overwrites it")
+    megloc("pairs-mapping", "-i", mapping, "-o", tmp_path / "new.txt").refused(
+        r"mapping: no global_features; give their folder with --features-dir"
+    )
+    query = ["pairs-query", "-i", mapping, "--query", finished / "query", "--exhaustive", "-q"]
+    assert megloc(*query, "-o", tmp_path / "query.txt").status == 0
+    assert len(read_pairs(tmp_path / "query.txt")) == 28
+
+
+def test_pairs_of_images_that_are_not_there(megloc: Any, finished: Path, tmp_path: Path) -> None:
+    pairs = tmp_path / "pairs.txt"
+    pairs.write_text("0000.jpg, 0002.jpg, 1.0\n0000.jpg, 0001.jpg, 1.0\n")
+    places = ["-i", finished / "mapping", "--pairs", pairs, "--features-dir", finished]
+    message = r"pairs\.txt: no image 0001\.jpg in .*/mapping"
+    megloc("match", *places, "-o", tmp_path / "new", "-q").refused(message)
+    assert not (tmp_path / "new").exists()
+
+
+def test_import_links_images_and_prefixes_queries(megloc: Any, scene: Path, tmp_path: Path) -> None:
+    done = megloc("import", "kapture", scene, "-o", tmp_path / "in", "--query-prefix", "q/")
+    counts = dict(line.rsplit(maxsplit=1) for line in done.out.splitlines())
+    assert counts == {
+        "map images": "7",
+        "map images with pose": "7",
+        "queries": "4",
+        "queries with truth": "4",
+    }
+    query = KaptureFolder(tmp_path / "in" / "query")
+    assert query.read().image_names()[0] == "q/0001.jpg"
+    assert (
+        query.image_path("q/0001.jpg").read_bytes()
+        == (scene / "query/sensors/records_data/0001.jpg").read_bytes()
+    )
+    megloc("import", "aachen", scene, "-o", tmp_path / "x").refused("unknown dataset 'aachen'")
