@@ -30,7 +30,7 @@ from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.matches import match_pairs
 from megloc_kapture.stages.triangulation import triangulate_map
 
-FEATURES, PAIRS_KIND, MATCHES, MAP = "features", "pairs", "matches", "map"
+FEATURES, MAP = "features", "map"
 
 Inputs = Annotated[tuple[Path, ...], tyro.conf.arg(aliases=["-i"]), tyro.conf.UseAppendAction]
 FeaturesDirs = Annotated[tuple[Path, ...], tyro.conf.UseAppendAction]

@@ -28,7 +28,7 @@ _CHUNK = 16384  # descriptors assigned at once: bounds memory at 16384 x cluster
 class VladOptions(Options):
     """Options of the vocabulary and the aggregation."""
 
-    num_clusters: int = Field(default=64, gt=0)
+    num_clusters: int = Field(default=128, gt=0)
     assignment: Literal["hard", "soft"] = "hard"
     alpha: float = Field(
         default=30.0,

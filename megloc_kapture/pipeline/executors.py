@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from multiprocessing import forkserver
 from multiprocessing.connection import wait
 from typing import Any, Literal
 
@@ -23,7 +24,7 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-class _SingleThread:
+class _SingleThreadedBlas:
     """Counts who needs one thread per matrix product; the first sets it, the last restores it."""
 
     def __init__(self) -> None:
@@ -36,7 +37,7 @@ class _SingleThread:
 
         with self._lock:
             if self._users == 0:
-                self._limits = threadpool_limits(limits=1)
+                self._limits = threadpool_limits(limits=1, user_api="blas")
             self._users += 1
 
     def leave(self) -> None:
@@ -46,7 +47,7 @@ class _SingleThread:
                 self._limits.restore_original_limits()
 
 
-_single_thread = _SingleThread()
+_single_threaded_blas = _SingleThreadedBlas()
 
 
 @contextmanager
@@ -56,11 +57,15 @@ def single_threaded() -> Iterator[None]:
     A product's last bits may depend on how it is split among threads; parallelism comes from
     the executor, so that results are the same bytes whatever the number of workers.
     """
-    _single_thread.enter()
+    from threadpoolctl import threadpool_limits
+
+    _single_threaded_blas.enter()
     try:
-        yield
+        # unlike BLAS's, OpenMP's limit is of the calling thread alone
+        with threadpool_limits(limits=1, user_api="openmp"):
+            yield
     finally:
-        _single_thread.leave()
+        _single_threaded_blas.leave()
 
 
 def _start_worker() -> None:
@@ -68,11 +73,25 @@ def _start_worker() -> None:
     import numpy  # noqa: F401  its thread pool must be there to be limited
     from threadpoolctl import threadpool_limits
 
-    # a Ctrl-C reaches every process of the terminal; the run itself ends its workers
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     threadpool_limits(limits=1)
     cv2.setNumThreads(1)
+
+
+@contextmanager
+def _deaf_to_interrupts() -> Iterator[None]:
+    """Processes started in the block ignore Ctrl-C, and so do those that they start.
+
+    A terminal sends it to every process; the run itself ends its workers.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _end_with_parent() -> None:
@@ -101,6 +120,8 @@ def open_executor(kind: ExecutorKind, workers: int | None = None) -> Iterator[Ex
     # never fork: BLAS and OpenCV have threads by now
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["megloc_kapture.stages.query_poses"])
+    with _deaf_to_interrupts():
+        forkserver.ensure_running()
     pool = ProcessPoolExecutor(count, mp_context=context, initializer=_start_worker)
     try:
         yield pool

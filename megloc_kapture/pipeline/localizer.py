@@ -84,7 +84,7 @@ class Localizer:
         self._matcher = self.options.make_matcher()
         self._descriptors: dict[str, NDArray[Any]] | None = None
         if not kapture_map.has_descriptors():
-            self._descriptors = extract_again(kapture_map, self._extractor())
+            self._descriptors = extract_again(kapture_map, self._extractor)
         self._cache = FeatureCache()
         self._vectors: dict[str, NDArray[np.float32]] = {}
 
@@ -260,10 +260,11 @@ class Localizer:
         return features, matches
 
     def _extract(self, query: Query) -> LocalFeatures:
-        extractor = self._extractor()
+        extractor = self._extractor
         features = extractor.extract(query.read_image(), query.read_mask())
         return checked_features(extractor, features, query.name)
 
+    @cached_property
     def _extractor(self) -> LocalFeatureExtractor:
         name = self.map.extractor_name()
         if name is None:

@@ -118,11 +118,12 @@ class KaptureQueries:
         if not self.names:
             raise DataError("there are no query images", path=self._folder.root)
         self._check_widths()
+        extractor = self._map.extractor_name()
         for name in self.names:
             if self._has_features(name):
                 if self._keypoints is not None and self._descriptors is not None:
                     check_lengths(self._keypoints, self._descriptors, name)
-            elif self._map.extractor_name() is None:
+            elif extractor is None:
                 raise DataError(
                     f"image {name!r} has no features of type {self._map.local_type!r}, and no "
                     "extractor for them is installed; give them with --features-dir, or in the "

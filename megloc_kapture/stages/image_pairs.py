@@ -35,7 +35,7 @@ class QueryPairsOptions(Options):
     """How a query's candidates among the map's images are chosen."""
 
     by: Literal["retrieval", "exhaustive"] = "retrieval"
-    top_k: int = Field(default=30, gt=0, description="most similar map images per query")
+    top_k: int = Field(default=50, gt=0, description="most similar map images per query")
 
 
 def read_global_features(reader: FeatureReader, images: Sequence[str]) -> NDArray[np.float32]:

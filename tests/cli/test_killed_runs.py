@@ -74,6 +74,22 @@ def test_workers_end_with_a_killed_run(scene: Path, tmp_path: Path) -> None:
         time.sleep(0.05)
 
 
+def test_a_run_ended_at_the_keyboard_says_how_to_go_on(scene: Path, tmp_path: Path) -> None:
+    run = start(scene, tmp_path / "run")
+    wait_for(run, "local_features: not done yet")
+    while not any((tmp_path / "run" / ".partial").rglob("*.desc")):
+        time.sleep(0.01)
+        assert run.poll() is None
+    # a terminal sends it to every process of the group
+    os.killpg(run.pid, signal.SIGINT)
+    assert run.stderr is not None
+    told = run.stderr.read().splitlines()
+    assert "megloc: interrupted; run the same command again to go on" in told
+    assert run.wait() == 130
+    assert not (tmp_path / "run" / "local_features").exists()
+    assert list((tmp_path / "run" / ".partial").iterdir()) == []
+
+
 def test_runs_killed_at_random_moments_end_in_the_same_bytes(
     scene: Path, finished: Path, tmp_path: Path, contents: Contents
 ) -> None:

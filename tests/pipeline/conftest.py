@@ -1,0 +1,42 @@
+"""Our own small map of a real scene, shared by the tests of what localizes in it."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from megloc_kapture.pipeline.evaluation_plan import Run, plan_evaluation
+from megloc_kapture.pipeline.plan import run_plan
+from megloc_kapture.pipeline.presets import options_of_preset
+from megloc_kapture.pipeline.workspace import Workspace
+
+
+@pytest.fixture(scope="session")
+def fountain(shared_data: Path) -> Path:
+    """The scene: mapping/, query/ and query_gt/; not to be written into."""
+    return shared_data / "scenes" / "fountain_p11"
+
+
+@pytest.fixture(scope="session")
+def virtual_gallery(shared_data: Path) -> Path:
+    """The foreign map: map/, query/ and query_gt/; not to be written into."""
+    return shared_data / "foreign_maps" / "virtual_gallery"
+
+
+@pytest.fixture(scope="session")
+def workspace(fountain: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A workspace with our map of the scene, few keypoints per image; not to be written into."""
+    workspace = Workspace(tmp_path_factory.mktemp("fountain") / "workspace")
+    options = options_of_preset(assignments=["local_features.options.max_keypoints=800"])
+    with workspace.lock():
+        run = Run("kapture", "classic", options, workspace, root=fountain)
+        run_plan(plan_evaluation(run), workspace, last="triangulation")
+    return workspace.root
+
+
+@pytest.fixture
+def map_copy(workspace: Path, tmp_path: Path) -> Path:
+    """A copy of our map, its images links, to be changed."""
+    return Path(shutil.copytree(workspace / "map", tmp_path / "map", symlinks=True))

@@ -1,0 +1,214 @@
+"""Maps of any tool: which type, whose pixel origin, what is missing."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.evaluation.folders import load_poses
+from megloc_kapture.evaluation.pose_errors import pose_errors
+from megloc_kapture.geometry.cameras import bearing_rays, project, shift_principal_point
+from megloc_kapture.io.kapture_store import FeatureWriter, KaptureFolder, Sensor, write_sensors
+from megloc_kapture.pipeline.kapture_map import KaptureMap
+from megloc_kapture.pipeline.localizer import Localizer
+from megloc_kapture.pipeline.presets import options_of_preset
+from megloc_kapture.pipeline.queries import KaptureQueries
+from megloc_kapture.stages.matches import Features, match_and_verify, two_view_verification
+from megloc_kapture.stages.query_poses import gather_correspondences
+from megloc_kapture.values import Camera, Pose
+
+
+def shift_keypoints(root: Path, shift_px: float) -> None:
+    """Store the keypoints of a map shifted."""
+    reader = KaptureFolder(root).keypoints("rootsift")
+    arrays = {image: reader.read(image) for image in reader.names}
+    with FeatureWriter(root, "keypoints", "rootsift", reader.config) as writer:
+        for image, array in arrays.items():
+            writer.write(image, array + np.float32(shift_px))
+
+
+def shift_intrinsics(root: Path, shift_px: float) -> None:
+    """Store the principal points of a map shifted."""
+    data = KaptureFolder(root).read()
+    moved = {
+        name: Sensor.from_camera(shift_principal_point(sensor.camera(), shift_px))
+        for name, sensor in data.sensors.items()
+    }
+    write_sensors(root, replace(data, sensors=moved))
+
+
+def test_our_own_map_is_as_colmap_has_it(workspace: Path) -> None:
+    opened = KaptureMap.open(workspace / "map")
+    assert opened.local_type == "rootsift"
+    assert (opened.pixel_origin.intrinsics, opened.pixel_origin.keypoints) == ("corner", "corner")
+    assert opened.pixel_origin.error_px["corner"] < opened.pixel_origin.error_px["centre"]
+    assert len(opened.images) == 7
+    assert opened.has_descriptors() and opened.has_images()
+    assert opened.extractor_name() == "rootsift"
+    assert opened.global_types() == ["vlad_rootsift"]
+
+
+@pytest.mark.parametrize(
+    ("change", "intrinsics", "keypoints"),
+    [
+        (lambda root: shift_keypoints(root, -0.5), "corner", "centre"),
+        (lambda root: shift_intrinsics(root, -0.5), "centre", "corner"),
+    ],
+    ids=["keypoints", "intrinsics"],
+)
+def test_a_half_pixel_between_keypoints_and_intrinsics_is_found_and_undone(
+    workspace: Path,
+    map_copy: Path,
+    change: Callable[[Path], None],
+    intrinsics: str,
+    keypoints: str,
+) -> None:
+    change(map_copy)
+    original, opened = KaptureMap.open(workspace / "map"), KaptureMap.open(map_copy)
+    found = opened.pixel_origin
+    assert (found.intrinsics, found.keypoints) == (intrinsics, keypoints)
+    assert found.error_px[found.intrinsics] == min(found.error_px.values())
+    for image in original.images:
+        np.testing.assert_allclose(
+            opened.keypoints_px(image), original.keypoints_px(image), atol=1e-3
+        )
+        np.testing.assert_allclose(
+            opened.camera(image).params, original.camera(image).params, atol=1e-9
+        )
+
+
+def residuals_px(opened: KaptureMap, queries: KaptureFolder, truth: Path) -> list[float]:
+    """Of each query, the median distance of its matches from where its true pose puts them."""
+    poses, options, found = load_poses(truth), options_of_preset(), []
+    matcher, verify = options.make_matcher(), two_view_verification(options.query_verification)
+
+    def features(camera: Camera, keypoints: np.ndarray, descriptors: np.ndarray) -> Features:
+        return Features(camera, keypoints, bearing_rays(camera, keypoints), descriptors)
+
+    for query in KaptureQueries(queries, opened):
+        assert query.features is not None
+        keypoints = query.features.keypoints_px
+        ours = features(query.camera, keypoints, query.features.descriptors)
+        matches = []
+        for image in opened.images:
+            theirs = features(
+                opened.camera(image), opened.keypoints_px(image), opened.descriptors(image)
+            )
+            matches.append((image, *match_and_verify(ours, theirs, matcher, verify)))
+        pairs = gather_correspondences(opened.index, matches)
+        seen = project(query.camera, poses[query.name], opened.index.xyz[pairs.point_ids])
+        distances = np.linalg.norm(seen - keypoints[pairs.keypoint_ids], axis=1)
+        found.append(float(np.median(distances)))
+    return found
+
+
+def test_the_origin_of_the_foreign_map_and_what_the_wrong_one_costs(virtual_gallery: Path) -> None:
+    """Its principal points are ((w - 1) / 2, (h - 1) / 2), its keypoints fit them as stored."""
+    right = KaptureMap.open(virtual_gallery / "map")
+    origin = right.pixel_origin
+    assert (origin.intrinsics, origin.keypoints) == ("centre", "centre")
+    assert origin.error_px["centre"] < 0.9 * origin.error_px["corner"]
+    wrong = KaptureMap.open(virtual_gallery / "map", pixel_origin="corner")
+    assert (wrong.pixel_origin.intrinsics, wrong.pixel_origin.reason) == ("corner", "as asked for")
+    # the map's points, seen from where the queries truly are; no pose can hide the half pixel
+    queries, truth = KaptureFolder(virtual_gallery / "query"), virtual_gallery / "query_gt"
+    errors = np.array([residuals_px(opened, queries, truth) for opened in (right, wrong)])
+    assert errors.shape == (2, 4)
+    assert (errors[0] < errors[1]).all(), errors
+
+
+def test_queries_are_described_as_their_map(
+    workspace: Path, map_copy: Path, fountain: Path
+) -> None:
+    # a map, and queries, that are all described with the origin at the centre
+    shift_intrinsics(map_copy, -0.5)
+    query = map_copy.parent / "query"
+    shutil.copytree(fountain / "query", query, symlinks=True)
+    shift_intrinsics(query, -0.5)
+    queries, truth = KaptureFolder(query, features_dirs=[workspace]), fountain / "query_gt"
+    right = KaptureMap.open(map_copy)
+    wrong = KaptureMap.open(map_copy, pixel_origin="corner")
+    errors = np.array([residuals_px(opened, queries, truth) for opened in (right, wrong)])
+    # half of one query's few matches are wrong ones
+    assert np.median(errors[0]) < 0.6 * np.median(errors[1]), errors
+    # and the poses are those of the map before
+    before = Localizer(KaptureMap.open(workspace / "map"))
+    original = KaptureFolder(fountain / "query", features_dirs=[workspace])
+    expected = dict(before.localize_kapture(original))
+    found = dict(Localizer(right).localize_kapture(queries))
+    for name, pose in found.items():
+        assert isinstance(pose, Pose)
+        reference = expected[name]
+        assert isinstance(reference, Pose)
+        difference = pose_errors({name: pose.cam_from_world}, {name: reference.cam_from_world})
+        assert difference.position_m[0] < 1e-3
+
+
+def test_opening_writes_nothing_and_reads_through_links(
+    virtual_gallery: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "link").symlink_to(virtual_gallery / "map")
+    before = {p: p.stat().st_mtime_ns for p in virtual_gallery.rglob("*")}
+    opened = KaptureMap.open(tmp_path / "link")
+    opened.check()
+    assert len(opened.images) == 12
+    assert {p: p.stat().st_mtime_ns for p in virtual_gallery.rglob("*")} == before
+
+
+def add_type(root: Path, name: str) -> None:
+    """Give the map the same points and keypoints under another type as well."""
+    for kind in ("keypoints", "descriptors"):
+        folder = root / "reconstruction" / kind
+        shutil.copytree(folder / "rootsift", folder / name)
+    observations = root / "reconstruction" / "observations.txt"
+    rows = observations.read_text().splitlines(keepends=True)
+    rows += [row.replace(" rootsift,", f" {name},") for row in rows if row[0] != "#"]
+    observations.write_text("".join(rows))
+
+
+def test_of_several_types_one_is_chosen(map_copy: Path) -> None:
+    add_type(map_copy, "other")
+    with pytest.raises(OptionError, match="choose one with --keypoints-type: other, rootsift"):
+        KaptureMap.open(map_copy)
+    opened = KaptureMap.open(map_copy, keypoints_type="other")
+    assert opened.local_type == "other"
+    # the name inside its configuration tells who extracted it
+    assert opened.extractor_name() == "rootsift"
+    with pytest.raises(OptionError, match="'third'; there are: other, rootsift"):
+        KaptureMap.open(map_copy, keypoints_type="third")
+
+
+def test_what_cannot_be_opened(workspace: Path, map_copy: Path, tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="give auto, corner or centre"):
+        KaptureMap.open(map_copy, pixel_origin="middle")  # type: ignore[arg-type]
+    with pytest.raises(DataError, match="no such kapture folder"):
+        KaptureMap.open(tmp_path / "nowhere")
+    with pytest.raises(DataError, match="no map to localize in: .*megloc triangulate"):
+        KaptureMap.open(workspace / "mapping")
+    observations = map_copy / "reconstruction" / "observations.txt"
+    header = [row for row in observations.read_text().splitlines() if row.startswith("#")]
+    observations.write_text("\n".join(header) + "\n")
+    with pytest.raises(DataError, match="the map's points have no observations"):
+        KaptureMap.open(map_copy)
+
+
+def test_features_may_lie_elsewhere(workspace: Path, map_copy: Path) -> None:
+    shutil.rmtree(map_copy / "reconstruction" / "descriptors")
+    assert not KaptureMap.open(map_copy).has_descriptors()
+    opened = KaptureMap.open(map_copy, features_dirs=[workspace])
+    assert opened.has_descriptors()
+    opened.check()
+
+
+def test_sizes_are_checked_without_reading(map_copy: Path) -> None:
+    opened = KaptureMap.open(map_copy)
+    file = map_copy / "reconstruction/descriptors/rootsift/0003.jpg.desc"
+    file.write_bytes(file.read_bytes()[:-512])
+    with pytest.raises(DataError, match=r"0003\.jpg\.desc: 799 descriptors for 800 keypoints"):
+        opened.check()

@@ -1,0 +1,85 @@
+"""Descriptors of a map that came without: joined to its keypoints by place and order."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
+from megloc_kapture.io.images import write_image
+from megloc_kapture.pipeline.kapture_map import KaptureMap
+from megloc_kapture.pipeline.map_descriptors import extract_again, rows_found_again
+
+
+def points(*xy: tuple[float, float]) -> np.ndarray:
+    return np.array(xy, dtype=np.float32).reshape(-1, 2)
+
+
+def test_rows_are_found_by_place() -> None:
+    stored = points((1, 1), (5, 5), (9, 9))
+    extracted = points((9, 9.01), (1, 1), (7, 7), (20, 20))
+    assert rows_found_again(stored, extracted).tolist() == [1, -1, 0]
+    assert rows_found_again(stored, stored).tolist() == [0, 1, 2]
+
+
+def test_keypoints_at_one_place_are_joined_in_order() -> None:
+    stored = points((1, 1), (1, 1), (2, 2), (1, 1))
+    extracted = points((2, 2), (1, 1), (3, 3), (1, 1))
+    assert rows_found_again(stored, extracted).tolist() == [1, 3, 0, -1]
+
+
+def test_nothing_to_find() -> None:
+    empty = points()
+    assert rows_found_again(points((1, 1)), empty).tolist() == [-1]
+    assert rows_found_again(empty, points((1, 1))).shape == (0,)
+    assert rows_found_again(empty, empty).dtype == np.int64
+
+
+@pytest.fixture
+def stripped(map_copy: Path) -> Path:
+    """Our map without its descriptors."""
+    shutil.rmtree(map_copy / "reconstruction" / "descriptors")
+    return map_copy
+
+
+def test_the_same_options_give_the_same_descriptors(workspace: Path, stripped: Path) -> None:
+    original = KaptureMap.open(workspace / "map")
+    found = extract_again(KaptureMap.open(stripped), RootSift(RootSiftOptions(max_keypoints=800)))
+    assert sorted(found) == original.images
+    for image, descriptors in found.items():
+        np.testing.assert_array_equal(descriptors, original.descriptors(image))
+
+
+def test_other_options_find_what_is_there(workspace: Path, stripped: Path) -> None:
+    original = KaptureMap.open(workspace / "map")
+    found = extract_again(KaptureMap.open(stripped), RootSift(RootSiftOptions(max_keypoints=400)))
+    for image, descriptors in found.items():
+        stored = original.descriptors(image)
+        known = descriptors.any(axis=1)
+        assert 300 < known.sum() <= 400
+        np.testing.assert_array_equal(descriptors[known], stored[known])
+
+
+def test_a_map_of_another_extractor_is_refused(stripped: Path) -> None:
+    opened = KaptureMap.open(stripped)
+    with pytest.raises(DataError, match=r"finds only \d+ of \d+ observed keypoints"):
+        extract_again(opened, RootSift(RootSiftOptions(contrast_threshold=0.2)))
+
+
+def test_without_images_there_is_nothing_to_extract_from(stripped: Path) -> None:
+    (stripped / "sensors" / "records_data").unlink()
+    opened = KaptureMap.open(stripped)
+    with pytest.raises(DataError, match="no descriptors of type 'rootsift', and no images"):
+        extract_again(opened, RootSift())
+
+
+def test_masks_are_used_as_they_were(stripped: Path) -> None:
+    mask = np.zeros((1024, 1536), np.uint8)
+    for image in KaptureMap.open(stripped).images:
+        write_image(stripped / "sensors" / "masks" / f"{image}.png", mask)
+    with pytest.raises(DataError, match=r"finds only 0 of \d+ observed keypoints"):
+        extract_again(KaptureMap.open(stripped), RootSift(RootSiftOptions(max_keypoints=800)))

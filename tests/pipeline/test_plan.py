@@ -1,0 +1,197 @@
+"""Stages run exactly when they have to; what a broken one leaves behind."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.pipeline.plan import Stage, StageReport, all_kept, run_plan
+from megloc_kapture.pipeline.workspace import Workspace
+
+
+@dataclass
+class Kitchen:
+    """A plan of three stages, each writing what it read and one letter more."""
+
+    workspace: Workspace
+    options: dict[str, dict[str, Any]] = field(default_factory=lambda: {"a": {}, "b": {}, "c": {}})
+    external: dict[str, str] = field(default_factory=lambda: {"flour": "1"})
+    version: int = 1
+    log: list[str] = field(default_factory=list)
+
+    def stages(self) -> list[Stage]:
+        return [
+            Stage(
+                "a", self.version, self.options["a"], (), ("a.txt",), self.do("a"), self.external
+            ),
+            Stage("b", 1, self.options["b"], ("a",), ("b", "b.csv"), self.do("b", "a.txt")),
+            Stage("c", 1, self.options["c"], ("a", "b"), ("c.txt",), self.do("c", "b/b.txt")),
+        ]
+
+    def do(self, name: str, reads: str | None = None) -> Callable[[Path], Mapping[str, float]]:
+        def run(out: Path) -> Mapping[str, float]:
+            self.log.append(name)
+            text = "" if reads is None else self.workspace.path(reads).read_text()
+            place = out / "b" / "b.txt" if name == "b" else out / f"{name}.txt"
+            place.parent.mkdir(exist_ok=True)
+            place.write_text(text + name + str(self.options[name].get("extra", "")))
+            if self.options[name].get("csv"):
+                (out / "b.csv").write_text("table")
+            if self.options[name].get("burns"):
+                raise DataError("burnt")
+            return {"letters": float(len(text) + 1)}
+
+        return run
+
+    def cook(self, **how: Any) -> list[StageReport]:
+        self.log.clear()
+        return run_plan(self.stages(), self.workspace, **how)
+
+    def meal(self) -> str:
+        return self.workspace.path("c.txt").read_text()
+
+
+@pytest.fixture
+def kitchen(tmp_path: Path) -> Kitchen:
+    return Kitchen(Workspace(tmp_path / "kitchen"))
+
+
+def test_everything_runs_once(kitchen: Kitchen) -> None:
+    reports = kitchen.cook()
+    assert [(r.name, r.state, r.why) for r in reports] == [
+        (name, "run", "not done yet") for name in "abc"
+    ]
+    assert [r.counts["letters"] for r in reports] == [1.0, 2.0, 3.0]
+    assert kitchen.meal() == "abc"
+    assert not all_kept(reports)
+    again = kitchen.cook()
+    assert kitchen.log == [] and all_kept(again)
+    assert [r.counts for r in again] == [r.counts for r in reports]
+
+
+def test_a_changed_option_reruns_what_follows(kitchen: Kitchen) -> None:
+    kitchen.cook()
+    kitchen.options["b"] = {"extra": "!"}
+    reports = kitchen.cook()
+    assert kitchen.log == ["b", "c"]
+    assert [r.why for r in reports] == ["", "options changed: extra", "b changed"]
+    assert kitchen.meal() == "ab!c"
+
+
+def test_only_what_differs_is_told(kitchen: Kitchen) -> None:
+    kitchen.options["a"] = {"pair": (1, 2), "deep": {"x": 1, "y": [(0.5, None)]}}
+    kitchen.cook()
+    kitchen.options["a"] = {"pair": (1, 2), "deep": {"x": 2, "y": [(0.5, None)]}, "new": 1}
+    assert kitchen.cook()[0].why == "options changed: deep.x, new"
+
+
+def test_a_changed_input_from_outside(kitchen: Kitchen) -> None:
+    kitchen.cook()
+    kitchen.external = {"flour": "2"}
+    assert kitchen.cook()[0].why == "flour changed"
+    kitchen.external = {}
+    assert kitchen.cook()[0].why == "flour changed"
+    assert kitchen.log == ["a", "b", "c"]
+
+
+def test_a_newer_version(kitchen: Kitchen) -> None:
+    kitchen.cook()
+    kitchen.version = 2
+    assert kitchen.cook()[0].why == "a newer version of the stage"
+
+
+def test_an_output_that_is_gone_is_made_again_and_nothing_else(kitchen: Kitchen) -> None:
+    kitchen.cook()
+    kitchen.workspace.path("a.txt").unlink()
+    assert kitchen.cook()[0].why == "a.txt is gone"
+    assert kitchen.log == ["a"]
+
+
+def test_an_output_a_stage_no_longer_writes_is_taken_away(kitchen: Kitchen) -> None:
+    kitchen.options["b"] = {"csv": True}
+    kitchen.cook()
+    assert kitchen.workspace.path("b.csv").is_file()
+    assert all_kept(kitchen.cook())
+    kitchen.options["b"] = {}
+    kitchen.cook()
+    assert not kitchen.workspace.path("b.csv").exists()
+    assert all_kept(kitchen.cook())
+
+
+def test_a_stage_that_fails_leaves_the_old_output(kitchen: Kitchen) -> None:
+    kitchen.cook()
+    kitchen.options["b"] = {"extra": "!", "burns": True}
+    with pytest.raises(DataError, match="burnt"):
+        kitchen.cook()
+    assert kitchen.workspace.path("b/b.txt").read_text() == "ab"
+    assert list(kitchen.workspace.path(".partial").iterdir()) == []
+    # its old output still belongs to its old options
+    kitchen.options["b"] = {}
+    assert all_kept(kitchen.cook())
+
+
+def test_a_run_cut_off_before_the_manifest_counts_as_not_done(kitchen: Kitchen) -> None:
+    kitchen.cook()
+    kitchen.workspace.manifest_path("b").unlink()
+    assert [r.why for r in kitchen.cook()] == ["", "not done yet", ""]
+
+
+def test_rests_of_a_killed_run_do_not_get_into_the_output(kitchen: Kitchen) -> None:
+    rest = kitchen.workspace.path(".partial/b/b")
+    rest.mkdir(parents=True)
+    (rest / "rest.txt").write_text("half")
+    kitchen.cook()
+    assert [p.name for p in kitchen.workspace.path("b").iterdir()] == ["b.txt"]
+
+
+def test_first_and_last(kitchen: Kitchen) -> None:
+    with pytest.raises(OptionError, match="--from b needs stage a, which has not run"):
+        kitchen.cook(first="b")
+    assert [r.name for r in kitchen.cook(last="a")] == ["a"]
+    reports = kitchen.cook(first="b")
+    assert [(r.name, r.state) for r in reports] == [("a", "skipped"), ("b", "run"), ("c", "run")]
+    reports = kitchen.cook(first="b", last="b")
+    assert [(r.state, r.why) for r in reports] == [("skipped", "--from"), ("run", "asked for")]
+    # what follows was asked for as well, and is still to be done
+    assert [r.why for r in kitchen.cook()] == ["", "", "not done yet"]
+    with pytest.raises(OptionError, match="--until a stands before --from c"):
+        kitchen.cook(first="c", last="a")
+    with pytest.raises(OptionError, match="no stage 'd'; stages: a, b, c"):
+        kitchen.cook(last="d")
+
+
+def test_first_takes_earlier_stages_as_they_are(kitchen: Kitchen) -> None:
+    kitchen.cook()
+    kitchen.options["a"] = {"extra": "?"}
+    kitchen.cook(first="c")
+    assert kitchen.log == ["c"] and kitchen.meal() == "abc"
+    kitchen.cook()
+    assert kitchen.log == ["a", "b", "c"] and kitchen.meal() == "a?bc"
+
+
+def test_first_leaves_alone_what_does_not_read_its_output(kitchen: Kitchen) -> None:
+    stages = kitchen.stages()
+    stages[2] = replace(stages[2], after=("a",))
+    run_plan(stages, kitchen.workspace)
+    kitchen.log.clear()
+    reports = run_plan(stages, kitchen.workspace, first="b")
+    assert [r.state for r in reports] == ["skipped", "run", "kept"]
+
+
+def test_a_dry_run_only_tells(kitchen: Kitchen) -> None:
+    told: list[str] = []
+    reports = kitchen.cook(dry_run=True, on_report=lambda report: told.append(report.name))
+    assert [r.state for r in reports] == ["pending"] * 3 and told == ["a", "b", "c"]
+    kitchen.cook()
+    kitchen.options["b"] = {"extra": "!"}
+    reports = kitchen.cook(dry_run=True)
+    assert [r.state for r in reports] == ["kept", "pending", "pending"]
+    reports = kitchen.cook(dry_run=True, first="b")
+    assert kitchen.log == []
+    kitchen.options["b"] = {}
+    assert all_kept(kitchen.cook())
