@@ -26,8 +26,8 @@ STATUS_COLUMNS = (
     "candidates",
 )
 
-# between the candidates of one query; kapture allows spaces in image names
-_CANDIDATE_SEPARATOR = ";"
+# between the candidates of one query; the one character that kapture allows in no image name
+_CANDIDATE_SEPARATOR = ","
 
 
 class QueryStatus(Options):

@@ -19,7 +19,7 @@ LOCALIZED = QueryStatus(
     num_matches=310,
     num_inliers=120,
     cluster=0,
-    candidates=("map/2, left.jpg", "map/1.jpg"),
+    candidates=("map/2; left.jpg", "map/1.jpg"),
 )
 FAILED = QueryStatus(
     image="q/a.jpg", status="failed", reason="7 inliers, 12 needed", fallback="retrieval"
@@ -62,7 +62,7 @@ def test_rows_are_sorted_whatever_the_order(tmp_path: Path) -> None:
     assert first.read_bytes() == second.read_bytes()
     assert first.read_text() == (
         f'{HEADER}q/a.jpg,failed,"7 inliers, 12 needed",0,0,,retrieval,\n'
-        'q/b.jpg,localized,,310,120,0,none,"map/2, left.jpg;map/1.jpg"\n'
+        'q/b.jpg,localized,,310,120,0,none,"map/2; left.jpg,map/1.jpg"\n'
     )
 
 
