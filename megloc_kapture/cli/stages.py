@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -44,6 +46,18 @@ class _StageCommand(Choosing, Working, Common):
             self.preset or DEFAULT_PRESET, changes=changes, assignments=self.set
         )
 
+    @contextmanager
+    def features_folder(
+        self, output: Path, *, force: bool
+    ) -> Iterator[tuple[Path, Executor | None]]:
+        """Where to write features or matches, and what to work with."""
+        with (
+            single_threaded(),
+            staged_output(output, kind=FEATURES, force=force) as out,
+            open_executor(self.executor, self.workers) as executor,
+        ):
+            yield out, executor
+
 
 @dataclass(frozen=True, kw_only=True)
 class ExtractLocal(_StageCommand):
@@ -67,11 +81,7 @@ class ExtractLocal(_StageCommand):
             load_plugin(LOCAL_FEATURES, name, chosen.options if name == chosen.name else {})
             for name in self.features
         ]
-        with (
-            single_threaded(),
-            staged_output(self.output, kind=FEATURES, force=self.force) as out,
-            open_executor(self.executor, self.workers) as executor,
-        ):
+        with self.features_folder(self.output, force=self.force) as (out, executor):
             for extractor in extractors:
                 counts = extract_local_features(
                     folders, extractor, out, executor=executor, track=console.track
@@ -110,11 +120,7 @@ class ExtractGlobal(_StageCommand):
         mapping = KaptureFolder(self.input, features_dirs=existing(self.features_dir))
         queries = [KaptureFolder(q, features_dirs=existing(self.features_dir)) for q in self.query]
         local_type = _only_type(mapping, "descriptors", self.local_type)
-        with (
-            single_threaded(),
-            staged_output(self.output, kind=FEATURES, force=self.force) as out,
-            open_executor(self.executor, self.workers) as executor,
-        ):
+        with self.features_folder(self.output, force=self.force) as (out, executor):
             counts = extract_vlad(
                 mapping,
                 [mapping, *queries],
@@ -237,11 +243,7 @@ class Match(_StageCommand):
             verification = options.verify_queries()
         pairs = read_pairs(self.pairs)
         _check_images_of(pairs, first, mapping, self.pairs)
-        with (
-            single_threaded(),
-            staged_output(self.output, kind=FEATURES, force=self.force) as out,
-            open_executor(self.executor, self.workers) as executor,
-        ):
+        with self.features_folder(self.output, force=self.force) as (out, executor):
             counts = match_pairs(
                 first,
                 mapping,
