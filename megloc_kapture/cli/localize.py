@@ -33,7 +33,7 @@ class Localize(Choosing, Common):
     """Kapture map: keypoints, points3d and observations of one type. Read only."""
     query: Path
     """Kapture folder with the queries, and their features where the map's cannot be extracted."""
-    output: Output
+    output: Output = Path("localized")
     """Kapture folder with the queries' poses, and status.csv."""
     features_dir: FeaturesDirs = ()
     """Features folder of map or queries; may be repeated."""
@@ -93,7 +93,8 @@ class Localize(Choosing, Common):
         console.say(f"candidates: {how}")
         console.say(f"pixel origin: {kapture_map.pixel_origin.intrinsics}")
         console.result(
-            f"{counts['localized']} of {counts['queries']} queries localized in {seconds:.1f} s"
+            f"{counts['localized']} of {counts['queries']} queries localized in {seconds:.1f} s; "
+            f"poses and status.csv in {self.output}"
             + (f", {counts['fallbacks']} fallback poses" if counts["fallbacks"] else "")
         )
         if counts["queries"] and not counts["localized"]:

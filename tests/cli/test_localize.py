@@ -67,6 +67,17 @@ def test_the_foreign_map(megloc: Any, shared_data: Path, tmp_path: Path) -> None
     assert all(s.status == "localized" and s.num_inliers > 50 for s in statuses.values())
 
 
+def test_without_output_it_goes_to_localized(
+    megloc: Any, shared_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = (shared_data / "foreign_maps" / "virtual_gallery").resolve()
+    monkeypatch.chdir(tmp_path)
+    done = megloc("localize", "-i", place / "map", "--query", place / "query")
+    assert done.status == 0
+    assert "in localized" in done.out
+    assert len(KaptureFolder(tmp_path / "localized").read().poses()) == 4
+
+
 def test_our_own_output_is_written_anew(megloc: Any, gallery: Path, contents: Any) -> None:
     places = ["-i", gallery / "map", "--query", gallery / "query", "-o", gallery / "localized"]
     assert megloc("localize", *places).status == 0
