@@ -20,6 +20,10 @@ KILLS = 5
 DATED = ("stages/", "timing.csv")
 
 
+def _obey_interrupts() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def start(scene: Path, workspace: Path) -> subprocess.Popen[str]:
     """Start a run with two worker processes in a session of its own."""
     return subprocess.Popen(
@@ -32,6 +36,8 @@ def start(scene: Path, workspace: Path) -> subprocess.Popen[str]:
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
+        # a shell ignores SIGINT for what it starts in the background, and that is inherited
+        preexec_fn=_obey_interrupts,
     )
 
 

@@ -18,7 +18,7 @@ BAD_ARGUMENTS = {
     "unknown command": (["evil"], r"Unrecognized options: evil; Available subcommands: eval, "),
     "missing flags": (
         ["localize", "-i", "map"],
-        r"Missing from megloc localize: --query PATH, -o PATH, --output PATH; see megloc localize",
+        r"Missing from megloc localize: --query PATH; see megloc localize",
     ),
     "unknown flag": (["eval", "kapture", "--roots", "x"], r"Unrecognized options: --roots, x; see"),
     "unknown long flag": (["eval", "--" + 100 * "x"], r"Unrecognized options: --x{100}; see"),

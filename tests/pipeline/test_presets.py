@@ -17,7 +17,7 @@ from megloc_kapture.pipeline.presets import (
 
 def test_a_preset_unchanged_is_the_preset() -> None:
     assert options_of_preset("classic") == PRESETS["classic"] == PipelineOptions()
-    assert options_of_preset(assignments=["query_pairs.top_k=30"]) == PipelineOptions()
+    assert options_of_preset(assignments=["query_pairs.top_k=50"]) == PipelineOptions()
 
 
 def test_assignments_and_tables_build_the_same() -> None:
