@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import importlib.util
 from dataclasses import dataclass
-from importlib import metadata
 
 from megloc_kapture.cli.common import Common
 from megloc_kapture.errors import MeglocError
+from megloc_kapture.evaluation.provenance import installed_version
 
 _PACKAGES = (
     "megloc-kapture",
@@ -30,7 +30,7 @@ class Doctor(Common):
         """Print what there is; exit status 2 when something is wrong."""
         console = self.console()
         for package in _PACKAGES:
-            console.result(f"{package:24s}{installed(package) or 'not installed'}")
+            console.result(f"{package:24s}{installed_version(package) or 'not installed'}")
         console.result(f"{'GPU':24s}{gpu()}")
         problems = find_problems()
         for problem in problems:
@@ -39,14 +39,6 @@ class Doctor(Common):
             raise MeglocError(f"{len(problems)} problems found, see above")
         console.result("no problem found")
         return 0
-
-
-def installed(package: str) -> str | None:
-    """Installed version of a package, None where it is absent."""
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return None
 
 
 def gpu() -> str:
@@ -61,13 +53,13 @@ def gpu() -> str:
 def find_problems() -> list[str]:
     """Known-bad combinations of installed packages, each with its remedy."""
     problems = []
-    torch, vision = installed("torch"), installed("torchvision")
+    torch, vision = installed_version("torch"), installed_version("torchvision")
     if vision and torch and "+cpu" in torch:
         problems.append(
             f"torchvision {vision} beside torch {torch}: its CPU builds fail to import and break "
             "transformers too; pip uninstall torchvision"
         )
-    if installed("opencv-python") and installed("opencv-python-headless"):
+    if installed_version("opencv-python") and installed_version("opencv-python-headless"):
         problems.append(
             "opencv-python beside opencv-python-headless: both write the folder cv2; uninstall "
             "both and install opencv-python-headless"

@@ -24,15 +24,18 @@ _PACKAGES = (
 )
 
 
+def installed_version(package: str) -> str | None:
+    """Installed version of a package, None where it is absent."""
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
+
+
 def package_versions() -> dict[str, str]:
     """Package -> installed version, for those that are installed."""
-    versions = {}
-    for package in _PACKAGES:
-        try:
-            versions[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            continue
-    return versions
+    found = ((package, installed_version(package)) for package in _PACKAGES)
+    return {package: version for package, version in found if version is not None}
 
 
 def provenance_path(pose_file: Path | str) -> Path:

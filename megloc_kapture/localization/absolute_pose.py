@@ -35,6 +35,16 @@ class AbsolutePoseOptions(Options):
     confidence: float = Field(default=0.9999, gt=0, lt=1)
     seed: int = Field(default=0, ge=0)
 
+    def for_poselib(self) -> dict[str, Any]:
+        """The RANSAC options in poselib's names."""
+        return {
+            "max_reproj_error": self.max_error_px,
+            "min_iterations": self.min_iterations,
+            "max_iterations": self.max_iterations,
+            "success_prob": self.confidence,
+            "seed": self.seed,
+        }
+
 
 @dataclass(frozen=True, eq=False)
 class _Estimate:
@@ -88,10 +98,8 @@ def absolute_pose(
             num_inliers=num_inliers,
         )
     # a left perturbation acts in the camera frame: the covariance does not see the offset
-    t = np.array(pose.translation) - pose.rotation_matrix() @ offset
-    world = RigidTransform(pose.quat_wxyz, (float(t[0]), float(t[1]), float(t[2])))
     return Pose(
-        cam_from_world=world,
+        cam_from_world=undo_recentring(pose, offset),
         num_matches=count,
         num_inliers=num_inliers,
         inliers=estimate.inliers,
@@ -115,26 +123,15 @@ def _estimate(
     usable = np.asarray(np.isfinite(rays).all(axis=1) & np.isfinite(points).all(axis=1))
     if usable.sum() < options.min_inliers:
         return _Estimate(RigidTransform.identity(), np.zeros(len(usable), dtype=np.bool_))
-    pinhole = {
-        "model": "PINHOLE",
-        "width": 1,
-        "height": 1,
-        "params": [focal, focal, 0.0, 0.0],
-    }
+    pinhole = poselib_pinhole(focal)
     found, _ = poselib.estimate_absolute_pose(
         np.ascontiguousarray(rays[usable, :2] * focal),
         np.ascontiguousarray(points[usable]),
         pinhole,
-        {
-            "max_reproj_error": options.max_error_px,
-            "min_iterations": options.min_iterations,
-            "max_iterations": options.max_iterations,
-            "success_prob": options.confidence,
-            "seed": options.seed,
-        },
+        options.for_poselib(),
         {"loss_type": "CAUCHY", "loss_scale": 1.0},
     )
-    pose = _rigid(found)
+    pose = rigid_from_poselib(found)
     errors = np.where(usable, _errors_px(pose, points_px, points, camera), np.inf)
     for _ in range(_REFINEMENTS):
         inliers = errors <= options.max_error_px
@@ -149,12 +146,24 @@ def _estimate(
             pinhole,
             {"loss_type": "CAUCHY", "loss_scale": _CAUCHY_EFFICIENT * sigma},
         )
-        pose = _rigid(found)
+        pose = rigid_from_poselib(found)
         errors = np.where(usable, _errors_px(pose, points_px, points, camera), np.inf)
     return _Estimate(pose, errors <= options.max_error_px)
 
 
-def _rigid(found: Any) -> RigidTransform:
+def poselib_pinhole(focal: float) -> dict[str, Any]:
+    """A camera for undistorted pixels measured from the principal point."""
+    return {"model": "PINHOLE", "width": 1, "height": 1, "params": [focal, focal, 0.0, 0.0]}
+
+
+def undo_recentring(pose: RigidTransform, offset: NDArray[np.float64]) -> RigidTransform:
+    """``cam_from_world`` of a pose estimated in a world moved by minus ``offset`` (3,)."""
+    t = np.array(pose.translation) - pose.rotation_matrix() @ offset
+    return RigidTransform(pose.quat_wxyz, (float(t[0]), float(t[1]), float(t[2])))
+
+
+def rigid_from_poselib(found: Any) -> RigidTransform:
+    """poselib's pose as ours, its quaternion of unit length."""
     quat = np.asarray(found.q, dtype=np.float64)
     quat = quat / np.linalg.norm(quat)
     t = np.asarray(found.t, dtype=np.float64)

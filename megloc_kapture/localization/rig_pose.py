@@ -10,7 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.geometry.cameras import bearing_rays, focal_px, px_from_cam
-from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions
+from megloc_kapture.localization.absolute_pose import (
+    AbsolutePoseOptions,
+    poselib_pinhole,
+    rigid_from_poselib,
+    undo_recentring,
+)
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
 
@@ -70,9 +75,7 @@ def rig_pose(
         extrinsic.q = np.array(view.cam_from_rig.quat_wxyz)
         extrinsic.t = np.array(view.cam_from_rig.translation)
         extrinsics.append(extrinsic)
-        cameras.append(
-            {"model": "PINHOLE", "width": 1, "height": 1, "params": [focal, focal, 0.0, 0.0]}
-        )
+        cameras.append(poselib_pinhole(focal))
     # its minimal solver draws from C's rand() whatever its own seed is: the last digits differ
     ctypes.CDLL(None).srand(ctypes.c_uint(options.seed))
     found, _ = poselib.estimate_generalized_absolute_pose(
@@ -80,22 +83,10 @@ def rig_pose(
         points_3d,
         extrinsics,
         cameras,
-        {
-            "max_reproj_error": options.max_error_px,
-            "min_iterations": options.min_iterations,
-            "max_iterations": options.max_iterations,
-            "success_prob": options.confidence,
-            "seed": options.seed,
-        },
+        options.for_poselib(),
         {"loss_type": "CAUCHY", "loss_scale": 1.0},
     )
-    quat = np.asarray(found.q, dtype=np.float64)
-    quat = quat / np.linalg.norm(quat)
-    rotation = RigidTransform(
-        (float(quat[0]), float(quat[1]), float(quat[2]), float(quat[3])), (0.0, 0.0, 0.0)
-    )
-    t = np.asarray(found.t, dtype=np.float64) - rotation.rotation_matrix() @ offset
-    rig_from_world = RigidTransform(rotation.quat_wxyz, (float(t[0]), float(t[1]), float(t[2])))
+    rig_from_world = undo_recentring(rigid_from_poselib(found), offset)
     inliers = []
     for view, usable_here in zip(views, usable, strict=True):
         cam_from_world = view.cam_from_rig @ rig_from_world

@@ -13,7 +13,7 @@ import numpy as np
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.atomic import output_error
 from megloc_kapture.io.colmap import MapImage, TriangulationOptions, triangulate
-from megloc_kapture.io.kapture_features import ArrayKind
+from megloc_kapture.io.kapture_features import SUFFIX, ArrayKind
 from megloc_kapture.io.kapture_store import (
     FeatureReader,
     FeatureWriter,
@@ -106,11 +106,7 @@ def triangulate_map(
     }
 
 
-_SUFFIXES: dict[ArrayKind, str] = {
-    "keypoints": ".kpt",
-    "descriptors": ".desc",
-    "global_features": ".gfeat",
-}
+_COPIED: tuple[ArrayKind, ...] = ("keypoints", "descriptors", "global_features")
 _VOCABULARY_FILES = ("vlad.json", "vocabulary.npy")
 
 
@@ -122,7 +118,7 @@ def copy_features(source: KaptureFolder, output: Path, local_type: str) -> None:
     somebody's data and copied; so is what comes out of a tar.
     """
     own = KaptureFolder(source.root)
-    for kind in _SUFFIXES:
+    for kind in _COPIED:
         types = source.types(kind) if kind == "global_features" else [local_type]
         for type_name in types:
             if type_name in source.types(kind):
@@ -141,9 +137,9 @@ def _copy_type(
         found = features_dir / parent / type_name / kind
         beside.append(found.parent)
         for image in images:
-            file = found / f"{image}{_SUFFIXES[kind]}"
+            file = found / f"{image}{SUFFIX[kind]}"
             if image not in kept and file.is_file():
-                _link(file, place / f"{image}{_SUFFIXES[kind]}")
+                _link(file, place / f"{image}{SUFFIX[kind]}")
     if kind == "global_features":
         for folder, name in product(beside, _VOCABULARY_FILES):
             if (folder / name).is_file():
