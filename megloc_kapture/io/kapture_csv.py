@@ -69,13 +69,17 @@ def read_rows(path: Path, *, version_required: bool = False) -> Iterator[Row]:
     Raises
     ------
     DataError : see :func:`read_lines`; or the format version on line 1 is another than 1.1, or
-        absent although required.
+        absent although required; or a line begins with blanks and "#": to kapture that is no
+        comment, and a name that could not be written again.
     """
     lines = read_lines(path)
     check_version(path, lines[0] if lines else "", required=version_required)
     for number, line in enumerate(lines, start=1):
-        if not line.startswith("#") and line.strip():
-            yield number, split_fields(line)
+        if line.startswith("#") or not line.strip():
+            continue
+        if line.lstrip().startswith("#"):
+            raise DataError("a comment must begin in the first column", path=path, line=number)
+        yield number, split_fields(line)
 
 
 def split_fields(line: str) -> list[str]:

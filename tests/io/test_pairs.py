@@ -60,6 +60,12 @@ def test_what_could_not_be_read_back_is_not_written(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_an_indented_comment_is_neither_comment_nor_name(tmp_path: Path) -> None:
+    (tmp_path / "p.txt").write_text("a, b, 1\n\t#, c, 0\n")
+    with pytest.raises(DataError, match=r"p\.txt:2: a comment must begin in the first column"):
+        read_pairs(tmp_path / "p.txt")
+
+
 @given(
     st.binary(max_size=100) | st.text(st.sampled_from("ab,1. \n#\r"), max_size=60).map(str.encode)
 )
