@@ -6,7 +6,9 @@ in the same way. A class may carry ``Options``, a frozen pydantic model its cons
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from importlib.metadata import entry_points
+from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -18,6 +20,7 @@ from megloc_kapture.values import LocalFeatures
 
 LOCAL_FEATURES = "megloc_kapture.local_features"
 MATCHERS = "megloc_kapture.matchers"
+DATASETS = "megloc_kapture.datasets"
 
 
 @runtime_checkable
@@ -45,7 +48,37 @@ class Matcher(Protocol):
         ...
 
 
-_PROTOCOLS: dict[str, type] = {LOCAL_FEATURES: LocalFeatureExtractor, MATCHERS: Matcher}
+@runtime_checkable
+class DatasetAdapter(Protocol):
+    """Group ``megloc_kapture.datasets``: a dataset's official layout to kapture folders.
+
+    ``card`` is a ``megloc_kapture.datasets.official.DatasetCard``, ``read`` returns an
+    ``OfficialDataset`` of the same module. Nothing is ever written below ``root``.
+    """
+
+    name: str
+    """The dataset, as on the command line."""
+    card: Any
+    """Where it is published and how it lies on disk."""
+
+    def check(self, root: Path) -> None:
+        """Raise DataError, quickly, when ``root`` cannot be this dataset."""
+        ...
+
+    def input_files(self, root: Path) -> Iterator[Path]:
+        """Every file an import of ``root`` may depend on, images included; cheap to list."""
+        ...
+
+    def read(self, root: Path, *, allow_missing: bool = False) -> Any:
+        """Read the dataset; raises DataError that names file and line."""
+        ...
+
+
+_PROTOCOLS: dict[str, type] = {
+    LOCAL_FEATURES: LocalFeatureExtractor,
+    MATCHERS: Matcher,
+    DATASETS: DatasetAdapter,
+}
 
 
 def plugin_names(group: str) -> list[str]:

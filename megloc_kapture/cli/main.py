@@ -15,10 +15,10 @@ import tyro
 from megloc_kapture.cli.arguments import one_line_errors
 from megloc_kapture.cli.datasets import Import, Synth
 from megloc_kapture.cli.doctor import Doctor
+from megloc_kapture.cli.evaluate import Evaluate
 from megloc_kapture.cli.evaluate_dataset import Eval
 from megloc_kapture.cli.info import Info
 from megloc_kapture.cli.localize import Localize
-from megloc_kapture.cli.results import Evaluate, Submit
 from megloc_kapture.cli.stages import (
     ExtractGlobal,
     ExtractLocal,
@@ -27,6 +27,7 @@ from megloc_kapture.cli.stages import (
     PairsQuery,
     Triangulate,
 )
+from megloc_kapture.cli.submit import Submit
 from megloc_kapture.errors import MeglocError
 
 DONE, DEFECT, USER_ERROR, INTERRUPTED = 0, 1, 2, 130

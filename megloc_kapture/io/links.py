@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from megloc_kapture.io.atomic import output_error
@@ -24,5 +25,26 @@ def link_images(source_root: Path, output_root: Path) -> None:
             if place.is_symlink():
                 place.unlink()
             place.symlink_to(source.resolve(), target_is_directory=True)
+        except OSError as error:
+            raise output_error(place, error) from error
+
+
+def link_records(output_root: Path, links: Mapping[str, Path]) -> None:
+    """Make folders below ``output_root/sensors/records_data`` links to folders of a dataset.
+
+    Parameters
+    ----------
+    links : path below ``records_data`` -> the folder it shows; ``""`` is ``records_data`` itself.
+
+    Raises
+    ------
+    OutputError : a link cannot be made.
+    """
+    records = Path(output_root) / "sensors" / "records_data"
+    for name, folder in links.items():
+        place = records / name if name else records
+        try:
+            place.parent.mkdir(parents=True, exist_ok=True)
+            place.symlink_to(Path(folder).resolve(), target_is_directory=True)
         except OSError as error:
             raise output_error(place, error) from error

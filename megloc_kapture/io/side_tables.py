@@ -5,8 +5,11 @@ groups.csv      image, condition, frame, location, scored: one row per image
 priors.csv      query, permitted: a group or map image the query may be matched with; several rows
                 per query
 world.json      ``official_from_local`` and the unit of the local frame
-protocol.json   thresholds, names in the pose file, conditions and how they are pooled
+protocol.json   thresholds, the pose file's format and names, conditions and how they are pooled
 ==============  ==================================================================================
+
+Two more tables, of challenges whose pose files are not what a rule can say, are read and written
+by :mod:`megloc_kapture.io.challenge_tables`.
 
 Written by datasets, read by stages and evaluation. A file that is absent stands for its default:
 no groups, no priors, one metric frame without offset, the default protocol.
@@ -40,6 +43,7 @@ PRIORS_COLUMNS = ("query", "permitted")
 MAX_QUATERNION_NORM_ERROR = 1e-3
 
 PoseFileNames = Literal["full", "basename"]
+PoseFileFormat = Literal["ltvl", "mlad"]
 
 
 class ImageGroup(Options):
@@ -119,7 +123,11 @@ class Protocol(Options):
     dataset : its name, as on the command line.
     thresholds : pairs (position in metres, angle in degrees); a query counts when both of its
         errors are at or below. An angle of null leaves the rotation out.
-    pose_file_names : how an image is called in the pose file: its whole path, or its last part.
+    pose_file : ``ltvl``, one file of absolute poses (visuallocalization.net), or ``mlad``, one
+        file per relocalization file with poses relative to reference keyframes.
+    pose_file_names : how an image is called in the pose file: its whole path, or its last part;
+        ``names.csv`` overrules it.
+    truth : who knows the true poses of the queries, where they are not published.
     conditions : in the order they are reported; conditions not listed follow, sorted.
     pools : name -> conditions that are pooled under it, as "day" pools dawn and noon.
     """
@@ -131,7 +139,9 @@ class Protocol(Options):
         (0.5, 5.0),
         (5.0, 10.0),
     )
+    pose_file: PoseFileFormat = "ltvl"
     pose_file_names: PoseFileNames = "full"
+    truth: str = ""
     conditions: tuple[str, ...] = ()
     pools: dict[str, tuple[str, ...]] = Field(default_factory=dict)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from megloc_kapture.datasets.synthetic.looks import Condition, Look
+from megloc_kapture.datasets.synthetic.looks import Look
 from megloc_kapture.datasets.synthetic.movers import Mover
 from megloc_kapture.datasets.synthetic.options import SyntheticWorldOptions, stream
 from megloc_kapture.values import Camera, RigidTransform
@@ -19,7 +19,7 @@ class Shot:
     ----------
     name : path of the image below ``records_data``.
     role : whether it belongs to the map or asks where it is.
-    condition : day or night.
+    condition : what it is reported under: day, night, or a name of the dataset's own.
     place : index of the place it shows.
     timestamp, sensor_id : its record; shots of one stop of the rig share the timestamp.
     camera : intrinsics.
@@ -31,7 +31,7 @@ class Shot:
 
     name: str
     role: Literal["mapping", "query"]
-    condition: Condition
+    condition: str
     place: int
     timestamp: int
     sensor_id: str

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from concurrent.futures import Executor
-from dataclasses import dataclass
-from functools import lru_cache
+from functools import partial
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from megloc_kapture.datasets.synthetic.mapping_shots import RIG_ID
 from megloc_kapture.datasets.synthetic.options import SyntheticWorldOptions
-from megloc_kapture.datasets.synthetic.places import build_place
 from megloc_kapture.datasets.synthetic.shots import Shot
-from megloc_kapture.datasets.synthetic.views import PlacePainter
+from megloc_kapture.datasets.synthetic.studio import draw_shots
+from megloc_kapture.datasets.synthetic.views import View
 from megloc_kapture.datasets.synthetic.world import SyntheticWorld, build_world
 from megloc_kapture.io.depth_maps import write_depth_map
 from megloc_kapture.io.images import write_image
@@ -27,17 +25,9 @@ from megloc_kapture.io.side_tables import (
     write_protocol,
     write_world,
 )
-from megloc_kapture.stages.parallel import Track, ordered_map, untracked
+from megloc_kapture.stages.parallel import Track, untracked
 
 DATASET = "synthetic"
-_SHOTS_PER_JOB = 13  # painting a place's textures costs about as much as four images
-
-
-@dataclass(frozen=True)
-class _Job:
-    root: Path
-    options: SyntheticWorldOptions
-    shots: tuple[Shot, ...]  # all of one place
 
 
 def write_synthetic_kapture(
@@ -64,10 +54,14 @@ def write_synthetic_kapture(
     """
     root = Path(root)
     world = build_world(options)
-    jobs = list(_jobs(root, world))
-    drawn = (name for names in ordered_map(_draw, jobs, executor) for name in names)
-    for _ in track(drawn, len(world.shots()), "drawing"):
-        pass
+    draw_shots(
+        world.options,
+        world.shots(),
+        partial(_write_files, root, world.options),
+        with_depth=[shot.name for shot in world.mapping] if world.options.depth else (),
+        executor=executor,
+        track=track,
+    )
     write_sensors(root / "mapping", mapping_data(world))
     write_sensors(root / "query", query_data(world, poses=False))
     write_sensors(root / "query_gt", query_data(world, poses=True))
@@ -132,33 +126,12 @@ def _depth_sensor(sensor_id: str) -> str:
     return f"{sensor_id}_depth"
 
 
-def _jobs(root: Path, world: SyntheticWorld) -> Iterable[_Job]:
-    for place in world.places:
-        shots = [shot for shot in world.shots() if shot.place == place.index]
-        for start in range(0, len(shots), _SHOTS_PER_JOB):
-            yield _Job(root, world.options, tuple(shots[start : start + _SHOTS_PER_JOB]))
-
-
-@lru_cache(maxsize=1)
-def _painter(options: SyntheticWorldOptions, place: int) -> PlacePainter:
-    return PlacePainter(
-        build_place(options, place), seed=options.seed, supersampling=options.supersampling
-    )
-
-
-def _draw(job: _Job) -> list[str]:
-    """Draw and write the shots of a job; returns their names."""
-    options = job.options
-    for shot in job.shots:
-        painter = _painter(options, shot.place)
-        with_depth = options.depth and shot.role == "mapping"
-        view = painter.draw(shot, depth=with_depth)
-        sensors = job.root / shot.role / "sensors"
-        records = sensors / "records_data"
-        write_image(records / shot.name, view.image, jpeg_quality=options.jpeg_quality)
-        if view.depth_m is not None:
-            write_depth_map(records / depth_name(shot.name), view.depth_m)
-        if options.masks and not view.mask.all():
-            mask = np.where(view.mask, 255, 0).astype(np.uint8)
-            write_image(sensors / "masks" / f"{shot.name}.png", mask)
-    return [shot.name for shot in job.shots]
+def _write_files(root: Path, options: SyntheticWorldOptions, shot: Shot, view: View) -> None:
+    sensors = root / shot.role / "sensors"
+    records = sensors / "records_data"
+    write_image(records / shot.name, view.image, jpeg_quality=options.jpeg_quality)
+    if view.depth_m is not None:
+        write_depth_map(records / depth_name(shot.name), view.depth_m)
+    if options.masks and not view.mask.all():
+        mask = np.where(view.mask, 255, 0).astype(np.uint8)
+        write_image(sensors / "masks" / f"{shot.name}.png", mask)

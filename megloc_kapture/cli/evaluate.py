@@ -1,4 +1,4 @@
-"""``megloc evaluate`` and ``megloc submit``: recall tables and pose files of localized kapture."""
+"""``megloc evaluate``: recall tables and reports of localized kapture and pose files."""
 
 from __future__ import annotations
 
@@ -8,19 +8,12 @@ from typing import Annotated
 
 import tyro
 
-from megloc_kapture.cli.common import Common, Force, Input, Output
+from megloc_kapture.cli.common import Common, Force, side_tables_beside
 from megloc_kapture.cli.stages import Inputs
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.outputs import staged_output
-from megloc_kapture.io.side_tables import PROTOCOL_FILE
 
-EVALUATION, SIDE_TABLES = "evaluation", "megloc"
-
-
-def side_tables_beside(result: Path) -> Path | None:
-    """The workspace's side tables, where a result lies in a workspace."""
-    place = result.resolve().parent / SIDE_TABLES
-    return place if (place / PROTOCOL_FILE).is_file() else None
+EVALUATION = "evaluation"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,37 +62,4 @@ class Evaluate(Common):
                     write_evaluation(place, evaluation)
         for evaluation in evaluations:
             console.result(recall_table(evaluation))
-        return 0
-
-
-@dataclass(frozen=True, kw_only=True)
-class Submit(Common):
-    """Write the pose file of a localized kapture folder, and its provenance beside it."""
-
-    dataset: tyro.conf.Positional[str]
-    """Dataset whose rules for names hold: kapture, synthetic."""
-    input: Input
-    """Localized kapture folder."""
-    output: Output
-    """Pose file."""
-    force: Force = False
-    """Overwrite the pose file."""
-
-    def run(self) -> int:
-        """Run it."""
-        from megloc_kapture.pipeline.datasets import DATASETS
-        from megloc_kapture.pipeline.evaluation_plan import write_submission
-
-        console = self.console()
-        if self.dataset not in DATASETS:
-            raise OptionError(f"unknown dataset {self.dataset!r}; known: {', '.join(DATASETS)}")
-        if self.output.exists() and not self.force:
-            raise OptionError(f"{self.output} exists; -f overwrites it")
-        counts = write_submission(
-            self.input,
-            self.output,
-            tables=side_tables_beside(self.input),
-            provenance={"dataset": self.dataset},
-        )
-        console.result(f"{counts['poses']} poses of {counts['queries']} queries: {self.output}")
         return 0

@@ -1,0 +1,262 @@
+"""What an adapter makes of a dataset's official layout, and how it becomes kapture folders.
+
+An adapter (group ``megloc_kapture.datasets``) reads; :func:`write_official` writes, the same way
+for every dataset: ``mapping/``, ``query/``, ``query_gt/`` where truth is known, ``megloc/`` and,
+where asked for, ``reference/``, the model the dataset ships. Images are linked.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+
+from megloc_kapture.datasets.kapture_folders import MAPPING, QUERY, QUERY_GT, SIDE_TABLES
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.challenge_tables import (
+    RelocalizationPair,
+    write_names,
+    write_relocalization,
+)
+from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, write_sensors
+from megloc_kapture.io.links import link_records
+from megloc_kapture.io.side_tables import (
+    ImageGroup,
+    Protocol,
+    World,
+    read_groups,
+    write_groups,
+    write_priors,
+    write_protocol,
+    write_world,
+)
+from megloc_kapture.values import Options, RigidTransform
+
+GROUND_TRUTH = "ground_truth"
+REFERENCE = "reference"
+_MISSING_SHOWN = 5
+
+
+class DatasetCard(Options):
+    """Where a dataset is published and how it has to lie on disk; for messages.
+
+    Parameters
+    ----------
+    title : its name in prose.
+    published_at : the official address.
+    size : of the download, in words.
+    folders : names the root usually has, below MEGLOC_DATA.
+    layout : the paths that must be there, in words.
+    """
+
+    title: str
+    published_at: str
+    size: str
+    folders: tuple[str, ...]
+    layout: str
+
+
+@dataclass(frozen=True, slots=True)
+class Count:
+    """One line of an import's summary: what was found, beside what is published."""
+
+    what: str
+    found: int
+    published: int | None = None
+
+    def __str__(self) -> str:
+        text = f"{self.what:44s}{self.found:>8d}"
+        if self.published is None or self.published == self.found:
+            return text + ("" if self.published is None else "  as published")
+        return f"{text}  published: {self.published}, {self.found - self.published:+d}"
+
+
+@dataclass
+class Missing:
+    """Files that should be there and are not; collected, then refused or let pass."""
+
+    root: Path
+    files: list[Path] = field(default_factory=list)
+
+    def require(self, file: Path) -> bool:
+        """Whether ``file`` exists; remembered if not."""
+        if file.exists():
+            return True
+        self.files.append(file)
+        return False
+
+    def refuse(self) -> None:
+        """Raise DataError with what is missing, folder by folder."""
+        if not self.files:
+            return
+        folders = Counter(file.parent for file in self.files)
+        first = {file.parent: file.name for file in reversed(self.files)}
+        parts = [
+            f"{self._shown(folder / first[folder])}"
+            + (f" and {number - 1} more in its folder" if number > 1 else "")
+            for folder, number in list(folders.items())[:_MISSING_SHOWN]
+        ]
+        more = len(folders) - len(parts)
+        raise DataError(
+            f"{len(self.files)} files are missing: {', '.join(parts)}"
+            + (f", and files of {more} more folders" if more else "")
+            + "; --allow-missing imports what is there",
+            path=self.root,
+        )
+
+    def _shown(self, file: Path) -> Path:
+        return file.relative_to(self.root) if file.is_relative_to(self.root) else file
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class OfficialDataset:
+    """A dataset as its adapter read it.
+
+    Parameters
+    ----------
+    mapping : sensors, records and poses of the map's images, in the local frame.
+    query : sensors and records of the queries; without poses.
+    query_gt : the queries' true poses where they are known, in the local frame; else None.
+    links : folder below ``records_data`` -> folder of the dataset it is a link to; ``""`` makes
+        ``records_data`` itself the link.
+    groups : of all images, the queries' and the map's.
+    priors : query -> map images or groups (``location`` of map images) it may be matched with.
+    names : scored query -> its name in the pose file, in the order of the challenge's list; empty
+        where the protocol's rule says it all.
+    relocalization : the pairs of an MLAD challenge, in order.
+    summary : what was found beside what is published.
+    remarks : what a user should know, a sentence each.
+    missing : what is not there.
+    write_more : writes what else belongs to the dataset (depth maps below ``mapping``, the
+        reference model) below the folder it is given.
+    """
+
+    mapping: KaptureData
+    query: KaptureData
+    links: Mapping[str, Path]
+    protocol: Protocol
+    query_gt: KaptureData | None = None
+    groups: Mapping[str, ImageGroup] = field(default_factory=dict)
+    priors: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    names: Mapping[str, str] = field(default_factory=dict)
+    relocalization: Sequence[RelocalizationPair] = ()
+    world: World = World()
+    summary: Sequence[Count] = ()
+    remarks: Sequence[str] = ()
+    missing: Missing | None = None
+    write_more: Callable[[Path], None] | None = None
+
+
+def write_official(dataset: OfficialDataset, output: Path, *, allow_missing: bool = False) -> None:
+    """Write a dataset below ``output``: mapping/, query/, query_gt/ and megloc/.
+
+    Raises
+    ------
+    DataError : files are missing and that was not allowed, nothing is left of the map or the
+        queries, or map and queries share names.
+    OutputError : something cannot be written.
+    """
+    if dataset.missing is not None and not allow_missing:
+        dataset.missing.refuse()
+    root = dataset.missing.root if dataset.missing is not None else None
+    if not dataset.mapping.records_camera or not dataset.mapping.trajectories:
+        raise DataError("no mapping image with a pose is left to import", path=root)
+    if not dataset.query.records_camera:
+        raise DataError("no query image is left to import", path=root)
+    shared = set(dataset.mapping.image_names()) & set(dataset.query.image_names())
+    if shared:
+        raise DataError(f"image {min(shared)!r} is in the map and a query", path=root)
+    for part, data in ((MAPPING, dataset.mapping), (QUERY, dataset.query)):
+        write_sensors(output / part, data)
+        link_records(output / part, dataset.links)
+    if dataset.query_gt is not None and dataset.query_gt.trajectories:
+        write_sensors(output / QUERY_GT, dataset.query_gt)
+    tables = output / SIDE_TABLES
+    write_protocol(tables, dataset.protocol)
+    write_world(tables, dataset.world)
+    if dataset.groups:
+        write_groups(tables, dataset.groups)
+    if dataset.priors:
+        write_priors(tables, dataset.priors)
+    if dataset.names:
+        write_names(tables, dataset.names)
+    if dataset.relocalization:
+        write_relocalization(tables, dataset.relocalization)
+    if dataset.write_more is not None:
+        dataset.write_more(output)
+
+
+def ground_truth_files(root: Path) -> Iterator[Path]:
+    """The files :func:`read_ground_truth` depends on."""
+    folder = root / GROUND_TRUTH
+    yield from sorted((folder / QUERY / "sensors").glob("*.txt"))
+    yield from sorted((folder / SIDE_TABLES).glob("*.csv"))
+
+
+def read_ground_truth(
+    root: Path, query: KaptureData, world: World
+) -> tuple[KaptureData | None, dict[str, ImageGroup]]:
+    """True poses that lie beside a dataset, for those of ``query`` that have one.
+
+    The challenges keep theirs; rendered twins bring them, and a user may put his own there:
+    ``<root>/ground_truth/query`` is a kapture folder with poses in the official frame and the
+    image names of the import, ``<root>/ground_truth/megloc/groups.csv`` the queries' conditions.
+
+    Returns
+    -------
+    The poses in the local frame (with ``query``'s sensors and records) or None, and the groups.
+
+    Raises
+    ------
+    DataError : the folder is broken.
+    """
+    folder = root / GROUND_TRUTH
+    if not (folder / QUERY / "sensors" / "sensors.txt").is_file():
+        return None, {}
+    true_poses = KaptureFolder(folder / QUERY).read().poses()
+    poses = {
+        record: world.pose_in_local(true_poses[image])
+        for record, image in query.records_camera.items()
+        if image in true_poses
+    }
+    truth = with_poses(query, poses)
+    return truth, read_groups(folder / SIDE_TABLES)
+
+
+def with_poses(data: KaptureData, poses: Mapping[tuple[int, str], RigidTransform]) -> KaptureData:
+    """``data`` with these trajectories, by (timestamp, device), instead of its own."""
+    return KaptureData(
+        sensors=dict(data.sensors),
+        rigs={rig: dict(members) for rig, members in data.rigs.items()},
+        trajectories=dict(poses),
+        records_camera=dict(data.records_camera),
+    )
+
+
+def without_images(data: KaptureData, gone: Iterable[str]) -> KaptureData:
+    """``data`` without the records of these images, and poses and sensors nothing needs."""
+    left_out = set(gone)
+    records = {key: name for key, name in data.records_camera.items() if name not in left_out}
+    times = {timestamp for timestamp, _ in records}
+    used = {sensor for _, sensor in records} | {s for _, s in data.records_depth}
+    rigs = {
+        rig: {sensor: pose for sensor, pose in members.items() if sensor in used}
+        for rig, members in data.rigs.items()
+    }
+    return KaptureData(
+        sensors={key: sensor for key, sensor in data.sensors.items() if key in used},
+        rigs={rig: members for rig, members in rigs.items() if members},
+        trajectories={
+            (timestamp, device): pose
+            for (timestamp, device), pose in data.trajectories.items()
+            if (timestamp, device) in records or (device in data.rigs and timestamp in times)
+        },
+        records_camera=records,
+        records_depth=dict(data.records_depth),
+    )
+
+
+def last_part(image: str) -> str:
+    """The file name of an image path."""
+    return PurePosixPath(image).name
