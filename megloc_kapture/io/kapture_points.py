@@ -15,7 +15,7 @@ from __future__ import annotations
 import contextlib
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -46,6 +46,7 @@ MAX_POINT_ID = 2**62
 
 # below this the plain readers take less time than importing numba
 LARGE_BYTES = 1 << 22
+LARGE_ROWS = 1 << 17
 
 _ROWS_AT_ONCE = 1 << 16
 _NUMBER_CHARACTERS = re.compile(r"[0-9eE.+\-]+")
@@ -260,7 +261,7 @@ def find_observation(
 # ------------------------------------------------------------------------------------ writing
 
 
-def write_points3d(root: Path, points: ArrayLike) -> None:
+def write_points3d(root: Path, points: ArrayLike, *, large_rows: int = LARGE_ROWS) -> None:
     """Write ``reconstruction/points3d.txt``: (N, 3) coordinates or (N, 6) with colours.
 
     Raises
@@ -273,16 +274,31 @@ def write_points3d(root: Path, points: ArrayLike) -> None:
         raise ValueError(f"expected points of shape (N, 3) or (N, 6), got {rows.shape}")
     if not np.isfinite(rows).all():
         raise ValueError("points are not finite")
-    # %r is the shortest text that reads back as the same float64
-    pattern = ",".join(["%r"] * rows.shape[1]) + "\n"
     with atomic_write(_output(root, "points3d.txt")) as file:
         file.write(f"{FORMAT_LINE}\n{POINTS_HEADERS[rows.shape[1]]}\n".encode())
-        for start in range(0, len(rows), _ROWS_AT_ONCE):
-            block = rows[start : start + _ROWS_AT_ONCE]
-            file.write((pattern * len(block) % tuple(block.ravel().tolist())).encode())
+        for text in _point_texts(rows, large_rows):
+            file.write(text)
 
 
-def write_observations(root: Path, observations: Mapping[str, Observations]) -> None:
+def _point_texts(rows: NDArray[np.float64], large: int) -> Iterator[bytes]:
+    """Text of the rows; each number is the shortest that reads back as the same float64."""
+    if len(rows) >= large:
+        from megloc_kapture.io.large_text_writing import point_rows
+
+        yield from point_rows(rows)
+        return
+    pattern = ",".join(["%r"] * rows.shape[1]) + "\n"
+    for start in range(0, len(rows), _ROWS_AT_ONCE):
+        block = rows[start : start + _ROWS_AT_ONCE]
+        yield (pattern * len(block) % tuple(block.ravel().tolist())).encode()
+
+
+def write_observations(
+    root: Path,
+    observations: Mapping[str, Observations],
+    *,
+    large_rows: int = LARGE_ROWS,
+) -> None:
     """Write ``reconstruction/observations.txt``: sorted by point, then by type.
 
     Raises
@@ -295,8 +311,8 @@ def write_observations(root: Path, observations: Mapping[str, Observations]) -> 
         _check_writable(keypoints_type, of_type)
     with atomic_write(_output(root, "observations.txt")) as file:
         file.write(f"{FORMAT_LINE}\n{OBSERVATIONS_HEADER}\n".encode())
-        for text in _observation_lines(observations):
-            file.write(text.encode())
+        for text in _observation_texts(observations, large_rows):
+            file.write(text)
 
 
 def _output(root: Path, name: str) -> Path:
@@ -304,21 +320,38 @@ def _output(root: Path, name: str) -> Path:
     return check_output(Path(root), folder) / name
 
 
-def _observation_lines(observations: Mapping[str, Observations]) -> Iterator[str]:
-    """Text of the rows, in blocks of some thousand points."""
-    parts = []
-    for keypoints_type in sorted(observations):
-        of_type = observations[keypoints_type]
-        ordered = sorted_observations(
-            keypoints_type,
-            of_type.image_names,
-            np.asarray(of_type.point_ids, dtype=np.int64),
-            np.asarray(of_type.image_ids, dtype=np.int32),
-            np.asarray(of_type.keypoint_ids, dtype=np.int32),
+def _observation_texts(observations: Mapping[str, Observations], large: int) -> Iterator[bytes]:
+    """Text of the rows; that of several types, which is rare, always by the plain writer."""
+    parts = [_sorted_part(name, observations[name]) for name in sorted(observations)]
+    if len(parts) == 1 and len(parts[0]) >= large:
+        from megloc_kapture.io.large_text_writing import observation_rows
+
+        part = parts[0]
+        yield from observation_rows(
+            part.keypoints_type,
+            part.image_names,
+            part.point_ids,
+            part.image_ids,
+            part.keypoint_ids,
         )
-        parts.append((ordered, [f", {name}, " for name in ordered.image_names]))
-    if not parts:
-        return
+    elif parts:
+        for text in _observation_lines(parts):
+            yield text.encode()
+
+
+def _sorted_part(keypoints_type: str, of_type: Observations) -> Observations:
+    return sorted_observations(
+        keypoints_type,
+        of_type.image_names,
+        np.asarray(of_type.point_ids, dtype=np.int64),
+        np.asarray(of_type.image_ids, dtype=np.int32),
+        np.asarray(of_type.keypoint_ids, dtype=np.int32),
+    )
+
+
+def _observation_lines(of_types: Sequence[Observations]) -> Iterator[str]:
+    """Text of the rows, in blocks of some thousand points."""
+    parts = [(ordered, [f", {name}, " for name in ordered.image_names]) for ordered in of_types]
     present = [ordered.point_ids for ordered, _ in parts]
     points = np.unique(np.concatenate(present))
     for start in range(0, len(points), _ROWS_AT_ONCE):

@@ -7,8 +7,6 @@ accept: the Python parser then reads the file and says what is wrong, or that no
 
 from __future__ import annotations
 
-import io
-import os
 import queue
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -21,11 +19,9 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io import text_kernels as kernels
-from megloc_kapture.io.kapture_csv import BYTE_ORDER_MARK, check_version
+from megloc_kapture.io.kapture_csv import check_version
+from megloc_kapture.io.text_chunks import CHUNK_BYTES, Chunk, num_threads, read_chunks
 
-CHUNK_BYTES = 1 << 23
-# the loops run at half a gigabyte per second and thread; two keep up with most disks
-MAX_THREADS = 2
 _MAX_LATE = 4096
 
 _Result = TypeVar("_Result")
@@ -45,15 +41,6 @@ class ObservationArrays(NamedTuple):
     type_ids: NDArray[np.int32]
 
 
-class _Chunk(NamedTuple):
-    """Whole lines: ``text[begin:end]`` ends with a line break, zeros follow."""
-
-    text: NDArray[np.uint8]
-    begin: int
-    end: int
-    first_line: int
-
-
 def read_observation_arrays(
     path: Path, check_line: CheckLine, *, chunk_bytes: int = CHUNK_BYTES
 ) -> ObservationArrays | None:
@@ -64,13 +51,13 @@ def read_observation_arrays(
     DataError : a line is wrong, or the file cannot be read.
     """
     # every thread has its own tables of names; ids become common ones at the end
-    threads = max(1, min(MAX_THREADS, os.cpu_count() or 1))
+    threads = num_threads()
     parsers = [_ObservationParser() for _ in range(threads)]
     free: queue.SimpleQueue[int] = queue.SimpleQueue()
     for index in range(threads):
         free.put(index)
 
-    def parse(chunk: _Chunk) -> tuple[int, list[_Part], int | None]:
+    def parse(chunk: Chunk) -> tuple[int, list[_Part], int | None]:
         index = free.get()
         try:
             return index, *parsers[index].parse(chunk)
@@ -116,7 +103,7 @@ def read_point_rows(
     DataError : a line is wrong, or the file cannot be read.
     """
 
-    def parse(chunk: _Chunk) -> tuple[NDArray[np.float64] | None, int | None]:
+    def parse(chunk: Chunk) -> tuple[NDArray[np.float64] | None, int | None]:
         _, lines = kernels.count_commas_and_lines(chunk.text[chunk.begin : chunk.end])
         bits = np.empty(lines * columns, np.uint64)
         late = np.empty((_MAX_LATE, 3), np.int64)
@@ -131,7 +118,7 @@ def read_point_rows(
         return values.reshape(rows, columns) if np.isfinite(values).all() else None, None
 
     parts: list[NDArray[np.float64]] = []
-    threads = max(1, min(MAX_THREADS, os.cpu_count() or 1))
+    threads = num_threads()
     for chunk, (values, refused) in _in_threads(parse, _chunks(path, chunk_bytes), threads):
         if refused is not None:
             _check_refused(path, chunk, refused, check_line)
@@ -142,10 +129,10 @@ def read_point_rows(
 
 
 def _in_threads(
-    work: Callable[[_Chunk], _Result], chunks: Iterator[_Chunk], threads: int
-) -> Iterator[tuple[_Chunk, _Result]]:
+    work: Callable[[Chunk], _Result], chunks: Iterator[Chunk], threads: int
+) -> Iterator[tuple[Chunk, _Result]]:
     """Every chunk with its result, in order; few chunks are in memory at a time."""
-    pending: deque[tuple[_Chunk, Future[_Result]]] = deque()
+    pending: deque[tuple[Chunk, Future[_Result]]] = deque()
     with ThreadPoolExecutor(threads) as pool:
         for chunk in chunks:
             pending.append((chunk, pool.submit(work, chunk)))
@@ -178,7 +165,7 @@ class _ObservationParser:
         self.images = _NameTable(1 << 14)
         self.types = _NameTable(256)
 
-    def parse(self, chunk: _Chunk) -> tuple[list[_Part], int | None]:
+    def parse(self, chunk: Chunk) -> tuple[list[_Part], int | None]:
         """Rows of a chunk, and the position of the line that was refused, if one was."""
         commas, _ = kernels.count_commas_and_lines(chunk.text[chunk.begin : chunk.end])
         room = commas // 2 + 1
@@ -219,7 +206,7 @@ def _merge(tables: list[_NameTable]) -> tuple[list[bytes], list[NDArray[np.int32
     return merged, maps
 
 
-def _check_refused(path: Path, chunk: _Chunk, begin: int, check_line: CheckLine) -> None:
+def _check_refused(path: Path, chunk: Chunk, begin: int, check_line: CheckLine) -> None:
     before = chunk.text[chunk.begin : begin]
     number = chunk.first_line + int(np.count_nonzero(before == 10))
     text = chunk.text[begin : chunk.end].tobytes()
@@ -232,57 +219,13 @@ def _check_refused(path: Path, chunk: _Chunk, begin: int, check_line: CheckLine)
         check_line(line.removesuffix("\r"), number)
 
 
-def _chunks(path: Path, chunk_bytes: int) -> Iterator[_Chunk]:
-    """Chunks of whole lines, each in memory of its own."""
-    try:
-        with io.FileIO(path, "rb") as file:
-            yield from _read_chunks(path, file, chunk_bytes)
-    except FileNotFoundError as error:
-        raise DataError("file is missing", path=path) from error
-    except OSError as error:
-        raise DataError(f"cannot read: {error.strerror}", path=path) from error
-
-
-def _read_chunks(path: Path, file: io.FileIO, chunk_bytes: int) -> Iterator[_Chunk]:
-    rest = np.empty(0, np.uint8)
-    line = 1
-    begin = -1
-    while True:
-        room = len(rest) + chunk_bytes
-        text = np.empty((room + 1 + kernels.PADDING + 7) // 8 * 8, np.uint8)
-        text[: len(rest)] = rest
-        read = file.readinto(text.data[len(rest) : room])
-        filled = len(rest) + read
-        if read:
-            end = _last_break(text, filled) + 1
-        elif filled:
-            text[filled] = 10  # the last line lacks its break
-            end = filled = filled + 1
-        else:
-            return
-        rest = text[end:filled].copy()
-        if end == 0:
-            continue  # a line longer than a chunk
-        text[end:] = 0
-        if begin < 0:
-            begin = len(BYTE_ORDER_MARK) if text[:3].tobytes() == BYTE_ORDER_MARK else 0
-            head = text[begin:end].tobytes().split(b"\n", 1)[0]
+def _chunks(path: Path, chunk_bytes: int) -> Iterator[Chunk]:
+    """Chunks of whole lines; the format version is checked on the first."""
+    for chunk in read_chunks(path, chunk_bytes):
+        if chunk.first_line == 1:
+            head = chunk.text[chunk.begin : chunk.end].tobytes().split(b"\n", 1)[0]
             check_version(path, head.decode("utf-8", errors="replace"), required=False)
-        else:
-            begin = 0
-        yield _Chunk(text, begin, end, line)
-        line += int(np.count_nonzero(text[:end] == 10))
-
-
-def _last_break(text: NDArray[np.uint8], filled: int) -> int:
-    """Position of the last line break before ``filled``, or -1."""
-    step = 1 << 12
-    for stop in range(filled, 0, -step):
-        start = max(0, stop - step)
-        found = np.flatnonzero(text[start:stop] == 10)
-        if len(found):
-            return start + int(found[-1])
-    return -1
+        yield chunk
 
 
 class _NameTable:

@@ -31,6 +31,7 @@ from megloc_kapture.io.json_model import read_json_model, write_json_model
 from megloc_kapture.io.paths import check_relative
 from megloc_kapture.values import Options, RigidTransform
 
+SIDE_TABLES = "megloc"
 GROUPS_FILE = "groups.csv"
 PRIORS_FILE = "priors.csv"
 WORLD_FILE = "world.json"

@@ -26,6 +26,8 @@ STATUS_COLUMNS = (
     "candidates",
 )
 
+Fallback = Literal["none", "retrieval", "rig"]
+
 # between the candidates of one query; the one character that kapture allows in no image name
 _CANDIDATE_SEPARATOR = ","
 
@@ -41,8 +43,9 @@ class QueryStatus(Options):
     num_matches : 2D-3D matches the solver was given.
     num_inliers : those that agree with the pose.
     cluster : index of the candidate cluster the pose comes from; None without clusters.
-    fallback : ``retrieval``: a failed query was given the pose of the best retrieved map image.
-        It is a guess, and everything that counts poses says how many of them are guesses.
+    fallback : ``retrieval``: a failed query was given the pose of the best retrieved map image, a
+        guess; ``rig``: it was given its pose through the rig, by another camera of its moment.
+        Everything that counts poses says how many of them are fallbacks.
     candidates : the map images the pose comes from, best first.
     """
 
@@ -52,7 +55,7 @@ class QueryStatus(Options):
     num_matches: int = Field(default=0, ge=0)
     num_inliers: int = Field(default=0, ge=0)
     cluster: int | None = Field(default=None, ge=0)
-    fallback: Literal["none", "retrieval"] = "none"
+    fallback: Fallback = "none"
     candidates: tuple[str, ...] = ()
 
     @model_validator(mode="after")

@@ -196,6 +196,49 @@ def test_the_compiled_reader_finds_the_nearest_float(tmp_path: Path, numbers: li
     assert np.array_equal(read.ravel().view(np.uint64), expected.view(np.uint64))
 
 
+@given(
+    st.lists(
+        st.floats(allow_nan=False, allow_infinity=False)
+        | st.floats(-1e4, 1e4).map(lambda x: round(x, 3))
+        | st.integers(-300, 300).map(float)
+        | st.integers(-1074, 1023).map(lambda x: 2.0**x)
+        | st.integers(-323, 308).map(lambda x: float(f"1e{x}")),
+        min_size=1,
+    ),
+    st.sampled_from([3, 6]),
+)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=200)
+def test_both_writers_write_the_same_points(
+    tmp_path: Path, numbers: list[float], columns: int
+) -> None:
+    points = np.resize(numbers, (len(numbers) // columns + 1, columns))
+    path = tmp_path / "reconstruction/points3d.txt"
+    write_points3d(tmp_path, points, large_rows=PLAIN)
+    expected = path.read_bytes()
+    write_points3d(tmp_path, points, large_rows=COMPILED)
+    assert path.read_bytes() == expected
+
+
+def test_the_compiled_writer_finds_the_shortest_text(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    any_bits = rng.integers(0, 2**64, 60_000, dtype=np.uint64).view(np.float64)
+    edges = 2.0 ** np.arange(-1074, 1024)
+    numbers = np.concatenate(
+        [
+            any_bits[np.isfinite(any_bits)],
+            edges,
+            np.nextafter(edges, 0),
+            np.nextafter(edges[:-1], np.inf),
+            rng.normal(0, 1e3, 60_000),
+            [0.0, -0.0, 5e-324, 1.7976931348623157e308, 1e16, 9999999999999998.0, 1e-4, 1e-5, 1e23],
+        ]
+    )
+    write_points3d(tmp_path, np.resize(numbers, (len(numbers) // 3, 3)), large_rows=COMPILED)
+    text = (tmp_path / "reconstruction/points3d.txt").read_text().split("\n", 2)[2]
+    found = text.replace("\n", ",").split(",")[:-1]
+    assert found == [repr(number) for number in numbers[: len(found)].tolist()]
+
+
 def test_points_that_cannot_be_stored_are_refused(tmp_path: Path) -> None:
     for points in (np.zeros(3), np.zeros((2, 4)), [[1, 2, np.nan]], [[1, 2, np.inf]]):
         with pytest.raises(ValueError, match="points"):
@@ -225,6 +268,15 @@ def test_observations_come_back_exactly(tmp_path: Path, large_bytes: int) -> Non
     read = read_observations(path, large_bytes=large_bytes)
     assert list(read) == ["T 1", "sift"]
     assert plain(read) == plain(written)
+
+
+def test_both_writers_write_the_same_observations(tmp_path: Path) -> None:
+    for of_type in (random_observations(3000), Observations("t", ("a",), *np.empty((3, 0), int))):
+        contents = []
+        for large_rows in (PLAIN, COMPILED):
+            write_observations(tmp_path, {of_type.keypoints_type: of_type}, large_rows=large_rows)
+            contents.append((tmp_path / "reconstruction/observations.txt").read_bytes())
+        assert contents[0] == contents[1]
 
 
 def test_the_layout_of_observations_is_kapture_s(tmp_path: Path) -> None:

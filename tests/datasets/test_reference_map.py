@@ -1,0 +1,256 @@
+"""A sparse model as a kapture map: read back by kapture itself, and localizable."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import kapture
+import kapture.io.csv
+import kapture.io.features
+import numpy as np
+import pytest
+from kapture.converter.colmap.database import COLMAPDatabase
+
+from megloc_kapture.datasets.grammars.sparse_points import SparsePoints
+from megloc_kapture.datasets.reference_map import write_reference_map
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, Sensor
+from megloc_kapture.values import Camera, RigidTransform
+
+# as a model lists them: not sorted, and one image that was not imported
+NAMES = ("db/b.jpg", "db/a.jpg", "gone/c.jpg", "db/d.jpg")
+# point, image, feature, x, y
+ROWS = [
+    (0, 0, 900, 1, 2),
+    (0, 1, 7, 3, 4),
+    (0, 2, 3, 0, 0),
+    (0, 0, 4, 5, 6),  # twice in one image
+    (1, 0, 4, 5, 6),  # a feature that sees two points
+    (1, 1, 7, 3, 4),
+    (1, 1, 7, 3, 4),  # the same again
+    (3, 1, 2, 7, 8),
+]
+
+
+def points() -> SparsePoints:
+    table = np.array(ROWS)
+    return SparsePoints(
+        np.arange(12.0).reshape(4, 3) / 7,
+        np.arange(12, dtype=np.uint8).reshape(4, 3),
+        table[:, 0],
+        table[:, 1].astype(np.int32),
+        table[:, 2].astype(np.int32),
+        table[:, 3:].astype(np.float32),
+    )
+
+
+def data(names: tuple[str, ...] = ("db/a.jpg", "db/b.jpg", "db/d.jpg")) -> KaptureData:
+    result = KaptureData()
+    result.sensors["cam"] = Sensor.from_camera(Camera("PINHOLE", 64, 48, (50, 50, 32, 24)))
+    for time, name in enumerate(names):
+        result.records_camera[time, "cam"] = name
+        result.trajectories[time, "cam"] = RigidTransform((1.0, 0.0, 0.0, 0.0), (time, 0.0, 0.0))
+    return result
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def keypoints_by_kapture(folder: Path, image: str) -> Any:
+    path = kapture.io.features.get_keypoints_fullpath("sift", str(folder), image)
+    return kapture.io.features.image_keypoints_from_file(path, np.float32, 2)
+
+
+def test_kapture_reads_the_map(tmp_path: Path) -> None:
+    images = tmp_path / "images"
+    (images / "db").mkdir(parents=True)
+    output = tmp_path / "reference"
+    counts = write_reference_map(output, data(), {"": images}, NAMES, points())
+    assert counts == {"images": 3, "keypoints": 4, "points": 4, "observations": 6}
+
+    read = kapture.io.csv.kapture_from_dir(str(output))
+    assert (output / "sensors/records_data").resolve() == images
+    assert sorted(name for *_, name in kapture.flatten(read.records_camera)) == [
+        "db/a.jpg",
+        "db/b.jpg",
+        "db/d.jpg",
+    ]
+    assert len(read.trajectories) == 3
+    table = read.points3d.as_array()
+    assert np.array_equal(table[:, :3], np.arange(12.0).reshape(4, 3) / 7)
+    assert np.array_equal(table[:, 3:], np.arange(12.0).reshape(4, 3))
+    # numbered without gaps, in the order of the model's ids
+    assert keypoints_by_kapture(output, "db/b.jpg").tolist() == [[5, 6], [1, 2]]
+    assert keypoints_by_kapture(output, "db/a.jpg").tolist() == [[7, 8], [3, 4]]
+    assert read.keypoints["sift"] == {"db/a.jpg", "db/b.jpg"}
+    seen = {point: read.observations[point, "sift"] for point in read.observations}
+    assert seen == {
+        0: [("db/b.jpg", 1), ("db/a.jpg", 1), ("db/b.jpg", 0)],
+        1: [("db/b.jpg", 0), ("db/a.jpg", 1)],
+        3: [("db/a.jpg", 0)],
+    }
+
+
+def test_our_own_reader_finds_nothing_wrong(tmp_path: Path) -> None:
+    write_reference_map(tmp_path, data(), {}, NAMES, points(), keypoints_type="colmap")
+    folder = KaptureFolder(tmp_path)
+    folder.validate()
+    assert folder.types("keypoints") == ["colmap"]
+    assert folder.observations()["colmap"].image_names == ("db/a.jpg", "db/b.jpg")
+
+
+def test_the_order_of_observations_in_memory_does_not_matter(tmp_path: Path) -> None:
+    model = points()
+    write_reference_map(tmp_path / "sorted", data(), {}, NAMES, model)
+    # by image, as some grammar might have them; the order within a point is the same
+    order = np.argsort(-model.point_ids, kind="stable")
+    mixed = SparsePoints(
+        model.xyz,
+        model.rgb,
+        model.point_ids[order],
+        model.image_ids[order],
+        model.feature_ids[order],
+        model.xy_px[order],
+    )
+    write_reference_map(tmp_path / "mixed", data(), {}, NAMES, mixed)
+    assert content(tmp_path / "mixed") == content(tmp_path / "sorted")
+
+
+def test_a_model_without_points_is_a_map_without_points(tmp_path: Path) -> None:
+    counts = write_reference_map(tmp_path, data(), {}, NAMES, SparsePoints.none())
+    assert counts == {"images": 3, "keypoints": 0, "points": 0, "observations": 0}
+    KaptureFolder(tmp_path).validate()
+
+
+def test_random_models_keep_every_observation(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    names = tuple(f"{k % 7}/{k}.jpg" for k in rng.permutation(50))
+    number = 4000
+    places = rng.uniform(0, 1000, (50, 300, 2)).astype(np.float32)
+    image_ids, feature_ids = rng.integers(0, 50, number), rng.integers(0, 300, number)
+    model = SparsePoints(
+        rng.normal(size=(500, 3)),
+        np.zeros((500, 3), np.uint8),
+        np.sort(rng.integers(0, 500, number)),
+        image_ids.astype(np.int32),
+        feature_ids.astype(np.int32),
+        places[image_ids, feature_ids],
+    )
+    counts = write_reference_map(tmp_path, data(tuple(sorted(names))), {}, names, model)
+    expected = {
+        (point, names[image], *xy)
+        for point, image, xy in zip(
+            model.point_ids.tolist(), image_ids.tolist(), model.xy_px.tolist(), strict=True
+        )
+    }
+    folder = KaptureFolder(tmp_path)
+    observations, keypoints = folder.observations()["sift"], folder.keypoints("sift")
+    found = [
+        (
+            point,
+            observations.image_names[image],
+            *keypoints.read(observations.image_names[image])[k],
+        )
+        for point, image, k in zip(
+            observations.point_ids.tolist(),
+            observations.image_ids.tolist(),
+            observations.keypoint_ids.tolist(),
+            strict=True,
+        )
+    ]
+    assert len(found) == len(set(found)) == counts["observations"]
+    assert set(found) == expected
+    assert counts["keypoints"] == len(set(zip(image_ids, feature_ids, strict=True)))
+
+
+def test_names_and_ids_must_fit(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="not unique"):
+        write_reference_map(tmp_path / "m", data(), {}, ("a", "a", "b", "c"), points())
+    with pytest.raises(ValueError, match="out of range"):
+        write_reference_map(tmp_path / "m", data(), {}, NAMES[:2], points())
+    assert not (tmp_path / "m").exists()
+
+
+# -------------------------------------------------------------------------------- with features
+
+
+def write_database(
+    path: Path, names: dict[str, int], *, shift: float = 0.0, descriptors: int | None = None
+) -> dict[str, tuple[Any, Any]]:
+    """Features that agree with ROWS; ``names`` gives how many each image of the database has."""
+    rng = np.random.default_rng(1)
+    database = COLMAPDatabase.connect(str(path))
+    database.create_tables()
+    camera_id = database.add_camera(1, 64, 48, np.array([50.0, 50, 32, 24]))
+    written = {}
+    for name, count in names.items():
+        keypoints = rng.uniform(0, 48, (count, 4)).astype(np.float32)
+        for _, image, feature, x, y in ROWS:
+            if NAMES[image].split(".")[0] == name.split(".")[0] and feature < count:
+                keypoints[feature, :2] = (x + shift, y)
+        values = rng.integers(0, 256, (descriptors or count, 128)).astype(np.uint8)
+        image_id = database.add_image(name, camera_id)
+        database.add_keypoints(image_id, keypoints)
+        database.add_descriptors(image_id, values)
+        written[name] = (keypoints, values)
+    database.commit()
+    database.close()
+    return written
+
+
+# another suffix than in the kapture, as RobotCar's database has it; one image more
+FEATURES = {"db/a.png": 10, "db/b.png": 901, "db/d.png": 0, "other.png": 2}
+
+
+def test_a_database_gives_all_features_under_its_numbers(tmp_path: Path) -> None:
+    written = write_database(tmp_path / "d.db", FEATURES, shift=0.01)
+    output = tmp_path / "map"
+    counts = write_reference_map(output, data(), {}, NAMES, points(), database=tmp_path / "d.db")
+    assert counts == {"images": 3, "keypoints": 911, "points": 4, "observations": 6}
+    folder = KaptureFolder(output)
+    folder.validate()
+    for name in ("a", "b"):
+        keypoints, descriptors = written[f"db/{name}.png"]
+        found = folder.keypoints("sift").read(f"db/{name}.jpg")
+        assert np.array_equal(found, keypoints[:, :2])
+        assert np.array_equal(folder.descriptors("sift").read(f"db/{name}.jpg"), descriptors)
+    config = folder.descriptors("sift").config
+    assert (config.keypoints_type, config.metric_type) == ("sift", "L2")
+    assert folder.keypoints("sift").names == ["db/a.jpg", "db/b.jpg"]
+    read = kapture.io.csv.kapture_from_dir(str(output))
+    assert read.descriptors["sift"] == {"db/a.jpg", "db/b.jpg"}
+    assert read.observations[0, "sift"] == [("db/b.jpg", 900), ("db/a.jpg", 7), ("db/b.jpg", 4)]
+
+
+@pytest.mark.parametrize(
+    ("names", "options", "match"),
+    [
+        ({"db/a.png": 10}, {}, "has no image 'db/b.jpg'"),
+        ({**FEATURES, "db/a.jpeg": 10}, {}, "several images for 'db/a.jpg': db/a.jpeg, db/a.png"),
+        ({**FEATURES, "db/b.png": 900}, {}, "not of this model: .*'db/b.png' has 900 keypoints"),
+        (FEATURES, {"shift": 1.5}, r"feature 7 of 'db/a.png' is at \(4.5, 4.0\), .*\(3.0, 4.0\)"),
+        (FEATURES, {"descriptors": 9}, r"descriptors of 'db/a.png' have the shape \(9, 128\)"),
+    ],
+)
+def test_another_model_s_database_is_refused(
+    tmp_path: Path, names: dict[str, int], options: dict[str, Any], match: str
+) -> None:
+    path = tmp_path / "d.db"
+    write_database(path, names, **options)
+    with pytest.raises(DataError, match=match) as caught:
+        write_reference_map(tmp_path / "m", data(), {}, NAMES, points(), database=path)
+    assert str(caught.value).startswith(f"{path}: ")
+
+
+def test_the_exact_name_comes_before_another_suffix(tmp_path: Path) -> None:
+    names = {"db/a.jpg": 10, "db/a.png": 10, "db/b.jpg": 901}
+    written = write_database(tmp_path / "d.db", names)
+    write_reference_map(tmp_path, data(), {}, NAMES, points(), database=tmp_path / "d.db")
+    found = KaptureFolder(tmp_path).keypoints("sift").read("db/a.jpg")
+    assert np.array_equal(found, written["db/a.jpg"][0][:, :2])
