@@ -7,7 +7,7 @@
 .PHONY: help venv eval test lint bench kloc-env clean
 
 # make eval
-DATASET ?= synthetic
+DATASET ?= synthetic-aachen
 ROOT ?=
 PRESET ?=
 WORKSPACE ?=
@@ -40,8 +40,7 @@ venv: $(STAMP)
 
 eval: $(STAMP)
 	@$(BIN)/megloc eval '$(DATASET)' $(if $(ROOT),--root '$(ROOT)') $(if $(PRESET),--preset '$(PRESET)') \
-		$(if $(WORKSPACE),--workspace '$(WORKSPACE)') \
-		$(if $(wildcard benchmarks/$(DATASET).toml),--config 'benchmarks/$(DATASET).toml') $(ARGS)
+		$(if $(WORKSPACE),--workspace '$(WORKSPACE)') $(ARGS)
 
 test: $(STAMP)
 	@$(BIN)/python -m pytest $(ARGS)

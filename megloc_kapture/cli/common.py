@@ -11,7 +11,7 @@ import tyro
 
 from megloc_kapture.cli.console import Console, configure_logging
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.side_tables import PROTOCOL_FILE
+from megloc_kapture.io.side_tables import PROTOCOL_FILE, SIDE_TABLES
 from megloc_kapture.pipeline.executors import ExecutorKind
 
 Input = Annotated[Path, tyro.conf.arg(aliases=["-i"])]
@@ -29,7 +29,7 @@ def existing(folders: Sequence[Path]) -> tuple[Path, ...]:
 
 def side_tables_beside(result: Path) -> Path | None:
     """The workspace's side tables, where a result lies in a workspace."""
-    place = result.resolve().parent / "megloc"
+    place = result.resolve().parent / SIDE_TABLES
     return place if (place / PROTOCOL_FILE).is_file() else None
 
 

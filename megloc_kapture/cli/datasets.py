@@ -1,18 +1,26 @@
-"""``megloc import`` and ``megloc synth``: datasets as kapture."""
+"""``megloc import`` and ``megloc synth``: datasets as kapture, and rendered ones."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import tyro
+from pydantic import ValidationError
 
 from megloc_kapture.cli.common import Common, Force, Output, Working
-from megloc_kapture.datasets.kapture_folders import import_kapture_folders
-from megloc_kapture.datasets.synthetic.options import SyntheticWorldOptions
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.outputs import staged_output
+from megloc_kapture.pipeline.datasets import (
+    KAPTURE,
+    SUMMARY_FILE,
+    SYNTHETIC,
+    TWIN_PREFIX,
+    choose_dataset,
+    twin_of,
+)
 from megloc_kapture.pipeline.executors import open_executor
+from megloc_kapture.pipeline.presets import assigned
 
 DATASET = "dataset"
 
@@ -22,11 +30,15 @@ class Import(Common):
     """Bring a dataset into DIR/{mapping,query,query_gt,megloc}; images are linked, not copied."""
 
     dataset: tyro.conf.Positional[str]
-    """kapture: any pair of kapture folders."""
+    """aachen, robotcar, 4seasons, inloc, or kapture: any pair of kapture folders."""
     root: tyro.conf.Positional[Path]
-    """Folder of the dataset."""
+    """Folder of the dataset, laid out as it is published."""
     output: Output
     """Where to."""
+    allow_missing: bool = False
+    """Import what is there of a partial download."""
+    set: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
+    """An option of the dataset: key=value (version=1.0, reference_model=true); may be repeated."""
     query_prefix: str = ""
     """Put the queries into a folder of this name, where they share names with the map."""
     force: Force = False
@@ -35,40 +47,57 @@ class Import(Common):
     def run(self) -> int:
         """Run it."""
         console = self.console()
-        if self.dataset != "kapture":
-            raise OptionError(f"unknown dataset {self.dataset!r}; known: kapture")
+        name = self.dataset.removeprefix(TWIN_PREFIX)
+        choice = choose_dataset(
+            KAPTURE if name == SYNTHETIC else name,
+            self.root,
+            import_options=assigned(self.set),
+            query_prefix=self.query_prefix,
+            allow_missing=self.allow_missing,
+        )
+        choice.check()
         with staged_output(self.output, kind=DATASET, force=self.force) as out:
-            counts = import_kapture_folders(self.root, out, query_prefix=self.query_prefix)
-        for name, value in counts.items():
-            console.result(f"{name.replace('_', ' '):24s}{value:g}")
+            counts = choice.import_to(self.root, out)
+            summary = out / SUMMARY_FILE
+            text = summary.read_text(encoding="utf-8") if summary.is_file() else ""
+        for what, value in counts.items():
+            console.result(f"{what.replace('_', ' '):44s}{value:>8g}")
+        if text:
+            console.result(text.rstrip())
         return 0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Synth(Working, Common):
-    """Render the synthetic world: DIR/{mapping,query,query_gt,megloc} in kapture, with truth."""
+    """Render a dataset: the synthetic world as kapture, or a small twin in an official layout."""
 
-    dataset: tyro.conf.Positional[str] = "synthetic"
-    """synthetic: the world as plain kapture."""
+    dataset: tyro.conf.Positional[str] = SYNTHETIC
+    """synthetic: the world as plain kapture; aachen, robotcar, 4seasons, inloc: its twin."""
     output: Output
     """Where to."""
     seed: int = 0
     """Another seed is another world."""
+    set: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
+    """An option of the world: key=value; may be repeated."""
     force: Force = False
     """Write into a folder that has other things in it."""
 
     def run(self) -> int:
         """Run it."""
-        from megloc_kapture.datasets.synthetic.writing import write_synthetic_kapture
-
         console = self.console()
-        if self.dataset != "synthetic":
-            raise OptionError(f"unknown dataset {self.dataset!r}; known: synthetic")
-        options = SyntheticWorldOptions(seed=self.seed)
+        changes = {"seed": self.seed, **assigned(self.set)}
+        try:
+            twin = twin_of(self.dataset.removeprefix(TWIN_PREFIX), **changes)
+        except ValidationError as error:
+            problem = error.errors()[0]
+            where = ".".join(str(part) for part in problem["loc"])
+            raise OptionError(f"option {where}: {problem['msg']}") from error
         with (
             staged_output(self.output, kind=DATASET, force=self.force) as out,
             open_executor(self.executor, self.workers) as executor,
         ):
-            write_synthetic_kapture(out, options, executor=executor, track=console.track)
+            counts = twin.write(out, twin.options, executor, track=console.track)
+        for what, value in counts.items():
+            console.result(f"{what.replace('_', ' '):44s}{value:>8g}")
         console.result(f"rendered: {self.output}")
         return 0

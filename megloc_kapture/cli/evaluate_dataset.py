@@ -14,8 +14,10 @@ from megloc_kapture.cli.console import Console
 from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.outputs import RECALL_JSON, RECALL_TEXT, REPORT_HTML
 from megloc_kapture.evaluation.thresholds import Threshold
+from megloc_kapture.evaluation.without_truth_outputs import AGREEMENT_TEXT
 from megloc_kapture.io.status_table import STATUS_FILE, read_status
-from megloc_kapture.pipeline.datasets import DatasetChoice, choose_dataset
+from megloc_kapture.pipeline.benchmarks import BenchmarkFile, find_benchmark, read_benchmark
+from megloc_kapture.pipeline.datasets import TWIN_PREFIX, DatasetChoice, choose_dataset
 from megloc_kapture.pipeline.evaluation_plan import (
     EVALUATION,
     LOCALIZED,
@@ -24,12 +26,7 @@ from megloc_kapture.pipeline.evaluation_plan import (
 )
 from megloc_kapture.pipeline.executors import available_cores, open_executor, single_threaded
 from megloc_kapture.pipeline.plan import StageReport, all_kept, run_plan
-from megloc_kapture.pipeline.presets import (
-    DEFAULT_PRESET,
-    BenchmarkFile,
-    options_of_preset,
-    read_benchmark,
-)
+from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.workspace import Workspace
 
 BELOW_RECALL = 3
@@ -39,14 +36,17 @@ BELOW_RECALL = 3
 class Eval(Choosing, Working, Common):
     """Run all stages on a dataset; what is done and still true is kept."""
 
-    dataset: tyro.conf.Positional[str] = "synthetic"
-    """kapture (any pair of kapture folders) or synthetic (a rendered world)."""
+    dataset: tyro.conf.Positional[str] = "synthetic-aachen"
+    """aachen, robotcar, 4seasons, inloc; synthetic-X: a rendered twin of one of them; kapture: any
+    pair of kapture folders; synthetic: the rendered world as plain kapture."""
     root: Path | None = None
-    """Folder of the dataset; for kapture: with mapping/, query/ and perhaps query_gt/."""
+    """Folder of the dataset as it is published; looked for below MEGLOC_DATA unless given."""
+    allow_missing: bool = False
+    """Go on with what is there of a partial download."""
     workspace: Annotated[Path | None, tyro.conf.arg(aliases=["-w"])] = None
     """Where everything is kept; runs/DATASET-PRESET unless given."""
     config: Path | None = None
-    """A benchmark file (TOML) with this dataset's options."""
+    """A benchmark file (TOML) with this dataset's options, instead of the one that we bring."""
     thresholds: tuple[str, ...] = ()
     """Recall thresholds, metres and degrees: 0.25,2 0.5,5."""
     query_prefix: str = ""
@@ -65,21 +65,29 @@ class Eval(Choosing, Working, Common):
     def run(self) -> int:
         """Run it; returns the exit status."""
         console = self.console()
-        choice = choose_dataset(self.dataset, self.root)
-        benchmark = read_benchmark(self.config) if self.config else None
-        if benchmark and benchmark.dataset != self.dataset:
-            raise OptionError(
-                f"{self.config} is for dataset {benchmark.dataset}, not {self.dataset}"
-            )
-        return self._run(console, choice, benchmark or BenchmarkFile(dataset=self.dataset))
+        benchmark = find_benchmark(self.dataset, TWIN_PREFIX)
+        if self.config:
+            benchmark = read_benchmark(self.config)
+            if benchmark.dataset != self.dataset:
+                raise OptionError(
+                    f"{self.config} is for dataset {benchmark.dataset}, not {self.dataset}"
+                )
+        choice = choose_dataset(
+            self.dataset,
+            self.root,
+            import_options=benchmark.import_options,
+            query_prefix=self.query_prefix,
+            allow_missing=self.allow_missing,
+        )
+        return self._run(console, choice, benchmark)
 
     def _run(self, console: Console, choice: DatasetChoice, benchmark: BenchmarkFile) -> int:
-        preset = self.preset or benchmark.preset or DEFAULT_PRESET
+        preset = self.preset or benchmark.preset
         options = options_of_preset(preset, changes=benchmark.options, assignments=self.set)
-        thresholds = benchmark.thresholds
         if self.thresholds:
             parsed = [Threshold.parse(text) for text in self.thresholds]
-            thresholds = tuple((t.position_m, t.angle_deg) for t in parsed)
+            pairs = tuple((t.position_m, t.angle_deg) for t in parsed)
+            benchmark = benchmark.model_copy(update={"thresholds": pairs})
         choice.check()
         self._check_judging(choice)
         place = self.workspace or Path("runs") / f"{self.dataset}-{preset}"
@@ -90,15 +98,11 @@ class Eval(Choosing, Working, Common):
             open_executor(self.executor, self.workers) as executor,
         ):
             run = Run(
-                dataset=self.dataset,
+                source=choice,
                 preset=preset,
                 options=options,
                 workspace=workspace,
-                root=choice.root,
-                render=choice.renderer(executor, console.track),
-                render_options=choice.render_options(),
-                query_prefix=self.query_prefix,
-                thresholds=thresholds,
+                benchmark=benchmark,
                 executor=executor,
                 track=console.track,
                 num_threads=self.workers or available_cores(),
@@ -118,7 +122,7 @@ class Eval(Choosing, Working, Common):
             console.say("nothing to do: every stage is up to date")
         if not any(report.name == "evaluation" for report in reports):
             return 0
-        return self._conclude(console, workspace, run.pose_file)
+        return self._conclude(console, workspace, run.submission_below(workspace.root), benchmark)
 
     def _check_judging(self, choice: DatasetChoice) -> None:
         if self.fail_below is None:
@@ -130,19 +134,20 @@ class Eval(Choosing, Working, Common):
         if not choice.has_truth():
             raise OptionError(f"--fail-below needs true poses: {choice.root}/query_gt is missing")
 
-    def _conclude(self, console: Console, workspace: Workspace, pose_file: str) -> int:
+    def _conclude(
+        self, console: Console, workspace: Workspace, pose_file: Path, benchmark: BenchmarkFile
+    ) -> int:
         evaluation = workspace.path(EVALUATION)
         statuses = read_status(workspace.path(LOCALIZED) / STATUS_FILE)
         if statuses and all(status.status == "failed" for status in statuses.values()):
             console.say("warning: no query was localized; reasons are in localized/status.csv")
         if (evaluation / RECALL_TEXT).is_file():
             console.result((evaluation / RECALL_TEXT).read_text(encoding="utf-8"))
-        else:
-            console.result(
-                f"{sum(s.status == 'localized' for s in statuses.values())} of {len(statuses)} "
-                "queries localized; no true poses (query_gt/) to compare with\n"
-            )
-        console.result(f"pose file  {shown(workspace.path(pose_file))}")
+        elif (evaluation / AGREEMENT_TEXT).is_file():
+            console.result((evaluation / AGREEMENT_TEXT).read_text(encoding="utf-8"))
+        for text in published_results(benchmark):
+            console.result(text)
+        console.result(f"pose file  {shown(pose_file)}")
         if (evaluation / REPORT_HTML).is_file():
             console.result(f"report     {shown(evaluation / REPORT_HTML)}")
         if self.fail_below is not None:
@@ -156,6 +161,18 @@ class Eval(Choosing, Working, Common):
             console.say(f"recall {recall:.3f} is below {self.fail_below:.3f}")
             return BELOW_RECALL
         return 0
+
+
+def published_results(benchmark: BenchmarkFile) -> list[str]:
+    """Lines about what others have reached on the dataset; empty where nothing is known."""
+    if not benchmark.published:
+        return []
+    width = max(len(result.method) for result in benchmark.published)
+    lines = ["published (percent, on the official data):"]
+    for result in benchmark.published:
+        recall = "   ".join(f"{name} {figures}" for name, figures in result.recall.items())
+        lines.append(f"  {result.method:{width}s}  {recall}   [{result.source}]")
+    return [*lines, ""]
 
 
 def describe(report: StageReport) -> str:

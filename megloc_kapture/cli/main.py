@@ -13,6 +13,7 @@ from typing import Annotated, Any, Protocol
 import tyro
 
 from megloc_kapture.cli.arguments import one_line_errors
+from megloc_kapture.cli.check import Check
 from megloc_kapture.cli.datasets import Import, Synth
 from megloc_kapture.cli.doctor import Doctor
 from megloc_kapture.cli.evaluate import Evaluate
@@ -55,6 +56,7 @@ COMMANDS: dict[str, type[Any]] = {
     "triangulate": Triangulate,
     "localize": Localize,
     "submit": Submit,
+    "check": Check,
     "evaluate": Evaluate,
     "info": Info,
     "doctor": Doctor,

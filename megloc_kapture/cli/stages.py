@@ -19,6 +19,7 @@ from megloc_kapture.cli.common import (
     Output,
     Working,
     existing,
+    side_tables_beside,
 )
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder, read_pairs, write_pairs
@@ -30,6 +31,7 @@ from megloc_kapture.stages.global_vlad import extract_vlad, vlad_type
 from megloc_kapture.stages.image_pairs import PairingMethod, pair_map_images, pair_queries
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.matches import match_pairs
+from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.triangulation import triangulate_map
 
 FEATURES, MAP = "features", "map"
@@ -164,7 +166,9 @@ class PairsMapping(_StageCommand):
         if "retrieval" in self.by:
             global_type = _only_type(mapping, "global_features", self.global_type)
         with single_threaded():
-            pairs = pair_map_images(mapping, options, global_type=global_type)
+            pairs = pair_map_images(
+                mapping, options, global_type=global_type, restrictions=_restrictions(self.input)
+            )
         _write_pairs(self.output, pairs, force=self.force)
         self.console().say(f"{len(pairs)} pairs")
         return 0
@@ -203,7 +207,13 @@ class PairsQuery(_StageCommand):
         if not self.exhaustive:
             global_type = _only_type(mapping, "global_features", self.global_type)
         with single_threaded():
-            pairs = pair_queries(mapping, query, options, global_type=global_type)
+            pairs = pair_queries(
+                mapping,
+                query,
+                options,
+                global_type=global_type,
+                restrictions=_restrictions(self.query),
+            )
         _write_pairs(self.output, pairs, force=self.force)
         self.console().say(f"{len(pairs)} pairs")
         return 0
@@ -296,6 +306,12 @@ class Triangulate(_StageCommand):
             )
         console.say(f"{counts['points']:g} points, {counts['observations']:g} observations")
         return 0
+
+
+def _restrictions(folder: Path) -> Restrictions:
+    """Of the dataset whose tables lie beside a kapture folder; none where there are none."""
+    tables = side_tables_beside(folder)
+    return UNRESTRICTED if tables is None else Restrictions.read(tables)
 
 
 def _folders(paths: Sequence[Path]) -> list[KaptureFolder]:

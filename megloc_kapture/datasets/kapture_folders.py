@@ -3,10 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.atomic import output_error
+from megloc_kapture.io.challenge_tables import (
+    NAMES_FILE,
+    RELOCALIZATION_FILE,
+    read_names,
+    read_relocalization,
+    write_names,
+    write_relocalization,
+)
 from megloc_kapture.io.images import image_size
 from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, write_sensors
 from megloc_kapture.io.links import link_images
@@ -15,6 +24,7 @@ from megloc_kapture.io.side_tables import (
     GROUPS_FILE,
     PRIORS_FILE,
     PROTOCOL_FILE,
+    SIDE_TABLES,
     WORLD_FILE,
     ImageGroup,
     Protocol,
@@ -28,7 +38,7 @@ from megloc_kapture.io.side_tables import (
     write_world,
 )
 
-MAPPING, QUERY, QUERY_GT, SIDE_TABLES = "mapping", "query", "query_gt", "megloc"
+MAPPING, QUERY, QUERY_GT = "mapping", "query", "query_gt"
 
 
 def check_root(root: Path) -> Path:
@@ -66,7 +76,14 @@ def input_files(root: Path) -> Iterator[Path]:
             mask = sensors / "masks" / f"{image}.png"
             if mask.is_file():
                 yield mask
-    for name in (GROUPS_FILE, PRIORS_FILE, PROTOCOL_FILE, WORLD_FILE):
+    for name in (
+        GROUPS_FILE,
+        PRIORS_FILE,
+        PROTOCOL_FILE,
+        WORLD_FILE,
+        NAMES_FILE,
+        RELOCALIZATION_FILE,
+    ):
         if (root / SIDE_TABLES / name).is_file():
             yield root / SIDE_TABLES / name
 
@@ -214,6 +231,12 @@ def _write_side_tables(
     priors = read_priors(source)
     if priors:
         write_priors(place, {rename(query): permitted for query, permitted in priors.items()})
+    names = read_names(source)
+    if names:
+        write_names(place, {rename(query): name for query, name in names.items()})
+    pairs = read_relocalization(source)
+    if pairs:
+        write_relocalization(place, [replace(pair, query=rename(pair.query)) for pair in pairs])
     protocol = read_protocol(source)
     write_protocol(place, protocol_change(protocol) if protocol_change else protocol)
     if (source / WORLD_FILE).is_file():

@@ -7,12 +7,11 @@ where asked for, ``reference/``, the model the dataset ships. Images are linked.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
-from megloc_kapture.datasets.kapture_folders import MAPPING, QUERY, QUERY_GT, SIDE_TABLES
+from megloc_kapture.datasets.kapture_folders import MAPPING, QUERY, QUERY_GT
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.challenge_tables import (
     RelocalizationPair,
@@ -22,6 +21,7 @@ from megloc_kapture.io.challenge_tables import (
 from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, write_sensors
 from megloc_kapture.io.links import link_records
 from megloc_kapture.io.side_tables import (
+    SIDE_TABLES,
     ImageGroup,
     Protocol,
     World,
@@ -86,21 +86,26 @@ class Missing:
         self.files.append(file)
         return False
 
+    def by_folder(self) -> list[str]:
+        """What is missing, a text for each folder, sorted."""
+        folders: dict[Path, list[str]] = {}
+        for file in self.files:
+            folders.setdefault(file.parent, []).append(file.name)
+        return [
+            f"{self._shown(folder / min(names))}"
+            + (f" and {len(names) - 1} more in its folder" if len(names) > 1 else "")
+            for folder, names in sorted(folders.items())
+        ]
+
     def refuse(self) -> None:
         """Raise DataError with what is missing, folder by folder."""
         if not self.files:
             return
-        folders = Counter(file.parent for file in self.files)
-        first = {file.parent: file.name for file in reversed(self.files)}
-        parts = [
-            f"{self._shown(folder / first[folder])}"
-            + (f" and {number - 1} more in its folder" if number > 1 else "")
-            for folder, number in list(folders.items())[:_MISSING_SHOWN]
-        ]
-        more = len(folders) - len(parts)
+        parts = self.by_folder()
+        more = len(parts) - _MISSING_SHOWN
         raise DataError(
-            f"{len(self.files)} files are missing: {', '.join(parts)}"
-            + (f", and files of {more} more folders" if more else "")
+            f"{len(self.files)} files are missing: {', '.join(parts[:_MISSING_SHOWN])}"
+            + (f", and files of {more} more folders" if more > 0 else "")
             + "; --allow-missing imports what is there",
             path=self.root,
         )
@@ -153,8 +158,8 @@ def write_official(dataset: OfficialDataset, output: Path, *, allow_missing: boo
 
     Raises
     ------
-    DataError : files are missing and that was not allowed, nothing is left of the map or the
-        queries, or map and queries share names.
+    DataError : files are missing and that was not allowed, nothing is left of the map (or of the
+        queries, where nothing may be missing), or map and queries share names.
     OutputError : something cannot be written.
     """
     if dataset.missing is not None and not allow_missing:
@@ -162,7 +167,7 @@ def write_official(dataset: OfficialDataset, output: Path, *, allow_missing: boo
     root = dataset.missing.root if dataset.missing is not None else None
     if not dataset.mapping.records_camera or not dataset.mapping.trajectories:
         raise DataError("no mapping image with a pose is left to import", path=root)
-    if not dataset.query.records_camera:
+    if not dataset.query.records_camera and not allow_missing:
         raise DataError("no query image is left to import", path=root)
     shared = set(dataset.mapping.image_names()) & set(dataset.query.image_names())
     if shared:

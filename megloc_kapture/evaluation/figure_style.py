@@ -17,8 +17,12 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
-# Okabe and Ito's palette: told apart with any colour vision, in print too
-PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7a5195", "#8c6d31")
+# Okabe and Ito's palette: told apart with any colour vision, in print too; then four more, for
+# RobotCar has nine conditions
+PALETTE = (
+    *("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9"),
+    *("#7a5195", "#8c6d31", "#5f6b7a", "#9a1750"),
+)
 INK = "#1f2933"
 MUTED = "#9aa5b1"
 MISS = "#c0262d"
@@ -94,7 +98,7 @@ def legend_label(name: str) -> str:
 
 
 def colors_of(names: Sequence[str]) -> dict[str, str]:
-    """A colour for each name, in order; they come again where there are more than eight."""
+    """A colour for each name, in order; they come again where there are more than ten."""
     return {name: PALETTE[i % len(PALETTE)] for i, name in enumerate(names)}
 
 

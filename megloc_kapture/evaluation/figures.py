@@ -1,13 +1,12 @@
-"""The report's figures, each as inline SVG: recall curves, errors against inliers, top view."""
+"""The report's figures of errors, as inline SVG: recall curves, errors against inliers."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
 from numpy.typing import NDArray
 
 from megloc_kapture.evaluation.evaluate import Evaluation
@@ -23,14 +22,23 @@ from megloc_kapture.evaluation.figure_style import (
     styled_figure,
     to_svg,
 )
+from megloc_kapture.evaluation.recall import ALL
 from megloc_kapture.evaluation.tables import display_name
-from megloc_kapture.evaluation.top_view import top_view
-from megloc_kapture.geometry.poses import camera_centers, stack_poses
-from megloc_kapture.values import RigidTransform
+from megloc_kapture.evaluation.thresholds import Threshold
 
 # errors below these are drawn at them: a logarithmic axis has no zero
 _SMALLEST_POSITION_M = 1e-4
 _SMALLEST_ANGLE_DEG = 1e-3
+
+
+@dataclass(frozen=True)
+class Series:
+    """One curve: errors (N,), infinite without a pose, and how it is drawn."""
+
+    name: str
+    errors: NDArray[np.float64]
+    color: str
+    style: str | tuple[int, tuple[int, int]] = "-"
 
 
 def recall_curves(evaluation: Evaluation) -> str:
@@ -39,58 +47,149 @@ def recall_curves(evaluation: Evaluation) -> str:
     Left the position error, right the angle; each ignores the other. The curves end below 1
     where queries have no pose. The thresholds stand as dotted lines.
     """
-    positions = [t.position_m for t in evaluation.thresholds]
-    angles = [t.angle_deg for t in evaluation.thresholds if t.angle_deg is not None]
+    colors = _condition_colors(evaluation)
+    conditions = np.array([query.condition for query in evaluation.queries])
     errors = evaluation.errors
+    panels = []
+    for values in (errors.position_m, errors.angle_deg):
+        series = [
+            Series(display_name(name), values[conditions == name], color)
+            for name, color in colors.items()
+        ]
+        panels.append([*series, Series("all", values, INK, (0, (4, 2)) if colors else "-")])
+    return _two_panels(panels, evaluation.thresholds)
+
+
+def compared_curves(evaluations: Sequence[Evaluation]) -> str:
+    """The curves of several results, over all queries; else as :func:`recall_curves`."""
+    colors = colors_of([evaluation.label for evaluation in evaluations])
+    panels = [
+        [Series(e.label, values, colors[e.label]) for e, values in errors]
+        for errors in (
+            [(e, e.errors.position_m) for e in evaluations],
+            [(e, e.errors.angle_deg) for e in evaluations],
+        )
+    ]
+    return _two_panels(panels, evaluations[0].thresholds)
+
+
+def curves_by_row(evaluations: Sequence[Evaluation]) -> str | None:
+    """A small panel of position error per condition or pool, several results in each.
+
+    None where there are no conditions.
+    """
+    rows = [name for name in evaluations[0].members if name != ALL]
+    if not rows:
+        return None
+    colors = colors_of([evaluation.label for evaluation in evaluations])
+    bounds = [threshold.position_m for threshold in evaluations[0].thresholds]
+    across = min(len(rows), 3)
+    down = -(-len(rows) // across)
+    every = np.concatenate([evaluation.errors.position_m for evaluation in evaluations])
+    with styled_figure(10.5, 2.5 * down + 0.4) as figure:
+        panels = figure.subplots(down, across, sharey=True, squeeze=False).ravel()
+        for axes in panels[len(rows) :]:
+            axes.set_axis_off()
+        for name, axes in zip(rows, panels, strict=False):
+            series = [
+                Series(e.label, e.errors.position_m[e.members[name]], colors[e.label])
+                for e in evaluations
+            ]
+            draw_curves(axes, series, bounds, _SMALLEST_POSITION_M, span=every)
+            axes.set_title(display_name(name))
+        for axes in panels[max(len(rows) - across, 0) : len(rows)]:
+            axes.set_xlabel("position error (m)")
+        for axes in panels[::across]:
+            axes.set_ylabel("queries (%)")
+        handles, labels = panels[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8)
+        return to_svg(figure, "rows")
+
+
+def _two_panels(panels: Sequence[Sequence[Series]], thresholds: Sequence[Threshold]) -> str:
+    """Position errors on the left, angles on the right, one legend below both."""
+    positions = [t.position_m for t in thresholds]
+    angles = [t.angle_deg for t in thresholds if t.angle_deg is not None]
     with styled_figure(10.5, 3.9) as figure:
         left, right = figure.subplots(1, 2, sharey=True)
-        _curves(left, evaluation, errors.position_m, positions, _SMALLEST_POSITION_M)
+        draw_curves(left, panels[0], positions, _SMALLEST_POSITION_M)
         left.set(xlabel="position error (m)", ylabel="share of queries (%)")
-        _curves(right, evaluation, errors.angle_deg, angles, _SMALLEST_ANGLE_DEG)
+        draw_curves(right, panels[1], angles, _SMALLEST_ANGLE_DEG)
         right.set(xlabel="rotation error (deg)")
         handles, labels = left.get_legend_handles_labels()
         if len(labels) > 1:
-            figure.legend(handles, labels, loc="outside lower center", ncols=8, fontsize=8)
+            columns = 8 if sum(map(len, labels)) < 90 else 3
+            figure.legend(handles, labels, loc="outside lower center", ncols=columns, fontsize=8)
         return to_svg(figure, "curves")
 
 
-def _curves(
+def draw_curves(
     axes: Axes,
-    evaluation: Evaluation,
-    errors: NDArray[np.float64],
-    bounds: list[float],
+    series: Sequence[Series],
+    bounds: Sequence[float],
     smallest: float,
+    *,
+    span: NDArray[np.float64] | None = None,
 ) -> None:
+    """Cumulative curves on a logarithmic axis that spans the errors (or those of ``span``)."""
+    errors = np.concatenate([one.errors for one in series]) if span is None else span
     finite = np.clip(errors[np.isfinite(errors)], smallest, None)
     seen = np.concatenate([finite, np.clip(bounds, smallest, None)])
     low, high = (10.0 * smallest, 1.0) if not seen.size else (seen.min() / 1.5, seen.max() * 1.5)
     grid = np.unique(np.concatenate([np.geomspace(low, high, 400), bounds, [high]]))
     grid = grid[(grid >= low) & (grid <= high)]
-    conditions = np.array([query.condition for query in evaluation.queries])
-    colors = _condition_colors(evaluation)
-    for name, color in colors.items():
-        _curve(axes, errors[conditions == name], grid, display_name(name), color, "-")
-    _curve(axes, errors, grid, "all", INK, (0, (4, 2)) if colors else "-")
+    for one in series:
+        within = np.searchsorted(np.sort(one.errors), grid, side="right")
+        share = 100.0 * within / max(len(one.errors), 1)
+        axes.step(
+            grid,
+            share,
+            where="post",
+            color=one.color,
+            linestyle=one.style,
+            label=legend_label(one.name),
+        )
     for bound in sorted(set(bounds)):
         axes.axvline(bound, color=MUTED, linewidth=0.9, linestyle=":", zorder=0)
     axes.set(xscale="log", xlim=(low, high), ylim=(0, 102))
     plain_ticks(axes.xaxis)
 
 
-def _curve(
-    axes: Axes,
-    errors: NDArray[np.float64],
-    grid: NDArray[np.float64],
-    name: str,
-    color: str,
-    style: str | tuple[int, tuple[int, int]],
-) -> None:
-    within = np.searchsorted(np.sort(errors), grid, side="right")
-    share = 100.0 * within / max(len(errors), 1)
-    axes.step(grid, share, where="post", color=color, linestyle=style, label=legend_label(name))
+def recall_intervals(evaluations: Sequence[Evaluation]) -> str:
+    """Recall of several results with its confidence interval: a panel per threshold, a line per
+    condition, pool and ``all``."""
+    colors = colors_of([evaluation.label for evaluation in evaluations])
+    rows = list(evaluations[0].members)
+    thresholds = evaluations[0].thresholds
+    number = len(evaluations)
+    lowest = min(at.low for e in evaluations for row in e.rows for at in row.recall)
+    left = 10.0 * np.floor(10.0 * lowest)
+    height = len(rows) * max(0.34, 0.17 * number) + 1.2
+    with styled_figure(10.5, height) as figure:
+        panels = figure.subplots(1, len(thresholds), sharey=True, squeeze=False)[0]
+        for index, (threshold, axes) in enumerate(zip(thresholds, panels, strict=True)):
+            for order, evaluation in enumerate(evaluations):
+                at = [row.recall[index] for row in evaluation.rows]
+                recall = 100.0 * np.array([one.recall for one in at])
+                ends = 100.0 * np.array([[one.low, one.high] for one in at])
+                # between the lines of the grid, in the order of the legend from above
+                y = np.arange(len(rows)) + (order - (number - 1) / 2) * 0.7 / number
+                color = colors[evaluation.label]
+                axes.hlines(y, ends[:, 0], ends[:, 1], color=color, linewidth=1.6, alpha=0.55)
+                label = legend_label(evaluation.label)
+                axes.plot(recall, y, "o", color=color, markersize=4.5, label=label)
+            axes.set(title=str(threshold), xlim=(left - 2, 102), xlabel="recall (%)")
+            axes.grid(False, axis="y")
+        panels[0].set_yticks(range(len(rows)), [display_name(name) for name in rows])
+        panels[0].set_ylim(len(rows) - 0.5, -0.5)
+        handles, labels = panels[0].get_legend_handles_labels()
+        if number > 1:
+            columns = 8 if sum(map(len, labels)) < 90 else 3
+            figure.legend(handles, labels, loc="outside lower center", ncols=columns, fontsize=8)
+        return to_svg(figure, "recall")
 
 
-def errors_against_inliers(evaluation: Evaluation) -> str | None:
+def errors_against_inliers(evaluation: Evaluation, *, prefix: str = "inliers") -> str | None:
     """Position error of every pose against the inliers it was estimated from.
 
     A good solver's errors fall to the right: many inliers and a large error are a wrong place
@@ -130,75 +229,7 @@ def errors_against_inliers(evaluation: Evaluation) -> str | None:
         plain_ticks(axes.yaxis)
         if len(colors) > 1 or guessed.any():
             legend_below(axes)
-        return to_svg(figure, "inliers")
-
-
-def map_from_above(
-    evaluation: Evaluation, map_poses: Mapping[str, RigidTransform] | None = None
-) -> tuple[str, int]:
-    """Top view of map cameras, true and estimated centres, each error a line.
-
-    The page spans the map and the truth; estimates beyond it are cut off.
-
-    Returns
-    -------
-    svg : the figure.
-    num_outside : estimates that lie outside the page.
-    """
-    truth_quats, truth_translations = stack_poses(evaluation.truth.values())
-    truth = camera_centers(truth_quats, truth_translations)
-    mapped_quats, mapped_translations = stack_poses((map_poses or {}).values())
-    mapped = camera_centers(mapped_quats, mapped_translations)
-    view = top_view(np.vstack([mapped_quats, truth_quats]), np.vstack([mapped, truth]))
-    found = np.array([name in evaluation.estimated for name in evaluation.truth], dtype=bool)
-    estimated = view.project(camera_centers(*stack_poses(evaluation.estimated.values())))
-    mapped_2d, truth_2d = view.project(mapped), view.project(truth)
-    low, high = _page(np.vstack([mapped_2d, truth_2d]))
-    outside = ~((estimated >= low) & (estimated <= high)).all(axis=1)
-    guessed = np.array([q.outcome == "fallback" for q in evaluation.queries], dtype=bool)[found]
-    look = _Crowd(len(mapped) + len(truth))
-    width, height = (high - low).tolist()
-    with styled_figure(10.5, float(np.clip(10.0 * height / width, 3.0, 8.0)) + 0.6) as figure:
-        axes = figure.subplots()
-        if len(mapped_2d):
-            look.dots(axes, mapped_2d, "map cameras", 10, c="#b8c4d0")
-        lines = np.stack([truth_2d[found], estimated], axis=1)
-        axes.add_collection(LineCollection(list(lines), colors=MISS, linewidths=1.0, alpha=0.8))
-        look.dots(axes, truth_2d[found], "truth", 26, facecolors="none", edgecolors="#009e73")
-        look.dots(axes, estimated[~guessed], "estimated", 7, c="#0072b2", linewidths=0)
-        if guessed.any():
-            look.dots(axes, estimated[guessed], "fallback pose", 20, c=MISS, marker="x")
-        if not found.all():
-            look.dots(axes, truth_2d[~found], "truth, no pose", 30, c=MISS, marker="+")
-        axes.set_aspect("equal")
-        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-        axes.set(xlabel=f"{view.labels[0]} (m)", ylabel=f"{view.labels[1]} (m)")
-        figure.legend(loc="outside lower center", ncols=5, fontsize=8)
-        return to_svg(figure, "above"), int(outside.sum())
-
-
-class _Crowd:
-    """How dots are drawn where there are ``count`` of them: smaller, and as pixels, in a crowd."""
-
-    def __init__(self, count: int) -> None:
-        self.shrink = float(np.clip(np.sqrt(800 / max(count, 1)), 0.3, 1.0))
-        self.raster = count > RASTER_ABOVE
-
-    def dots(
-        self, axes: Axes, points: NDArray[np.float64], label: str, size: float, **look: Any
-    ) -> None:
-        look = {"linewidths": 1.3 * self.shrink, "rasterized": self.raster} | look
-        axes.scatter(points[:, 0], points[:, 1], s=size * self.shrink, label=label, **look)
-
-
-def _page(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Lower left and upper right corner around points (N, 2), with a margin; never flat."""
-    low, high = points.min(axis=0), points.max(axis=0)
-    size = max(float((high - low).max()), 1.0)
-    # a path walked straight ahead would leave a page without height
-    half = np.maximum((high - low) / 2, 0.12 * size) + 0.06 * size
-    center = (low + high) / 2
-    return center - half, center + half
+        return to_svg(figure, prefix)
 
 
 def _condition_colors(evaluation: Evaluation) -> dict[str, str]:

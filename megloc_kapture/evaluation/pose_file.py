@@ -12,25 +12,41 @@ from pathlib import Path
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.atomic import write_bytes
+from megloc_kapture.io.kapture_data import FLOAT_PATTERN
 from megloc_kapture.io.side_tables import MAX_QUATERNION_NORM_ERROR, PoseFileNames
 from megloc_kapture.io.text import read_text
 from megloc_kapture.values import RigidTransform
 
-_COLUMNS = "name qw qx qy qz tx ty tz"
+COLUMNS = "name qw qx qy qz tx ty tz"
+
+# how images are called: by a rule, or by a table in the order of the challenge's list
+Names = PoseFileNames | Mapping[str, str]
 
 
-def names_in_pose_file(images: Iterable[str], rule: PoseFileNames) -> dict[str, str]:
-    """Image -> the name it bears in a pose file, sorted by image.
+def names_in_pose_file(images: Iterable[str], names: Names) -> dict[str, str]:
+    """Image -> the name it bears in a pose file, in the order of the file.
+
+    By a rule that is the order of the names; by a table (image -> name) the table's, and images
+    that are not in it have no name.
 
     Raises
     ------
     DataError : two images would bear one name (names both), or a name holds white space, which
         the format cannot express.
     """
-    names: dict[str, str] = {}
+    if isinstance(names, str):
+        called = {i: i if names == "full" else i.rsplit("/", 1)[-1] for i in sorted(set(images))}
+        _check_names(called)
+        return dict(sorted(called.items(), key=lambda item: item[1]))
+    wanted = set(images)
+    called = {image: name for image, name in names.items() if image in wanted}
+    _check_names(called)
+    return called
+
+
+def _check_names(names: Mapping[str, str]) -> None:
     bearer: dict[str, str] = {}
-    for image in sorted(images):
-        name = image if rule == "full" else image.rsplit("/", 1)[-1]
+    for image, name in names.items():
         if not name or name.split() != [name]:
             raise DataError(f"image {image!r}: a pose file cannot hold the name {name!r}")
         if name in bearer:
@@ -39,14 +55,18 @@ def names_in_pose_file(images: Iterable[str], rule: PoseFileNames) -> dict[str, 
                 "file; use full names"
             )
         bearer[name] = image
-        names[image] = name
-    return names
 
 
-def format_pose_file(poses: Mapping[str, RigidTransform], *, names: PoseFileNames = "full") -> str:
-    """The text of a pose file, sorted by the names it holds.
+def format_pose_file(poses: Mapping[str, RigidTransform], *, names: Names = "full") -> str:
+    """The text of a pose file.
 
     Numbers have the fewest digits that read back to the same float64, so nothing is lost.
+
+    Parameters
+    ----------
+    poses : image -> ``cam_from_world``.
+    names : a rule, and the rows are sorted by name; or the challenge's list as image -> name, and
+        the rows stand in its order: images that are not in it are left out.
 
     Raises
     ------
@@ -55,14 +75,14 @@ def format_pose_file(poses: Mapping[str, RigidTransform], *, names: PoseFileName
     """
     lines = []
     for image, name in names_in_pose_file(poses, names).items():
-        pose = _checked(poses[image].quat_wxyz, poses[image].translation, f"image {image!r}")
+        pose = checked_pose(poses[image].quat_wxyz, poses[image].translation, f"image {image!r}")
         numbers = " ".join(repr(float(v)) for v in (*pose.quat_wxyz, *pose.translation))
-        lines.append((name, numbers))
-    return "".join(f"{name} {numbers}\n" for name, numbers in sorted(lines))
+        lines.append(f"{name} {numbers}\n")
+    return "".join(lines)
 
 
 def write_pose_file(
-    path: Path | str, poses: Mapping[str, RigidTransform], *, names: PoseFileNames = "full"
+    path: Path | str, poses: Mapping[str, RigidTransform], *, names: Names = "full"
 ) -> None:
     """Write a pose file atomically; see :func:`format_pose_file`.
 
@@ -100,29 +120,33 @@ def read_pose_file(path: Path | str) -> dict[str, RigidTransform]:
             continue
         if len(fields) != 8:
             raise DataError(
-                f"{len(fields)} columns instead of 8 ({_COLUMNS})", path=path, line=number
+                f"{len(fields)} columns instead of 8 ({COLUMNS})", path=path, line=number
             )
         name = fields[0]
         if name in poses:
             raise DataError(f"{name!r} is given twice", path=path, line=number)
         try:
-            qw, qx, qy, qz, tx, ty, tz = (_number(field) for field in fields[1:])
-        except ValueError as error:
-            raise DataError(f"{name!r}: {error}", path=path, line=number) from error
-        try:
-            poses[name] = _checked((qw, qx, qy, qz), (tx, ty, tz), repr(name))
+            qw, qx, qy, qz, tx, ty, tz = (parse_number(field) for field in fields[1:])
+            poses[name] = checked_pose((qw, qx, qy, qz), (tx, ty, tz), repr(name))
         except DataError as error:
             raise DataError(error.message, path=path, line=number) from error
     return poses
 
 
 def poses_by_image(
-    poses: Mapping[str, RigidTransform], images: Iterable[str]
+    poses: Mapping[str, RigidTransform],
+    images: Iterable[str],
+    names: Mapping[str, str] | None = None,
 ) -> dict[str, RigidTransform]:
     """Give the poses of a pose file the names that ``images`` bear in kapture.
 
-    A name that is an image stays; one that is the last part of exactly one image's path becomes
-    that image; any other stays as it is, unknown, for the evaluation to report.
+    A name of the challenge's list becomes its image. Of the others, one that is an image stays;
+    one that is the last part of exactly one image's path becomes that image; any other stays as it
+    is, unknown, for the evaluation to report.
+
+    Parameters
+    ----------
+    names : the challenge's list, image -> name in the pose file.
 
     Raises
     ------
@@ -132,9 +156,12 @@ def poses_by_image(
     by_basename: dict[str, list[str]] = {}
     for image in sorted(known):
         by_basename.setdefault(image.rsplit("/", 1)[-1], []).append(image)
+    listed = {name: image for image, name in (names or {}).items()}
     renamed: dict[str, RigidTransform] = {}
     for name, pose in poses.items():
         fitting = [name] if name in known else by_basename.get(name, [name])
+        if name in listed:
+            fitting = [listed[name]]
         if len(fitting) > 1:
             raise DataError(f"{name!r} may be {fitting[0]!r} or {fitting[1]!r}; use full names")
         if fitting[0] in renamed:
@@ -143,18 +170,31 @@ def poses_by_image(
     return renamed
 
 
-def _number(text: str) -> float:
-    if "_" in text:  # python reads 1_0 as 10; nobody means that in a pose file
-        raise ValueError(f"could not convert string to float: {text!r}")
-    return float(text)
+def parse_number(text: str) -> float:
+    """A decimal number; "nan" and the like become one that :func:`checked_pose` refuses.
+
+    Raises
+    ------
+    DataError : anything else that Python would take ("1_0", digits of other scripts) or not take.
+    """
+    if FLOAT_PATTERN.fullmatch(text):
+        return float(text)
+    if text.lower().lstrip("+-") in ("nan", "inf", "infinity"):
+        return math.nan
+    raise DataError(f"{text!r} is not a number")
 
 
-def _checked(
+def checked_pose(
     quat_wxyz: tuple[float, float, float, float],
     translation: tuple[float, float, float],
     whose: str,
 ) -> RigidTransform:
-    """The pose with a unit quaternion; one that is unit to rounding keeps its very digits."""
+    """The pose with a unit quaternion; one that is unit to rounding keeps its very digits.
+
+    Raises
+    ------
+    DataError : not finite, or a quaternion off unit length by 1e-3 or more; names ``whose``.
+    """
     if not all(math.isfinite(v) for v in (*quat_wxyz, *translation)):
         raise DataError(f"{whose}: the pose is not finite")
     norm = math.sqrt(sum(q * q for q in quat_wxyz))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -38,41 +38,53 @@ def package_versions() -> dict[str, str]:
     return {package: version for package, version in found if version is not None}
 
 
-def provenance_path(pose_file: Path | str) -> Path:
-    """The provenance of ``poses.txt`` is ``poses.txt.json``."""
-    path = Path(pose_file)
+def provenance_path(place: Path | str) -> Path:
+    """Where it stands: ``x.txt.json`` beside a file ``x.txt``, ``x.json`` beside a folder ``x``."""
+    path = Path(place)
     return path.with_name(f"{path.name}.json")
 
 
 def write_provenance(
-    pose_file: Path | str, provenance: Mapping[str, Any], *, counts: Mapping[str, int]
+    place: Path | str,
+    provenance: Mapping[str, Any],
+    *,
+    counts: Mapping[str, int],
+    files: Sequence[str] | None = None,
 ) -> Path:
     """Write the provenance of a pose file that has been written; returns its path.
 
-    The JSON holds the SHA-256 of the pose file, so that the two can be told to belong together,
-    the package versions, ``counts`` and the entries of ``provenance`` (options, preset, inputs).
-    It holds no date and no duration: the same run gives the same bytes.
+    The JSON holds the SHA-256 of each file, so that they can be told to belong together, the
+    package versions, ``counts`` and the entries of ``provenance`` (options, preset, inputs). It
+    holds no date and no duration: the same run gives the same bytes.
+
+    Parameters
+    ----------
+    place : the pose file, or the folder of a challenge that takes several.
+    files : names of the pose files below the folder ``place``; None: it is a file.
 
     Raises
     ------
-    DataError : the pose file cannot be read.
+    DataError : a pose file cannot be read.
     ValueError : an entry of ``provenance`` would replace one of ours, or is not JSON.
     OutputError : the file cannot be written.
     """
-    pose_file = Path(pose_file)
-    try:
-        content = pose_file.read_bytes()
-    except OSError as error:
-        raise DataError(f"cannot read: {error.strerror or error}", path=pose_file) from error
+    place = Path(place)
+    paths = {place.name: place} if files is None else {name: place / name for name in files}
     ours: dict[str, Any] = {
-        "pose_file": pose_file.name,
-        "sha256": hashlib.sha256(content).hexdigest(),
+        "files": {name: _sha256(path) for name, path in sorted(paths.items())},
         "versions": package_versions(),
         "counts": dict(counts),
     }
     taken = sorted(ours.keys() & provenance.keys())
     if taken:
         raise ValueError(f"provenance entries are already ours: {', '.join(taken)}")
-    path = provenance_path(pose_file)
+    path = provenance_path(place)
     write_json(path, ours | dict(provenance))
     return path
+
+
+def _sha256(path: Path) -> str:
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise DataError(f"cannot read: {error.strerror or error}", path=path) from error

@@ -1,4 +1,4 @@
-"""Recall at thresholds, per condition and pooled, with the medians that go with it."""
+"""Recall at thresholds, per condition and pooled, with its confidence and the medians beside it."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, PlainSerializer
 
 from megloc_kapture.errors import OptionError
+from megloc_kapture.evaluation.confidence import confidence_interval
 from megloc_kapture.evaluation.pose_errors import PoseErrors
 from megloc_kapture.evaluation.thresholds import Threshold
 from megloc_kapture.values import Options
@@ -25,11 +26,21 @@ MaybeInfinite = Annotated[
 
 
 class RecallAt(Options):
-    """Recall at one threshold: ``num_within`` of the row's ``num_queries``, and their ratio."""
+    """Recall at one threshold.
+
+    Parameters
+    ----------
+    num_within : queries within the threshold, of the row's ``num_queries``.
+    recall : their ratio.
+    low, high : the 95 % confidence interval of ``recall``
+        (:func:`megloc_kapture.evaluation.confidence.confidence_interval`).
+    """
 
     threshold: Threshold
     num_within: int
     recall: float
+    low: float
+    high: float
 
 
 class RecallRow(Options):
@@ -89,6 +100,7 @@ def recall_row(
     localized = posed & ~guessed
     num_queries = int(chosen.sum())
     counts = [int((within(errors, threshold) & chosen).sum()) for threshold in thresholds]
+    lows, highs = confidence_interval(counts, num_queries)
     return RecallRow(
         name=name,
         num_queries=num_queries,
@@ -100,8 +112,10 @@ def recall_row(
                 threshold=threshold,
                 num_within=count,
                 recall=count / num_queries if num_queries else 0.0,
+                low=float(low),
+                high=float(high),
             )
-            for threshold, count in zip(thresholds, counts, strict=True)
+            for threshold, count, low, high in zip(thresholds, counts, lows, highs, strict=True)
         ),
         median_position_m=_median(errors.position_m[chosen]),
         median_angle_deg=_median(errors.angle_deg[chosen]),
@@ -110,16 +124,14 @@ def recall_row(
     )
 
 
-def recall_rows(
-    errors: PoseErrors,
-    thresholds: Sequence[Threshold],
+def row_members(
+    conditions: Sequence[str],
     *,
-    conditions: Sequence[str] | None = None,
     order: Sequence[str] = (),
     pools: Mapping[str, Sequence[str]] | None = None,
-    fallback: NDArray[np.bool_] | None = None,
-) -> tuple[RecallRow, ...]:
-    """One row per condition, then one per pool, then the row ``"all"`` of every query.
+) -> dict[str, NDArray[np.bool_]]:
+    """The rows of a recall table and the queries they count: one row per condition, then one per
+    pool, then ``"all"``.
 
     A pool counts the queries of its conditions together; it is not the mean of their recalls.
 
@@ -130,11 +142,15 @@ def recall_rows(
     order : conditions in the order to report them; others follow, sorted, those without last.
     pools : name -> conditions; a pool without queries is left out.
 
+    Returns
+    -------
+    Name -> bool (N,).
+
     Raises
     ------
     OptionError : two rows would bear one name.
     """
-    of_query = np.array([""] * len(errors.names) if conditions is None else list(conditions), str)
+    of_query = np.array(list(conditions), str)
     present = set(of_query.tolist())
     named = [c for c in order if c in present] + sorted(present - {""} - set(order))
     if named and "" in present:
@@ -146,7 +162,18 @@ def recall_rows(
         if pooled.any():
             members[pool] = pooled
     _check_free(ALL, members)
-    members[ALL] = np.ones(len(errors.names), bool)
+    members[ALL] = np.ones(len(of_query), bool)
+    return members
+
+
+def recall_rows(
+    errors: PoseErrors,
+    thresholds: Sequence[Threshold],
+    members: Mapping[str, NDArray[np.bool_]],
+    *,
+    fallback: NDArray[np.bool_] | None = None,
+) -> tuple[RecallRow, ...]:
+    """The rows of a recall table, of the queries that :func:`row_members` puts into them."""
     return tuple(
         recall_row(name, errors, thresholds, members=chosen, fallback=fallback)
         for name, chosen in members.items()

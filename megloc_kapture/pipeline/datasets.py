@@ -1,75 +1,273 @@
-"""The datasets that ``megloc eval`` knows, by name."""
+"""The datasets that ``megloc eval`` and ``megloc import`` know, by name.
+
+``kapture`` is any pair of kapture folders; an adapter (group ``megloc_kapture.datasets``) knows an
+official layout; ``synthetic`` and ``synthetic-X`` are rendered, the latter in the layout of X.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from megloc_kapture.datasets.kapture_folders import QUERY_GT, check_root
-from megloc_kapture.datasets.synthetic.options import SYNTHETIC_VERSION, SyntheticWorldOptions
+from megloc_kapture.datasets.kapture_folders import (
+    QUERY_GT,
+    check_root,
+    import_kapture_folders,
+    input_files,
+)
+from megloc_kapture.datasets.official import OfficialDataset, write_official
 from megloc_kapture.errors import OptionError
+from megloc_kapture.io.atomic import write_bytes
+from megloc_kapture.io.side_tables import SIDE_TABLES, Protocol
+from megloc_kapture.plugins import DATASETS, DatasetAdapter, load_plugin, plugin_names
 from megloc_kapture.stages.parallel import Track
+from megloc_kapture.values import Options
 
-DATASETS = ("kapture", "synthetic")
+KAPTURE, SYNTHETIC = "kapture", "synthetic"
+TWIN_PREFIX = f"{SYNTHETIC}-"
+DATA_VARIABLE = "MEGLOC_DATA"
+SUMMARY_FILE = f"{SIDE_TABLES}/summary.txt"
 
 Renderer = Callable[[Path], Mapping[str, float]]
+ProtocolChange = Callable[[Protocol], Protocol]
+
+
+@dataclass(frozen=True)
+class Twin:
+    """A rendered dataset: its options, the version of what draws it, and its writer."""
+
+    options: Options
+    version: int
+    write: Callable[..., Mapping[str, float]]
 
 
 @dataclass(frozen=True)
 class DatasetChoice:
-    """A dataset and where it comes from: a folder, or a rendered world."""
+    """A dataset and where it comes from.
+
+    Attributes
+    ----------
+    root : its folder; None where it is rendered.
+    adapter : of its official layout; None for kapture folders.
+    import_options : the adapter's, by name.
+    twin : what renders it; None for a dataset with a root.
+    """
 
     name: str
     root: Path | None
-    world: SyntheticWorldOptions | None = None
+    adapter: DatasetAdapter | None = None
+    import_options: Mapping[str, Any] = field(default_factory=dict)
+    twin: Twin | None = None
+    query_prefix: str = ""
+    allow_missing: bool = False
 
     def check(self) -> None:
         """Raise DataError when the folder cannot be the dataset's, before anything is written."""
-        if self.root is not None:
+        if self.root is None:
+            return
+        if self.adapter is None:
             check_root(self.root)
+        else:
+            self.adapter.check(self.root)
 
     def has_truth(self) -> bool:
-        """Whether the true poses of the queries are known."""
-        if self.root is None:
+        """Whether true poses may lie beside the dataset; an adapter may know of more."""
+        if self.root is None or self.adapter is not None:
             return True
         return (self.root / QUERY_GT / "sensors" / "sensors.txt").is_file()
 
+    def settings(self) -> dict[str, Any]:
+        """What, beside the files, determines an import."""
+        settings: dict[str, Any] = {"dataset": self.name, "query_prefix": self.query_prefix}
+        if self.adapter is not None:
+            settings["adapter"] = self.adapter.name
+            settings["options"] = dict(self.import_options)
+            settings["allow_missing"] = self.allow_missing
+        return settings
+
+    def input_files(self, root: Path) -> Iterator[Path]:
+        """Every file an import depends on."""
+        return input_files(root) if self.adapter is None else self.adapter.input_files(root)
+
+    def import_to(
+        self, root: Path, output: Path, change: ProtocolChange | None = None
+    ) -> dict[str, float]:
+        """Import ``root`` into ``output``; returns counts for the log.
+
+        Beside the kapture folders an official dataset leaves a summary of what was found and
+        what is published, ``megloc/summary.txt``.
+
+        Raises
+        ------
+        DataError : something is missing or broken; names file and line.
+        """
+        if self.adapter is None:
+            return import_kapture_folders(
+                root, output, query_prefix=self.query_prefix, protocol_change=change
+            )
+        dataset: OfficialDataset = self.adapter.read(root, allow_missing=self.allow_missing)
+        if change is not None:
+            dataset = replace(dataset, protocol=change(dataset.protocol))
+        write_official(dataset, output, allow_missing=self.allow_missing)
+        write_bytes(output / SUMMARY_FILE, summary_text(dataset).encode())
+        truth = dataset.query_gt
+        return {
+            "map_images": len(dataset.mapping.records_camera),
+            "queries": len(dataset.query.records_camera),
+            "queries_with_truth": 0 if truth is None else len(truth.poses()),
+        }
+
     def renderer(self, executor: Executor | None, track: Track) -> Renderer | None:
-        """Writes the world below the folder it is given; None for a dataset with a root."""
-        if self.world is None:
+        """Writes the rendered dataset below the folder it is given; None where there is a root."""
+        twin = self.twin
+        if twin is None:
             return None
-        options = self.world
-
-        def render(out: Path) -> Mapping[str, float]:
-            from megloc_kapture.datasets.synthetic.writing import write_synthetic_kapture
-
-            return write_synthetic_kapture(out / "world", options, executor=executor, track=track)
-
-        return render
+        return lambda out: twin.write(out / "world", twin.options, executor, track=track)
 
     def render_options(self) -> dict[str, Any]:
-        """What determines the rendered world."""
-        if self.world is None:
+        """What determines the rendered dataset."""
+        if self.twin is None:
             return {}
-        return {"version": SYNTHETIC_VERSION, "world": self.world.model_dump(mode="json")}
+        return {"version": self.twin.version, "world": self.twin.options.model_dump(mode="json")}
 
 
-def choose_dataset(name: str, root: Path | None) -> DatasetChoice:
-    """The dataset of a name.
+def summary_text(dataset: OfficialDataset) -> str:
+    """What an import found, beside what is published, and what a user should know."""
+    lines = [str(count) for count in dataset.summary]
+    if dataset.missing is not None and dataset.missing.files:
+        lines += ["", f"{len(dataset.missing.files)} files are missing (--allow-missing):"]
+        lines += [f"  {text}" for text in dataset.missing.by_folder()]
+    for remark in dataset.remarks:
+        lines += ["", remark]
+    return "\n".join(lines) + "\n"
+
+
+def dataset_names() -> list[str]:
+    """Every name that :func:`choose_dataset` takes."""
+    official = plugin_names(DATASETS)
+    return [KAPTURE, *official, SYNTHETIC, *(f"{TWIN_PREFIX}{n}" for n in official if n in _TWINS)]
+
+
+def choose_dataset(
+    name: str,
+    root: Path | None,
+    *,
+    import_options: Mapping[str, Any] | None = None,
+    query_prefix: str = "",
+    allow_missing: bool = False,
+) -> DatasetChoice:
+    """The dataset of a name; without ``root`` it is looked for below MEGLOC_DATA.
 
     Raises
     ------
-    OptionError : unknown name, or no root where one is needed.
+    OptionError : unknown name, no root where one is needed (says where the data is published), or
+        an option the dataset does not have.
     """
-    if name == "kapture":
-        if root is None:
-            raise OptionError(
-                "dataset kapture needs --root, a folder with mapping/, query/ and perhaps query_gt/"
-            )
-        return DatasetChoice(name, root)
-    if name == "synthetic":
-        return DatasetChoice(name, root, None if root else SyntheticWorldOptions())
-    raise OptionError(f"unknown dataset {name!r}; known: {', '.join(DATASETS)}")
+    if name not in dataset_names():
+        raise OptionError(f"unknown dataset {name!r}; known: {', '.join(dataset_names())}")
+    layout = name.removeprefix(TWIN_PREFIX)
+    adapter: DatasetAdapter | None = None
+    if layout not in (KAPTURE, SYNTHETIC):
+        adapter = load_plugin(DATASETS, layout, dict(import_options or {}))
+        if query_prefix:
+            raise OptionError("--query-prefix is for datasets of kapture folders")
+    elif import_options:
+        raise OptionError(f"dataset {name} has no import options: {', '.join(import_options)}")
+    choice = DatasetChoice(
+        name, root, adapter, dict(import_options or {}), None, query_prefix, allow_missing
+    )
+    if root is None and (name == SYNTHETIC or name.startswith(TWIN_PREFIX)):
+        return replace(choice, twin=twin_of(layout))
+    if root is None:
+        choice = replace(choice, root=_root_in_environment(name, adapter))
+    return choice
+
+
+def _root_in_environment(name: str, adapter: DatasetAdapter | None) -> Path:
+    folder = os.environ.get(DATA_VARIABLE)
+    names: Sequence[str] = (name,) if adapter is None else (name, *adapter.card.folders)
+    tried = []
+    if folder:
+        tried = [Path(folder) / own for own in names]
+        for place in tried:
+            if place.is_dir():
+                return place
+    looked = f"; {DATA_VARIABLE} has none of {', '.join(p.name for p in tried)}" if tried else ""
+    if adapter is None:
+        raise OptionError(
+            f"dataset {name} needs --root, a folder with mapping/, query/ and perhaps query_gt/"
+            + looked
+        )
+    card = adapter.card
+    twin = f"; without the data, `megloc eval {TWIN_PREFIX}{name}` runs a rendered twin"
+    raise OptionError(
+        f"dataset {name} needs --root or {DATA_VARIABLE}{looked}: {card.title} is published at "
+        f"{card.published_at} ({card.size}) and has to lie as {card.layout}"
+        + (twin if name in _TWINS else "")
+    )
+
+
+def twin_of(layout: str, **changes: Any) -> Twin:
+    """What renders the world in a layout, by the layout's name, with changed options.
+
+    Raises
+    ------
+    OptionError : no such twin.
+    """
+    if layout not in _TWINS:
+        raise OptionError(f"nothing renders {layout!r}; known: {', '.join(_TWINS)}")
+    return _TWINS[layout](changes)
+
+
+# each imports its renderer only when it is asked for
+def _world(changes: Mapping[str, Any]) -> Twin:
+    from megloc_kapture.datasets.synthetic.options import (
+        SYNTHETIC_VERSION,
+        SyntheticWorldOptions,
+    )
+    from megloc_kapture.datasets.synthetic.writing import write_synthetic_kapture
+
+    return Twin(SyntheticWorldOptions(**changes), SYNTHETIC_VERSION, write_synthetic_kapture)
+
+
+def _aachen(changes: Mapping[str, Any]) -> Twin:
+    from megloc_kapture.datasets.synthetic import aachen_twin as twin
+
+    return Twin(twin.AachenTwinOptions(**changes), twin.AACHEN_TWIN_VERSION, twin.write_aachen_twin)
+
+
+def _robotcar(changes: Mapping[str, Any]) -> Twin:
+    from megloc_kapture.datasets.synthetic import robotcar_twin as twin
+
+    return Twin(
+        twin.RobotCarTwinOptions(**changes), twin.ROBOTCAR_TWIN_VERSION, twin.write_robotcar_twin
+    )
+
+
+def _fourseasons(changes: Mapping[str, Any]) -> Twin:
+    from megloc_kapture.datasets.synthetic import fourseasons_twin as twin
+
+    return Twin(
+        twin.FourSeasonsTwinOptions(**changes),
+        twin.FOURSEASONS_TWIN_VERSION,
+        twin.write_fourseasons_twin,
+    )
+
+
+def _inloc(changes: Mapping[str, Any]) -> Twin:
+    from megloc_kapture.datasets.synthetic import inloc_twin as twin
+
+    return Twin(twin.InLocTwinOptions(**changes), twin.INLOC_TWIN_VERSION, twin.write_inloc_twin)
+
+
+_TWINS: dict[str, Callable[[Mapping[str, Any]], Twin]] = {
+    SYNTHETIC: _world,
+    "aachen": _aachen,
+    "robotcar": _robotcar,
+    "4seasons": _fourseasons,
+    "inloc": _inloc,
+}

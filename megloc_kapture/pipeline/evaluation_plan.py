@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,28 +13,32 @@ from megloc_kapture.datasets.kapture_folders import (
     MAPPING,
     QUERY,
     QUERY_GT,
-    SIDE_TABLES,
-    check_root,
-    import_kapture_folders,
-    input_files,
 )
-from megloc_kapture.evaluation.folders import evaluate_folders, load_poses, load_statuses
+from megloc_kapture.datasets.official import REFERENCE
+from megloc_kapture.evaluation.folders import evaluate_folders, results_without_truth
 from megloc_kapture.evaluation.outputs import write_evaluation
-from megloc_kapture.evaluation.pose_file import write_pose_file
-from megloc_kapture.evaluation.provenance import package_versions, write_provenance
+from megloc_kapture.evaluation.provenance import package_versions
+from megloc_kapture.evaluation.rules import read_rules
+from megloc_kapture.evaluation.surroundings import surroundings_of
+from megloc_kapture.evaluation.without_truth_outputs import write_without_truth
 from megloc_kapture.io.atomic import write_bytes
 from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder, read_pairs, write_pairs
-from megloc_kapture.io.side_tables import Protocol, read_protocol, read_world
+from megloc_kapture.io.side_tables import SIDE_TABLES, Protocol, read_protocol
+from megloc_kapture.pipeline.benchmarks import BenchmarkFile
+from megloc_kapture.pipeline.datasets import DatasetChoice
 from megloc_kapture.pipeline.manifests import FileHashes
 from megloc_kapture.pipeline.plan import Stage
 from megloc_kapture.pipeline.presets import PipelineOptions
+from megloc_kapture.pipeline.submission import place_of, write_submission
 from megloc_kapture.pipeline.workspace import HASHES, Workspace
 from megloc_kapture.stages.global_vlad import extract_vlad, vlad_type
 from megloc_kapture.stages.image_pairs import pair_map_images, pair_queries
+from megloc_kapture.stages.lifting import lift_map
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.matches import iterate_candidates, match_pairs
 from megloc_kapture.stages.parallel import Track, untracked
 from megloc_kapture.stages.query_poses import localize_from_matches, write_localized
+from megloc_kapture.stages.restrictions import Restrictions
 from megloc_kapture.stages.triangulation import triangulate_map
 from megloc_kapture.values import RigidTransform
 
@@ -50,27 +54,32 @@ class Run:
 
     Attributes
     ----------
-    root : the pair of kapture folders; None when ``render`` makes it inside the workspace.
-    render : writes the dataset to the folder it is given (rendered worlds); with its options.
+    benchmark : what it wants different in the dataset's protocol.
     """
 
-    dataset: str
+    source: DatasetChoice
     preset: str
     options: PipelineOptions
     workspace: Workspace
-    root: Path | None = None
-    render: Callable[[Path], Mapping[str, float]] | None = None
-    render_options: Mapping[str, Any] | None = None
-    query_prefix: str = ""
-    thresholds: tuple[tuple[float, float | None], ...] | None = None
+    benchmark: BenchmarkFile | None = None
     executor: Executor | None = None
     track: Track = untracked
     num_threads: int = 1
 
     @property
-    def pose_file(self) -> str:
-        """Name of the pose file, below the workspace."""
-        return f"{SUBMISSIONS}/{self.dataset}_eval_megloc-{self.preset}.txt"
+    def dataset(self) -> str:
+        """The dataset's name."""
+        return self.source.name
+
+    def submission_below(self, folder: Path) -> Path:
+        """Where, below ``folder``, the pose file stands; a folder where it is several files."""
+        protocol = read_protocol(self.workspace.path(SIDE_TABLES))
+        stem = f"{self.dataset}_eval_megloc-{self.preset}"
+        return place_of(folder / SUBMISSIONS, stem, protocol)
+
+    def restrictions(self) -> Restrictions:
+        """What the dataset's side tables permit."""
+        return Restrictions.read(self.workspace.path(SIDE_TABLES))
 
 
 def plan_evaluation(run: Run) -> list[Stage]:
@@ -83,9 +92,8 @@ def plan_evaluation(run: Run) -> list[Stage]:
     options, local_type = run.options, run.options.make_extractor().name
     run.options.make_matcher()
     dump = options.model_dump(mode="json")
-    verification = dump["verification"]
-    stages = _dataset_stages(run)
-    stages += [
+    stages = [
+        *_dataset_stages(run),
         Stage(
             "local_features",
             1,
@@ -102,37 +110,10 @@ def plan_evaluation(run: Run) -> list[Stage]:
             ("global_features",),
             lambda out: _global_features(run, out, local_type),
         ),
-        Stage(
-            "mapping_pairs",
-            1,
-            {"mapping_pairs": dump["mapping_pairs"]},
-            ("import", "global_features"),
-            (MAPPING_PAIRS,),
-            lambda out: _mapping_pairs(run, out, local_type),
-        ),
-        Stage(
-            "mapping_matches",
-            1,
-            {
-                "matching": dump["matching"],
-                "verification": verification,
-                "known_poses": dump["mapping_verification"],
-            },
-            ("import", "local_features", "mapping_pairs"),
-            (MAPPING_MATCHES,),
-            lambda out: _matches(run, out, local_type, for_queries=False),
-        ),
-        Stage(
-            "triangulation",
-            1,
-            {"triangulation": dump["triangulation"]},
-            ("import", "local_features", "global_features", "mapping_matches"),
-            (MAP,),
-            lambda out: _triangulation(run, out, local_type),
-        ),
+        *_map_stages(run, dump, local_type),
         Stage(
             "query_pairs",
-            1,
+            2,
             {"query_pairs": dump["query_pairs"]},
             ("import", "global_features"),
             (QUERY_PAIRS,),
@@ -143,7 +124,7 @@ def plan_evaluation(run: Run) -> list[Stage]:
             1,
             {
                 "matching": dump["matching"],
-                "verification": verification,
+                "verification": dump["verification"],
                 "two_view": dump["query_verification"],
             },
             ("import", "local_features", "query_pairs"),
@@ -152,15 +133,15 @@ def plan_evaluation(run: Run) -> list[Stage]:
         ),
         Stage(
             "localization",
-            1,
+            2,
             {"localization": dump["localization"]},
-            ("import", "local_features", "triangulation", "query_pairs", "query_matches"),
+            ("import", "local_features", "map", "query_pairs", "query_matches"),
             (LOCALIZED, TIMING),
             lambda out: _localization(run, out, local_type),
         ),
         Stage(
             "submission",
-            1,
+            2,
             {"dataset": run.dataset, "preset": run.preset, "options": dump},
             ("import", "localization"),
             (SUBMISSIONS,),
@@ -168,7 +149,7 @@ def plan_evaluation(run: Run) -> list[Stage]:
         ),
         Stage(
             "evaluation",
-            1,
+            2,
             {"dataset": run.dataset, "preset": run.preset, "options": dump},
             ("import", "localization"),
             (EVALUATION,),
@@ -178,39 +159,104 @@ def plan_evaluation(run: Run) -> list[Stage]:
     return stages
 
 
+def _map_stages(run: Run, dump: Mapping[str, Any], local_type: str) -> list[Stage]:
+    """How the map gets its points; the last of them is called ``map``."""
+    if run.options.map == "lift":
+        return [
+            Stage(
+                "map",
+                1,
+                {"by": "lift", "lifting": dump["lifting"]},
+                ("import", "local_features", "global_features"),
+                (MAP,),
+                lambda out: lift_map(
+                    run.workspace.folder(MAPPING, ""),
+                    local_type,
+                    out / MAP,
+                    run.options.lifting,
+                    executor=run.executor,
+                    track=run.track,
+                ),
+            )
+        ]
+    return [
+        Stage(
+            "mapping_pairs",
+            2,
+            {"mapping_pairs": dump["mapping_pairs"]},
+            ("import", "global_features"),
+            (MAPPING_PAIRS,),
+            lambda out: _mapping_pairs(run, out, local_type),
+        ),
+        Stage(
+            "mapping_matches",
+            1,
+            {
+                "matching": dump["matching"],
+                "verification": dump["verification"],
+                "known_poses": dump["mapping_verification"],
+            },
+            ("import", "local_features", "mapping_pairs"),
+            (MAPPING_MATCHES,),
+            lambda out: _matches(run, out, local_type, for_queries=False),
+        ),
+        Stage(
+            "map",
+            1,
+            {"by": "triangulate", "triangulation": dump["triangulation"]},
+            ("import", "local_features", "global_features", "mapping_matches"),
+            (MAP,),
+            lambda out: _triangulation(run, out, local_type),
+        ),
+    ]
+
+
 def _dataset_stages(run: Run) -> list[Stage]:
     """Import, behind rendering where the dataset is made rather than given."""
-    protocol = {"thresholds": run.thresholds, "query_prefix": run.query_prefix}
 
     def change(given: Protocol) -> Protocol:
-        dataset = run.dataset if given.dataset == Protocol().dataset else given.dataset
-        changes: dict[str, Any] = {"dataset": dataset}
-        if run.thresholds is not None:
-            changes["thresholds"] = run.thresholds
-        return given.model_copy(update=changes)
+        if given.dataset == Protocol().dataset:
+            given = given.model_copy(update={"dataset": run.dataset})
+        return given if run.benchmark is None else run.benchmark.change(given)
 
-    def import_from(root: Path) -> Callable[[Path], Mapping[str, float]]:
-        return lambda out: import_kapture_folders(
-            root, out, query_prefix=run.query_prefix, protocol_change=change
-        )
-
-    outputs = (MAPPING, QUERY, QUERY_GT, SIDE_TABLES)
-    settings = {"dataset": run.dataset, **protocol}
-    if run.render is not None:
+    source = run.source
+    outputs = (MAPPING, QUERY, QUERY_GT, SIDE_TABLES, REFERENCE)
+    wanted = None if run.benchmark is None else run.benchmark.change(Protocol())
+    settings = {**source.settings(), "protocol": wanted and wanted.model_dump(mode="json")}
+    render = source.renderer(run.executor, run.track)
+    if render is not None:
         world = run.workspace.path("world")
         return [
-            Stage("render", 1, dict(run.render_options or {}), (), ("world",), run.render),
-            Stage("import", 1, settings, ("render",), outputs, import_from(world)),
+            Stage("render", 1, source.render_options(), (), ("world",), render),
+            Stage(
+                "import",
+                2,
+                settings,
+                ("render",),
+                outputs,
+                lambda out: source.import_to(world, out, change),
+            ),
         ]
-    if run.root is None:
+    if source.root is None:
         raise ValueError("a run needs a root or something that renders one")
-    root = check_root(run.root).resolve()
+    source.check()
+    root = source.root.resolve()
     remembered = run.workspace.path(HASHES)
     hashes = FileHashes(remembered)
-    content = hashes.of_files(root, input_files(root))
+    content = hashes.of_files(root, source.input_files(root))
     write_bytes(remembered, (json.dumps(hashes.content()) + "\n").encode())
     external = {"dataset files": content, "dataset root": str(root)}
-    return [Stage("import", 1, settings, (), outputs, import_from(root), external)]
+    return [
+        Stage(
+            "import",
+            2,
+            settings,
+            (),
+            outputs,
+            lambda out: source.import_to(root, out, change),
+            external,
+        )
+    ]
 
 
 def _local_features(run: Run, out: Path) -> dict[str, int]:
@@ -238,6 +284,7 @@ def _mapping_pairs(run: Run, out: Path, local_type: str) -> dict[str, int]:
         run.workspace.folder(MAPPING, ""),
         run.options.mapping_pairs,
         global_type=vlad_type(local_type),
+        restrictions=run.restrictions(),
     )
     write_pairs(out / MAPPING_PAIRS, pairs)
     return {"pairs": len(pairs)}
@@ -249,6 +296,7 @@ def _query_pairs(run: Run, out: Path, local_type: str) -> dict[str, int]:
         run.workspace.folder(QUERY, ""),
         run.options.query_pairs,
         global_type=vlad_type(local_type),
+        restrictions=run.restrictions(),
     )
     write_pairs(out / QUERY_PAIRS, pairs)
     return {"pairs": len(pairs)}
@@ -293,6 +341,7 @@ def _localization(run: Run, out: Path, local_type: str) -> dict[str, int]:
         pairs,
         local_type,
         options,
+        restrictions=run.restrictions(),
         executor=run.executor,
         track=run.track,
     )
@@ -327,52 +376,37 @@ def _provenance(run: Run) -> dict[str, Any]:
 
 
 def _submission(run: Run, out: Path) -> dict[str, int]:
-    localized = run.workspace.path(LOCALIZED)
     tables = run.workspace.path(SIDE_TABLES)
     return write_submission(
-        localized, out / run.pose_file, tables=tables, provenance=_provenance(run)
+        run.workspace.path(LOCALIZED),
+        run.submission_below(out),
+        tables=tables,
+        provenance=_provenance(run),
     )
-
-
-def write_submission(
-    localized: Path, place: Path, *, tables: Path | None, provenance: Mapping[str, Any]
-) -> dict[str, int]:
-    """Write the pose file of a localized kapture, in the official frame, and its provenance."""
-    poses = load_poses(localized)
-    rule = Protocol() if tables is None else read_protocol(tables)
-    if tables is not None:
-        world = read_world(tables)
-        poses = {image: world.pose_in_official(pose) for image, pose in poses.items()}
-    statuses = load_statuses(localized) or {}
-    write_pose_file(place, poses, names=rule.pose_file_names)
-    counts = {
-        "queries": len(KaptureFolder(localized).read().image_names()),
-        "poses": len(poses),
-        "fallbacks": sum(status.fallback != "none" for status in statuses.values()),
-    }
-    write_provenance(place, provenance, counts=counts)
-    return counts
 
 
 def _evaluation(run: Run, out: Path) -> dict[str, float]:
-    truth = run.workspace.path(QUERY_GT)
+    """Recall where the true poses are known, else what can be known without them."""
+    localized, truth = run.workspace.path(LOCALIZED), run.workspace.path(QUERY_GT)
+    tables = run.workspace.path(SIDE_TABLES)
+    label = f"{run.dataset}, {run.preset}"
+    map_poses = run.workspace.folder(MAPPING).read().poses()
+    provenance = _provenance(run) | {"versions": package_versions()}
+    around = surroundings_of(localized)
     if not truth.is_dir():
+        found = results_without_truth(
+            [localized], read_rules(tables), map_poses=map_poses, labels=[label]
+        )
+        write_without_truth(
+            out / EVALUATION, found, map_poses=map_poses, provenance=provenance, around=[around]
+        )
         return {"queries_with_truth": 0}
     evaluation = evaluate_folders(
-        run.workspace.path(LOCALIZED),
-        truth,
-        side_tables=run.workspace.path(SIDE_TABLES),
-        label=f"{run.dataset}, {run.preset}",
+        localized, truth, side_tables=tables, label=label, mapping=run.workspace.path(MAPPING)
     )
     write_evaluation(
-        out / EVALUATION,
-        evaluation,
-        map_poses=run.workspace.folder(MAPPING).read().poses(),
-        provenance=_provenance(run) | {"versions": package_versions()},
+        out / EVALUATION, evaluation, map_poses=map_poses, provenance=provenance, around=around
     )
     row = evaluation.row()
     recall = {f"recall at {at.threshold}": round(at.recall, 4) for at in row.recall}
     return {"queries_with_truth": len(evaluation.queries), **recall}
-
-
-__all__ = ["Run", "plan_evaluation", "write_submission"]

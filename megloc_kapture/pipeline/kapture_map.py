@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.geometry.cameras import shift_principal_point
 from megloc_kapture.io.kapture_store import FeatureReader, KaptureFolder
+from megloc_kapture.io.side_tables import PROTOCOL_FILE, SIDE_TABLES
 from megloc_kapture.localization.map_index import MapIndex
 from megloc_kapture.mapping.pixel_origin import (
     ObservedImage,
@@ -23,6 +24,7 @@ from megloc_kapture.mapping.pixel_origin import (
 )
 from megloc_kapture.plugins import LOCAL_FEATURES, plugin_names
 from megloc_kapture.stages.query_poses import index_map
+from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
 from megloc_kapture.values import Camera, RigidTransform
 
 PixelOriginChoice = Literal["auto", "corner", "centre"]
@@ -41,11 +43,14 @@ class KaptureMap:
     folder : the kapture folder; nothing is ever written to it.
     local_type : the keypoints type that is localized with.
     pixel_origin : where the map puts its pixel origin, and why we think so.
+    restrictions : coordinate frames of its images, and priors of queries, where it lies in a
+        workspace whose dataset has them.
     """
 
     folder: KaptureFolder
     local_type: str
     pixel_origin: PixelOrigin
+    restrictions: Restrictions = UNRESTRICTED
 
     @classmethod
     def open(
@@ -97,7 +102,12 @@ class KaptureMap:
         if pixel_origin != "auto":
             given: Origin = pixel_origin
             found = replace(found, intrinsics=given, reason="as asked for")
-        return cls(folder, local_type, found)
+        # a workspace's map has its dataset's tables beside it, a foreign map has none
+        tables = folder.root.resolve().parent / SIDE_TABLES
+        restrictions = UNRESTRICTED
+        if (tables / PROTOCOL_FILE).is_file():
+            restrictions = Restrictions.read(tables)
+        return cls(folder, local_type, found, restrictions)
 
     @cached_property
     def index(self) -> MapIndex:

@@ -39,7 +39,7 @@ from megloc_kapture.stages.matches import (
     two_view_verification,
 )
 from megloc_kapture.stages.parallel import ordered_map
-from megloc_kapture.stages.query_poses import gather_correspondences, pose_from_matches
+from megloc_kapture.stages.query_poses import gather_correspondences, pose_in_best_frame
 from megloc_kapture.values import Camera, Failure, LocalFeatures, Pose, RigidTransform
 
 # a map this small is matched whole where nothing can rank its images
@@ -149,11 +149,12 @@ class Localizer:
         """Localize a query that may bring its features."""
         with single_threaded():
             features, matches = self._match(query)
-            return pose_from_matches(
+            return pose_in_best_frame(
                 self.map.index,
                 features.keypoints_px,
                 query.camera,
                 matches,
+                [self.map.restrictions.frame(image) for image, _, _ in matches],
                 self.options.localization.pose,
             )
 
@@ -168,22 +169,31 @@ class Localizer:
         -------
         Pose whose ``cam_from_world`` is ``rig_from_world``, or Failure.
         """
+        frame_of = self.map.restrictions.frame
         with single_threaded():
-            rig_views, candidates = [], []
-            for query, cam_from_rig in views:
-                features, matches = self._match(query)
-                found = gather_correspondences(self.map.index, matches)
-                candidates += [image for image, pairs, _ in matches if len(pairs)]
-                rig_views.append(
-                    RigView(
-                        camera=query.camera,
-                        cam_from_rig=cam_from_rig,
-                        points_px=features.keypoints_px[found.keypoint_ids].astype(np.float64),
-                        points_world=self.map.index.xyz[found.point_ids],
+            matched = [(*self._match(query), query, cam_from_rig) for query, cam_from_rig in views]
+            frames = dict.fromkeys(
+                frame_of(image) for _, matches, _, _ in matched for image, _, _ in matches
+            )
+            results = []
+            # as for one camera: points of different frames never meet in one solver
+            for frame in frames or {"": None}:
+                rig_views, candidates = [], []
+                for features, matches, query, cam_from_rig in matched:
+                    own = [match for match in matches if frame_of(match[0]) == frame]
+                    found = gather_correspondences(self.map.index, own)
+                    candidates += [image for image, pairs, _ in own if len(pairs)]
+                    rig_views.append(
+                        RigView(
+                            camera=query.camera,
+                            cam_from_rig=cam_from_rig,
+                            points_px=features.keypoints_px[found.keypoint_ids].astype(np.float64),
+                            points_world=self.map.index.xyz[found.point_ids],
+                        )
                     )
-                )
-            result = rig_pose(rig_views, self.options.localization.pose)
-            return replace(result, candidates=tuple(dict.fromkeys(candidates)))
+                result = rig_pose(rig_views, self.options.localization.pose)
+                results.append(replace(result, candidates=tuple(dict.fromkeys(candidates))))
+            return max(results, key=lambda result: (bool(result), result.num_inliers))
 
     # ------------------------------------------------------------------ the steps
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import Field, ValidationError
 
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import OptionError
 from megloc_kapture.features.vlad import VladOptions
 from megloc_kapture.io.colmap import TriangulationOptions
+from megloc_kapture.mapping.lifting import LiftingOptions
 from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
 from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS, Matcher, load_plugin
 from megloc_kapture.plugins import LocalFeatureExtractor as Extractor
@@ -41,7 +41,13 @@ class PipelineOptions(Options):
     )
     mapping_verification: KnownPoseOptions = KnownPoseOptions()
     query_verification: TwoViewOptions = TwoViewOptions()
+    map: Literal["triangulate", "lift"] = Field(
+        default="triangulate",
+        description="points of the map: triangulated from matches, or keypoints lifted through "
+        "the map images' depth maps",
+    )
     triangulation: TriangulationOptions = TriangulationOptions()
+    lifting: LiftingOptions = LiftingOptions()
     localization: LocalizationOptions = LocalizationOptions()
 
     def make_extractor(self) -> Extractor:
@@ -85,6 +91,20 @@ def options_of_preset(
         raise OptionError(f"unknown preset {preset!r}; known: {', '.join(PRESETS)}")
     tree = PRESETS[preset].model_dump()
     _merge(tree, changes or {})
+    _merge(tree, assigned(assignments))
+    try:
+        return PipelineOptions.model_validate(tree)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        if first["type"] == "extra_forbidden":
+            raise OptionError(f"unknown option {where}; known here: {_known(where)}") from error
+        raise OptionError(f"option {where}: {first['msg']}") from error
+
+
+def assigned(assignments: Sequence[str]) -> dict[str, Any]:
+    """Nested tables of ``key.key=value`` texts; raises OptionError for one that is not."""
+    tree: dict[str, Any] = {}
     for assignment in assignments:
         key, equals, text = assignment.partition("=")
         if not equals or not key:
@@ -96,14 +116,7 @@ def options_of_preset(
             place = place.setdefault(parent, {})
         place[last] = _value(text.strip())
         _merge(tree, nested)
-    try:
-        return PipelineOptions.model_validate(tree)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        if first["type"] == "extra_forbidden":
-            raise OptionError(f"unknown option {where}; known here: {_known(where)}") from error
-        raise OptionError(f"option {where}: {first['msg']}") from error
+    return tree
 
 
 def _known(path: str) -> str:
@@ -133,32 +146,3 @@ def _value(text: str) -> Any:
         return tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
         return text
-
-
-class BenchmarkFile(Options):
-    """``benchmarks/<dataset>.toml``: how one dataset is run."""
-
-    dataset: str
-    preset: str = DEFAULT_PRESET
-    thresholds: tuple[tuple[float, float | None], ...] | None = None
-    options: dict[str, Any] = Field(default_factory=dict)
-
-
-def read_benchmark(path: Path) -> BenchmarkFile:
-    """Read a benchmark file.
-
-    Raises
-    ------
-    DataError : absent, not TOML, or a key or value that is not of it; names the file.
-    """
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-        return BenchmarkFile.model_validate(content)
-    except OSError as error:
-        raise DataError(f"cannot be read: {error.strerror}", path=path) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise DataError(f"not TOML: {error}", path=path) from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise DataError(f"{where}: {first['msg']}", path=path) from error

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -172,8 +173,24 @@ class KaptureQueries:
             name=name,
             features=self._features(name),
             global_features=vectors,
+            prior=self._prior(name),
             mask=self._folder.root / "sensors" / "masks" / f"{name}.png",
         )
+
+    def _prior(self, name: str) -> tuple[str, ...] | None:
+        if name not in self._map.restrictions.priors:
+            return None
+        return self._priors[name]
+
+    @cached_property
+    def _priors(self) -> dict[str, tuple[str, ...]]:
+        """What the map's dataset permits; queries of one pool share their tuple."""
+        images = self._map.images
+        found = {}
+        for positions, permitted in self._map.restrictions.pools(self.names, images):
+            prior = tuple(images[position] for position in permitted)
+            found.update(dict.fromkeys((self.names[at] for at in positions), prior))
+        return found
 
     def _has_features(self, name: str) -> bool:
         return self._keypoints is not None and name in self._keypoints

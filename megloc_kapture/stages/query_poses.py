@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,15 +20,15 @@ from megloc_kapture.io.kapture_store import (
     write_sensors,
 )
 from megloc_kapture.io.links import link_images
-from megloc_kapture.io.status_table import STATUS_FILE, QueryStatus, write_status
+from megloc_kapture.io.status_table import STATUS_FILE, Fallback, QueryStatus, write_status
 from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions, absolute_pose
 from megloc_kapture.localization.correspondences import Correspondences, resolve
 from megloc_kapture.localization.map_index import MapIndex
 from megloc_kapture.stages.matches import iterate_candidates
 from megloc_kapture.stages.parallel import FolderSpec, Track, ordered_map, untracked
+from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
+from megloc_kapture.stages.rig_siblings import poses_through_rig
 from megloc_kapture.values import Camera, Failure, Options, Pose, RigidTransform
-
-Fallback = Literal["none", "retrieval"]
 
 
 class LocalizationOptions(Options):
@@ -47,6 +46,7 @@ class _Job:
     local_type: str
     image: str
     candidates: tuple[str, ...]
+    frames: tuple[str, ...]  # of the candidates
     options: AbsolutePoseOptions
 
 
@@ -88,6 +88,38 @@ def gather_correspondences(
     return resolve(np.concatenate(keypoints), np.concatenate(points), np.concatenate(scores))
 
 
+def pose_in_best_frame(
+    index: MapIndex,
+    keypoints_px: NDArray[np.float32],
+    camera: Camera,
+    matches: Sequence[tuple[str, NDArray[np.int64], NDArray[np.floating]]],
+    frames: Sequence[str],
+    options: AbsolutePoseOptions,
+) -> Pose | Failure:
+    """Localize one query in each coordinate frame its candidates stand in; keep the best.
+
+    Points of different frames never meet in one solver: their coordinates say nothing about
+    each other. The pose with the most inliers is kept, of equals that of the first candidate.
+
+    Parameters
+    ----------
+    frames : of the map images of ``matches``, in their order.
+    """
+    results = [
+        pose_from_matches(
+            index,
+            keypoints_px,
+            camera,
+            [match for match, own in zip(matches, frames, strict=True) if own == frame],
+            options,
+        )
+        for frame in dict.fromkeys(frames)
+    ]
+    if not results:
+        return pose_from_matches(index, keypoints_px, camera, [], options)
+    return max(results, key=lambda result: (bool(result), result.num_inliers))
+
+
 def pose_from_matches(
     index: MapIndex,
     keypoints_px: NDArray[np.float32],
@@ -95,7 +127,7 @@ def pose_from_matches(
     matches: Sequence[tuple[str, NDArray[np.int64], NDArray[np.floating]]],
     options: AbsolutePoseOptions,
 ) -> Pose | Failure:
-    """Localize one query from its verified matches with map images."""
+    """Localize one query from its verified matches with map images of one coordinate frame."""
     candidates = tuple(image for image, pairs, _ in matches if len(pairs))
     if not candidates:
         return Failure("no map image matches")
@@ -120,16 +152,19 @@ def _localize(job: _Job) -> tuple[Pose | Failure, float]:
     index = _indices[job.map.key]
     query = job.query.open()
     reader = job.matches.open().matches(job.local_type)
-    matches = [
-        (image, *reader.read(job.image, image))
-        for image in job.candidates
+    if not job.candidates:
+        return Failure("no map image is a candidate"), time.perf_counter() - started
+    matched = [
+        (frame, (image, *reader.read(job.image, image)))
+        for image, frame in zip(job.candidates, job.frames, strict=True)
         if (job.image, image) in reader
     ]
-    result = pose_from_matches(
+    result = pose_in_best_frame(
         index,
         query.keypoints(job.local_type).read(job.image),
         query.read().camera_of(job.image),
-        matches,
+        [match for _, match in matched],
+        [frame for frame, _ in matched],
         job.options,
     )
     if isinstance(result, Pose):
@@ -146,10 +181,16 @@ def localize_from_matches(
     local_type: str,
     options: LocalizationOptions,
     *,
+    restrictions: Restrictions = UNRESTRICTED,
     executor: Executor | None = None,
     track: Track = untracked,
 ) -> Iterator[tuple[str, Pose | Failure, float]]:
-    """Localize every query from stored matches: image, result, seconds; in order of names."""
+    """Localize every query from stored matches: image, result, seconds; in order of names.
+
+    Parameters
+    ----------
+    restrictions : the coordinate frames of the map's images, which are never mixed.
+    """
     map_spec, query_spec, matches_spec = (
         FolderSpec(f.root, f.features_dirs) for f in (map_folder, query, matches)
     )
@@ -162,6 +203,7 @@ def localize_from_matches(
             local_type=local_type,
             image=image,
             candidates=tuple(candidates.get(image, ())),
+            frames=tuple(restrictions.frame(other) for other in candidates.get(image, ())),
             options=options.pose,
         )
         for image in query.read().image_names()
@@ -185,18 +227,23 @@ def write_localized(
 
     Parameters
     ----------
-    first_candidates : query -> (best retrieved map image, its pose), needed for a fallback.
+    fallback : what a query that failed gets: nothing; the pose of its best retrieved image; or its
+        pose through the rig, from another camera of its moment, where that was localized.
+    first_candidates : query -> (best retrieved map image, its pose), needed for "retrieval".
     timing : where to write seconds per query and step.
     """
     data = query.read()
+    named = list(results)
+    guesses: Mapping[str, tuple[str, RigidTransform]] = {}
+    if fallback == "retrieval":
+        guesses = first_candidates or {}
+    elif fallback == "rig":
+        found = {image: result for image, result, _ in named if isinstance(result, Pose)}
+        guesses = poses_through_rig(data, found)
     poses: dict[tuple[int, str], RigidTransform] = {}
     statuses = []
-    seconds_of: list[tuple[str, str, str]] = []
-    localized = fallbacks = 0
-    for image, result, seconds in results:
-        seconds_of.append((image, "localization", f"{seconds:.4f}"))
-        best = (first_candidates or {}).get(image)
-        guessed = not result and fallback == "retrieval" and best is not None
+    for image, result, _ in named:
+        guess = None if result else guesses.get(image)
         statuses.append(
             QueryStatus(
                 image=image,
@@ -204,16 +251,14 @@ def write_localized(
                 reason="" if isinstance(result, Pose) else result.reason,
                 num_matches=result.num_matches,
                 num_inliers=result.num_inliers,
-                fallback="retrieval" if guessed else "none",
+                fallback="none" if guess is None else fallback,
                 candidates=result.candidates,
             )
         )
         if isinstance(result, Pose):
             poses[data.record_of(image)] = result.cam_from_world
-            localized += 1
-        elif guessed and best is not None:
-            poses[data.record_of(image)] = best[1]
-            fallbacks += 1
+        elif guess is not None:
+            poses[data.record_of(image)] = guess[1]
     write_sensors(
         output,
         KaptureData(
@@ -227,10 +272,12 @@ def write_localized(
     link_images(query.root, output)
     write_status(output / STATUS_FILE, statuses)
     if timing is not None:
-        write_csv_table(timing, ("image", "step", "seconds"), seconds_of)
+        rows = ((image, "localization", f"{seconds:.4f}") for image, _, seconds in named)
+        write_csv_table(timing, ("image", "step", "seconds"), rows)
+    localized = sum(bool(result) for _, result, _ in named)
     return {
-        "queries": len(statuses),
+        "queries": len(named),
         "localized": localized,
-        "failed": len(statuses) - localized,
-        "fallbacks": fallbacks,
+        "failed": len(named) - localized,
+        "fallbacks": len(poses) - localized,
     }

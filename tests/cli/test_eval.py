@@ -24,7 +24,7 @@ STAGES = (
     "global_features",
     "mapping_pairs",
     "mapping_matches",
-    "triangulation",
+    "map",
     "query_pairs",
     "query_matches",
     "localization",
@@ -201,7 +201,7 @@ def test_a_touched_image_reruns_nothing(evaluate: Any, dataset: Path) -> None:
 @pytest.mark.parametrize(
     ("output", "stage"),
     [
-        ("map", "triangulation"),
+        ("map", "map"),
         ("pairs/query.txt", "query_pairs"),
         ("localized", "localization"),
         ("submissions", "submission"),
@@ -237,7 +237,7 @@ def test_a_dry_run_says_what_would_run_and_why(
     done = evaluate(scene, workspace, "--dry-run", "--set", "query_pairs.top_k=3")
     assert done.out == ""
     told = states(done.err)
-    assert told["triangulation"] == "up to date"
+    assert told["map"] == "up to date"
     assert told["query_pairs"] == "would run (options changed: query_pairs.top_k)"
     assert told["localization"].startswith("would run (")
     assert contents(workspace) == before

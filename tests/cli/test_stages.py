@@ -174,4 +174,4 @@ def test_import_links_images_and_prefixes_queries(megloc: Any, scene: Path, tmp_
         query.image_path("q/0001.jpg").read_bytes()
         == (scene / "query/sensors/records_data/0001.jpg").read_bytes()
     )
-    megloc("import", "aachen", scene, "-o", tmp_path / "x").refused("unknown dataset 'aachen'")
+    megloc("import", "venice", scene, "-o", tmp_path / "x").refused("unknown dataset 'venice'")

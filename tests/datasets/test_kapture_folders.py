@@ -15,6 +15,13 @@ from megloc_kapture.datasets.kapture_folders import (
     prefixed,
 )
 from megloc_kapture.errors import DataError
+from megloc_kapture.io.challenge_tables import (
+    RelocalizationPair,
+    read_names,
+    read_relocalization,
+    write_names,
+    write_relocalization,
+)
 from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.io.side_tables import (
@@ -99,6 +106,8 @@ def test_side_tables_come_along(root: Path, tmp_path: Path) -> None:
     world = World(official_from_local=SimilarityTransform(translation=(1.0, 2.0, 3.0)))
     write_groups(tables, groups)
     write_priors(tables, {"r.png": ["a.png"]})
+    write_names(tables, {"r.png": "R"})
+    write_relocalization(tables, [RelocalizationPair("x.txt", "a.png", "r.png")])
     write_world(tables, world)
     write_protocol(tables, Protocol(dataset="mine", thresholds=((1.0, 2.0),)))
     out = tmp_path / "out"
@@ -110,6 +119,9 @@ def test_side_tables_come_along(root: Path, tmp_path: Path) -> None:
     )
     assert read_groups(out / "megloc") == {"a.png": groups["a.png"], "q/r.png": groups["r.png"]}
     assert read_priors(out / "megloc") == {"q/r.png": ("a.png",)}
+    assert read_names(out / "megloc") == {"q/r.png": "R"}
+    pairs = read_relocalization(out / "megloc")
+    assert pairs == [RelocalizationPair("x.txt", "a.png", "q/r.png")]
     assert read_world(out / "megloc") == world
     assert read_protocol(out / "megloc") == Protocol(
         dataset="mine", thresholds=((1.0, 2.0),), conditions=("night",)

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from megloc_kapture.io.kapture_store import KaptureData, Sensor, write_sensors
 from megloc_kapture.io.status_table import QueryStatus
-from megloc_kapture.values import RigidTransform
+from megloc_kapture.values import Camera, RigidTransform
+
+VOID_ELEMENTS = {"meta", "br", "img"}
 
 
 @dataclass
@@ -92,3 +98,82 @@ def displace() -> Callable[[RigidTransform, np.ndarray, float], RigidTransform]:
 @pytest.fixture
 def upright() -> Callable[[np.ndarray, float], RigidTransform]:
     return upright_camera
+
+
+def write_kapture(
+    root: Path,
+    images: Sequence[str],
+    poses: Mapping[str, RigidTransform],
+    camera: Camera | None = None,
+) -> Path:
+    """A kapture folder of one camera: all ``images`` recorded, ``poses`` as trajectories."""
+    sensor = Sensor.from_camera(camera or Camera("SIMPLE_PINHOLE", 640, 480, (500.0, 320.0, 240.0)))
+    stamped = dict(enumerate(sorted(images)))
+    data = KaptureData(
+        sensors={"cam0": sensor},
+        rigs={},
+        trajectories={(t, "cam0"): poses[i] for t, i in stamped.items() if i in poses},
+        records_camera={(t, "cam0"): image for t, image in stamped.items()},
+        records_depth={},
+    )
+    write_sensors(root, data)
+    return root
+
+
+@pytest.fixture
+def kaptures() -> Callable[..., Path]:
+    return write_kapture
+
+
+class Page(HTMLParser):
+    """Checks that elements close in order; collects ids, references and the visible text."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.ids: list[str] = []
+        self.references: list[str] = []
+        self.pieces: list[str] = []
+        self.feed(html)
+        self.close()
+        assert self.open == []
+        # every reference stays on the page: to an id of the page, or data inside it
+        assert len(self.ids) == len(set(self.ids))
+        for reference in self.references:
+            assert reference.startswith("data:") or reference.removeprefix("#") in self.ids
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.pieces).split())
+
+    @property
+    def images(self) -> list[str]:
+        return [r for r in self.references if r.startswith("data:image/jpeg;base64,")]
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.note(attrs)
+        assert tag != "script"
+        if tag not in VOID_ELEMENTS:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.note(attrs)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.pieces.append(data)
+
+    def note(self, attrs: list[tuple[str, str | None]]) -> None:
+        for name, value in attrs:
+            if name == "id":
+                self.ids.append(value or "")
+            elif name in ("href", "xlink:href", "src"):
+                self.references.append(value or "")
+            self.references += re.findall(r"url\(([^)]*)\)", value or "")
+
+
+@pytest.fixture
+def page_of() -> Callable[[str], Page]:
+    return Page

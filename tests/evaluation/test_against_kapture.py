@@ -200,3 +200,40 @@ def test_folders_written_by_kapture_are_evaluated(
         found.errors.position_m, expected.errors.position_m, rtol=0, atol=1e-9
     )
     assert found.thresholds[1] == Threshold(position_m=0.25, angle_deg=2.0)
+
+
+def test_equal_without_rotation(
+    displace: Callable[..., RigidTransform], figures_of_kapture: Callable[..., Any]
+) -> None:
+    # MLAD's thresholds: kapture leaves the rotation out where its bound is negative
+    rng = np.random.default_rng(9)
+    truth = {f"{i:03d}.jpg": random_pose(rng) for i in range(50)}
+    estimated = {
+        name: displace(pose, rng.normal(size=3) * 0.2, rng.uniform(0, 90))
+        for name, pose in list(truth.items())[4:]
+    }
+    _, results = figures_of_kapture(estimated, truth, BINS)
+    # thresholds that single queries meet exactly, to the last bit
+    bounds = [float(position_m) for _, position_m, _ in results if np.isfinite(position_m)][:8]
+    statistics, _ = figures_of_kapture(estimated, truth, [(bound, -1.0) for bound in bounds])
+    row = evaluate(
+        estimated, truth, thresholds=thresholds_from_pairs((bound, None) for bound in bounds)
+    ).row()
+    assert [at.num_within for at in row.recall] == [count for _, _, count in statistics.filled_bins]
+    assert len(set(at.num_within for at in row.recall)) == len(bounds)
+
+
+def test_recall_is_the_share_that_kapture_prints(
+    displace: Callable[..., RigidTransform], figures_of_kapture: Callable[..., Any]
+) -> None:
+    rng = np.random.default_rng(2)
+    truth = {f"{i:03d}.jpg": random_pose(rng) for i in range(37)}
+    estimated = {
+        name: displace(pose, rng.normal(size=3) * 0.3, rng.exponential(2))
+        for name, pose in list(truth.items())[3:]
+    }
+    statistics, _ = figures_of_kapture(estimated, truth, BINS)
+    shares = [count / statistics.number_of_images for _, _, count in statistics.filled_bins]
+    row = evaluate(estimated, truth, thresholds=thresholds_from_pairs(BINS)).row()
+    assert [at.recall for at in row.recall] == pytest.approx(shares, abs=1e-9)
+    assert all(at.low <= at.recall <= at.high for at in row.recall)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,28 +27,14 @@ from megloc_kapture.io.status_table import write_status
 from megloc_kapture.values import Camera, RigidTransform
 
 
-def write_kapture(root: Path, images: list[str], poses: dict[str, RigidTransform]) -> Path:
-    camera = Sensor.from_camera(Camera("SIMPLE_PINHOLE", 640, 480, (500.0, 320.0, 240.0)))
-    stamped = dict(enumerate(sorted(images)))
-    data = KaptureData(
-        sensors={"cam0": camera},
-        rigs={},
-        trajectories={(t, "cam0"): poses[i] for t, i in stamped.items() if i in poses},
-        records_camera={(t, "cam0"): image for t, image in stamped.items()},
-        records_depth={},
-    )
-    write_sensors(root, data)
-    return root
+@pytest.fixture
+def truth(world: Any, tmp_path: Path, kaptures: Callable[..., Path]) -> Path:
+    return kaptures(tmp_path / "query_gt", list(world.truth), world.truth)
 
 
 @pytest.fixture
-def truth(world: Any, tmp_path: Path) -> Path:
-    return write_kapture(tmp_path / "query_gt", list(world.truth), world.truth)
-
-
-@pytest.fixture
-def result(world: Any, tmp_path: Path) -> Path:
-    folder = write_kapture(tmp_path / "localized", list(world.truth), world.estimated)
+def result(world: Any, tmp_path: Path, kaptures: Callable[..., Path]) -> Path:
+    folder = kaptures(tmp_path / "localized", list(world.truth), world.estimated)
     write_status(folder / "status.csv", world.statuses.values())
     return folder
 

@@ -60,6 +60,20 @@ def test_what_a_server_reads() -> None:
     )
 
 
+def test_a_list_names_the_rows_and_orders_them() -> None:
+    listed = {"night/rear/2.jpg": "rear/2.png", "dawn/rear/1.jpg": "rear/1.png", "x.jpg": "x.png"}
+    given_poses = dict.fromkeys(["dawn/rear/1.jpg", "night/rear/2.jpg", "dawn/left/1.jpg"], HERE)
+    text = format_pose_file(given_poses, names=listed)
+    assert [line.split()[0] for line in text.splitlines()] == ["rear/2.png", "rear/1.png"]
+
+
+def test_a_list_that_calls_two_images_alike_is_refused() -> None:
+    with pytest.raises(DataError, match=r"a/1\.jpg.*b/1\.jpg.*'1\.jpg'"):
+        names_in_pose_file(["a/1.jpg", "b/1.jpg"], {"a/1.jpg": "1.jpg", "b/1.jpg": "1.jpg"})
+    with pytest.raises(DataError, match="cannot hold"):
+        names_in_pose_file(["a"], {"a": "a b"})
+
+
 def test_no_poses_make_an_empty_file(tmp_path: Path) -> None:
     write_pose_file(tmp_path / "poses.txt", {})
     assert (tmp_path / "poses.txt").read_bytes() == b""
@@ -118,10 +132,12 @@ def test_foreign_habits_are_taken(tmp_path: Path, text: str) -> None:
         ("b.jpg 1 0 0 0 1.5 -0.2", "7 columns instead of 8"),
         ("b.jpg 1 0 0 0 1.5 -0.2 3 4", "9 columns instead of 8"),
         ("# name qw qx qy qz tx ty tz", "9 columns"),
-        ("b.jpg, 1, 0, 0, 0, 1.5, -0.2, 3", "could not convert"),
-        ("b.jpg 1 0 0 0 1.5 -0.2 x", "could not convert"),
-        ("b.jpg 1 0 0 0 1_5 -0.2 3", "could not convert"),
+        ("b.jpg, 1, 0, 0, 0, 1.5, -0.2, 3", "is not a number"),
+        ("b.jpg 1 0 0 0 1.5 -0.2 x", "is not a number"),
+        ("b.jpg 1 0 0 0 1_5 -0.2 3", "is not a number"),
+        ("b.jpg 1 0 0 0 ١ -0.2 3", "'١' is not a number"),
         ("b.jpg 1 0 0 0 nan -0.2 3", "not finite"),
+        ("b.jpg 1 0 0 0 1e999 -0.2 3", "not finite"),
         ("b.jpg 1 0 0 0 inf -0.2 3", "not finite"),
         ("b.jpg nan 0 0 0 1 -0.2 3", "not finite"),
         ("b.jpg 1 1 0 0 1 -0.2 3", "length 1.414"),
@@ -189,3 +205,11 @@ def test_short_names_find_their_images() -> None:
         poses_by_image({"2.jpg": HERE}, images)
     with pytest.raises(DataError, match="in two ways"):
         poses_by_image({"1.jpg": HERE, "q/day/1.jpg": HERE}, images)
+
+
+def test_names_of_a_list_find_their_images() -> None:
+    listed = {"dawn/rear/1.jpg": "rear/1.png", "dusk/rear/2.jpg": "rear/2.png"}
+    found = poses_by_image({"rear/1.png": HERE, "dusk/rear/2.jpg": HERE}, listed, listed)
+    assert list(found) == ["dawn/rear/1.jpg", "dusk/rear/2.jpg"]
+    with pytest.raises(DataError, match="in two ways"):
+        poses_by_image({"rear/1.png": HERE, "dawn/rear/1.jpg": HERE}, listed, listed)

@@ -11,7 +11,13 @@ from hypothesis import strategies as st
 
 from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.pose_errors import PoseErrors
-from megloc_kapture.evaluation.recall import RecallRow, recall_row, recall_rows, within
+from megloc_kapture.evaluation.recall import (
+    RecallRow,
+    recall_row,
+    recall_rows,
+    row_members,
+    within,
+)
 from megloc_kapture.evaluation.thresholds import Threshold
 
 INF = float("inf")
@@ -74,13 +80,12 @@ def test_a_group_without_queries() -> None:
 def test_rows_by_condition_pool_and_all() -> None:
     errors = errors_of((0.1, 1), (0.1, 1), (0.1, 1), (9, 1), (9, 1), (INF, INF))
     conditions = ["noon", "noon", "noon", "dawn", "night", ""]
-    rows = recall_rows(
-        errors,
-        [QUARTER],
-        conditions=conditions,
+    members = row_members(
+        conditions,
         order=("noon", "rain"),
         pools={"day": ("dawn", "noon"), "wet": ("rain",)},
     )
+    rows = recall_rows(errors, [QUARTER], members)
     assert [row.name for row in rows] == ["noon", "dawn", "night", "", "day", "all"]
     recall = {row.name: row.recall[0].recall for row in rows}
     # pooled: 3 of 4 queries, not the mean 0.5 of the two recalls
@@ -90,9 +95,8 @@ def test_rows_by_condition_pool_and_all() -> None:
 
 
 def test_without_conditions_there_is_one_row() -> None:
-    assert [row.name for row in recall_rows(errors_of((1, 1)), [QUARTER])] == ["all"]
-    rows = recall_rows(errors_of((1, 1)), [QUARTER], conditions=[""])
-    assert [row.name for row in rows] == ["all"]
+    assert list(row_members([""])) == ["all"]
+    assert list(row_members([])) == ["all"]
 
 
 @pytest.mark.parametrize(
@@ -100,7 +104,7 @@ def test_without_conditions_there_is_one_row() -> None:
 )
 def test_two_rows_of_one_name_are_refused(condition: str, pools: dict) -> None:
     with pytest.raises(OptionError, match="rename one"):
-        recall_rows(errors_of((1, 1)), [QUARTER], conditions=[condition], pools=pools)
+        row_members([condition], pools=pools)
 
 
 @given(st.lists(st.tuples(st.floats(0, 10), st.floats(0, 180)), max_size=20), st.integers(0, 5))

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from megloc_kapture.pipeline.datasets import choose_dataset
 from megloc_kapture.pipeline.evaluation_plan import Run, plan_evaluation
 from megloc_kapture.pipeline.plan import run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
@@ -31,8 +32,8 @@ def workspace(fountain: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     workspace = Workspace(tmp_path_factory.mktemp("fountain") / "workspace")
     options = options_of_preset(assignments=["local_features.options.max_keypoints=800"])
     with workspace.lock():
-        run = Run("kapture", "classic", options, workspace, root=fountain)
-        run_plan(plan_evaluation(run), workspace, last="triangulation")
+        run = Run(choose_dataset("kapture", fountain), "classic", options, workspace)
+        run_plan(plan_evaluation(run), workspace, last="map")
     return workspace.root
 
 

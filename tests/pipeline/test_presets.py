@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
-from megloc_kapture.errors import DataError, OptionError, PluginError
+from megloc_kapture.errors import OptionError, PluginError
 from megloc_kapture.pipeline.presets import (
     PRESETS,
     PipelineOptions,
     options_of_preset,
-    read_benchmark,
 )
 
 
@@ -95,41 +92,3 @@ def test_plugins_are_made_with_their_options() -> None:
     assert options_of_preset().verify_queries() != options_of_preset().verify_mapping()
     with pytest.raises(PluginError, match="no plugin 'surf' .*; registered: nn"):
         options_of_preset(assignments=["matching.name=surf"]).make_matcher()
-
-
-def test_a_benchmark_file(tmp_path: Path) -> None:
-    path = tmp_path / "b.toml"
-    path.write_text(
-        'dataset = "kapture"\nthresholds = [[0.25, 2], [0.5, 5]]\n'
-        "[options.query_pairs]\ntop_k = 9\n"
-    )
-    benchmark = read_benchmark(path)
-    assert benchmark.thresholds == ((0.25, 2.0), (0.5, 5.0))
-    options = options_of_preset(benchmark.preset, changes=benchmark.options)
-    assert options.query_pairs.top_k == 9
-
-
-@pytest.mark.parametrize("path", sorted(Path(__file__).parents[2].glob("benchmarks/*.toml")))
-def test_our_own_benchmark_files_are_good(path: Path) -> None:
-    benchmark = read_benchmark(path)
-    assert benchmark.dataset == path.stem
-    options_of_preset(benchmark.preset, changes=benchmark.options)
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (None, "b.toml: cannot be read: No such file"),
-        (b"dataset = ", "b.toml: not TOML: "),
-        (b"\xff\xfe", "b.toml: not TOML: "),
-        (b"", "b.toml: dataset: "),
-        (b'dataset = "x"\npresets = "y"\n', "b.toml: presets: "),
-    ],
-)
-def test_a_broken_benchmark_file_is_named(
-    tmp_path: Path, content: bytes | None, message: str
-) -> None:
-    if content is not None:
-        (tmp_path / "b.toml").write_bytes(content)
-    with pytest.raises(DataError, match=message):
-        read_benchmark(tmp_path / "b.toml")

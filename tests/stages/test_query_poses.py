@@ -87,7 +87,7 @@ def test_workers_find_the_same_poses(world: Any, two_processes: Executor) -> Non
 def test_a_query_without_candidates_fails_and_says_so(world: Any) -> None:
     only_b = [ImagePair("query/b.png", "right/2.png", 1.0)]
     (_, first, _), (_, second, _) = localize(world, only_b)
-    assert first == Failure("no map image matches")
+    assert first == Failure("no map image is a candidate")
     assert isinstance(second, Pose) and second.candidates == ("right/2.png",)
 
 

@@ -1,0 +1,293 @@
+"""Aachen Day-Night, versions 1.0 and 1.1: a city by day, queried by day and at night."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, field_validator
+
+from megloc_kapture.datasets.aachen_layout import (
+    ADDITIONAL_NIGHT,
+    DATABASE_FOLDER,
+    NUM_CAMERAS,
+    NUM_DATABASE,
+    NUM_DAY,
+    NUM_NIGHT,
+    NUM_SEQUENCES,
+    SEQUENCES_FOLDER,
+    Layout,
+    Version,
+)
+from megloc_kapture.datasets.aachen_model import MapImage, read_map_images, read_points
+from megloc_kapture.datasets.grammars.query_list import read_query_list
+from megloc_kapture.datasets.official import (
+    REFERENCE,
+    Count,
+    DatasetCard,
+    Missing,
+    OfficialDataset,
+    ground_truth_files,
+    last_part,
+    read_ground_truth,
+)
+from megloc_kapture.datasets.reference_map import write_reference_map
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.kapture_store import KaptureData, Sensor
+from megloc_kapture.io.side_tables import ImageGroup, Protocol, World
+from megloc_kapture.values import Camera, Options
+
+THRESHOLDS = ((0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
+DAY, NIGHT = "day", "night"
+# the first timestamp of each list; map images count from 0
+_FIRST_TIMESTAMP = {DAY: 100_000, NIGHT: 200_000}
+_WRONG_IMAGE = "db/1228.jpg"
+
+
+class AachenOptions(Options):
+    """What of Aachen Day-Night to import."""
+
+    version: Literal["auto", "1.0", "1.1"] = Field(
+        default="auto", description="auto: 1.1 where 3D-models/aachen_v_1_1 is there"
+    )
+    reference_model: bool = Field(
+        default=False, description="import the SIFT model too, as a kapture map in reference/"
+    )
+
+    @field_validator("version", mode="before")
+    @classmethod
+    def _as_text(cls, version: Any) -> Any:
+        # on the command line and in TOML 1.1 is a number
+        return str(version) if isinstance(version, float) else version
+
+
+@dataclass(frozen=True, slots=True)
+class _Query:
+    """An image of a list, and its line's number among the list's images."""
+
+    name: str
+    condition: str
+    position: int
+    camera: Camera
+
+
+class Aachen:
+    """Adapter of Aachen Day-Night.
+
+    The queries are those of the lists: the folders hold more images. World and poses are the
+    published ones.
+    """
+
+    name = "aachen"
+    Options = AachenOptions
+    card = DatasetCard(
+        title="Aachen Day-Night",
+        published_at="https://data.ciirc.cvut.cz/public/projects/2020VisualLocalization/"
+        "Aachen-Day-Night/",
+        size="several GB of images; aachen.db is wanted by reference_model only",
+        folders=("Aachen-Day-Night", "Aachen-Day-Night-v1.1", "aachen_v1.1"),
+        layout="images_upright/{db,query[,sequences]}/ (archives extracted in place), "
+        "queries/{day,night}_time_queries_with_intrinsics.txt and 3D-models/ with "
+        "aachen_cvpr2018_db.nvm and database_intrinsics.txt (v1.0) or "
+        "aachen_v_1_1/{cameras,images,points3D}.bin (v1.1)",
+    )
+
+    def __init__(self, options: AachenOptions | None = None) -> None:
+        self.options = options or AachenOptions()
+
+    def check(self, root: Path) -> None:
+        """Raise DataError, quickly, when ``root`` cannot be Aachen Day-Night."""
+        layout = Layout(Path(root))
+        wanted = (layout.images, layout.query_list(DAY).parent, layout.nvm.parent)
+        absent = [folder.name for folder in wanted if not folder.is_dir()]
+        if absent:
+            raise DataError(
+                f"not {self.card.title}, no folder {' and '.join(absent)}; it has to lie as "
+                f"{self.card.layout}",
+                path=root,
+            )
+        layout.model_files(layout.version(self.options.version), with_points=False)
+
+    def input_files(self, root: Path) -> Iterator[Path]:
+        """Every file an import may depend on, images included."""
+        layout = Layout(Path(root))
+        reference = self.options.reference_model
+        version = layout.version(self.options.version)
+        yield from layout.model_files(version, with_points=reference)
+        single = [layout.query_list(DAY), layout.query_list(NIGHT)]
+        if reference and version == "1.0":
+            single.append(layout.feature_database)
+        yield from (path for path in single if path.is_file())
+        yield from layout.image_files()
+        yield from ground_truth_files(layout.root)
+
+    def read(self, root: Path, *, allow_missing: bool = False) -> OfficialDataset:
+        """Read the dataset.
+
+        Raises
+        ------
+        DataError : something is broken, or ``root`` is not the dataset; names file and line.
+        """
+        self.check(root)
+        layout = Layout(Path(root))
+        version = layout.version(self.options.version)
+        missing = Missing(layout.root)
+        images = read_map_images(layout, version, missing)
+        queries, left_out = _read_queries(layout, version, missing)
+        mapping, query = _mapping_data(images), _query_data(queries)
+        truth, _ = read_ground_truth(layout.root, query, World())  # the lists tell conditions
+        links = {"": layout.images}
+        return OfficialDataset(
+            mapping=mapping,
+            query=query,
+            query_gt=truth,
+            links=links,
+            groups={query.name: ImageGroup(condition=query.condition) for query in queries},
+            names=_pose_file_names(queries, layout),
+            protocol=Protocol(
+                dataset=self.name,
+                thresholds=THRESHOLDS,
+                pose_file_names="basename",
+                truth="The challenge keeps the true poses; visuallocalization.net scores pose "
+                "files.",
+                conditions=(DAY, NIGHT),
+            ),
+            summary=_summary(version, mapping, queries),
+            remarks=self._remarks(layout, version, mapping, left_out),
+            missing=missing,
+            write_more=partial(_write_reference, layout, version, mapping, links)
+            if self.options.reference_model
+            else None,
+        )
+
+    def _remarks(
+        self, layout: Layout, version: Version, mapping: KaptureData, left_out: int
+    ) -> list[str]:
+        """What a user should know about this import."""
+        remarks = []
+        if _WRONG_IMAGE in mapping.records_camera.values():
+            remarks.append(
+                f"{_WRONG_IMAGE} has a wrong pose in the published model; its maintainer says that "
+                "it may be dropped. It is imported as published."
+            )
+        if version == "1.0" and not layout.database_intrinsics.is_file():
+            remarks.append(
+                f"Without {layout.database_intrinsics.name} the map images' principal points are "
+                "taken to be in the middle, and their sizes from the image files."
+            )
+        if left_out:
+            remarks.append(
+                f"{left_out} night queries of v1.1 ({ADDITIONAL_NIGHT}) are left out of v1.0."
+            )
+        if self.options.reference_model and _descriptors(layout, version) is None:
+            remarks.append(
+                "The reference model comes without descriptors: those of v1.0 are in "
+                f"{layout.feature_database.name}, which is not there."
+                if version == "1.0"
+                else "The reference model comes without descriptors: v1.1 publishes none."
+            )
+        return remarks
+
+
+def _read_queries(layout: Layout, version: Version, missing: Missing) -> tuple[list[_Query], int]:
+    """The listed queries whose images are there, day first, in the order of the lists; and how
+    many of v1.1's a v1.0 leaves out."""
+    queries: list[_Query] = []
+    listed: dict[str, Path] = {}
+    left_out = 0
+    for condition in (DAY, NIGHT):
+        path = layout.query_list(condition)
+        if not missing.require(path):
+            continue
+        for position, (name, camera) in enumerate(read_query_list(path).items()):
+            if listed.setdefault(name, path) != path:
+                raise DataError(
+                    f"image {name!r} is also in {listed[name].name}: a query by day or at night?",
+                    path=path,
+                )
+            if version == "1.0" and name.startswith(ADDITIONAL_NIGHT):
+                left_out += 1
+            elif missing.require(layout.images / name):
+                queries.append(_Query(name, condition, position, camera))
+    return queries, left_out
+
+
+def _mapping_data(images: Mapping[int, MapImage]) -> KaptureData:
+    data = KaptureData()
+    for position, image in images.items():
+        sensor_id = f"camera_{image.camera_id:05d}"
+        data.sensors[sensor_id] = Sensor.from_camera(image.camera)
+        data.records_camera[position, sensor_id] = image.name
+        data.trajectories[position, sensor_id] = image.cam_from_world
+    return data
+
+
+def _query_data(queries: Sequence[_Query]) -> KaptureData:
+    data = KaptureData()
+    for query in queries:
+        sensor_id = f"{query.condition}_{query.position:05d}"
+        timestamp = _FIRST_TIMESTAMP[query.condition] + query.position
+        data.sensors[sensor_id] = Sensor.from_camera(query.camera)
+        data.records_camera[timestamp, sensor_id] = query.name
+    return data
+
+
+def _pose_file_names(queries: Sequence[_Query], layout: Layout) -> dict[str, str]:
+    """Last parts of the names, in the order of the lists."""
+    names: dict[str, str] = {}
+    taken: dict[str, str] = {}
+    for query in queries:
+        name = names[query.name] = last_part(query.name)
+        other = taken.setdefault(name, query.name)
+        if other != query.name:
+            raise DataError(
+                f"{query.name} and {other} would both be {name} in the pose file",
+                path=layout.query_list(query.condition),
+            )
+    return names
+
+
+def _summary(version: Version, mapping: KaptureData, queries: Sequence[_Query]) -> list[Count]:
+    folders = [name.split("/")[0] for name in mapping.records_camera.values()]
+    conditions = [query.condition for query in queries]
+    counts = [Count("database images", folders.count(DATABASE_FOLDER), NUM_DATABASE)]
+    if version == "1.1":
+        published = NUM_DATABASE + NUM_SEQUENCES
+        counts += [
+            Count("sequence images", folders.count(SEQUENCES_FOLDER), NUM_SEQUENCES),
+            Count("map images", len(folders), published),
+            Count(
+                "cameras of map and night queries",
+                len(mapping.sensors) + conditions.count(NIGHT),
+                NUM_CAMERAS,
+            ),
+        ]
+    counts += [
+        Count("day queries", conditions.count(DAY), NUM_DAY),
+        Count("night queries", conditions.count(NIGHT), NUM_NIGHT[version]),
+    ]
+    return counts
+
+
+def _descriptors(layout: Layout, version: Version) -> Path | None:
+    """The database with the descriptors of a version's model, if it is there."""
+    there = version == "1.0" and layout.feature_database.is_file()
+    return layout.feature_database if there else None
+
+
+def _write_reference(
+    layout: Layout, version: Version, mapping: KaptureData, links: Mapping[str, Path], output: Path
+) -> None:
+    """Write the dataset's own model as a kapture map."""
+    names, points = read_points(layout, version)
+    write_reference_map(
+        output / REFERENCE,
+        mapping,
+        links,
+        names,
+        points,
+        database=_descriptors(layout, version),
+    )

@@ -1,0 +1,158 @@
+"""RobotCar Seasons, versions 1 and 2: three cameras on a car, 49 locations, nine conditions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from functools import partial
+from pathlib import Path
+
+from megloc_kapture.datasets.official import (
+    REFERENCE,
+    DatasetCard,
+    Missing,
+    OfficialDataset,
+    ground_truth_files,
+    read_ground_truth,
+)
+from megloc_kapture.datasets.reference_map import write_reference_map
+from megloc_kapture.datasets.robotcar_kapture import (
+    mapping_data,
+    query_data,
+    query_truth,
+    read_car,
+)
+from megloc_kapture.datasets.robotcar_layout import CAMERAS, Layout
+from megloc_kapture.datasets.robotcar_queries import read_queries
+from megloc_kapture.datasets.robotcar_reference import read_points, read_reference
+from megloc_kapture.datasets.robotcar_selection import RobotCarOptions, Selection, select
+from megloc_kapture.datasets.robotcar_tables import (
+    image_groups,
+    pose_file_names,
+    protocol,
+    query_priors,
+    remarks,
+    summary,
+)
+from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.io.kapture_store import KaptureData
+from megloc_kapture.io.side_tables import World
+
+__all__ = ["RobotCar", "RobotCarOptions"]
+
+
+class RobotCar:
+    """Adapter of RobotCar Seasons.
+
+    All locations become one map in one metric frame; the side tables say which images belong to
+    which location. ``names.csv`` holds what has to be handed in; scored are also the images whose
+    poses version 2 publishes, so that recall can be measured with them.
+    """
+
+    name = "robotcar"
+    Options = RobotCarOptions
+    card = DatasetCard(
+        title="RobotCar Seasons",
+        published_at="https://data.ciirc.cvut.cz/public/projects/2020VisualLocalization/"
+        "RobotCar-Seasons/",
+        size="tens of GB, much of it a feature database that only the reference model needs",
+        folders=("RobotCar-Seasons", "RobotCar_Seasons", "robotcar_seasons"),
+        layout="images/<condition>/{left,rear,right}/*.jpg (archives extracted in place), "
+        "intrinsics/, extrinsics/, 3D-models/all-merged/all.nvm, "
+        "3D-models/individual/{queries_per_location,colmap_reconstructions}/ and, for version 2, "
+        "robotcar_v2_{train,test}.txt",
+    )
+
+    def __init__(self, options: RobotCarOptions | None = None) -> None:
+        self.options = options or RobotCarOptions()
+
+    def check(self, root: Path) -> None:
+        """Raise DataError, quickly, when ``root`` cannot be RobotCar Seasons."""
+        layout = Layout(Path(root))
+        absent = [p.name for p in (layout.images, layout.models) if not p.is_dir()]
+        if absent:
+            raise DataError(
+                f"not {self.card.title}, no folder {' and '.join(absent)}; it has to lie as "
+                f"{self.card.layout}",
+                path=root,
+            )
+
+    def input_files(self, root: Path) -> Iterator[Path]:
+        """Every file an import may depend on, images included."""
+        layout = Layout(Path(root))
+        single = [of(camera) for of in (layout.intrinsics, layout.extrinsics) for camera in CAMERAS]
+        single += [layout.train_list, layout.test_list, layout.merged_model]
+        if self.options.reference_model:
+            single.append(layout.feature_database)
+        yield from (path for path in single if path.is_file())
+        yield from layout.query_lists().values()
+        for folder in layout.individual_models().values():
+            yield from sorted(path for path in folder.iterdir() if path.is_file())
+        yield from layout.image_files()
+        yield from ground_truth_files(layout.root)
+
+    def read(self, root: Path, *, allow_missing: bool = False) -> OfficialDataset:
+        """Read the dataset.
+
+        Raises
+        ------
+        DataError : something is broken, or ``root`` is not the dataset; names file and line.
+        OptionError : an option of version 2 where version 1 is read.
+        """
+        self.check(root)
+        layout = Layout(Path(root))
+        version = self._version(layout)
+        missing = Missing(layout.root)
+        queries = read_queries(layout, version, missing, allow_missing=allow_missing)
+        places = sorted({place for listed in queries.locations.values() for place in listed})
+        reference = read_reference(layout, self.options.model, places, missing)
+        selection = select(layout, self.options, version, reference, queries, missing)
+        car = read_car(selection, missing)
+        mapping, query = mapping_data(selection, car), query_data(selection, car)
+        beside, _ = read_ground_truth(layout.root, query, World())  # conditions are in the names
+        groups = image_groups(selection)
+        links = {"": layout.images}
+        return OfficialDataset(
+            mapping=mapping,
+            query=query,
+            query_gt=query_truth(selection, query, beside),
+            links=links,
+            groups=groups,
+            priors=query_priors(selection, groups),
+            names=pose_file_names(selection),
+            protocol=protocol(self.name, version),
+            summary=summary(selection),
+            remarks=remarks(selection),
+            missing=missing,
+            write_more=partial(_write_reference, selection, mapping, links)
+            if self.options.reference_model
+            else None,
+        )
+
+    def _version(self, layout: Layout) -> int:
+        version = self.options.version
+        if version == "auto":
+            version = 2 if layout.test_list.is_file() else 1
+        if version == 1 and (self.options.train_as_map or self.options.queries != "all"):
+            raise OptionError(
+                f"train_as_map and queries are about version 2, whose {layout.test_list.name} is "
+                "not there or not wanted (version=2)"
+            )
+        return version
+
+
+def _write_reference(
+    selection: Selection, mapping: KaptureData, links: Mapping[str, Path], output: Path
+) -> None:
+    """Write the dataset's own model as a kapture map."""
+    images, points = read_points(selection.layout, merged=selection.reference.merged)
+    # an image that is not on disk keeps its place in the list
+    names = [selection.map_images.get(image, f"{image.path}.jpg") for image in images]
+    database = selection.layout.feature_database
+    write_reference_map(
+        output / REFERENCE,
+        mapping,
+        links,
+        names,
+        points,
+        database=database if database.is_file() else None,
+    )

@@ -1,0 +1,6 @@
+"""Is a pose file what its challenge takes, and are its poses what they seem to be?
+
+Unlike the readers beside it, which stop at the first thing that is wrong, this looks at the whole
+file and reports every problem: broken rows, names, and the classic mistakes of pose conventions,
+which it finds by comparing the poses with the map's cameras.
+"""

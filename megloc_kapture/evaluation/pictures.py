@@ -1,0 +1,104 @@
+"""Images inside a page: small JPEGs as data addresses, and two side by side with their matches."""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from markupsafe import Markup, escape
+from numpy.typing import NDArray
+
+from megloc_kapture.io.images import read_image_rgb
+
+_QUALITY = 72
+_GAP = 6
+AGREES, DISAGREES, UNKNOWN = "#12a150", "#e02424", "#f2b705"
+
+
+@dataclass(frozen=True)
+class Picture:
+    """An image made small.
+
+    Attributes
+    ----------
+    width, height : of the small image, pixels.
+    scale : small pixels per pixel of the original.
+    address : ``data:image/jpeg;base64,...``.
+    """
+
+    width: int
+    height: int
+    scale: float
+    address: str
+
+
+def small_picture(path: Path, *, width: int, height: int) -> Picture:
+    """An image that fits into ``width`` x ``height`` pixels; never made larger.
+
+    Raises
+    ------
+    DataError : the image is missing or broken.
+    """
+    import cv2  # only a report with images waits for it
+
+    pixels = read_image_rgb(path)
+    scale = min(width / pixels.shape[1], height / pixels.shape[0], 1.0)
+    size = (max(round(pixels.shape[1] * scale), 1), max(round(pixels.shape[0] * scale), 1))
+    small = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+    bgr = np.ascontiguousarray(small[:, :, ::-1])
+    encoded = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
+    text = base64.b64encode(encoded.tobytes()).decode("ascii")
+    return Picture(size[0], size[1], scale, f"data:image/jpeg;base64,{text}")
+
+
+def image_tag(picture: Picture, name: str) -> Markup:
+    """``<img>`` of a picture; ``name`` is read out where images are not shown."""
+    return Markup('<img src="{}" width="{}" height="{}" alt="{}">').format(
+        picture.address, picture.width, picture.height, name
+    )
+
+
+def side_by_side(
+    left: Picture,
+    right: Picture,
+    points_px: tuple[NDArray[np.float64], NDArray[np.float64]],
+    colors: list[str],
+    name: str,
+) -> Markup:
+    """Two pictures in one ``<svg>``, matched points joined by lines.
+
+    Parameters
+    ----------
+    points_px : (M, 2) and (M, 2), matched pixels of the two original images.
+    colors : of the M lines.
+    name : read out where images are not shown.
+    """
+    width, height = left.width + _GAP + right.width, max(left.height, right.height)
+    first = points_px[0] * left.scale
+    second = points_px[1] * right.scale + np.array([left.width + _GAP, 0.0])
+    parts = [
+        f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="{escape(name)}">',
+        _placed(left, 0),
+        _placed(right, left.width + _GAP),
+    ]
+    # one path per colour: a line of its own for every match would make the page three times longer
+    for color in dict.fromkeys(colors):
+        mine = [index for index, own in enumerate(colors) if own == color]
+        lines = "".join(
+            f"M{x0:.1f} {y0:.1f}L{x1:.1f} {y1:.1f}"
+            for (x0, y0), (x1, y1) in zip(first[mine].tolist(), second[mine].tolist(), strict=True)
+        )
+        parts.append(
+            f'<path d="{lines}" stroke="{color}" stroke-width="0.9" stroke-opacity="0.8" '
+            'fill="none"/>'
+        )
+    return Markup("".join([*parts, "</svg>"]))
+
+
+def _placed(picture: Picture, x: int) -> str:
+    return (
+        f'<image x="{x}" y="0" width="{picture.width}" height="{picture.height}" '
+        f'href="{picture.address}"/>'
+    )

@@ -1,0 +1,91 @@
+"""What lies around a result in its workspace: side tables, map, images, matches."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.side_tables import PROTOCOL_FILE, SIDE_TABLES, read_groups
+from megloc_kapture.values import RigidTransform
+
+# parts of a workspace; datasets and the pipeline write them
+_MAPPING, _QUERY, _QUERY_MATCHES = "mapping", "query", "matches/query"
+_SENSORS = "sensors/sensors.txt"
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """Kapture folders that a report can show something of; each may be absent.
+
+    Attributes
+    ----------
+    queries : images and cameras of the queries, their keypoints, their matches with the map.
+    mapping : images, cameras and poses of the map.
+    frames : map image or query -> its coordinate frame, where a dataset has several.
+    """
+
+    queries: KaptureFolder | None = None
+    mapping: KaptureFolder | None = None
+    frames: Mapping[str, str] = field(default_factory=dict)
+
+    def map_poses(self) -> dict[str, RigidTransform]:
+        """``cam_from_world`` of the map's images; empty without a map.
+
+        Raises
+        ------
+        DataError : the map is broken.
+        """
+        return {} if self.mapping is None else self.mapping.read().poses()
+
+    def query_images(self) -> list[str]:
+        """Names of the queries; empty where they are not known.
+
+        Raises
+        ------
+        DataError : the folder is broken.
+        """
+        return [] if self.queries is None else self.queries.read().image_names()
+
+
+def workspace_of(result: Path | str) -> Path | None:
+    """The workspace that a result (``localized/``, or a file in ``submissions/``) lies in."""
+    place = Path(result).resolve()
+    for folder in place.parents[:2]:
+        if (folder / SIDE_TABLES / PROTOCOL_FILE).is_file():
+            return folder
+    return None
+
+
+def side_tables_near(result: Path | str) -> Path | None:
+    """The side tables of the workspace a result lies in; None outside a workspace."""
+    workspace = workspace_of(result)
+    return None if workspace is None else workspace / SIDE_TABLES
+
+
+def surroundings_of(result: Path | str, *, mapping: Path | str | None = None) -> Surroundings:
+    """Find what a report of ``result`` can show.
+
+    Parameters
+    ----------
+    result : a localized kapture folder or a pose file.
+    mapping : kapture folder of the map, where it is not the workspace's.
+
+    Raises
+    ------
+    DataError : broken side tables.
+    """
+    workspace = workspace_of(result)
+    features = [] if workspace is None else [workspace, workspace / _QUERY_MATCHES]
+    candidates = [Path(result)] if workspace is None else [workspace / _QUERY, Path(result)]
+    queries = next((place for place in candidates if (place / _SENSORS).is_file()), None)
+    map_place = None if mapping is None else Path(mapping)
+    if map_place is None and workspace is not None and (workspace / _MAPPING / _SENSORS).is_file():
+        map_place = workspace / _MAPPING
+    groups = {} if workspace is None else read_groups(workspace / SIDE_TABLES)
+    return Surroundings(
+        queries=None if queries is None else KaptureFolder(queries, features_dirs=features),
+        mapping=None if map_place is None else KaptureFolder(map_place, features_dirs=features),
+        frames={image: group.frame for image, group in groups.items() if group.frame},
+    )

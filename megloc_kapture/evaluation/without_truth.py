@@ -1,0 +1,325 @@
+"""What can be known of results whose true poses nobody publishes.
+
+Three things: how many queries got a pose and from how many inliers; whether poses lie where
+retrieval looked; and whether two results agree. None of them is accuracy: results that share a
+mistake agree as well as right ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.evaluation.evaluate import Outcome
+from megloc_kapture.evaluation.near_candidates import NearCandidates, near_candidates
+from megloc_kapture.evaluation.pose_errors import PoseErrors, pose_errors
+from megloc_kapture.evaluation.recall import RecallAt, recall_row, row_members
+from megloc_kapture.evaluation.results import Poses, Result
+from megloc_kapture.evaluation.thresholds import DEFAULT_THRESHOLDS, Threshold
+from megloc_kapture.io.status_table import QueryStatus
+
+PRIOR_DISTANCES_M = (5.0, 10.0, 25.0)
+PRIOR_ANGLE_DEG = 45.0
+_QUARTILES = (0.25, 0.5, 0.75)
+
+
+@dataclass(frozen=True, slots=True)
+class QueryWithoutTruth:
+    """What became of one query.
+
+    Parameters
+    ----------
+    image, condition, outcome, reason, num_matches, num_inliers, candidates : as in
+        :class:`megloc_kapture.evaluation.evaluate.QueryResult`.
+    near : None without an estimated pose, candidates, or their poses in the map.
+    """
+
+    image: str
+    condition: str
+    outcome: Outcome
+    reason: str
+    num_matches: int | None = None
+    num_inliers: int | None = None
+    candidates: tuple[str, ...] = ()
+    near: NearCandidates | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class PriorAgreement:
+    """How close localized poses of a group lie to one of their candidates.
+
+    Parameters
+    ----------
+    num_compared : localized queries with a candidate that has a pose in the map.
+    within : how many of these lie within 5, 10 and 25 m (``PRIOR_DISTANCES_M``).
+    num_same_direction : how many look within 45 degrees of the candidate's direction.
+    median_m, median_deg : of the distances and angles.
+    """
+
+    num_compared: int
+    within: tuple[int, ...]
+    num_same_direction: int
+    median_m: float
+    median_deg: float
+
+
+@dataclass(frozen=True, slots=True)
+class RowWithoutTruth:
+    """One condition, pool or ``"all"`` of one result.
+
+    Parameters
+    ----------
+    inliers : quartiles (25, 50, 75 %) over the localized queries; None where nothing says them.
+    first, nearest : agreement with the first and with the nearest candidate; None: no map, or no
+        candidates.
+    """
+
+    name: str
+    num_queries: int
+    num_localized: int
+    num_fallback: int
+    num_missing: int
+    inliers: tuple[float, float, float] | None
+    first: PriorAgreement | None
+    nearest: PriorAgreement | None
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ResultWithoutTruth:
+    """One result: rows and queries as in an evaluation, without errors."""
+
+    label: str
+    rows: tuple[RowWithoutTruth, ...]
+    queries: tuple[QueryWithoutTruth, ...]
+    poses: Poses
+
+
+@dataclass(frozen=True, slots=True)
+class AgreementRow:
+    """Two results in one condition, pool or ``"all"``.
+
+    Parameters
+    ----------
+    first, second : positions of the results in the list.
+    num_both, num_only_first, num_only_second : queries with a pose in both or one of them.
+    within : per threshold the queries whose two poses differ by no more, as a share of all
+        queries, with its confidence interval.
+    median_m, median_deg : of the differences where both have a pose; infinite where none has.
+    """
+
+    first: int
+    second: int
+    name: str
+    num_queries: int
+    num_both: int
+    num_only_first: int
+    num_only_second: int
+    within: tuple[RecallAt, ...]
+    median_m: float
+    median_deg: float
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class WithoutTruth:
+    """Everything that can be said.
+
+    Parameters
+    ----------
+    statement : who knows the true poses.
+    thresholds : of the agreement between results.
+    agreement : per pair of results, per row; empty for one result.
+    apart : per pair of results, how far their poses of each query are apart; infinite where one
+        has none.
+    """
+
+    statement: str
+    thresholds: tuple[Threshold, ...]
+    results: tuple[ResultWithoutTruth, ...]
+    agreement: tuple[AgreementRow, ...]
+    apart: tuple[PoseErrors, ...]
+
+
+def evaluate_without_truth(
+    results: Sequence[Result],
+    *,
+    queries: Sequence[str] | None = None,
+    conditions: Mapping[str, str] | None = None,
+    thresholds: Sequence[Threshold] = DEFAULT_THRESHOLDS,
+    condition_order: Sequence[str] = (),
+    pools: Mapping[str, Sequence[str]] | None = None,
+    map_poses: Poses | None = None,
+    statement: str = "",
+) -> WithoutTruth:
+    """Localized share, inliers, agreement with retrieval and between results.
+
+    Parameters
+    ----------
+    results : in one frame.
+    queries : every query that counts; by default all that any of the results is about.
+    conditions, condition_order, pools : as in :func:`megloc_kapture.evaluation.evaluate.evaluate`.
+    thresholds : of the agreement between two results.
+    map_poses : ``cam_from_world`` of the map's images, in the same frame.
+    statement : who knows the true poses; empty: they were not given.
+
+    Raises
+    ------
+    DataError : there is no query.
+    OptionError : no result, two with one label, or two rows would bear one name.
+    """
+    labels = [result.label for result in results]
+    if not results or len(set(labels)) != len(labels):
+        raise OptionError("results need different labels, and at least one is needed")
+    images = sorted({i for r in results for i in r.images} if queries is None else set(queries))
+    if not images:
+        raise DataError("no query: the results name no image")
+    of_image = conditions or {}
+    members = row_members(
+        [of_image.get(image, "") for image in images], order=condition_order, pools=pools
+    )
+    pairs = list(combinations(range(len(results)), 2))
+    apart = {(i, j): _apart(results[i].poses, results[j].poses, images) for i, j in pairs}
+    return WithoutTruth(
+        statement=statement or "No true poses were given.",
+        thresholds=tuple(thresholds),
+        results=tuple(
+            _result(result, images, of_image, members, map_poses or {}) for result in results
+        ),
+        agreement=tuple(
+            row
+            for pair in pairs
+            for row in _agreement(results, pair, apart[pair], members, thresholds)
+        ),
+        apart=tuple(apart.values()),
+    )
+
+
+def _result(
+    result: Result,
+    images: Sequence[str],
+    conditions: Mapping[str, str],
+    members: Mapping[str, NDArray[np.bool_]],
+    map_poses: Poses,
+) -> ResultWithoutTruth:
+    statuses = result.statuses or {}
+    # a guess taken from a candidate agrees with it, which says nothing
+    guessed = {image for image, status in statuses.items() if status.fallback != "none"}
+    localized = [image for image in images if image in result.poses and image not in guessed]
+    near = near_candidates(result.poses, statuses, localized, map_poses)
+    queries = tuple(
+        _query(
+            image,
+            conditions.get(image, ""),
+            has_pose=image in result.poses,
+            status=statuses.get(image),
+            near=near.get(image),
+        )
+        for image in images
+    )
+    rows = tuple(
+        _row(name, [queries[index] for index in np.flatnonzero(chosen).tolist()])
+        for name, chosen in members.items()
+    )
+    return ResultWithoutTruth(result.label, rows, queries, result.poses)
+
+
+def _query(
+    image: str,
+    condition: str,
+    *,
+    has_pose: bool,
+    status: QueryStatus | None,
+    near: NearCandidates | None,
+) -> QueryWithoutTruth:
+    if status is None:
+        outcome: Outcome = "localized" if has_pose else "missing"
+        return QueryWithoutTruth(image, condition, outcome, "" if has_pose else "no pose")
+    outcome = "missing"
+    reason = status.reason or "status says localized, but the result has no pose"
+    if has_pose:
+        outcome = "localized" if status.fallback == "none" else "fallback"
+        reason = status.reason
+    return QueryWithoutTruth(
+        image,
+        condition,
+        outcome,
+        reason,
+        status.num_matches,
+        status.num_inliers,
+        status.candidates,
+        near,
+    )
+
+
+def _row(name: str, queries: Sequence[QueryWithoutTruth]) -> RowWithoutTruth:
+    localized = [query for query in queries if query.outcome == "localized"]
+    inliers = [query.num_inliers for query in localized if query.num_inliers is not None]
+    near = [query.near for query in localized if query.near is not None]
+    quartiles = None
+    if inliers:
+        low, middle, high = np.quantile(inliers, _QUARTILES).tolist()
+        quartiles = (low, middle, high)
+    return RowWithoutTruth(
+        name=name,
+        num_queries=len(queries),
+        num_localized=len(localized),
+        num_fallback=sum(query.outcome == "fallback" for query in queries),
+        num_missing=sum(query.outcome == "missing" for query in queries),
+        inliers=quartiles,
+        first=_prior([(n.first_m, n.first_deg) for n in near]) if near else None,
+        nearest=_prior([(n.nearest_m, n.nearest_deg) for n in near]) if near else None,
+    )
+
+
+def _prior(pairs: Sequence[tuple[float, float]]) -> PriorAgreement:
+    distance_m, angle_deg = np.array(pairs).T
+    return PriorAgreement(
+        num_compared=len(pairs),
+        within=tuple(int((distance_m <= bound).sum()) for bound in PRIOR_DISTANCES_M),
+        num_same_direction=int((angle_deg <= PRIOR_ANGLE_DEG).sum()),
+        median_m=float(np.median(distance_m)),
+        median_deg=float(np.median(angle_deg)),
+    )
+
+
+def _apart(first: Poses, second: Poses, images: Sequence[str]) -> PoseErrors:
+    """How far two results' poses are apart; infinite where one of them has none."""
+    both = [index for index, image in enumerate(images) if image in first and image in second]
+    shared = pose_errors(first, second, [images[index] for index in both])
+    position_m, angle_deg = np.full(len(images), np.inf), np.full(len(images), np.inf)
+    position_m[both], angle_deg[both] = shared.position_m, shared.angle_deg
+    return PoseErrors(tuple(images), position_m, angle_deg)
+
+
+def _agreement(
+    results: Sequence[Result],
+    pair: tuple[int, int],
+    apart: PoseErrors,
+    members: Mapping[str, NDArray[np.bool_]],
+    thresholds: Sequence[Threshold],
+) -> list[AgreementRow]:
+    in_first, in_second = (
+        np.array([image in results[index].poses for image in apart.names]) for index in pair
+    )
+    rows = []
+    for name, chosen in members.items():
+        row = recall_row(name, apart, thresholds, members=chosen)
+        rows.append(
+            AgreementRow(
+                first=pair[0],
+                second=pair[1],
+                name=name,
+                num_queries=row.num_queries,
+                num_both=int((in_first & in_second & chosen).sum()),
+                num_only_first=int((in_first & ~in_second & chosen).sum()),
+                num_only_second=int((in_second & ~in_first & chosen).sum()),
+                within=row.recall,
+                median_m=row.median_localized_position_m,
+                median_deg=row.median_localized_angle_deg,
+            )
+        )
+    return rows

@@ -1,0 +1,293 @@
+"""What is handed in: the pose files of a localized kapture, by its challenge's rules."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from megloc_kapture.datasets.kapture_folders import MAPPING, QUERY
+from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.evaluation.mlad_file import (
+    RelativePose,
+    format_mlad_file,
+    relative_pose,
+    timestamp_of,
+)
+from megloc_kapture.evaluation.pose_file import format_pose_file
+from megloc_kapture.evaluation.provenance import write_provenance
+from megloc_kapture.io.atomic import write_bytes
+from megloc_kapture.io.challenge_tables import (
+    RELOCALIZATION_FILE,
+    read_names,
+    read_relocalization,
+)
+from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder
+from megloc_kapture.io.paths import safe_join
+from megloc_kapture.io.side_tables import (
+    PROTOCOL_FILE,
+    ImageGroup,
+    Protocol,
+    World,
+    read_groups,
+    read_protocol,
+    read_world,
+)
+from megloc_kapture.io.status_table import STATUS_FILE, QueryStatus, read_status
+from megloc_kapture.pipeline.datasets import KAPTURE, SYNTHETIC, TWIN_PREFIX, dataset_names
+from megloc_kapture.pipeline.manifests import read_manifest
+from megloc_kapture.stages import rig_siblings
+from megloc_kapture.values import Pose, RigidTransform
+
+_IMPORT_MANIFEST = "stages/import.json"
+# a row of MLAD for a query without a pose; kapture's own exporter writes the same
+_DUMMY = RigidTransform.identity()
+
+
+@dataclass(frozen=True)
+class _Result:
+    """The queries, and their poses in the workspace's frame; which are guesses or of the rig."""
+
+    data: KaptureData
+    poses: Mapping[str, RigidTransform]
+    guesses: Collection[str]
+    from_rig: Collection[str]
+
+
+@dataclass(frozen=True)
+class _Content:
+    """Texts by file name ("" where it is one file), images of the rows with a pose, the rest."""
+
+    files: Mapping[str, str]
+    posed: Sequence[str]
+    missing: Sequence[str]
+
+
+def check_dataset(dataset: str, protocol: Protocol, *, tables: Path | None) -> None:
+    """Refuse a dataset whose rules are not those of the side tables.
+
+    Kapture folders may be anything; what an official dataset's import wrote goes by its own name
+    only. A rendered twin's rules are those of its dataset.
+
+    Parameters
+    ----------
+    tables : where the protocol was read; None: nowhere, it is the default.
+
+    Raises
+    ------
+    OptionError : unknown, without side tables where the dataset has rules of its own, or another
+        dataset's.
+    """
+    check_known(dataset)
+    plain = (KAPTURE, SYNTHETIC)
+    wanted, given = (name.removeprefix(TWIN_PREFIX) for name in (dataset, protocol.dataset))
+    if tables is None and wanted not in plain:
+        raise OptionError(
+            f"the rules of {dataset} stand in the megloc/ folder that its import writes, and there "
+            "is none here; submit takes it with --side-tables, check with --data"
+        )
+    official = {name for name in dataset_names() if name not in plain}
+    if wanted != given and (wanted not in plain or given in official):
+        raise OptionError(
+            f"dataset {dataset} is asked for, and {(tables or Path()) / PROTOCOL_FILE} is of "
+            f"dataset {protocol.dataset}"
+        )
+
+
+def check_known(dataset: str) -> None:
+    """Refuse a dataset that nobody knows; raises OptionError with those that are known."""
+    if dataset not in dataset_names():
+        raise OptionError(f"unknown dataset {dataset!r}; known: {', '.join(dataset_names())}")
+
+
+def place_of(folder: Path, stem: str, protocol: Protocol) -> Path:
+    """Where a submission goes below ``folder``: a file, or a folder where it is several files."""
+    return folder / (stem if protocol.pose_file == "mlad" else f"{stem}.txt")
+
+
+def write_submission(
+    localized: Path,
+    place: Path,
+    *,
+    tables: Path | None,
+    provenance: Mapping[str, Any],
+    from_rig: bool = False,
+    weights: Mapping[str, str] | None = None,
+) -> dict[str, int]:
+    """Write the pose file or files of a localized kapture, and the provenance beside them.
+
+    Poses leave in the official frame. A query without a pose has no row; where every row is asked
+    for (MLAD) its row is the identity, a dummy that counts as missing.
+
+    Parameters
+    ----------
+    place : the file; for MLAD the folder, which gets one file per relocalization file.
+    tables : the workspace's ``megloc/`` folder; None: no list, no rules, one frame. Beside it lie
+        ``mapping/`` (poses of MLAD's reference keyframes), ``query/`` (all queries, the rig) and
+        ``stages/`` (the dataset's fingerprint), where there are any.
+    provenance : entries for the provenance (dataset, preset, options).
+    from_rig : queries without a pose of their own get one through the rig.
+    weights : name -> SHA-256 of the network weights that took part.
+
+    Returns
+    -------
+    Counts: ``queries``, ``scored`` (images, or rows of MLAD, that the challenge counts),
+    ``poses`` written for them, ``missing``, and of the poses ``fallbacks`` (guesses) and
+    ``from_rig``; ``dummies`` are rows that hold no pose.
+
+    Raises
+    ------
+    DataError : something is missing or broken, or two images would bear one name.
+    OutputError : a file cannot be written.
+    """
+    beside = None if tables is None else tables.parent
+    rules = Protocol() if tables is None else read_protocol(tables)
+    result = _read_result(localized, beside, from_rig=from_rig)
+    if rules.pose_file == "mlad" and tables is not None:
+        content = _mlad(result, tables)
+        for name, text in content.files.items():
+            write_bytes(safe_join(place, name), text.encode("ascii"))
+    else:
+        content = _ltvl(result, tables, rules)
+        write_bytes(place, content.files[""].encode("utf-8"))
+    counts = {
+        "queries": len(result.data.records_camera),
+        "scored": len(content.posed) + len(content.missing),
+        "poses": len(content.posed),
+        "missing": len(content.missing),
+        "fallbacks": sum(image in result.guesses for image in content.posed),
+        "from_rig": sum(image in result.from_rig for image in content.posed),
+        "dummies": len(content.missing) if rules.pose_file == "mlad" else 0,
+    }
+    entries = {
+        **provenance,
+        "weights": dict(weights or {}),
+        "dataset_fingerprint": _dataset_fingerprint(beside),
+        "dummies" if rules.pose_file == "mlad" else "missing": content.missing,
+    }
+    files = None if rules.pose_file == "ltvl" else list(content.files)
+    write_provenance(place, entries, counts=counts, files=files)
+    return counts
+
+
+def poses_through_rig(
+    data: KaptureData,
+    poses: Mapping[str, RigidTransform],
+    statuses: Mapping[str, QueryStatus] | None = None,
+) -> dict[str, RigidTransform]:
+    """Poses of images that have none of their own, through the rig, from another of the moment.
+
+    A pose that is only a guess (a fallback) is none of its own, and gives none to others. Of
+    several siblings the one with the most inliers counts.
+
+    Parameters
+    ----------
+    data : sensors, rigs and records of the images.
+    poses : ``cam_from_world`` by image.
+    statuses : rows of ``status.csv``; without, all poses are taken for localized.
+    """
+    known = statuses or {}
+    localized = {}
+    for image, pose in poses.items():
+        status = known.get(image)
+        if status is None:
+            localized[image] = Pose(pose, 0, 0)
+        elif status.status == "localized":
+            localized[image] = Pose(pose, status.num_matches, status.num_inliers)
+    found = rig_siblings.poses_through_rig(data, localized)
+    return {image: pose for image, (_, pose) in found.items()}
+
+
+def _read_result(localized: Path, beside: Path | None, *, from_rig: bool) -> _Result:
+    own = KaptureFolder(localized).read()
+    data = own
+    query = None if beside is None else beside / QUERY
+    if query is not None and (query / "sensors" / "sensors.txt").is_file():
+        # it has the queries that a foreign result leaves out, and the rig
+        data = KaptureFolder(query).read()
+        strange = set(own.image_names()) - set(data.image_names())
+        if strange:
+            raise DataError(
+                f"image {min(strange)!r} is not among the queries of {query}: is the result of "
+                "this dataset?",
+                path=localized,
+            )
+    path = localized / STATUS_FILE
+    statuses = read_status(path) if path.is_file() else {}
+    poses = own.poses()
+    derived: dict[str, RigidTransform] = {}
+    if from_rig:
+        if not data.rigs:
+            raise DataError(
+                "no pose can come from the rig: neither the queries nor the result have a rigs.txt",
+                path=localized,
+            )
+        derived = poses_through_rig(data, poses, statuses)
+    guesses = {image for image, s in statuses.items() if s.fallback == "retrieval"}
+    by_stage = {image for image, s in statuses.items() if s.fallback == "rig"}
+    return _Result(data, poses | derived, guesses - derived.keys(), by_stage | derived.keys())
+
+
+def _ltvl(result: _Result, tables: Path | None, rules: Protocol) -> _Content:
+    names = {} if tables is None else read_names(tables)
+    world = World() if tables is None else read_world(tables)
+    images = list(names)
+    if not names:
+        groups = {} if tables is None else read_groups(tables)
+        every = result.data.image_names()
+        images = [image for image in every if groups.get(image, ImageGroup()).scored]
+    posed = [image for image in images if image in result.poses]
+    official = {image: world.pose_in_official(result.poses[image]) for image in posed}
+    text = format_pose_file(official, names=names or rules.pose_file_names)
+    return _Content({"": text}, posed, [image for image in images if image not in result.poses])
+
+
+def _mlad(result: _Result, tables: Path) -> _Content:
+    pairs = read_relocalization(tables)
+    if not pairs:
+        raise DataError(
+            "no pairs, and an MLAD challenge is about pairs: was the dataset imported with its "
+            "relocalization files?",
+            path=tables / RELOCALIZATION_FILE,
+        )
+    scale = read_world(tables).official_from_local.scale
+    references = KaptureFolder(tables.parent / MAPPING).read().poses()
+    rows: dict[str, list[RelativePose]] = {}
+    posed, missing = [], []
+    for pair in pairs:
+        query, reference = result.poses.get(pair.query), references.get(pair.reference)
+        if query is None or reference is None:
+            missing.append(f"{pair.file}: {pair.reference} {pair.query}")
+            pose = _DUMMY
+        else:
+            posed.append(pair.query)
+            pose = relative_pose(query, reference, scale=scale)
+        row = RelativePose(timestamp_of(pair.reference), timestamp_of(pair.query), pose)
+        rows.setdefault(pair.file, []).append(row)
+    return _Content({name: format_mlad_file(own) for name, own in rows.items()}, posed, missing)
+
+
+def _dataset_fingerprint(workspace: Path | None) -> str | None:
+    """Fingerprint of the imported dataset; None where it was not imported by a run."""
+    if workspace is None:
+        return None
+    manifest = read_manifest(workspace / _IMPORT_MANIFEST)
+    return None if manifest is None else manifest.fingerprint
+
+
+def workspace_provenance(localized: Path) -> dict[str, Any]:
+    """What a workspace's manifests say of the result in it: preset and options; else nothing.
+
+    They are told only where they are those of this very result, and not of an older one.
+    """
+    stages = localized.resolve().parent / "stages"
+    made = read_manifest(stages / "localization.json")
+    handed_in = read_manifest(stages / "submission.json")
+    if made is None or localized.resolve().name not in made.outputs:
+        return {}
+    found: dict[str, Any] = {"localization_fingerprint": made.fingerprint}
+    if handed_in is not None and handed_in.inputs.get("localization") == made.fingerprint:
+        options = handed_in.options
+        found |= {key: options[key] for key in ("preset", "options") if key in options}
+    return found

@@ -1,0 +1,183 @@
+"""Stage: a dense map without triangulation, from map images with depth.
+
+Every keypoint with depth becomes a 3D point of its own, seen by its own image. Where a dataset has
+depth (laser scans, RGB-D) such a map knows a point for nearly every keypoint, also where images
+share their centre and nothing could be triangulated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.depth_maps import read_depth_map
+from megloc_kapture.io.kapture_store import (
+    KaptureData,
+    KaptureFolder,
+    Observations,
+    write_observations,
+    write_points3d,
+    write_sensors,
+)
+from megloc_kapture.io.links import link_images
+from megloc_kapture.mapping.lifting import LiftingOptions, lift_keypoints
+from megloc_kapture.stages.parallel import FolderSpec, Track, ordered_map, untracked
+from megloc_kapture.stages.triangulation import copy_features
+from megloc_kapture.values import Camera, RigidTransform
+
+
+@dataclass(frozen=True)
+class DepthRecord:
+    """A depth map that was taken with an image.
+
+    Parameters
+    ----------
+    path : below ``records_data``.
+    camera : of the depth sensor.
+    image_from_depth : from the depth camera's frame to the image's.
+    """
+
+    path: str
+    camera: Camera
+    image_from_depth: RigidTransform
+
+
+@dataclass(frozen=True)
+class _Job:
+    folder: FolderSpec
+    local_type: str
+    image: str
+    depth: DepthRecord
+    options: LiftingOptions
+
+
+def depth_records(data: KaptureData) -> dict[str, DepthRecord]:
+    """Image -> the depth map of its moment, of a depth sensor on one rig with its camera.
+
+    Where several depth sensors share the rig, the one nearest to the camera counts.
+    """
+    rigs_of: dict[str, list[str]] = {}
+    for rig, members in sorted(data.rigs.items()):
+        for sensor in members:
+            rigs_of.setdefault(sensor, []).append(rig)
+    at_time: dict[int, list[tuple[str, str]]] = {}
+    for (timestamp, sensor), path in sorted(data.records_depth.items()):
+        at_time.setdefault(timestamp, []).append((sensor, path))
+    found = {}
+    for (timestamp, camera), image in data.records_camera.items():
+        options = [
+            (image_from_depth, sensor, path)
+            for sensor, path in at_time.get(timestamp, ())
+            if (image_from_depth := _between(data, rigs_of, camera, sensor)) is not None
+        ]
+        if options:
+            image_from_depth, sensor, path = min(
+                options, key=lambda option: (np.linalg.norm(option[0].translation), option[1])
+            )
+            found[image] = DepthRecord(path, data.sensors[sensor].camera(), image_from_depth)
+    return found
+
+
+def _between(
+    data: KaptureData, rigs_of: dict[str, list[str]], camera: str, depth: str
+) -> RigidTransform | None:
+    for rig in rigs_of.get(camera, ()):
+        if depth in data.rigs[rig]:
+            return data.rigs[rig][camera] @ data.rigs[rig][depth].inverse()
+    return None
+
+
+def lift_map(
+    mapping: KaptureFolder,
+    local_type: str,
+    output: Path,
+    options: LiftingOptions,
+    *,
+    executor: Executor | None = None,
+    track: Track = untracked,
+) -> dict[str, float]:
+    """Lift the keypoints of the map's images through their depth maps, and write the map.
+
+    Returns
+    -------
+    Counts for the log.
+
+    Raises
+    ------
+    DataError : no image has a pose, or none has depth; a depth map is missing or broken.
+    """
+    data = mapping.read()
+    poses = data.poses()
+    records = depth_records(data)
+    images = sorted(poses)
+    with_depth = [image for image in images if image in records]
+    if not with_depth:
+        raise DataError(
+            "no mapping image has a pose and a depth map of its moment (records_depth.txt, a "
+            "rig with camera and depth sensor)",
+            path=mapping.root,
+        )
+    spec = FolderSpec(mapping.root, mapping.features_dirs)
+    jobs = [_Job(spec, local_type, image, records[image], options) for image in with_depth]
+    row_of = {image: row for row, image in enumerate(images)}
+    points: list[NDArray[np.float64]] = []
+    image_ids: list[NDArray[np.int32]] = []
+    keypoint_ids: list[NDArray[np.int32]] = []
+    results = track(ordered_map(_lift, jobs, executor), len(jobs), "lifting")
+    for image, (lifted, ids) in zip(with_depth, results, strict=True):
+        points.append(poses[image].inverse().apply(lifted))
+        image_ids.append(np.full(len(ids), row_of[image], np.int32))
+        keypoint_ids.append(ids)
+    xyz = np.concatenate(points)
+    write_sensors(output, data)
+    link_images(mapping.root, output)
+    copy_features(mapping, output, local_type)
+    write_points3d(output, np.concatenate([xyz, np.zeros_like(xyz)], axis=1))
+    seen = _observations(local_type, images, image_ids, keypoint_ids)
+    write_observations(output, {local_type: seen})
+    return {
+        "images": len(images),
+        "images_with_depth": len(with_depth),
+        "points": len(xyz),
+    }
+
+
+def _observations(
+    local_type: str,
+    images: Sequence[str],
+    image_ids: Sequence[NDArray[np.int32]],
+    keypoint_ids: Sequence[NDArray[np.int32]],
+) -> Observations:
+    keypoints = np.concatenate(keypoint_ids)
+    return Observations(
+        keypoints_type=local_type,
+        image_names=tuple(images),
+        point_ids=np.arange(len(keypoints)),
+        image_ids=np.concatenate(image_ids),
+        keypoint_ids=keypoints,
+    )
+
+
+def _lift(job: _Job) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """Points in the image's camera frame (N, 3), and the keypoints they belong to (N,)."""
+    folder = job.folder.open()
+    depth_m = read_depth_map(
+        folder.image_path(job.depth.path),
+        width=job.depth.camera.width,
+        height=job.depth.camera.height,
+    )
+    points, valid = lift_keypoints(
+        folder.keypoints(job.local_type).read(job.image),
+        depth_m,
+        folder.read().camera_of(job.image),
+        job.depth.camera,
+        job.depth.image_from_depth,
+        job.options,
+    )
+    return points[valid], np.flatnonzero(valid).astype(np.int32)

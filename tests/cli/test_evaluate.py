@@ -1,0 +1,205 @@
+"""``megloc evaluate``: one result, several, runs of one method, and results without truth."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from megloc_kapture.evaluation.pose_file import write_pose_file
+from megloc_kapture.evaluation.protocols import protocol_of
+from megloc_kapture.io.kapture_store import KaptureData, Sensor, write_sensors
+from megloc_kapture.io.side_tables import ImageGroup, write_groups, write_protocol
+from megloc_kapture.io.status_table import QueryStatus, write_status
+from megloc_kapture.values import Camera, RigidTransform
+
+NUM_QUERIES = 40
+IMAGES = [f"query/{'night' if i % 4 == 0 else 'day'}/{i:03d}.jpg" for i in range(NUM_QUERIES)]
+MAPPED = {
+    f"map/{i}.jpg": RigidTransform((1.0, 0.0, 0.0, 0.0), (-4.0 * i, 0.0, 0.0)) for i in range(20)
+}
+
+
+def write_kapture(root: Path, images: list[str], poses: dict[str, RigidTransform]) -> Path:
+    camera = Sensor.from_camera(Camera("SIMPLE_PINHOLE", 640, 480, (500.0, 320.0, 240.0)))
+    records = {(number, "cam"): image for number, image in enumerate(images)}
+    data = KaptureData(
+        sensors={"cam": camera},
+        rigs={},
+        trajectories={key: poses[image] for key, image in records.items() if image in poses},
+        records_camera=records,
+    )
+    write_sensors(root, data)
+    return root
+
+
+def poses_off(by_m: float, num_lost: int = 0) -> dict[str, RigidTransform]:
+    """Every query 2 m from the next, moved by ``by_m``; the first ``num_lost`` by 50 m."""
+    return {
+        image: RigidTransform((1.0, 0.0, 0.0, 0.0), (-2.0 * i, 50.0 if i < num_lost else by_m, 0.0))
+        for i, image in enumerate(IMAGES)
+    }
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> Path:
+    """A workspace with truth, and results of three runs in workspaces of their own."""
+    for name, by_m, num_lost in (("a", 0.01, 2), ("b", 0.02, 14), ("c", 0.01, 3)):
+        workspace = tmp_path / name
+        write_kapture(workspace / "query_gt", IMAGES, poses_off(0.0))
+        write_kapture(workspace / "mapping", list(MAPPED), MAPPED)
+        write_kapture(workspace / "localized", IMAGES, poses_off(by_m, num_lost))
+        write_status(
+            workspace / "localized/status.csv",
+            [
+                QueryStatus(
+                    image=image,
+                    status="localized",
+                    num_matches=99,
+                    num_inliers=50,
+                    candidates=(f"map/{i // 2}.jpg",),
+                )
+                for i, image in enumerate(IMAGES)
+            ],
+        )
+        write_protocol(workspace / "megloc", protocol_of("aachen"))
+        write_groups(
+            workspace / "megloc",
+            {image: ImageGroup(condition=image.split("/")[1]) for image in IMAGES},
+        )
+    return tmp_path
+
+
+def test_one_result(megloc: Any, runs: Path) -> None:
+    out = runs / "out"
+    done = megloc("evaluate", "-i", runs / "a/localized", "--gt", runs / "a/query_gt", "-o", out)
+    assert done.status == 0
+    assert "95.0 / 95.0 / 95.0" in done.out  # all but the two lost ones
+    interval = json.loads((out / "recall.json").read_text())["rows"][-1]["recall"][0]
+    assert (interval["low"], interval["high"]) == pytest.approx((0.8308, 0.9939), abs=1e-4)
+    assert sorted(p.name for p in out.iterdir() if p.suffix) == [
+        "per_query.csv",
+        "recall.json",
+        "recall.txt",
+        "report.html",
+    ]
+    # the map of the workspace is on the page
+    assert "map cameras" in (out / "report.html").read_text()
+
+
+def test_two_results_are_compared(megloc: Any, runs: Path) -> None:
+    out = runs / "out"
+    both = ("-i", runs / "a/localized", "-i", runs / "b/localized")
+    done = megloc("evaluate", *both, "--gt", runs / "a/query_gt", "-o", out)
+    assert done.status == 0
+    flat = " ".join(done.out.split())
+    assert (
+        "At 0.25 m, 2 deg a finds 12 queries that b misses and b finds none that a misses: the "
+        "difference is real (p = 0.0015)."
+    ) in flat  # 2 * 0.5^12, times the three thresholds
+    comparison = json.loads((out / "recall.json").read_text())["comparison"]
+    assert comparison["tests"][0]["only_first"] == sorted(IMAGES[2:14])
+    assert (out / "differences.csv").read_text().count("\n") == 1 + 3 * 12
+    assert (out / "recall.txt").read_text() == done.out.removesuffix("\n")
+
+
+def test_pose_files_and_folders_mix(megloc: Any, runs: Path) -> None:
+    poses = runs / "poses.txt"
+    write_pose_file(poses, poses_off(0.01, 2), names="basename")
+    done = megloc("evaluate", "-i", runs / "a/localized", "-i", poses, "--gt", runs / "a/query_gt")
+    assert "a/localized and poses.txt find the same 38 queries" in " ".join(done.out.split())
+
+
+def test_seeds(megloc: Any, runs: Path) -> None:
+    arguments = [item for name in "abc" for item in ("-i", runs / name / "localized")]
+    out = runs / "out"
+    done = megloc("evaluate", *arguments, "--seeds", "--gt", runs / "a/query_gt", "-o", out)
+    recalls = [100 * (40 - lost) / 40 for lost in (2, 14, 3)]
+    expected = f"{np.mean(recalls):.1f} +- {np.std(recalls, ddof=1):.1f}"
+    assert done.out.startswith("3 runs of one method: a, b, c")
+    assert expected in done.out and "real" not in done.out
+    assert json.loads((out / "recall.json").read_text())["seeds"][-1]["name"] == "all"
+
+
+def test_a_datasets_protocol_by_name(megloc: Any, runs: Path) -> None:
+    truth = write_kapture(runs / "lone/gt", IMAGES, poses_off(0.0))
+    result = write_kapture(runs / "lone_result", IMAGES, poses_off(0.3))
+    plain = megloc("evaluate", "-i", result, "--gt", truth)
+    assert "0.05 m, 5 deg" in plain.out and "night" not in plain.out
+    named = megloc("evaluate", "-i", result, "--gt", truth, "--dataset", "aachen")
+    assert "recall (%) at 0.25 m, 2 deg / 0.5 m, 5 deg / 5 m, 10 deg" in named.out
+    # its conditions are folders of the images
+    assert [line.split()[0] for line in named.out.splitlines()[8:10]] == ["day", "night"]
+    inloc = megloc("evaluate", "-i", result, "--gt", truth, "--dataset", "inloc")
+    assert "0.0 / 100.0 / 100.0" in inloc.out
+    own = megloc("evaluate", "-i", result, "--gt", truth, "--thresholds", "0.4,1", "0.3")
+    assert "recall (%) at 0.4 m, 1 deg / 0.3 m\n" in own.out
+
+
+def test_without_truth(megloc: Any, runs: Path) -> None:
+    out = runs / "out"
+    both = ("-i", runs / "a/localized", "-i", runs / "b/localized")
+    done = megloc("evaluate", *both, "-o", out)
+    assert done.status == 0
+    assert "No recall: The true poses of the queries are not published" in done.out
+    found = json.loads((out / "agreement.json").read_text())
+    whole = found["results"][0]["rows"][-1]
+    assert whole["num_localized"] == 40 and whole["inliers_quartiles"] == [50.0, 50.0, 50.0]
+    # the lost ones are 50 m from their candidates, the others in reach of 2 m
+    assert whole["first_candidate"]["within"][0]["num_within"] == 38
+    # 26 queries are 1 cm apart, 2 are lost in the same way
+    agreement = found["agreement"][-1]
+    assert agreement["within"][0]["num_within"] == 28
+    assert (out / "report.html").is_file() and not (out / "recall.json").exists()
+    assert (out / "agreement.txt").read_text() == done.out.removesuffix("\n")
+
+
+def test_the_map_may_be_given(megloc: Any, runs: Path) -> None:
+    alone = write_kapture(runs / "x/y/z/alone", IMAGES, poses_off(0.0))
+    write_status(
+        alone / "status.csv",
+        [
+            QueryStatus(image=image, status="localized", candidates=("map/0.jpg",))
+            for image in IMAGES
+        ],
+    )
+    assert "no map or no candidates are known" in megloc("evaluate", "-i", alone).out
+    with_map = megloc("evaluate", "-i", alone, "--map", runs / "a/mapping")
+    assert "of 40 localized queries with candidates" in " ".join(with_map.out.split())
+
+
+def test_the_same_bytes_twice(megloc: Any, runs: Path, contents: Any) -> None:
+    both = ("-i", runs / "a/localized", "-i", runs / "b/localized")
+    for arguments in ((*both, "--gt", runs / "a/query_gt"), both):
+        for place in ("one", "two"):
+            assert megloc("evaluate", *arguments, "-o", runs / place, "-f").status == 0
+        assert contents(runs / "one") == contents(runs / "two")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ((), "no result given; use -i"),
+        (("-i", "{}/a/localized", "-i", "{}/a/../a/localized"), "is given twice"),
+        (("-i", "{}/a/localized", "--seeds"), "--seeds needs at least two results"),
+        (
+            ("-i", "{}/a/localized", "-i", "{}/b/localized", "--seeds"),
+            r"--seeds needs true poses \(--gt\)",
+        ),
+        (("-i", "{}/a/localized", "--dataset", "cmu"), "unknown dataset 'cmu'; known: aachen"),
+        (("-i", "{}/a/localized", "--map", "{}/nowhere"), "nowhere"),
+        (("-i", "{}/nowhere"), "nowhere"),
+        (("-i", "{}/a/localized", "--gt", "{}/nowhere"), "nowhere"),
+        (("-i", "{}/a/localized", "--gt", "{}/a/query_gt", "--thresholds", "x"), "METRES,DEGREES"),
+        (("-i", "{}/a/localized", "--gt", "{}/a/query_gt", "-o", "{}/a"), "is not empty"),
+    ],
+)
+def test_what_cannot_be_done_is_said_in_one_line(
+    megloc: Any, runs: Path, arguments: tuple[str, ...], said: str
+) -> None:
+    before = sorted(runs.rglob("*"))
+    megloc("evaluate", *(argument.format(runs) for argument in arguments)).refused(said)
+    assert sorted(runs.rglob("*")) == before

@@ -1,0 +1,183 @@
+"""What adapters return becomes kapture folders, the same way for every dataset."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import kapture
+import numpy as np
+import pytest
+from kapture.io.csv import kapture_from_dir
+
+from megloc_kapture.datasets.official import (
+    Count,
+    Missing,
+    OfficialDataset,
+    read_ground_truth,
+    with_poses,
+    without_images,
+    write_official,
+)
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.challenge_tables import (
+    RelocalizationPair,
+    read_names,
+    read_relocalization,
+)
+from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, Sensor, write_sensors
+from megloc_kapture.io.side_tables import (
+    ImageGroup,
+    Protocol,
+    SimilarityTransform,
+    World,
+    read_groups,
+    read_priors,
+    read_protocol,
+    read_world,
+    write_groups,
+)
+from megloc_kapture.values import Camera, RigidTransform
+
+CAMERA = Sensor.from_camera(Camera("SIMPLE_PINHOLE", 100, 80, (90.0, 50.0, 40.0)))
+POSE = RigidTransform((0.5, 0.5, -0.5, 0.5), (1.0, 2.0, 3.0))
+
+
+def records(*names: str, poses: bool = False) -> KaptureData:
+    data = KaptureData(sensors={"cam": CAMERA})
+    for timestamp, name in enumerate(names):
+        data.records_camera[timestamp, "cam"] = name
+        if poses:
+            data.trajectories[timestamp, "cam"] = POSE
+    return data
+
+
+@pytest.fixture
+def dataset(tmp_path: Path) -> OfficialDataset:
+    """Two map images and a query below one folder."""
+    images = tmp_path / "official" / "images"
+    for name in ("db/1.jpg", "db/2.jpg", "query/3.jpg"):
+        (images / name).parent.mkdir(parents=True, exist_ok=True)
+        (images / name).write_bytes(name.encode())
+    return OfficialDataset(
+        mapping=records("db/1.jpg", "db/2.jpg", poses=True),
+        query=records("query/3.jpg"),
+        query_gt=records("query/3.jpg", poses=True),
+        links={"": images},
+        protocol=Protocol(dataset="toy"),
+        groups={"query/3.jpg": ImageGroup(condition="day")},
+        priors={"query/3.jpg": ["db/1.jpg"]},
+        names={"query/3.jpg": "3.jpg"},
+        relocalization=[RelocalizationPair("a.txt", "db/1.jpg", "query/3.jpg")],
+        world=World(official_from_local=SimilarityTransform(translation=(1e6, 0.0, 0.0))),
+    )
+
+
+def test_folders_and_tables_are_written_and_images_linked(
+    dataset: OfficialDataset, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    write_official(dataset, out)
+    for part, names in (("mapping", ["db/1.jpg", "db/2.jpg"]), ("query", ["query/3.jpg"])):
+        theirs = kapture_from_dir(str(out / part))
+        found = [image for _, _, image in kapture.flatten(theirs.records_camera)]
+        assert sorted(found) == names
+        folder = KaptureFolder(out / part)
+        assert folder.image_path(names[0]).read_bytes() == names[0].encode()
+        assert (out / part / "sensors" / "records_data").is_symlink()
+    assert kapture_from_dir(str(out / "query")).trajectories is None
+    assert KaptureFolder(out / "query_gt").read().poses() == {"query/3.jpg": POSE}
+    tables = out / "megloc"
+    assert read_groups(tables) == dataset.groups
+    assert read_priors(tables) == {"query/3.jpg": ("db/1.jpg",)}
+    assert read_names(tables) == dataset.names
+    assert read_relocalization(tables) == dataset.relocalization
+    assert read_world(tables) == dataset.world
+    assert read_protocol(tables) == dataset.protocol
+
+
+def test_folders_can_be_linked_one_by_one(dataset: OfficialDataset, tmp_path: Path) -> None:
+    images = dataset.links[""]
+    parted = replace(dataset, links={"db": images / "db", "query": images / "query"})
+    write_official(parted, tmp_path / "out")
+    folder = KaptureFolder(tmp_path / "out" / "mapping")
+    assert folder.image_path("db/2.jpg").read_bytes() == b"db/2.jpg"
+
+
+def test_what_is_missing_is_refused_folder_by_folder(
+    dataset: OfficialDataset, tmp_path: Path
+) -> None:
+    root = tmp_path / "official"
+    missing = Missing(root)
+    assert missing.require(root / "images/db/1.jpg")
+    for name in ("night/1.jpg", "night/2.jpg", "night/3.jpg", "lists/night.txt"):
+        assert not missing.require(root / "images" / name)
+    message = (
+        r"official: 4 files are missing: images/lists/night\.txt, images/night/1\.jpg and 2 more "
+        r"in its folder; --allow-missing imports what is there$"
+    )
+    with pytest.raises(DataError, match=message):
+        write_official(replace(dataset, missing=missing), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    write_official(replace(dataset, missing=missing), tmp_path / "out", allow_missing=True)
+
+
+@pytest.mark.parametrize(
+    ("part", "message"),
+    [
+        ({"mapping": records("db/1.jpg")}, "no mapping image with a pose is left"),
+        ({"query": KaptureData()}, "no query image is left"),
+        ({"query": records("db/2.jpg")}, "image 'db/2.jpg' is in the map and a query"),
+    ],
+)
+def test_nothing_useful_is_refused(
+    dataset: OfficialDataset, tmp_path: Path, part: dict[str, KaptureData], message: str
+) -> None:
+    with pytest.raises(DataError, match=message):
+        write_official(replace(dataset, **part), tmp_path / "out")  # type: ignore[arg-type]
+
+
+def test_of_a_partial_download_the_map_alone_will_do(
+    dataset: OfficialDataset, tmp_path: Path
+) -> None:
+    write_official(replace(dataset, query=KaptureData()), tmp_path / "out", allow_missing=True)
+    assert kapture_from_dir(str(tmp_path / "out" / "query")).records_camera is None
+    assert len(KaptureFolder(tmp_path / "out" / "mapping").read().poses()) == 2
+
+
+def test_counts_say_how_they_differ_from_what_is_published() -> None:
+    assert str(Count("night queries", 191, 191)).endswith("  191  as published")
+    assert str(Count("night queries", 98, 191)).endswith("98  published: 191, -93")
+    assert str(Count("cameras", 7)).endswith("  7")
+
+
+def test_ground_truth_beside_a_dataset_comes_in_the_local_frame(tmp_path: Path) -> None:
+    turn = (0.5, 0.5, 0.5, 0.5)
+    world = World(
+        official_from_local=SimilarityTransform(quat_wxyz=turn, translation=(4e6, 1e6, -2e6))
+    )
+    assert read_ground_truth(tmp_path, records("q/1.jpg"), world) == (None, {})
+    truth = tmp_path / "ground_truth"
+    write_sensors(truth / "query", records("q/1.jpg", "q/2.jpg", poses=True))
+    write_groups(truth / "megloc", {"q/1.jpg": ImageGroup(condition="DUC1")})
+    found, groups = read_ground_truth(tmp_path, records("q/0.jpg", "q/1.jpg"), world)
+    assert found is not None and list(found.poses()) == ["q/1.jpg"]
+    assert groups == {"q/1.jpg": ImageGroup(condition="DUC1")}
+    back = world.pose_in_official(found.poses()["q/1.jpg"])
+    np.testing.assert_allclose(back.center(), POSE.center(), atol=1e-6)
+    np.testing.assert_allclose(back.quat_wxyz, POSE.quat_wxyz, atol=1e-12)
+
+
+def test_images_are_left_out_with_all_that_only_they_needed() -> None:
+    data = records("1.jpg", "2.jpg", poses=True)
+    data.sensors["other"] = CAMERA
+    data.rigs["rig"] = {"cam": RigidTransform.identity(), "other": RigidTransform.identity()}
+    data.records_camera[7, "other"] = "7.jpg"
+    data.trajectories[7, "rig"] = POSE
+    left = without_images(data, ["7.jpg", "1.jpg"])
+    assert left.image_names() == ["2.jpg"]
+    assert list(left.sensors) == ["cam"] and list(left.rigs["rig"]) == ["cam"]
+    assert left.poses() == {"2.jpg": POSE} and list(left.trajectories) == [(1, "cam")]
+    kept = without_images(data, ["1.jpg"])
+    assert list(kept.poses()) == ["2.jpg", "7.jpg"]
+    assert with_poses(left, {}).poses() == {}

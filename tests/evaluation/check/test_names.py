@@ -1,0 +1,205 @@
+"""Names of a pose file against the challenge's list: what is wrong with them is told."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import pytest
+
+from megloc_kapture.evaluation.check.findings import Finding
+from megloc_kapture.evaluation.check.names import (
+    NamedRows,
+    check_shape,
+    match_names,
+    match_pairs,
+)
+from megloc_kapture.io.side_tables import ImageGroup
+
+ROBOTCAR = {
+    f"rear/{100 + i}.jpg": f"{c}/rear/{100 + i}.jpg" for i, c in enumerate(["dawn", "night"] * 3)
+}
+CAMERAS = [
+    image.replace("/rear/", f"/{side}/")
+    for image in ROBOTCAR.values()
+    for side in ("left", "rear", "right")
+]
+AACHEN = {f"IMG_{i}.jpg": f"query/day/nexus4/IMG_{i}.jpg" for i in range(5)}
+
+
+def match(
+    names: Sequence[str],
+    expected: Mapping[str, str],
+    *,
+    queries: Sequence[str] = (),
+    groups: Mapping[str, ImageGroup] | None = None,
+    dataset: str = "aachen",
+    listed: bool = True,
+) -> NamedRows:
+    named: dict[str, int] = {}
+    for line, name in enumerate(names, start=1):
+        named.setdefault(name, line)
+    return match_names(
+        named,
+        expected,
+        queries=queries or list(expected.values()),
+        groups=groups or {},
+        listed=listed,
+        dataset=dataset,
+    )
+
+
+def told(found: NamedRows) -> list[tuple[str, str]]:
+    return [(finding.severity, finding.kind) for finding in found.findings]
+
+
+def only(found: NamedRows) -> Finding:
+    (finding,) = found.findings
+    return finding
+
+
+def test_right_names() -> None:
+    found = match(list(AACHEN), AACHEN)
+    assert found.images == AACHEN and not found.findings
+
+
+def test_the_camera_forgotten_on_robotcar() -> None:
+    names = [name.removeprefix("rear/") for name in ROBOTCAR]
+    found = match(names, ROBOTCAR, queries=CAMERAS, dataset="robotcar")
+    finding = only(found)
+    assert (finding.severity, finding.kind) == ("error", "name-folder")
+    assert finding.message == (
+        "6 names lack the folder before them: 100.jpg should be rear/100.jpg; the server finds "
+        "none of them, and every figure is zero"
+    )
+    assert list(found.images.values()) == list(ROBOTCAR.values())
+
+
+def test_all_three_cameras_of_robotcar() -> None:
+    names = [image.split("/", 1)[1] for image in CAMERAS]
+    finding = only(match(names, ROBOTCAR, queries=CAMERAS, dataset="robotcar"))
+    assert (finding.severity, finding.kind) == ("note", "not-scored")
+    assert len(finding.names) == 12 and "left/100.jpg" in finding.message
+
+
+@pytest.mark.parametrize(("dataset", "severity"), [("robotcar", "warning"), ("aachen", "error")])
+def test_the_other_ending(dataset: str, severity: str) -> None:
+    names = [name.replace(".jpg", ".png") for name in ROBOTCAR]
+    finding = only(match(names, ROBOTCAR, queries=CAMERAS, dataset=dataset))
+    assert (finding.severity, finding.kind) == (severity, "name-ending")
+    assert "end in '.png' instead of '.jpg': rear/100.png should be rear/100.jpg" in finding.message
+
+
+def test_the_whole_path_where_the_last_part_is_wanted() -> None:
+    finding = only(match(list(AACHEN.values()), AACHEN))
+    assert finding.kind == "name-path"
+    assert "query/day/nexus4/IMG_0.jpg should be IMG_0.jpg" in finding.message
+
+
+@pytest.mark.parametrize("prefix", ["./", "/"])
+def test_marks_before_the_name(prefix: str) -> None:
+    assert only(match([prefix + name for name in AACHEN], AACHEN)).kind == "name-path"
+
+
+def test_several_differences_at_once() -> None:
+    names = [f"{image.removesuffix('.jpg')}.PNG" for image in AACHEN.values()]
+    finding = only(match(names, AACHEN))
+    assert finding.kind == "name-path"
+    assert "more of the path than the list and end in '.PNG' instead of '.jpg'" in finding.message
+
+
+def test_letters() -> None:
+    finding = only(match([name.replace(".jpg", ".JPG") for name in AACHEN], AACHEN))
+    assert finding.kind == "name-letters" and "upper and lower case" in finding.message
+
+
+def test_the_folder_of_something_else() -> None:
+    finding = only(
+        match([f"phones/{name}" for name in AACHEN], {f"q/{n}": i for n, i in AACHEN.items()})
+    )
+    assert (
+        finding.kind == "name-folders"
+        and "phones/IMG_0.jpg should be q/IMG_0.jpg" in finding.message
+    )
+
+
+def test_unknown_and_missing_names() -> None:
+    found = match(["IMG_0.jpg", "else.jpg", "IMG_1.jpg", "more.jpg"], AACHEN)
+    unknown = [finding for finding in found.findings if finding.kind == "unknown"]
+    assert [(f.line, f.names, f.severity) for f in unknown] == [
+        (2, ("else.jpg",), "error"),
+        (4, ("more.jpg",), "error"),
+    ]
+    missing = found.findings[-1]
+    assert (missing.severity, missing.kind) == ("warning", "missing")
+    assert missing.message.startswith("3 of 5 queries have no row")
+    assert missing.names == ("IMG_2.jpg", "IMG_3.jpg", "IMG_4.jpg")
+
+
+def test_a_condition_that_is_missing_as_a_whole() -> None:
+    groups = {image: ImageGroup(condition=image.split("/")[0]) for image in ROBOTCAR.values()}
+    names = [name for name, image in ROBOTCAR.items() if image.startswith("dawn")][:2]
+    finding = only(match(names, ROBOTCAR, queries=CAMERAS, groups=groups, dataset="robotcar"))
+    assert finding.message.endswith("there is no row at all of condition night")
+
+
+def test_nothing_of_the_list() -> None:
+    found = match(["x.jpg"], AACHEN)
+    assert told(found) == [("error", "unknown"), ("error", "missing")]
+    assert told(match([], AACHEN)) == [("error", "missing")]
+
+
+def test_one_query_under_two_names() -> None:
+    found = match([*AACHEN, "query/day/nexus4/IMG_3.jpg"], AACHEN)
+    assert told(found) == [("error", "name-path"), ("error", "duplicate")]
+    double = found.findings[1]
+    assert double.line == 6 and "IMG_3.jpg (line 4)" in double.message
+
+
+def test_order_is_a_note_and_only_where_there_is_one() -> None:
+    backwards = list(AACHEN)[::-1]
+    assert told(match(backwards, AACHEN)) == [("note", "order")]
+    assert not match(backwards, AACHEN, listed=False).findings
+
+
+def test_a_stem_that_several_names_share_is_unknown() -> None:
+    expected = {"a/1.jpg": "a/1.jpg", "b/1.jpg": "b/1.jpg"}
+    assert told(match(["1.jpg"], expected))[0] == ("error", "unknown")
+    assert match(["b/1.png"], expected).images == {"b/1.png": "b/1.jpg"}
+
+
+@pytest.mark.parametrize(
+    ("dataset", "name", "kind"),
+    [
+        ("robotcar", "1418.jpg", "name-folder"),
+        ("robotcar", "rear/1418.tif", "name-ending"),
+        ("aachen", "query/IMG.jpg", "name-path"),
+        ("inloc", "IMG_0801.jpg", "name-ending"),
+    ],
+)
+def test_what_names_alone_show(dataset: str, name: str, kind: str) -> None:
+    assert [finding.kind for finding in check_shape({name: 1}, dataset)] == [kind]
+
+
+@pytest.mark.parametrize(
+    ("dataset", "name"),
+    [("robotcar", "rear/1.png"), ("aachen", "a.jpg"), ("inloc", "A.JPG"), ("kapture", "a/b.tif")],
+)
+def test_names_that_look_right(dataset: str, name: str) -> None:
+    assert not check_shape({name: 1}, dataset)
+
+
+PAIRS = {("1", "10"): None, ("2", "20"): None, ("3", "30"): None}
+
+
+def test_pairs() -> None:
+    assert match_pairs({"1 10": 1, "2 20": 2, "3 30": 3}, PAIRS) == (False, [])
+    swapped, findings = match_pairs({"10 1": 1, "20 2": 2, "30 3": 3}, PAIRS)
+    assert swapped and [f.kind for f in findings] == ["swapped"]
+    swapped, findings = match_pairs({"3 30": 1, "1 10": 2, "2 30": 3}, PAIRS)
+    assert not swapped
+    assert [(f.severity, f.kind, f.line) for f in findings] == [
+        ("error", "unknown", 3),
+        ("error", "missing", None),
+        ("note", "order", None),
+    ]
+    assert findings[1].names == ("2 20",)

@@ -1,0 +1,48 @@
+"""The protocols of the benchmarks, by name."""
+
+from __future__ import annotations
+
+import pytest
+
+from megloc_kapture.errors import OptionError
+from megloc_kapture.evaluation.protocols import protocol_names, protocol_of
+from megloc_kapture.io.side_tables import Protocol, read_protocol, write_protocol
+
+
+def test_thresholds_of_the_challenges() -> None:
+    # papers: (0.25, 2) (0.5, 5) (5, 10) outdoors, (0.25, 0.5, 1 m; 10 deg) on InLoc, MLAD by metres
+    outdoors = ((0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
+    assert protocol_of("aachen").thresholds == outdoors
+    assert protocol_of("robotcar").thresholds == outdoors
+    assert protocol_of("inloc").thresholds == ((0.25, 10.0), (0.5, 10.0), (1.0, 10.0))
+    assert protocol_of("4seasons").thresholds == ((0.1, None), (0.2, None), (0.5, None))
+    assert protocol_of("4seasons").pose_file == "mlad"
+    assert protocol_of("kapture") == Protocol()
+
+
+def test_pools_of_robotcar_hold_each_condition_once() -> None:
+    protocol = protocol_of("robotcar")
+    pooled = [condition for parts in protocol.pools.values() for condition in parts]
+    assert sorted(pooled) == sorted(protocol.conditions)
+    assert protocol.pools["night-all"] == ("night", "night-rain")
+    assert len(protocol.pools["day-all"]) == 7
+
+
+@pytest.mark.parametrize("name", protocol_names())
+def test_every_protocol_survives_its_file(name: str, tmp_path: object) -> None:
+    write_protocol(str(tmp_path), protocol_of(name))
+    assert read_protocol(str(tmp_path)) == protocol_of(name)
+
+
+def test_hidden_truth_is_said_and_a_twins_is_not_hidden() -> None:
+    assert "visuallocalization.net" in protocol_of("aachen").truth
+    twin = protocol_of("synthetic-aachen")
+    assert (twin.dataset, twin.truth) == ("synthetic-aachen", "")
+    assert twin.thresholds == protocol_of("aachen").thresholds
+    assert protocol_of("synthetic").truth == ""
+
+
+@pytest.mark.parametrize("name", ["", "Aachen", "synthetic-kapture", "synthetic-cmu", "cmu"])
+def test_unknown_names_are_refused_with_the_known_ones(name: str) -> None:
+    with pytest.raises(OptionError, match="known: aachen, robotcar, 4seasons, inloc"):
+        protocol_of(name)

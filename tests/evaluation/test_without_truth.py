@@ -1,0 +1,231 @@
+"""What can be known without truth: shares, inliers, agreement with retrieval, of two results."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.spatial.transform import Rotation
+
+from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.evaluation.folders import results_without_truth
+from megloc_kapture.evaluation.protocols import protocol_of
+from megloc_kapture.evaluation.results import Result
+from megloc_kapture.evaluation.rules import Rules, read_rules
+from megloc_kapture.evaluation.thresholds import Threshold
+from megloc_kapture.evaluation.without_truth import WithoutTruth, evaluate_without_truth
+from megloc_kapture.evaluation.without_truth_outputs import write_without_truth
+from megloc_kapture.evaluation.without_truth_report import render_without_truth
+from megloc_kapture.evaluation.without_truth_text import without_truth_text
+from megloc_kapture.io.challenge_tables import write_names
+from megloc_kapture.io.side_tables import ImageGroup, write_groups, write_protocol
+from megloc_kapture.io.status_table import QueryStatus, write_status
+from megloc_kapture.values import RigidTransform
+
+THRESHOLDS = [Threshold(position_m=0.25, angle_deg=2.0), Threshold(position_m=5.0, angle_deg=10.0)]
+
+
+def pose_at(x: float, turn_deg: float = 0.0) -> RigidTransform:
+    rotation = Rotation.from_euler("y", turn_deg, degrees=True).as_matrix()
+    return RigidTransform.from_matrix(rotation, -rotation @ np.array([x, 0.0, 0.0]))
+
+
+def localized(image: str, inliers: int, *candidates: str) -> QueryStatus:
+    return QueryStatus(
+        image=image,
+        status="localized",
+        num_matches=2 * inliers,
+        num_inliers=inliers,
+        candidates=candidates,
+    )
+
+
+MAP = {"m/0.jpg": pose_at(0.0), "m/8.jpg": pose_at(8.0), "m/30.jpg": pose_at(30.0, 90.0)}
+CONDITIONS = {"d/1.jpg": "day", "d/2.jpg": "day", "n/1.jpg": "night", "n/2.jpg": "night"}
+
+
+@pytest.fixture
+def first() -> Result:
+    """One query at its first candidate, one beside another, a guess, and one without a pose."""
+    return Result(
+        label="A",
+        poses={"d/1.jpg": pose_at(1.0, 20.0), "d/2.jpg": pose_at(9.0), "n/1.jpg": pose_at(0.0)},
+        images=tuple(CONDITIONS),
+        statuses={
+            "d/1.jpg": localized("d/1.jpg", 100, "m/0.jpg", "m/8.jpg"),
+            "d/2.jpg": localized("d/2.jpg", 20, "m/30.jpg", "m/8.jpg", "m/gone.jpg"),
+            "n/1.jpg": QueryStatus(
+                image="n/1.jpg",
+                status="failed",
+                reason="dark",
+                fallback="retrieval",
+                candidates=("m/0.jpg",),
+            ),
+            "n/2.jpg": QueryStatus(image="n/2.jpg", status="failed", reason="no matches"),
+        },
+    )
+
+
+@pytest.fixture
+def second() -> Result:
+    """A pose file: nothing but poses."""
+    poses = {"d/1.jpg": pose_at(1.1, 20.0), "d/2.jpg": pose_at(9.0, 5.0), "n/2.jpg": pose_at(3.0)}
+    return Result(label="B", poses=poses, images=tuple(poses))
+
+
+@pytest.fixture
+def found(first: Result, second: Result) -> WithoutTruth:
+    return evaluate_without_truth(
+        [first, second],
+        conditions=CONDITIONS,
+        thresholds=THRESHOLDS,
+        map_poses=MAP,
+        statement="Nobody tells.",
+    )
+
+
+def test_counts_and_inliers(found: WithoutTruth) -> None:
+    day, night, whole = found.results[0].rows
+    assert (day.name, night.name, whole.name) == ("day", "night", "all")
+    assert (whole.num_queries, whole.num_localized, whole.num_fallback, whole.num_missing) == (
+        4,
+        2,
+        1,
+        1,
+    )
+    assert whole.inliers == tuple(np.quantile([100, 20], (0.25, 0.5, 0.75)))
+    assert night.inliers is None and night.first is None
+    other = found.results[1].rows[-1]
+    assert (other.num_localized, other.num_missing, other.inliers) == (3, 1, None)
+    assert [q.reason for q in found.results[0].queries] == ["", "", "dark", "no matches"]
+
+
+def test_agreement_with_the_candidates(found: WithoutTruth) -> None:
+    one, two, guess, _ = found.results[0].queries
+    assert one.near is not None and two.near is not None
+    assert (one.near.first_m, one.near.nearest) == (pytest.approx(1.0), "m/0.jpg")
+    assert one.near.first_deg == pytest.approx(20.0)
+    assert (two.near.first_m, two.near.nearest) == (pytest.approx(21.0), "m/8.jpg")
+    assert two.near.first_deg == pytest.approx(90.0)
+    assert two.near.nearest_m == pytest.approx(1.0)
+    # the pose of a guess is its candidate's: that is no agreement
+    assert guess.near is None
+    whole = found.results[0].rows[-1]
+    assert whole.first is not None and whole.nearest is not None
+    assert whole.first.num_compared == 2
+    assert whole.first.within == (1, 1, 2)
+    assert whole.first.num_same_direction == 1
+    assert whole.first.median_m == pytest.approx(11.0)
+    assert whole.nearest.within == (2, 2, 2)
+    assert whole.nearest.num_same_direction == 2
+
+
+def test_agreement_of_two_results(found: WithoutTruth) -> None:
+    day, night, whole = found.agreement
+    assert (whole.num_both, whole.num_only_first, whole.num_only_second) == (2, 1, 1)
+    # 0.1 m apart; and 5 degrees apart
+    assert [at.num_within for at in whole.within] == [1, 2]
+    assert whole.within[0].recall == 0.25
+    interval = stats.binomtest(1, 4).proportion_ci(method="exact")
+    assert whole.within[0].low == pytest.approx(interval.low)
+    assert (day.num_both, night.num_both) == (2, 0)
+    assert np.isinf(night.median_m)
+    assert whole.median_m == pytest.approx(0.05)
+    np.testing.assert_allclose(found.apart[0].position_m, [0.1, 0.0, np.inf, np.inf], atol=1e-12)
+
+
+def test_a_result_agrees_with_itself(first: Result) -> None:
+    twin = Result("twin", first.poses, first.images, first.statuses)
+    (row,) = evaluate_without_truth([first, twin], thresholds=THRESHOLDS).agreement
+    assert [at.num_within for at in row.within] == [3, 3]
+    assert row.median_m == 0.0
+
+
+def test_said_in_every_file(
+    found: WithoutTruth, tmp_path: Path, page_of: Callable[[str], Any]
+) -> None:
+    paths = write_without_truth(tmp_path, found, map_poses=MAP, provenance={"preset": "classic"})
+    text = paths["agreement.txt"].read_text()
+    assert text == without_truth_text(found)
+    assert "No recall: Nobody tells." in text and "accuracy" in text
+    assert "agreement of A and B" in text and "25.0 / 50.0" in text
+    assert "Only A has a pose for 1 query, only B for 1." in text
+    assert text.isascii() and max(map(len, text.splitlines())) <= 100
+    summary = json.loads(paths["agreement.json"].read_text())
+    assert summary["statement"] == "Nobody tells."
+    row = summary["results"][0]["rows"][-1]
+    assert row["first_candidate"]["within"][0] == {
+        "distance_m": 5.0,
+        "num_within": 1,
+        "share": 0.5,
+    }
+    assert summary["results"][1]["rows"][-1]["first_candidate"] is None
+    assert summary["agreement"][1]["median_m"] is None
+    with paths["per_query.csv"].open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["A: outcome"] for row in rows] == ["localized", "localized", "fallback", "missing"]
+    assert float(rows[1]["A: first_candidate_m"]) == pytest.approx(21.0)
+    assert rows[1]["A: nearest_candidate"] == "m/8.jpg"
+    assert float(rows[0]["A to B: position_m"]) == pytest.approx(0.1)
+    assert rows[3]["A to B: position_m"] == ""
+    page = page_of(paths["report.html"].read_text())
+    assert "No recall: Nobody tells." in page.text and "Do they agree?" in page.text
+
+
+def test_the_same_bytes_each_time(found: WithoutTruth) -> None:
+    first = render_without_truth(found, map_poses=MAP)
+    assert render_without_truth(found, map_poses=MAP) == first
+
+
+def test_one_pose_file_alone(second: Result, page_of: Callable[[str], Any]) -> None:
+    found = evaluate_without_truth([second])
+    text = without_truth_text(found)
+    assert "No true poses were given." in text
+    assert "no map or no candidates are known" in text
+    assert "agreement of" not in text
+    assert "Do they agree" not in page_of(render_without_truth(found)).text
+
+
+def test_no_pose_at_all(page_of: Callable[[str], Any]) -> None:
+    found = evaluate_without_truth([Result("x", {}, ("a.jpg",))])
+    assert found.results[0].rows[0].num_missing == 1
+    assert "Where they are" not in page_of(render_without_truth(found)).text
+
+
+def test_nothing_to_say_is_refused(first: Result) -> None:
+    with pytest.raises(DataError, match="no query"):
+        evaluate_without_truth([Result("x", {}, ())])
+    with pytest.raises(OptionError, match="different labels"):
+        evaluate_without_truth([first, first])
+    with pytest.raises(OptionError, match="different labels"):
+        evaluate_without_truth([])
+
+
+def test_from_a_workspace(first: Result, tmp_path: Path, kaptures: Callable[..., Path]) -> None:
+    workspace = tmp_path / "workspace"
+    kaptures(workspace / "mapping", list(MAP), MAP)
+    kaptures(workspace / "query", [*CONDITIONS, "d/training.jpg"], {})
+    kaptures(workspace / "localized", [*CONDITIONS, "d/training.jpg"], first.poses)
+    assert first.statuses is not None
+    write_status(workspace / "localized/status.csv", first.statuses.values())
+    tables = workspace / "megloc"
+    write_protocol(tables, protocol_of("aachen"))
+    write_groups(tables, {name: ImageGroup(condition=c) for name, c in CONDITIONS.items()})
+    write_names(tables, {name: name.replace("/", "_") for name in CONDITIONS})
+    rules = read_rules(tables)
+    found = results_without_truth([workspace / "localized"], rules, map_poses=MAP)
+    assert "visuallocalization.net keeps them" in found.statement
+    # the challenge's list says which queries count
+    assert [row.num_queries for row in found.results[0].rows] == [2, 2, 4]
+    assert found.results[0].rows[-1].first is not None
+    # without a list, all queries of the workspace do that are scored
+    everything = results_without_truth(
+        [workspace / "localized"], Rules(protocol=rules.protocol, groups=rules.groups)
+    )
+    assert everything.results[0].rows[-1].num_queries == 5

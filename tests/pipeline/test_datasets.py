@@ -1,0 +1,130 @@
+"""Datasets by name: where their root is looked for, and what is said when it is nowhere."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from megloc_kapture.datasets.official import Count, DatasetCard, Missing, OfficialDataset
+from megloc_kapture.errors import DataError, OptionError, PluginError
+from megloc_kapture.io.kapture_store import KaptureData, Sensor
+from megloc_kapture.io.side_tables import Protocol, read_protocol
+from megloc_kapture.pipeline.datasets import (
+    SUMMARY_FILE,
+    DatasetChoice,
+    choose_dataset,
+    dataset_names,
+    twin_of,
+)
+from megloc_kapture.plugins import DATASETS, DatasetAdapter, plugin_names
+from megloc_kapture.values import Camera, RigidTransform
+
+OFFICIAL = ("4seasons", "aachen", "inloc", "robotcar")
+
+
+class Toy:
+    """The smallest dataset: one image, one query."""
+
+    name = "toy"
+    card = DatasetCard(title="Toy", published_at="x", size="1 kB", folders=(), layout="1.jpg")
+
+    def check(self, root: Path) -> None:
+        if not (root / "1.jpg").is_file():
+            raise DataError("1.jpg is missing", path=root)
+
+    def input_files(self, root: Path) -> Iterator[Path]:
+        yield root / "1.jpg"
+
+    def read(self, root: Path, *, allow_missing: bool = False) -> OfficialDataset:
+        sensor = Sensor.from_camera(Camera("SIMPLE_PINHOLE", 10, 8, (9.0, 5.0, 4.0)))
+        missing = Missing(root)
+        missing.require(root / "2.jpg")
+        return OfficialDataset(
+            mapping=KaptureData(
+                {"c": sensor}, {}, {(0, "c"): RigidTransform.identity()}, {(0, "c"): "1.jpg"}
+            ),
+            query=KaptureData({"c": sensor}, {}, {}, {(0, "c"): "2.jpg"}),
+            links={"": root},
+            protocol=Protocol(dataset="toy"),
+            summary=[Count("queries", 1, 2)],
+            remarks=["A remark."],
+            missing=missing,
+        )
+
+
+def test_the_names_are_those_of_the_adapters_and_their_twins() -> None:
+    assert set(OFFICIAL) <= set(plugin_names(DATASETS))
+    twins = {f"synthetic-{name}" for name in OFFICIAL}
+    assert {"kapture", "synthetic", *OFFICIAL} | twins == set(dataset_names())
+
+
+@pytest.mark.parametrize("name", OFFICIAL)
+def test_an_official_dataset_says_where_it_is_published(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("MEGLOC_DATA", raising=False)
+    with pytest.raises(OptionError) as refused:
+        choose_dataset(name, None)
+    text = str(refused.value)
+    assert "--root or MEGLOC_DATA" in text and "://" in text
+    assert f"`megloc eval synthetic-{name}`" in text
+    card = choose_dataset(name, Path()).adapter.card  # type: ignore[union-attr]
+    assert card.size in text and card.layout in text and card.title in text
+
+
+def test_the_root_is_found_below_the_environment(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("MEGLOC_DATA", str(tmp_path))
+    with pytest.raises(OptionError, match="MEGLOC_DATA has none of aachen, Aachen-Day-Night"):
+        choose_dataset("aachen", None)
+    (tmp_path / "Aachen-Day-Night").mkdir()
+    assert choose_dataset("aachen", None).root == tmp_path / "Aachen-Day-Night"
+    (tmp_path / "aachen").mkdir()
+    assert choose_dataset("aachen", None).root == tmp_path / "aachen"
+    assert choose_dataset("aachen", tmp_path).root == tmp_path
+
+
+def test_what_cannot_be_is_refused() -> None:
+    with pytest.raises(OptionError, match="unknown dataset 'venice'; known: kapture, "):
+        choose_dataset("venice", None)
+    with pytest.raises(PluginError, match="refuses its options: colour"):
+        choose_dataset("aachen", Path(), import_options={"colour": "red"})
+    with pytest.raises(OptionError, match="kapture has no import options: version"):
+        choose_dataset("kapture", Path(), import_options={"version": "1.0"})
+    with pytest.raises(OptionError, match="--query-prefix"):
+        choose_dataset("inloc", Path(), query_prefix="q")
+    with pytest.raises(OptionError, match="nothing renders 'venice'"):
+        twin_of("venice")
+
+
+@pytest.mark.parametrize("name", OFFICIAL)
+def test_a_twin_is_rendered_and_imported_by_the_adapter_of_its_layout(name: str) -> None:
+    choice = choose_dataset(f"synthetic-{name}", None)
+    assert choice.root is None and choice.twin is not None
+    assert choice.adapter is not None and choice.adapter.name == name
+    assert isinstance(choice.adapter, DatasetAdapter)
+    assert choice.render_options()["world"]["seed"] == 0
+    assert twin_of(name, seed=3).options != choice.twin.options
+
+
+def test_an_import_leaves_a_summary_and_takes_a_changed_protocol(tmp_path: Path) -> None:
+    root = tmp_path / "root"
+    root.mkdir()
+    choice = DatasetChoice("toy", root, Toy())
+    with pytest.raises(DataError, match="1.jpg is missing"):
+        choice.check()
+    (root / "1.jpg").touch()
+    choice.check()
+    with pytest.raises(DataError, match="1 files are missing: 2.jpg; --allow-missing"):
+        choice.import_to(root, tmp_path / "out")
+    choice = DatasetChoice("toy", root, Toy(), allow_missing=True)
+    counts = choice.import_to(
+        root, tmp_path / "out", lambda given: given.model_copy(update={"truth": "mine"})
+    )
+    assert counts == {"map_images": 1, "queries": 1, "queries_with_truth": 0}
+    assert read_protocol(tmp_path / "out" / "megloc").truth == "mine"
+    text = (tmp_path / "out" / SUMMARY_FILE).read_text()
+    assert "published: 2, -1" in text and "A remark." in text and "2.jpg" in text

@@ -1,0 +1,458 @@
+"""What is handed in: names, order, frames, rows, the rig, and the provenance beside it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import kapture
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.evaluation.mlad_file import read_mlad_file
+from megloc_kapture.evaluation.pose_file import read_pose_file
+from megloc_kapture.io.challenge_tables import (
+    RelocalizationPair,
+    write_names,
+    write_relocalization,
+)
+from megloc_kapture.io.json_model import write_json_model
+from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, Sensor, write_sensors
+from megloc_kapture.io.side_tables import (
+    ImageGroup,
+    Protocol,
+    SimilarityTransform,
+    World,
+    write_groups,
+    write_protocol,
+    write_world,
+)
+from megloc_kapture.io.status_table import QueryStatus, write_status
+from megloc_kapture.pipeline.manifests import Manifest
+from megloc_kapture.pipeline.submission import (
+    check_dataset,
+    place_of,
+    poses_through_rig,
+    workspace_provenance,
+    write_submission,
+)
+from megloc_kapture.values import Camera, RigidTransform
+
+CAMERA = Sensor.from_camera(Camera("PINHOLE", 640, 480, (500, 500, 320, 240)))
+SIDES = ("left", "rear", "right")
+# the origin of 4Seasons' frames, and a scale that some maps have
+FAR = SimilarityTransform(
+    quat_wxyz=(0.5, 0.5, -0.5, 0.5), translation=(4.1e6, 8.5e5, 4.8e6), scale=1.25
+)
+
+
+def random_poses(number: int, seed: int = 0) -> list[RigidTransform]:
+    turns = Rotation.random(number, random_state=seed).as_matrix()
+    shifts = np.random.default_rng(seed).normal(size=(number, 3)) * 20
+    return [RigidTransform.from_matrix(r, t) for r, t in zip(turns, shifts, strict=True)]
+
+
+def matrix(pose: RigidTransform) -> np.ndarray:
+    w, x, y, z = pose.quat_wxyz
+    whole = np.eye(4)
+    whole[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
+    whole[:3, 3] = pose.translation
+    return whole
+
+
+class Dataset:
+    """An import with a rig of three cameras at four moments, and a result for it."""
+
+    def __init__(self, root: Path) -> None:
+        self.root, self.tables, self.result = root, root / "megloc", root / "localized"
+        offsets = random_poses(3, seed=7)
+        self.rig = dict(zip(SIDES, offsets, strict=True))
+        self.cars = dict(zip((10, 20, 30, 40), random_poses(4), strict=True))
+        self.query = KaptureData(
+            sensors=dict.fromkeys(SIDES, CAMERA),
+            rigs={"car": self.rig},
+            records_camera={
+                (time, side): f"{'night' if time > 20 else 'dawn'}/{side}/{time}.jpg"
+                for time in self.cars
+                for side in SIDES
+            },
+        )
+        write_sensors(root / "query", self.query)
+        write_protocol(self.tables, Protocol(dataset="robotcar"))
+        self.groups = {
+            image: ImageGroup(scored="/rear/" in image) for image in self.query.image_names()
+        }
+        write_groups(self.tables, self.groups)
+        self.names = {
+            f"{'night' if time > 20 else 'dawn'}/rear/{time}.jpg": f"rear/{time}.png"
+            for time in (40, 10, 30, 20)
+        }
+
+    def true_pose(self, image: str) -> RigidTransform:
+        time, side = self.query.record_of(image)
+        return self.rig[side] @ self.cars[time]
+
+    def localize(self, images: list[str], statuses: Mapping[str, Mapping[str, Any]]) -> None:
+        poses = {self.query.record_of(image): self.true_pose(image) for image in images}
+        write_sensors(self.result, replace(self.query, rigs={}, trajectories=poses))
+        rows = [
+            QueryStatus(image=image, **{"status": "localized", **statuses.get(image, {})})
+            for image in images
+        ]
+        write_status(self.result / "status.csv", rows)
+
+
+@pytest.fixture
+def dataset(tmp_path: Path) -> Dataset:
+    return Dataset(tmp_path / "workspace")
+
+
+FAILED = {"status": "failed", "reason": "no map image matches"}
+
+
+def submit(dataset: Dataset, place: Path, **options: Any) -> tuple[dict[str, int], dict[str, Any]]:
+    counts = write_submission(
+        dataset.result,
+        place,
+        tables=dataset.tables,
+        provenance={"dataset": "robotcar", "preset": "classic", "options": {"a": 1}},
+        **options,
+    )
+    return counts, json.loads(place.with_name(f"{place.name}.json").read_text())
+
+
+def test_scored_images_by_the_rule(dataset: Dataset, tmp_path: Path) -> None:
+    dataset.localize(["dawn/left/10.jpg", "dawn/rear/10.jpg", "night/rear/40.jpg"], {})
+    counts, beside = submit(dataset, tmp_path / "poses.txt")
+    assert list(read_pose_file(tmp_path / "poses.txt")) == ["dawn/rear/10.jpg", "night/rear/40.jpg"]
+    assert counts == {
+        "queries": 12,
+        "scored": 4,
+        "poses": 2,
+        "missing": 2,
+        "fallbacks": 0,
+        "from_rig": 0,
+        "dummies": 0,
+    }
+    assert beside["counts"] == counts
+    assert beside["missing"] == ["dawn/rear/20.jpg", "night/rear/30.jpg"]
+
+
+def test_the_list_names_and_orders(dataset: Dataset, tmp_path: Path) -> None:
+    write_names(dataset.tables, dataset.names)
+    dataset.localize(dataset.query.image_names(), {})
+    counts, _ = submit(dataset, tmp_path / "poses.txt")
+    found = read_pose_file(tmp_path / "poses.txt")
+    assert list(found) == ["rear/40.png", "rear/10.png", "rear/30.png", "rear/20.png"]
+    assert found["rear/30.png"] == dataset.true_pose("night/rear/30.jpg")
+    assert counts["poses"] == counts["scored"] == 4
+
+
+def test_poses_leave_in_the_official_frame(dataset: Dataset, tmp_path: Path) -> None:
+    write_world(dataset.tables, World(official_from_local=FAR))
+    dataset.localize(["dawn/rear/10.jpg"], {})
+    submit(dataset, tmp_path / "poses.txt")
+    pose = matrix(read_pose_file(tmp_path / "poses.txt")["dawn/rear/10.jpg"])
+    points = np.random.default_rng(0).normal(size=(5, 3)) * 10
+    local = matrix(dataset.true_pose("dawn/rear/10.jpg"))
+    turn = Rotation.from_quat(np.roll(FAR.quat_wxyz, -1))
+    official = 1.25 * turn.apply(points) + FAR.translation
+    np.testing.assert_allclose(
+        official @ pose[:3, :3].T + pose[:3, 3],
+        1.25 * (points @ local[:3, :3].T + local[:3, 3]),
+        atol=1e-8,
+    )
+
+
+def test_names_that_collide_are_refused(dataset: Dataset, tmp_path: Path) -> None:
+    write_protocol(dataset.tables, Protocol(dataset="robotcar", pose_file_names="basename"))
+    write_groups(dataset.tables, {})
+    dataset.localize(dataset.query.image_names(), {})
+    with pytest.raises(DataError, match="would both be called '10.jpg'"):
+        submit(dataset, tmp_path / "poses.txt")
+    assert not (tmp_path / "poses.txt").exists()
+
+
+def test_without_tables_every_image_counts(dataset: Dataset, tmp_path: Path) -> None:
+    dataset.localize(["dawn/left/10.jpg"], {})
+    counts = write_submission(dataset.result, tmp_path / "poses.txt", tables=None, provenance={})
+    assert (counts["queries"], counts["scored"], counts["poses"]) == (12, 12, 1)
+
+
+def test_a_result_of_something_else_is_refused(dataset: Dataset, tmp_path: Path) -> None:
+    dataset.localize(["dawn/left/10.jpg"], {})
+    stranger = replace(dataset.query, records_camera={(1, "left"): "other.jpg"})
+    write_sensors(dataset.root / "query", stranger)
+    with pytest.raises(DataError, match="is not among the queries of .*query"):
+        submit(dataset, tmp_path / "poses.txt")
+
+
+def test_poses_of_the_rig_only_when_asked(dataset: Dataset, tmp_path: Path) -> None:
+    statuses = {
+        "dawn/left/10.jpg": {"num_inliers": 30},
+        "dawn/right/10.jpg": {"num_inliers": 90},
+        "dawn/rear/20.jpg": {**FAILED, "fallback": "retrieval"},
+        "dawn/left/20.jpg": {"num_inliers": 20},
+        "night/left/30.jpg": {**FAILED, "fallback": "retrieval"},
+    }
+    dataset.localize(list(statuses), statuses)
+    counts, _ = submit(dataset, tmp_path / "without.txt")
+    assert list(read_pose_file(tmp_path / "without.txt")) == ["dawn/rear/20.jpg"]
+    assert (counts["poses"], counts["fallbacks"], counts["from_rig"]) == (1, 1, 0)
+    counts, beside = submit(dataset, tmp_path / "with.txt", from_rig=True)
+    found = read_pose_file(tmp_path / "with.txt")
+    # a guess gives nothing to others, and gives way to a pose of the rig
+    assert list(found) == ["dawn/rear/10.jpg", "dawn/rear/20.jpg"]
+    assert (counts["poses"], counts["fallbacks"], counts["from_rig"]) == (2, 0, 2)
+    for image, pose in found.items():
+        np.testing.assert_allclose(matrix(pose), matrix(dataset.true_pose(image)), atol=1e-9)
+    assert beside["counts"]["from_rig"] == 2
+
+
+def test_poses_that_came_from_the_rig_before_are_counted(dataset: Dataset, tmp_path: Path) -> None:
+    dataset.localize(["dawn/rear/10.jpg"], {"dawn/rear/10.jpg": {**FAILED, "fallback": "rig"}})
+    counts, _ = submit(dataset, tmp_path / "poses.txt")
+    assert (counts["poses"], counts["fallbacks"], counts["from_rig"]) == (1, 0, 1)
+
+
+def test_the_sibling_with_most_inliers_counts(dataset: Dataset) -> None:
+    poses = {"dawn/left/10.jpg": random_poses(1, 3)[0], "dawn/right/10.jpg": random_poses(1, 4)[0]}
+    for best in poses:
+        statuses = {
+            image: QueryStatus(image=image, status="localized", num_inliers=50 + (image == best))
+            for image in poses
+        }
+        found = poses_through_rig(dataset.query, poses, statuses)
+        assert list(found) == ["dawn/rear/10.jpg"]
+        side = best.split("/")[1]
+        expected = matrix(dataset.rig["rear"]) @ np.linalg.inv(matrix(dataset.rig[side]))
+        np.testing.assert_allclose(
+            matrix(found["dawn/rear/10.jpg"]), expected @ matrix(poses[best]), atol=1e-9
+        )
+    assert list(poses_through_rig(dataset.query, poses)) == ["dawn/rear/10.jpg"]
+
+
+def test_no_rig_to_ask(dataset: Dataset, tmp_path: Path) -> None:
+    write_sensors(dataset.root / "query", replace(dataset.query, rigs={}))
+    (dataset.root / "query" / "sensors" / "rigs.txt").unlink()
+    dataset.localize(["dawn/rear/10.jpg"], {})
+    with pytest.raises(DataError, match="no pose can come from the rig"):
+        submit(dataset, tmp_path / "poses.txt", from_rig=True)
+
+
+class Drives:
+    """A map and queries of 4Seasons, and pairs of them in two relocalization files."""
+
+    def __init__(self, root: Path, world: World) -> None:
+        self.root, self.tables, self.result = root, root / "megloc", root / "localized"
+        start = 1602074877390449152
+        poses = random_poses(9)
+        sensors = {"cam0": CAMERA}
+        stamps = [start + 33_333_333 * i for i in range(9)]
+        self.mapping = KaptureData(
+            sensors=sensors,
+            trajectories={(t, "cam0"): p for t, p in zip(stamps[:4], poses[:4], strict=True)},
+            records_camera={(t, "cam0"): f"ref/cam0/{t}.png" for t in stamps[:5]},
+        )
+        self.localized = KaptureData(
+            sensors=sensors,
+            trajectories={(t, "cam0"): p for t, p in zip(stamps[5:8], poses[5:8], strict=True)},
+            records_camera={(t, "cam0"): f"test/cam0/{t}.png" for t in stamps[5:]},
+        )
+        write_sensors(root / "mapping", self.mapping)
+        write_sensors(root / "query", replace(self.localized, trajectories={}))
+        write_sensors(self.result, self.localized)
+        write_protocol(self.tables, Protocol(dataset="4seasons", pose_file="mlad"))
+        write_world(self.tables, world)
+        pairs = [(3, 7), (0, 5), (1, 6), (2, 8)]
+        self.pairs = [(stamps[r], stamps[q]) for r, q in pairs]
+        self.rows = [
+            RelocalizationPair("a_to_b.txt", f"ref/cam0/{r}.png", f"test/cam0/{q}.png")
+            for r, q in self.pairs
+        ]
+        self.unposed = RelocalizationPair(
+            "sub/b.txt", f"ref/cam0/{stamps[4]}.png", f"test/cam0/{stamps[5]}.png"
+        )
+        write_relocalization(self.tables, [*self.rows, self.unposed])
+
+
+@pytest.mark.parametrize("far", [False, True])
+def test_mlad_files_are_those_of_kaptures_own_exporter(tmp_path: Path, far: bool) -> None:
+    from tools.kapture_export_4seasons_pairs import export_4seasons_pairfile
+
+    origin = SimilarityTransform(quat_wxyz=FAR.quat_wxyz, translation=FAR.translation)
+    drives = Drives(tmp_path / "workspace", World(official_from_local=origin) if far else World())
+    both = KaptureData(
+        sensors=drives.mapping.sensors,
+        trajectories=drives.mapping.trajectories | drives.localized.trajectories,
+        records_camera=drives.mapping.records_camera | drives.localized.records_camera,
+    )
+    write_sensors(tmp_path / "both", both)
+    pairs = tmp_path / "pairs.txt"
+    pairs.write_text("".join(f"{r} {q}\n" for r, q in drives.pairs))
+    export_4seasons_pairfile(
+        str(tmp_path / "both"), str(pairs), str(tmp_path / "theirs.txt"), heal_timestamps=False
+    )
+    place = tmp_path / "submission"
+    counts = write_submission(drives.result, place, tables=drives.tables, provenance={})
+    ours = np.loadtxt(place / "a_to_b.txt")
+    theirs = np.loadtxt(tmp_path / "theirs.txt")
+    assert ours.shape == theirs.shape == (4, 9)
+    np.testing.assert_array_equal(ours[:, :2], theirs[:, :2])
+    np.testing.assert_allclose(ours[:, 2:5], theirs[:, 2:5], atol=1e-9)
+    found, expected = (Rotation.from_quat(rows[:, 5:]) for rows in (ours, theirs))
+    assert (found * expected.inv()).magnitude().max() < 1e-12
+    assert counts == {
+        "queries": 4,
+        "scored": 5,
+        "poses": 3,
+        "missing": 2,
+        "fallbacks": 0,
+        "from_rig": 0,
+        "dummies": 2,
+    }
+
+
+def test_mlad_rows_without_a_pose_are_dummies_by_name(tmp_path: Path) -> None:
+    drives = Drives(tmp_path / "workspace", World(official_from_local=FAR))
+    place = tmp_path / "out" / "submission"
+    write_submission(drives.result, place, tables=drives.tables, provenance={}, weights={"n": "0a"})
+    rows = read_mlad_file(place / "a_to_b.txt")
+    assert [(row.reference, row.query) for row in rows] == drives.pairs
+    last = place / "a_to_b.txt"
+    assert last.read_text().splitlines()[3].split(" ", 2)[2] == "0.0 0.0 0.0 0.0 0.0 0.0 1.0"
+    assert (place / "sub" / "b.txt").read_text().endswith("0.0 0.0 0.0 0.0 0.0 0.0 1.0\n")
+    beside = json.loads((tmp_path / "out" / "submission.json").read_text())
+    assert beside["dummies"] == [
+        f"a_to_b.txt: {drives.rows[3].reference} {drives.rows[3].query}",
+        f"sub/b.txt: {drives.unposed.reference} {drives.unposed.query}",
+    ]
+    assert beside["weights"] == {"n": "0a"}
+    assert sorted(beside["files"]) == ["a_to_b.txt", "sub/b.txt"]
+    # lengths are the official ones
+    first = rows[1].query_from_reference
+    query, reference = drives.localized.poses(), drives.mapping.poses()
+    relative = matrix(query[drives.rows[1].query]) @ np.linalg.inv(
+        matrix(reference[drives.rows[1].reference])
+    )
+    assert first is not None
+    np.testing.assert_allclose(first.translation, 1.25 * relative[:3, 3], atol=1e-9)
+
+
+def test_mlad_without_pairs_is_refused(tmp_path: Path) -> None:
+    drives = Drives(tmp_path / "workspace", World())
+    write_relocalization(drives.tables, [])
+    with pytest.raises(DataError, match=r"relocalization\.csv: no pairs"):
+        write_submission(drives.result, tmp_path / "s", tables=drives.tables, provenance={})
+
+
+def manifest(stage: str, **changes: Any) -> Manifest:
+    content: dict[str, Any] = {
+        "stage": stage,
+        "version": 1,
+        "options": {},
+        "inputs": {},
+        "fingerprint": f"print of {stage}",
+        "outputs": (),
+        "seconds": 1.5,
+        "started": "2024-01-01T00:00:00",
+        "versions": {},
+    }
+    return Manifest(**(content | changes))
+
+
+def test_provenance_says_where_it_comes_from_and_when_nothing(
+    dataset: Dataset, tmp_path: Path
+) -> None:
+    dataset.localize(["dawn/rear/10.jpg"], {})
+    write_json_model(dataset.root / "stages" / "import.json", manifest("import"))
+    place = tmp_path / "poses.txt"
+    _, beside = submit(dataset, place, weights={"superpoint": "ab"})
+    assert beside["dataset_fingerprint"] == "print of import"
+    assert beside["weights"] == {"superpoint": "ab"}
+    assert beside["dataset"] == "robotcar" and beside["preset"] == "classic"
+    assert beside["options"] == {"a": 1} and "megloc-kapture" in beside["versions"]
+    assert beside["files"] == {"poses.txt": hashlib.sha256(place.read_bytes()).hexdigest()}
+    text = place.with_name("poses.txt.json").read_text()
+    assert "2024" not in text and "1.5" not in text
+    submit(dataset, tmp_path / "again" / "poses.txt", weights={"superpoint": "ab"})
+    assert (tmp_path / "again" / "poses.txt").read_bytes() == place.read_bytes()
+    assert (tmp_path / "again" / "poses.txt.json").read_text() == text
+
+
+def test_options_of_a_workspace_are_told_only_where_they_are_the_results(tmp_path: Path) -> None:
+    stages, result = tmp_path / "stages", tmp_path / "localized"
+    assert workspace_provenance(result) == {}
+    done = manifest("localization", outputs=("localized", "timing.csv"))
+    write_json_model(stages / "localization.json", done)
+    assert workspace_provenance(result) == {"localization_fingerprint": "print of localization"}
+    assert workspace_provenance(tmp_path / "other") == {}
+    options = {"dataset": "kapture", "preset": "classic", "options": {"map": "lift"}}
+    inputs = {"localization": "print of localization"}
+    write_json_model(
+        stages / "submission.json", manifest("submission", options=options, inputs=inputs)
+    )
+    told = workspace_provenance(result)
+    assert told["preset"] == "classic" and told["options"] == {"map": "lift"}
+    inputs = {"localization": "an older one"}
+    write_json_model(
+        stages / "submission.json", manifest("submission", options=options, inputs=inputs)
+    )
+    assert "preset" not in workspace_provenance(result)
+
+
+@pytest.mark.parametrize(
+    ("asked", "written"),
+    [
+        ("aachen", "aachen"),
+        ("synthetic-aachen", "aachen"),
+        ("aachen", "synthetic-aachen"),
+        ("kapture", "kapture"),
+        ("synthetic", "kapture"),
+        ("kapture", "synthetic"),
+        ("kapture", "my-own-scene"),
+    ],
+)
+def test_datasets_that_go_together(asked: str, written: str, tmp_path: Path) -> None:
+    check_dataset(asked, Protocol(dataset=written), tables=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("asked", "written", "words"),
+    [
+        ("aachen", "robotcar", r"aachen is asked for, and .*protocol\.json is of dataset robotcar"),
+        ("aachen", "kapture", "of dataset kapture"),
+        ("kapture", "aachen", "of dataset aachen"),
+        ("synthetic", "synthetic-inloc", "of dataset synthetic-inloc"),
+        ("aahcen", "aachen", "unknown dataset 'aahcen'; known: kapture, "),
+    ],
+)
+def test_datasets_that_do_not(asked: str, written: str, words: str, tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match=words):
+        check_dataset(asked, Protocol(dataset=written), tables=tmp_path)
+
+
+def test_rules_that_are_nowhere() -> None:
+    check_dataset("kapture", Protocol(), tables=None)
+    with pytest.raises(OptionError, match="rules of aachen stand in the megloc/ folder"):
+        check_dataset("aachen", Protocol(), tables=None)
+
+
+def test_places(tmp_path: Path) -> None:
+    assert place_of(tmp_path, "x_1.1", Protocol()) == tmp_path / "x_1.1.txt"
+    assert place_of(tmp_path, "x_1.1", Protocol(pose_file="mlad")) == tmp_path / "x_1.1"
+
+
+def test_ltvl_poses_are_kaptures_own(dataset: Dataset, tmp_path: Path) -> None:
+    dataset.localize(["dawn/rear/10.jpg"], {})
+    submit(dataset, tmp_path / "poses.txt")
+    name, *numbers = (tmp_path / "poses.txt").read_text().split()
+    stored = KaptureFolder(dataset.result).read().poses()[name]
+    theirs = kapture.PoseTransform([float(v) for v in numbers[:4]], [float(v) for v in numbers[4:]])
+    np.testing.assert_allclose(theirs.inverse().t_raw, stored.center(), atol=1e-9)
