@@ -30,6 +30,7 @@ def main() -> None:
     options, arguments = parser.parse_known_args()
     run("map_reading.py")
     run("nvm_reading.py")
+    run("evaluation.py")
     scene = ("--scene", str(options.scene))
     run("end_to_end.py", *scene, *arguments)
     if options.kloc_python:

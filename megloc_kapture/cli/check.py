@@ -60,10 +60,15 @@ class Check(Common):
         return PROBLEMS_FOUND if report.has_problems else 0
 
     def _workspace(self, console: Console) -> Path | None:
+        from megloc_kapture.pipeline.datasets import dataset_names
+
+        # runs/synthetic-aachen-classic is no run of dataset synthetic
+        longer = tuple(f"{n}-" for n in dataset_names() if n.startswith(f"{self.dataset}-"))
         found = [
             path
             for path in sorted(_RUNS.glob(f"{self.dataset}-*"))
             if (path / "mapping" / "sensors" / "sensors.txt").is_file()
+            and not path.name.startswith(longer or "/")
         ]
         if len(found) == 1:
             console.say(f"compared with {found[0]}")

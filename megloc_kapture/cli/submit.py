@@ -71,8 +71,8 @@ def summary(counts: Mapping[str, int]) -> str:
         text += f" that are scored ({counts['queries']} in all)"
     parts = [
         f"{counts['missing']} missing" if counts["missing"] else "",
-        f"written as {counts['dummies']} dummies" if counts["dummies"] else "",
-        f"{counts['fallbacks']} fallbacks" if counts["fallbacks"] else "",
+        "dummies in their place" if counts["dummies"] else "",
+        f"{counts['fallbacks']} of the poses guessed" if counts["fallbacks"] else "",
         f"{counts['from_rig']} from the rig" if counts["from_rig"] else "",
     ]
     return ", ".join([text, *filter(None, parts)])

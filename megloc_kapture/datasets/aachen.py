@@ -36,11 +36,11 @@ from megloc_kapture.datasets.official import (
 )
 from megloc_kapture.datasets.reference_map import write_reference_map
 from megloc_kapture.errors import DataError
+from megloc_kapture.evaluation.protocols import protocol_of
 from megloc_kapture.io.kapture_store import KaptureData, Sensor
-from megloc_kapture.io.side_tables import ImageGroup, Protocol, World
+from megloc_kapture.io.side_tables import ImageGroup, World
 from megloc_kapture.values import Camera, Options
 
-THRESHOLDS = ((0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
 DAY, NIGHT = "day", "night"
 # the first timestamp of each list; map images count from 0
 _FIRST_TIMESTAMP = {DAY: 100_000, NIGHT: 200_000}
@@ -147,14 +147,7 @@ class Aachen:
             links=links,
             groups={query.name: ImageGroup(condition=query.condition) for query in queries},
             names=_pose_file_names(queries, layout),
-            protocol=Protocol(
-                dataset=self.name,
-                thresholds=THRESHOLDS,
-                pose_file_names="basename",
-                truth="The challenge keeps the true poses; visuallocalization.net scores pose "
-                "files.",
-                conditions=(DAY, NIGHT),
-            ),
+            protocol=protocol_of(self.name),
             summary=_summary(version, mapping, queries),
             remarks=self._remarks(layout, version, mapping, left_out),
             missing=missing,

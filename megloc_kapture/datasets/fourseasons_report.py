@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from megloc_kapture.datasets.fourseasons_challenge import ChallengeTables, Task
 from megloc_kapture.datasets.fourseasons_frames import KeyframePoses, LocalFrame
@@ -17,11 +18,11 @@ from megloc_kapture.datasets.fourseasons_selection import Selection
 from megloc_kapture.datasets.grammars.fourseasons_poses import read_keyframe_accuracy
 from megloc_kapture.datasets.grammars.fourseasons_times import read_times
 from megloc_kapture.datasets.official import Count
+from megloc_kapture.evaluation.protocols import protocol_of
 from megloc_kapture.io.kapture_store import KaptureData
 from megloc_kapture.io.side_tables import ImageGroup, Protocol
 
-# of the challenges, positions only; and of the long-term benchmarks, where no challenge asks
-RELATIVE_THRESHOLDS = ((0.1, None), (0.2, None), (0.5, None))
+# of other long-term benchmarks, where no challenge asks
 GENERAL_THRESHOLDS = ((0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
 
 
@@ -54,14 +55,10 @@ def protocol(name: str, queries: Sequence[Recording], *, challenge: bool) -> Pro
 
     Without a challenge nobody takes a pose file; ours has absolute poses in ECEF then.
     """
-    return Protocol(
-        dataset=name,
-        thresholds=RELATIVE_THRESHOLDS if challenge else GENERAL_THRESHOLDS,
-        pose_file="mlad" if challenge else "ltvl",
-        truth="poses of most recordings are published with them (GNSSPoses.txt); those of the "
-        "challenges' test recordings are held by the organisers of MLAD",
-        conditions=tuple(recording.name for recording in queries),
-    )
+    own: dict[str, Any] = {"conditions": tuple(recording.name for recording in queries)}
+    if not challenge:
+        own |= {"thresholds": GENERAL_THRESHOLDS, "pose_file": "ltvl"}
+    return protocol_of(name).model_copy(update=own)
 
 
 def summary(

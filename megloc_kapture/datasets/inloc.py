@@ -34,9 +34,10 @@ from megloc_kapture.datasets.official import (
     read_ground_truth,
 )
 from megloc_kapture.errors import DataError
+from megloc_kapture.evaluation.protocols import protocol_of
 from megloc_kapture.io.images import image_size
 from megloc_kapture.io.kapture_store import KaptureData, Sensor
-from megloc_kapture.io.side_tables import ImageGroup, Protocol, World
+from megloc_kapture.io.side_tables import ImageGroup, World
 from megloc_kapture.values import Camera, Options, RigidTransform
 
 CUTOUTS, QUERIES, DEPTH = "database/cutouts", "query/iphone7", "depth"
@@ -137,13 +138,7 @@ class InLoc:
             links={CUTOUTS: layout.cutouts, QUERIES: layout.query},
             groups=map_.groups | groups,
             names={image: last_part(image) for image in names},
-            protocol=Protocol(
-                dataset=DATASET,
-                thresholds=((0.25, 10.0), (0.5, 10.0), (1.0, 10.0)),
-                pose_file_names="basename",
-                conditions=FLOORS,
-                truth="withheld; visuallocalization.net evaluates pose files",
-            ),
+            protocol=protocol_of(DATASET),
             summary=self._summary(map_, groups),
             remarks=self._remarks(map_, groups, left_out, turned),
             missing=missing,

@@ -8,8 +8,6 @@ from collections.abc import Mapping
 from megloc_kapture.datasets.official import Count
 from megloc_kapture.datasets.robotcar_layout import (
     CAMERAS,
-    DAY,
-    NIGHT,
     NUM_LOCATIONS,
     NUM_QUERIES,
     NUM_REFERENCE_IMAGES,
@@ -21,9 +19,8 @@ from megloc_kapture.datasets.robotcar_layout import (
     SCORED_CAMERA,
 )
 from megloc_kapture.datasets.robotcar_selection import Selection
+from megloc_kapture.evaluation.protocols import protocol_of
 from megloc_kapture.io.side_tables import ImageGroup, Protocol
-
-THRESHOLDS = ((0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
 
 
 def image_groups(selection: Selection) -> dict[str, ImageGroup]:
@@ -77,13 +74,11 @@ def protocol(dataset: str, version: int) -> Protocol:
     """How the benchmark is scored."""
     public = "The true poses of version 2's training images are public (robotcar_v2_train.txt)"
     others = "test images" if version == 2 else "other queries"
-    return Protocol(
-        dataset=dataset,
-        thresholds=THRESHOLDS,
-        truth=f"{public}; those of the {others} are kept by visuallocalization.net, which scores "
-        "the rear camera only.",
-        conditions=(*DAY, *NIGHT),
-        pools={"day-all": DAY, "night-all": NIGHT},
+    return protocol_of(dataset).model_copy(
+        update={
+            "truth": f"{public}; those of the {others} are kept by visuallocalization.net, which "
+            "scores the rear camera only."
+        }
     )
 
 

@@ -21,6 +21,7 @@ from megloc_kapture.datasets.kapture_folders import (
 )
 from megloc_kapture.datasets.official import OfficialDataset, write_official
 from megloc_kapture.errors import OptionError
+from megloc_kapture.evaluation.protocols import TWIN_PREFIX
 from megloc_kapture.io.atomic import write_bytes
 from megloc_kapture.io.side_tables import SIDE_TABLES, Protocol
 from megloc_kapture.plugins import DATASETS, DatasetAdapter, load_plugin, plugin_names
@@ -28,7 +29,6 @@ from megloc_kapture.stages.parallel import Track
 from megloc_kapture.values import Options
 
 KAPTURE, SYNTHETIC = "kapture", "synthetic"
-TWIN_PREFIX = f"{SYNTHETIC}-"
 DATA_VARIABLE = "MEGLOC_DATA"
 SUMMARY_FILE = f"{SIDE_TABLES}/summary.txt"
 
@@ -271,3 +271,16 @@ _TWINS: dict[str, Callable[[Mapping[str, Any]], Twin]] = {
     "4seasons": _fourseasons,
     "inloc": _inloc,
 }
+
+__all__ = [
+    "KAPTURE",
+    "SUMMARY_FILE",
+    "SYNTHETIC",
+    "TWIN_PREFIX",
+    "DatasetChoice",
+    "Twin",
+    "choose_dataset",
+    "dataset_names",
+    "summary_text",
+    "twin_of",
+]

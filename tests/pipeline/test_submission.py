@@ -240,7 +240,6 @@ def test_the_sibling_with_most_inliers_counts(dataset: Dataset) -> None:
 
 def test_no_rig_to_ask(dataset: Dataset, tmp_path: Path) -> None:
     write_sensors(dataset.root / "query", replace(dataset.query, rigs={}))
-    (dataset.root / "query" / "sensors" / "rigs.txt").unlink()
     dataset.localize(["dawn/rear/10.jpg"], {})
     with pytest.raises(DataError, match="no pose can come from the rig"):
         submit(dataset, tmp_path / "poses.txt", from_rig=True)
@@ -290,6 +289,7 @@ def test_mlad_files_are_those_of_kaptures_own_exporter(tmp_path: Path, far: bool
     drives = Drives(tmp_path / "workspace", World(official_from_local=origin) if far else World())
     both = KaptureData(
         sensors=drives.mapping.sensors,
+        rigs={"car": {"cam0": RigidTransform.identity()}},  # it asks for rigs
         trajectories=drives.mapping.trajectories | drives.localized.trajectories,
         records_camera=drives.mapping.records_camera | drives.localized.records_camera,
     )

@@ -29,7 +29,7 @@ _WALL_DISTANCE_M = 0.7
 _NEAREST_M, _MEDIAN_M = 0.7, 1.6  # of what a query sees: 10th percentile, median
 # share of a query's view that the scans of its floor have seen from about there; how much more
 # that must be than what scans of other rooms of the kind have seen of theirs, which is alike
-_MIN_SEEN, _MIN_MARGIN = 0.6, 0.16
+_MIN_SEEN, _MIN_MARGIN = 0.6, 0.2
 # 90 degrees wide, 106 high
 _QUARTER = Camera("SIMPLE_PINHOLE", 240, 320, (120.0, 120.0, 160.0))
 _MAX_ANGLE_DEG, _MAX_DISTANCE_RATIO = 35.0, 2.0

@@ -8,7 +8,8 @@ from pathlib import Path, PurePosixPath
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.check.comparison import compare_poses, compare_relative
 from megloc_kapture.evaluation.check.findings import CheckReport, Finding, plural, some
-from megloc_kapture.evaluation.check.names import check_shape, match_names, match_pairs
+from megloc_kapture.evaluation.check.names import check_shape, match_names
+from megloc_kapture.evaluation.check.pairs import match_pairs
 from megloc_kapture.evaluation.check.reference import Reference
 from megloc_kapture.evaluation.check.rows import Rows, read_rows
 from megloc_kapture.io.challenge_tables import RelocalizationPair
@@ -39,7 +40,7 @@ def check_submission(
     if path.is_dir():
         raise DataError("a folder; the pose file of this challenge is one file", path=path)
     rows = read_rows(path, "ltvl")
-    findings = list(rows.findings)
+    findings: list[Finding] = []
     expected: int | None = None
     images: dict[str, str] = {}
     if not rows.named:
@@ -63,7 +64,10 @@ def check_submission(
         findings.append(_not_checked("poses", reference))
     else:
         queries = [images.get(key) for key in rows.keys]
-        findings += compare_poses(rows.keys, rows.quats, rows.translations, queries, reference)
+        of_map = compare_poses(rows.keys, rows.quats, rows.translations, queries, reference)
+        # what is wrong with the whole file is told first
+        findings = of_map + findings
+    findings += rows.findings
     return CheckReport(
         dataset=dataset,
         file=str(path),

@@ -56,6 +56,9 @@ def compare_poses(
     cameras = reference.cameras
     if cameras is None or not len(keys):
         return []
+    if len(cameras.images) < MIN_POSES:
+        message = f"the map has {plural(len(cameras.images), 'camera')}: too few to compare with"
+        return [Finding("note", "too-few", message)]
     pools = pools_of(reference, queries)
     hood = Neighbourhood(cameras, pools.members)
     sample = _sample(len(keys))

@@ -38,15 +38,15 @@ class _Difference:
     def __str__(self) -> str:
         parts = []
         if self.folders == "lacks":
-            parts.append("lack the folder before them")
+            parts.append("without the folder before them")
         elif self.folders == "besides":
-            parts.append("have more of the path than the list")
+            parts.append("with more of the path than the list")
         elif self.folders == "others":
-            parts.append("have other folders than the list")
+            parts.append("with other folders than the list")
         if self.ending:
-            parts.append(f"end in {self.ending[0]!r} instead of {self.ending[1]!r}")
+            parts.append(f"ending in {self.ending[0]!r} instead of {self.ending[1]!r}")
         if self.letters:
-            parts.append("differ in upper and lower case letters")
+            parts.append("with other upper and lower case letters")
         return " and ".join(parts)
 
     @property
@@ -123,7 +123,7 @@ def match_names(
         )
     findings += _doubles(images, named)
     findings += missing_names(expected, set(images.values()), groups)
-    if listed and not _in_order(named, expected):
+    if listed and not in_order(named, expected):
         findings.append(
             Finding("note", "order", "the rows are not in the order of the challenge's list")
         )
@@ -182,51 +182,6 @@ def check_shape(named: Mapping[str, int], dataset: str) -> list[Finding]:
         )
         findings.append(Finding("error", "name-ending", message, names=tuple(others)))
     return findings
-
-
-def match_pairs(
-    named: Mapping[str, int], expected: Mapping[tuple[str, str], object]
-) -> tuple[bool, list[Finding]]:
-    """Compare the rows of an MLAD file with the pairs that are asked for.
-
-    Parameters
-    ----------
-    named : keys (two timestamps with a blank between) -> line.
-    expected : the pairs in the order of the relocalization file.
-
-    Returns
-    -------
-    Whether the two timestamps are swapped, and what is wrong.
-    """
-    wanted = {" ".join(pair): None for pair in expected}
-    unknown = [key for key in named if key not in wanted]
-    turned = [key for key in unknown if " ".join(reversed(key.split(" "))) in wanted]
-    if len(turned) > 0.5 * len(named):
-        message = (
-            f"the two timestamps are swapped in {plural(len(turned), 'row')}: the reference "
-            "stands first, then the query"
-        )
-        return True, [Finding("error", "swapped", message, names=tuple(turned))]
-    findings = [
-        Finding("error", "unknown", f"pair {key} is not asked for", line=named[key], names=(key,))
-        for key in unknown
-    ]
-    missing = [key for key in wanted if key not in named]
-    if missing:
-        findings.append(
-            Finding(
-                "error",
-                "missing",
-                f"{len(missing)} of {len(wanted)} pairs have no row, and every one is asked for: "
-                f"{some(missing)}",
-                names=tuple(missing),
-            )
-        )
-    if not _in_order(named, wanted):
-        findings.append(
-            Finding("note", "order", "the rows are not in the order of the relocalization file")
-        )
-    return False, findings
 
 
 def _wrong_names(
@@ -301,7 +256,8 @@ def _ends_alike(name: str, images: Sequence[str]) -> bool:
     return False
 
 
-def _in_order(named: Mapping[str, int], expected: Mapping[str, object]) -> bool:
+def in_order(named: Mapping[str, int], expected: Mapping[str, object]) -> bool:
+    """Whether the names that are expected stand in the expected order."""
     position = {name: number for number, name in enumerate(expected)}
     places = [position[name] for name in named if name in position]
     return all(a < b for a, b in zip(places, places[1:], strict=False))

@@ -133,7 +133,7 @@ def path_scores(
     between = places[:-2] + share[:, None] * (places[2:] - places[:-2])
     with np.errstate(invalid="ignore", over="ignore"):
         off = np.linalg.norm(places[1:-1] - between, axis=1)
-    scores[1:-1] = np.where(usable, -np.log1p(off / scale[order][1:-1]), 0.0)
+        scores[1:-1] = np.where(usable, -np.log1p(off / scale[order][1:-1]), 0.0)
     unordered = np.empty_like(scores)
     unordered[order] = scores
     return unordered

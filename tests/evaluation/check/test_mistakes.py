@@ -243,6 +243,14 @@ def test_too_few_poses_to_tell(make_scene: Any, pose_lines: Any, check: Check) -
     assert only_error(check(whole, scene.reference())).kind == "inverted"
 
 
+def test_too_few_cameras_to_compare_with(make_scene: Any, pose_lines: Any, check: Check) -> None:
+    scene = make_scene("city")
+    small = replace(scene, map_rotations=scene.map_rotations[:2], map_centers=scene.map_centers[:2])
+    report = check(pose_lines(scene, ("inverted",)), small.reference())
+    (note,) = report.findings
+    assert note.severity == "note" and "the map has 2 cameras" in note.message
+
+
 def test_numbers_that_overflow_are_far(make_scene: Any, pose_lines: Any, check: Check) -> None:
     scene = make_scene("table")
     lines = pose_lines(scene)
