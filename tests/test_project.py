@@ -104,3 +104,8 @@ def test_help_names_every_target() -> None:
     ).stdout
     for target in set(phony.group(1).split()) - {"help", "venv"}:
         assert re.search(rf"^make {target} ", shown, re.MULTILINE), target
+
+
+def test_the_command_line_does_not_wait_for_matplotlib() -> None:
+    code = "import sys, megloc_kapture.cli.main; sys.exit('matplotlib' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from megloc_kapture.evaluation.comparison import Comparison, MedianDifference, PairedTest
-from megloc_kapture.evaluation.comparison_report import render_comparison, render_seeds
 from megloc_kapture.evaluation.comparison_text import comparison_text, seeds_text
 from megloc_kapture.evaluation.evaluate import Evaluation
 from megloc_kapture.evaluation.outputs import (
@@ -63,6 +62,9 @@ def write_comparison(
     ------
     OutputError : a file cannot be written.
     """
+    # matplotlib loads with it, which other commands need not wait for
+    from megloc_kapture.evaluation.comparison_report import render_comparison
+
     page = render_comparison(comparison, map_poses=map_poses, provenance=provenance, around=around)
     summary = {
         "results": [recall_summary(evaluation) for evaluation in comparison.evaluations],
@@ -85,6 +87,9 @@ def write_seeds(
     around: Sequence[Surroundings] = (),
 ) -> dict[str, Path]:
     """Write recall.json, recall.txt, per_query.csv and report.html about runs of one method."""
+    # matplotlib loads with it, which other commands need not wait for
+    from megloc_kapture.evaluation.comparison_report import render_seeds
+
     page = render_seeds(seeds, map_poses=map_poses, provenance=provenance, around=around)
     summary = {
         "results": [recall_summary(evaluation) for evaluation in seeds.evaluations],

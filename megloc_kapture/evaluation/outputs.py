@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from megloc_kapture.evaluation.evaluate import Evaluation, QueryResult
-from megloc_kapture.evaluation.report import render_report
 from megloc_kapture.evaluation.surroundings import Surroundings
 from megloc_kapture.evaluation.tables import criterion, notes, recall_table
 from megloc_kapture.io.atomic import write_bytes
@@ -57,6 +56,9 @@ def write_evaluation(
     names = (RECALL_JSON, RECALL_TEXT, PER_QUERY_CSV, REPORT_HTML)
     paths = {name: folder / name for name in names}
     # the report first: whatever is wrong with its data is found before anything is written
+    # matplotlib loads with it, which other commands need not wait for
+    from megloc_kapture.evaluation.report import render_report
+
     page = render_report(evaluation, map_poses=map_poses, provenance=provenance, around=around)
     write_json(paths[RECALL_JSON], recall_summary(evaluation))
     write_bytes(paths[RECALL_TEXT], recall_table(evaluation).encode("utf-8"))

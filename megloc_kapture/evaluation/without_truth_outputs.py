@@ -19,7 +19,6 @@ from megloc_kapture.evaluation.without_truth import (
     ResultWithoutTruth,
     WithoutTruth,
 )
-from megloc_kapture.evaluation.without_truth_report import render_without_truth
 from megloc_kapture.evaluation.without_truth_text import CAUTION, without_truth_text
 from megloc_kapture.io.atomic import write_bytes
 from megloc_kapture.io.csv_table import write_csv_table
@@ -63,6 +62,9 @@ def write_without_truth(
     """
     names = (AGREEMENT_JSON, AGREEMENT_TEXT, PER_QUERY_CSV, REPORT_HTML)
     paths = {name: Path(folder) / name for name in names}
+    # matplotlib loads with it, which other commands need not wait for
+    from megloc_kapture.evaluation.without_truth_report import render_without_truth
+
     page = render_without_truth(found, map_poses=map_poses, provenance=provenance, around=around)
     write_json(paths[AGREEMENT_JSON], agreement_summary(found))
     write_bytes(paths[AGREEMENT_TEXT], without_truth_text(found).encode("utf-8"))
