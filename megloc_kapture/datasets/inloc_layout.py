@@ -14,6 +14,7 @@ from megloc_kapture.datasets.grammars.inloc_files import (
 )
 from megloc_kapture.datasets.official import Missing
 from megloc_kapture.errors import DataError
+from megloc_kapture.io.paths import has_control_characters
 
 FLOORS = ("DUC1", "DUC2")
 DISTRACTOR_FLOORS = ("CSE3", "CSE4", "CSE5")
@@ -77,8 +78,11 @@ class Layout:
         """
         names = [name for name in _listed(self.query) if name.lower().endswith(_PHOTOGRAPH)]
         for name in names:
-            if name.split() != [name] or "," in name:
-                raise DataError("a query's name has no blanks and commas", path=self.query / name)
+            if name.split() != [name] or "," in name or has_control_characters(name):
+                raise DataError(
+                    "a query's name has no blanks, commas and control characters",
+                    path=self.query / name,
+                )
         return names
 
     def scans(self, floor: str, missing: Missing) -> list[Scan]:

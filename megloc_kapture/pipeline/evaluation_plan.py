@@ -15,6 +15,7 @@ from megloc_kapture.datasets.kapture_folders import (
     QUERY_GT,
 )
 from megloc_kapture.datasets.official import REFERENCE
+from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.folders import evaluate_folders, results_without_truth
 from megloc_kapture.evaluation.outputs import write_evaluation
 from megloc_kapture.evaluation.provenance import package_versions
@@ -25,7 +26,7 @@ from megloc_kapture.io.atomic import write_bytes
 from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder, read_pairs, write_pairs
 from megloc_kapture.io.side_tables import SIDE_TABLES, Protocol, read_protocol
 from megloc_kapture.pipeline.benchmarks import BenchmarkFile
-from megloc_kapture.pipeline.datasets import DatasetChoice
+from megloc_kapture.pipeline.datasets import DatasetChoice, ProtocolChange
 from megloc_kapture.pipeline.manifests import FileHashes
 from megloc_kapture.pipeline.plan import Stage
 from megloc_kapture.pipeline.presets import PipelineOptions
@@ -234,7 +235,7 @@ def _dataset_stages(run: Run) -> list[Stage]:
                 settings,
                 ("render",),
                 outputs,
-                lambda out: source.import_to(world, out, change),
+                lambda out: _import(run, world, out, change),
             ),
         ]
     if source.root is None:
@@ -253,10 +254,17 @@ def _dataset_stages(run: Run) -> list[Stage]:
             settings,
             (),
             outputs,
-            lambda out: source.import_to(root, out, change),
+            lambda out: _import(run, root, out, change),
             external,
         )
     ]
+
+
+def _import(run: Run, root: Path, out: Path, change: ProtocolChange) -> dict[str, float]:
+    counts = run.source.import_to(root, out, change)
+    if not counts["queries"]:
+        raise DataError("no query image is left to localize", path=root)
+    return counts
 
 
 def _local_features(run: Run, out: Path) -> dict[str, int]:

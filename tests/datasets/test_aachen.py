@@ -334,8 +334,10 @@ def test_nothing_left_of_map_or_queries(root: Path, tmp_path: Path) -> None:
     backup = tmp_path / "backup"
     shutil.copytree(root, backup)
     shutil.rmtree(root / "images_upright/query")
-    with pytest.raises(DataError, match="no query image is left"):
-        written(root, tmp_path / "out", allow_missing=True)
+    with pytest.raises(DataError, match="files are missing: images_upright/query/"):
+        written(root, tmp_path / "refused")
+    without = written(root, tmp_path / "out", allow_missing=True)
+    assert not KaptureFolder(without / "query").read().records_camera
     shutil.rmtree(backup / "images_upright/db")
     with pytest.raises(DataError, match="no mapping image"):
         written(backup, tmp_path / "out2", allow_missing=True)

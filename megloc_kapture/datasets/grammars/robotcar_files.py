@@ -100,7 +100,7 @@ def read_intrinsics(path: Path) -> tuple[float, float, float, float]:
         value that is no number; names file and line.
     """
     values: dict[str, float] = {}
-    number = 0
+    number = 1
     for number, text in _lines(path):
         fields = _BLANKS.split(text)
         if len(fields) != 2 or fields[0] not in INTRINSICS_KEYS:
@@ -115,7 +115,7 @@ def read_intrinsics(path: Path) -> tuple[float, float, float, float]:
         values[key] = parse_float(fields[1], key, path, number)
     absent = [key for key in INTRINSICS_KEYS if key not in values]
     if absent:
-        raise DataError(f"{', '.join(absent)} missing at its end", path=path, line=number + 1)
+        raise DataError(f"{', '.join(absent)} missing; it ends here", path=path, line=number)
     fx, fy, cx, cy = (values[key] for key in INTRINSICS_KEYS)
     return fx, fy, cx, cy
 

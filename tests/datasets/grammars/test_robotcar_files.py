@@ -167,7 +167,7 @@ def test_no_such_file(tmp_path: Path, kind: str, content: bytes, line: int) -> N
         ("intrinsics", INTRINSICS.replace("cy 4", "cz 4"), 4, "key one of fx, fy, cx, cy"),
         ("intrinsics", INTRINSICS.replace("400.000000", "nan", 1), 1, "fx 'nan' is not finite"),
         ("intrinsics", INTRINSICS.replace("400.0", "4_0", 1), 1, "is not a number"),
-        ("intrinsics", "fx 1\nfy 1\ncx 1\n", 4, "cy missing"),
+        ("intrinsics", "fx 1\nfy 1\ncx 1\n", 3, "cy missing"),
         ("extrinsics", EXTRINSICS.replace(",0.153691", ""), 2, "line 2 with 3"),
         ("extrinsics", EXTRINSICS + "0,0,0,1\n", 5, "got line 5"),
         ("extrinsics", EXTRINSICS.replace("0,0,0,1\n", ""), 4, "got 3"),
