@@ -176,7 +176,7 @@ def test_thresholds_are_an_option_of_the_import(
     evaluate: Any, scene: Path, workspace: Path
 ) -> None:
     done = evaluate(scene, workspace, "--thresholds", "0.001,1", "0.5,5", "--until", "import")
-    assert reasons(done.err) == {"import": "options changed: thresholds"}
+    assert reasons(done.err) == {"import": "options changed: protocol.thresholds"}
 
 
 def test_a_changed_image_reruns_everything(evaluate: Any, dataset: Path) -> None:
