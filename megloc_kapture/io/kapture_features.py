@@ -15,7 +15,6 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Literal
 
 import numpy as np
@@ -30,6 +29,7 @@ from megloc_kapture.io.blobs import (
     TarBlobs,
     TarBlobWriter,
 )
+from megloc_kapture.io.closing import Closing
 from megloc_kapture.io.kapture_csv import format_table, read_rows
 from megloc_kapture.io.paths import (
     check_component,
@@ -282,7 +282,7 @@ class FeatureReader:
         return found
 
 
-class FeatureWriter:
+class FeatureWriter(Closing):
     """Write the features of one kind and type; each image's file is atomic.
 
     Opening writes the configuration, or checks that the one there is the same, so that a stopped
@@ -347,17 +347,6 @@ class FeatureWriter:
 
     def close(self) -> None:
         self._blobs.close()
-
-    def __enter__(self) -> FeatureWriter:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
 
 def check_field(image: str) -> str:

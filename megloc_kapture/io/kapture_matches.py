@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.atomic import output_error
 from megloc_kapture.io.blobs import BlobSource, FolderBlobWriter, TarBlobWriter
+from megloc_kapture.io.closing import Closing
 from megloc_kapture.io.kapture_features import (
     SUFFIX,
     blob_sources,
@@ -118,7 +118,7 @@ class MatchesReader:
         return None
 
 
-class MatchesWriter:
+class MatchesWriter(Closing):
     """Write matches of one keypoints type; each pair's file is atomic.
 
     ``(a, b) in writer`` tells what is written already. Use as a context manager.
@@ -175,17 +175,6 @@ class MatchesWriter:
 
     def close(self) -> None:
         self._blobs.close()
-
-    def __enter__(self) -> MatchesWriter:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
 
 def _name(first: str, second: str) -> str:

@@ -30,7 +30,7 @@ SMALL: dict[str, dict[str, Any]] = {
     },
     "robotcar": {"num_locations": 2, "size_px": 360, "moments_per_condition": 2},
     "4seasons": {"num_places": 2, "map_keyframes": 24, "winter_keyframes": 6, "dusk_keyframes": 2},
-    "inloc": {"modules": 2, "queries": 6, "cutout_width": 320, "cutout_height": 240},
+    "inloc": {"queries": 6},
 }
 # conditions that are hard by design: a failure there is reported, not hidden
 DARK = {"night", "night-rain", "night-all", "all"}

@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 from urllib.parse import quote
 
@@ -22,6 +21,7 @@ from megloc_kapture.datasets.grammars.binary_file import check_plain
 from megloc_kapture.datasets.grammars.colmap_values import CAMERA_MODELS
 from megloc_kapture.datasets.grammars.fields import image_name
 from megloc_kapture.errors import DataError
+from megloc_kapture.io.closing import Closing
 from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera
 
 _SIZE_END = 2**31
@@ -38,7 +38,7 @@ class DatabaseImage:
     camera_id: int
 
 
-class ColmapDatabase:
+class ColmapDatabase(Closing):
     """An open database. Use as a context manager.
 
     Attributes
@@ -133,17 +133,6 @@ class ColmapDatabase:
 
     def close(self) -> None:
         self._connection.close()
-
-    def __enter__(self) -> ColmapDatabase:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def _connect(self) -> sqlite3.Connection:
         place = quote(str(self.path.resolve()))
