@@ -12,7 +12,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.io.text_kernels import compiled_loop, product
+from megloc_kapture.compiling import compiled_loop
+from megloc_kapture.io.text_kernels import product
 
 # of the longest text, "-2.2250738585072014e-308"
 MAX_FLOAT_CHARACTERS = 24

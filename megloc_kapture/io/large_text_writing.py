@@ -13,8 +13,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from megloc_kapture.compiling import compiled_loop
 from megloc_kapture.io.float_text import MAX_FLOAT_CHARACTERS, put_float
-from megloc_kapture.io.text_kernels import compiled_loop
 
 _OBSERVATIONS_AT_ONCE = 1 << 17
 _POINTS_AT_ONCE = 1 << 16

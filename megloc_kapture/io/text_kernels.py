@@ -14,23 +14,13 @@ are handed back. Names are compared byte by byte; the hash only finds the candid
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from megloc_kapture.compiling import compiled_loop
 
 # how a loop ends: all read; a line is not plain; a table must grow and the line be read again
 DONE, REFUSED, GROW = 0, 1, 2
-
-
-def compiled_loop(function: Callable[..., Any]) -> Any:
-    """Compile at the first call, without the interpreter's lock, and cache on disk."""
-    try:
-        return njit(cache=True, nogil=True)(function)
-    except RuntimeError:  # neither the package nor the home can be written to: nowhere to cache
-        return njit(nogil=True)(function)
 
 
 _U = np.uint64

@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from megloc_kapture.io.text_kernels import DONE, REFUSED, compiled_loop, read_float
+from megloc_kapture.compiling import compiled_loop
+from megloc_kapture.io.text_kernels import DONE, REFUSED, read_float
 
 _U = np.uint64
 _NEWLINE, _HASH, _MINUS, _ONE = 10, 35, 45, 49
@@ -191,7 +192,7 @@ def skip_rows(text, begin, end, max_rows):
 
 
 @compiled_loop
-def parse_image_features(text, begin, xy):
+def parse_model_features(text, begin, xy):
     """Read a line of X Y POINT3D_ID from an ``images.txt``, up to its line break.
 
     ``xy`` takes the bits of the floats, flattened. Returns the number of features, -1 where the
