@@ -1,0 +1,201 @@
+"""Projection under COLMAP's camera models with its derivatives, compiled.
+
+The models are those of COLMAP's ``sensor/models.h``, with the same expansions near the axis.
+Imported only when needed: numba costs half a second to import. Loops elsewhere call
+:func:`project_point` or :func:`distorted`.
+"""
+
+# mypy: allow-untyped-defs, allow-untyped-calls, allow-untyped-decorators
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.compiling import compiled_loop
+from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, ONE_FOCAL_MODELS, Camera
+
+NUM_PARAMS = 12
+
+_NUMBERS = {name: number for number, name in enumerate(CAMERA_MODEL_NUM_PARAMS)}
+# models up to this number have no distortion
+PINHOLES = _NUMBERS["PINHOLE"]
+_SIMPLE_RADIAL, _RADIAL = _NUMBERS["SIMPLE_RADIAL"], _NUMBERS["RADIAL"]
+_OPENCV, _OPENCV_FISHEYE = _NUMBERS["OPENCV"], _NUMBERS["OPENCV_FISHEYE"]
+_FULL_OPENCV, _FOV = _NUMBERS["FULL_OPENCV"], _NUMBERS["FOV"]
+_SIMPLE_RADIAL_FISHEYE = _NUMBERS["SIMPLE_RADIAL_FISHEYE"]
+_RADIAL_FISHEYE = _NUMBERS["RADIAL_FISHEYE"]
+_THIN_PRISM_FISHEYE = _NUMBERS["THIN_PRISM_FISHEYE"]
+
+_FOV_EPSILON = 1e-4  # COLMAP's
+# below this radius the angle is its series to double precision
+_NEAR_AXIS = 1e-3
+
+
+def model_id(camera: Camera) -> int:
+    """The number by which :func:`project_point` knows a camera's model."""
+    return _NUMBERS[camera.model]
+
+
+def packed_params(camera: Camera) -> NDArray[np.float64]:
+    """Parameters as :func:`project_point` takes them: float64 (12,) fx, fy, cx, cy, then the rest.
+
+    Two focal lengths for every model, and zeros behind the model's own.
+    """
+    packed = np.zeros(NUM_PARAMS)
+    params = camera.params
+    if camera.model in ONE_FOCAL_MODELS:
+        params = (params[0], *params)
+    packed[: len(params)] = params
+    return packed
+
+
+def project_with_jacobian(
+    camera: Camera, points_in_cam: NDArray[np.floating[Any]]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Pixels and their derivatives with respect to the points.
+
+    Parameters
+    ----------
+    points_in_cam : (N, 3) in the camera frame.
+
+    Returns
+    -------
+    px : float64 (N, 2), the first pixel's centre at (0.5, 0.5); NaN behind the camera.
+    jacobian : float64 (N, 2, 3), NaN where ``px`` is.
+    """
+    points = np.ascontiguousarray(points_in_cam, dtype=np.float64).reshape(-1, 3)
+    out = np.empty((len(points), 8))
+    _project_all(model_id(camera), packed_params(camera), points, out)
+    return out[:, :2].copy(), out[:, 2:].reshape(-1, 2, 3).copy()
+
+
+@compiled_loop
+def _angle(r):
+    """``atan(r) / r`` and its derivative by r, divided by r."""
+    if r < _NEAR_AXIS:
+        r2 = r * r
+        return 1.0 - r2 / 3.0 + r2 * r2 / 5.0, -2.0 / 3.0 + 0.8 * r2
+    theta = math.atan(r)
+    return theta / r, (1.0 / (1.0 + r * r) - theta / r) / (r * r)
+
+
+@compiled_loop
+def _radial_factor(model, p, r):
+    """The factor that radially symmetric models put on (u, v), and its derivative by r over r."""
+    r2 = r * r
+    if model in (_SIMPLE_RADIAL, _RADIAL):
+        return 1.0 + r2 * (p[4] + r2 * p[5]), 2.0 * p[4] + 4.0 * p[5] * r2
+    if model == _FOV:
+        omega = p[4]
+        omega2 = omega * omega
+        if omega2 < _FOV_EPSILON:
+            return omega2 * r2 / 3.0 - omega2 / 12.0 + 1.0, 2.0 * omega2 / 3.0
+        tan_half = math.tan(omega / 2.0)
+        if r2 < _FOV_EPSILON:
+            factor = -2.0 * tan_half * (4.0 * r2 * tan_half * tan_half - 3.0) / (3.0 * omega)
+            return factor, -16.0 * tan_half**3 / (3.0 * omega)
+        scaled = 2.0 * r * tan_half
+        angle = math.atan(scaled)
+        slope = 2.0 * tan_half / (1.0 + scaled * scaled)
+        return angle / (r * omega), (slope - angle / r) / (r2 * omega)
+    # the fisheye models: theta (1 + k1 theta^2 + ...) / r
+    per_r, slope = _angle(r)
+    theta = per_r * r
+    t2 = theta * theta
+    k1, k2, k3, k4 = p[4], p[5], p[6], p[7]
+    scale = 1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))
+    scale_slope = 2.0 * k1 + t2 * (4.0 * k2 + t2 * (6.0 * k3 + t2 * 8.0 * k4))
+    # d theta / d r = 1 / (1 + r^2); the slope of the scale by r is scale_slope * theta * that
+    return per_r * scale, slope * scale + per_r * scale_slope * per_r / (1.0 + r * r)
+
+
+@compiled_loop
+def _not_radial(model, p, u, v):
+    """Distorted (x, y) of models that are not radially symmetric, and the four derivatives."""
+    u2, v2, uv = u * u, v * v, u * v
+    r2 = u2 + v2
+    if model == _OPENCV:
+        radial, slope = 1.0 + r2 * (p[4] + r2 * p[5]), p[4] + 2.0 * p[5] * r2
+        p1, p2, s1, s2 = p[6], p[7], 0.0, 0.0
+    elif model == _FULL_OPENCV:
+        above = 1.0 + r2 * (p[4] + r2 * (p[5] + r2 * p[8]))
+        below = 1.0 + r2 * (p[9] + r2 * (p[10] + r2 * p[11]))
+        above_slope = p[4] + r2 * (2.0 * p[5] + r2 * 3.0 * p[8])
+        below_slope = p[9] + r2 * (2.0 * p[10] + r2 * 3.0 * p[11])
+        radial = above / below
+        slope = (above_slope - radial * below_slope) / below
+        p1, p2, s1, s2 = p[6], p[7], 0.0, 0.0
+    else:  # the thin prism, of angles
+        radial = 1.0 + r2 * (p[4] + r2 * (p[5] + r2 * (p[8] + r2 * p[9])))
+        slope = p[4] + r2 * (2.0 * p[5] + r2 * (3.0 * p[8] + r2 * 4.0 * p[9]))
+        p1, p2, s1, s2 = p[6], p[7], p[10], p[11]
+    x = u * radial + 2.0 * p1 * uv + p2 * (r2 + 2.0 * u2) + s1 * r2
+    y = v * radial + 2.0 * p2 * uv + p1 * (r2 + 2.0 * v2) + s2 * r2
+    # slope is the derivative by r^2, whose own are 2u and 2v
+    cross = 2.0 * uv * slope
+    xu = radial + 2.0 * u2 * slope + 2.0 * p1 * v + 6.0 * p2 * u + 2.0 * s1 * u
+    xv = cross + 2.0 * p1 * u + 2.0 * p2 * v + 2.0 * s1 * v
+    yu = cross + 2.0 * p2 * v + 2.0 * p1 * u + 2.0 * s2 * u
+    yv = radial + 2.0 * v2 * slope + 2.0 * p2 * u + 6.0 * p1 * v + 2.0 * s2 * v
+    return x, y, xu, xv, yu, yv
+
+
+@compiled_loop
+def distorted(model, p, u, v):
+    """Distorted normalised coordinates of undistorted ones, and the four derivatives.
+
+    Parameters
+    ----------
+    model, p : see :func:`model_id` and :func:`packed_params`.
+    u, v : ``x / z`` and ``y / z`` of a point in the camera frame.
+
+    Returns
+    -------
+    a, b, then the derivatives of a by u and v and of b by u and v; the pixel is
+    ``(p[0] a + p[2], p[1] b + p[3])``.
+    """
+    if model <= PINHOLES:
+        return u, v, 1.0, 0.0, 0.0, 1.0
+    if model in (_OPENCV, _FULL_OPENCV):
+        return _not_radial(model, p, u, v)
+    if model == _THIN_PRISM_FISHEYE:
+        factor, slope = _angle(math.sqrt(u * u + v * v))
+        a, b, ds, dt, es, et = _not_radial(model, p, u * factor, v * factor)
+        su, sv, tv = factor + slope * u * u, slope * u * v, factor + slope * v * v
+        return a, b, ds * su + dt * sv, ds * sv + dt * tv, es * su + et * sv, es * sv + et * tv
+    factor, slope = _radial_factor(model, p, math.sqrt(u * u + v * v))
+    cross = slope * u * v
+    return u * factor, v * factor, factor + slope * u * u, cross, cross, factor + slope * v * v
+
+
+@compiled_loop
+def project_point(model, p, x, y, z, out):
+    """Pixel of one point in the camera frame, and its derivatives.
+
+    Parameters
+    ----------
+    model, p : see :func:`model_id` and :func:`packed_params`.
+    out : float64 (8,), filled with px, py, then the derivatives of px by x, y, z and of py by x, y,
+        z; NaN behind the camera.
+    """
+    if not z > 0.0:
+        for i in range(8):
+            out[i] = math.nan
+        return
+    inverse = 1.0 / z
+    u, v = x * inverse, y * inverse
+    a, b, au, av, bu, bv = distorted(model, p, u, v)
+    fx, fy = p[0] * inverse, p[1] * inverse
+    out[0], out[1] = p[0] * a + p[2], p[1] * b + p[3]
+    out[2], out[3], out[4] = fx * au, fx * av, -fx * (au * u + av * v)
+    out[5], out[6], out[7] = fy * bu, fy * bv, -fy * (bu * u + bv * v)
+
+
+@compiled_loop
+def _project_all(model, p, points, out):
+    for i in range(len(points)):
+        project_point(model, p, points[i, 0], points[i, 1], points[i, 2], out[i])

@@ -1,0 +1,283 @@
+"""Uncertainty of points, against Ceres, Monte Carlo, and by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pycolmap
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.geometry.cameras import project
+from megloc_kapture.mapping.uncertainty import (
+    point_covariances,
+    point_deviations,
+)
+from megloc_kapture.values import Camera, RigidTransform
+
+Floats = NDArray[np.float64]
+
+MODELS = {
+    "PINHOLE": (500.0, 510.0, 320.0, 240.0),
+    "RADIAL": (500.0, 320.0, 240.0, -0.12, 0.04),
+    "OPENCV": (500.0, 510.0, 320.0, 240.0, -0.1, 0.03, 0.002, -0.003),
+    "OPENCV_FISHEYE": (400.0, 410.0, 320.0, 240.0, -0.05, 0.01, 0.002, -0.001),
+}
+
+
+def full(covariances: Floats) -> Floats:
+    """(..., 6) to (..., 3, 3)."""
+    xx, xy, xz, yy, yz, zz = np.moveaxis(covariances, -1, 0)
+    rows = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def synthetic(model: str, *, narrow: bool = False) -> pycolmap.Reconstruction:
+    """COLMAP's own synthetic scene with one pixel of noise.
+
+    Its cameras stand all around, which determines every point well in all directions; ``narrow``
+    moves them close together, so that depths are hardly known. They are turned about their optical
+    axes: those of COLMAP are not, which makes two entries of each rotation equal.
+    """
+    pycolmap.set_random_seed(0)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_frames_per_rig, options.num_points3D = 2, 8, 300
+    options.camera_model_id = getattr(pycolmap.CameraModelId, model)
+    options.camera_params = list(MODELS[model])
+    options.camera_width, options.camera_height = 640, 480
+    scene = pycolmap.synthesize_dataset(options)
+    noise = pycolmap.SyntheticNoiseOptions()
+    noise.point2D_stddev, noise.point3D_stddev = 1.0, 0.01
+    pycolmap.synthesize_noise(noise, scene)
+    for number, frame_id in enumerate(sorted(scene.frames)):
+        frame = scene.frames[frame_id]
+        turn = Rotation.from_rotvec((0.0, 0.0, 0.3 + number)).as_matrix()
+        rolled = pycolmap.Rigid3d(pycolmap.Rotation3d(turn), np.zeros(3))
+        if narrow:
+            tilt = pycolmap.Rotation3d(Rotation.from_rotvec((0.1, -0.05, 0.2)).as_matrix())
+            away = np.array([0.02 * number, 0.01 * (number % 3), 8.0])
+            frame.rig_from_world = rolled * pycolmap.Rigid3d(tilt, away)
+        else:
+            frame.rig_from_world = rolled * frame.rig_from_world
+    return scene
+
+
+def ceres(scene: pycolmap.Reconstruction, ids: list[int]) -> Floats:
+    """Ceres' covariances (N, 3, 3) of points with poses and cameras fixed."""
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in scene.images:
+        config.add_image(image_id)
+    for frame_id in scene.frames:
+        config.set_constant_rig_from_world_pose(frame_id)
+    for camera_id in scene.cameras:
+        config.set_constant_cam_intrinsics(camera_id)
+    adjuster = pycolmap.create_default_ceres_bundle_adjuster(
+        pycolmap.BundleAdjustmentOptions(), config, scene
+    )
+    options = pycolmap.BACovarianceOptions()
+    options.params = pycolmap.BACovarianceOptionsParams.POINTS
+    options.damping = 0.0
+    found = pycolmap.estimate_ba_covariance(options, scene, adjuster)
+    return np.array([found.get_point_cov(point_id) for point_id in ids])
+
+
+@pytest.mark.parametrize("narrow", [False, True])
+@pytest.mark.parametrize("model", MODELS)
+def test_covariances_are_those_of_ceres(model: str, narrow: bool) -> None:
+    scene = synthetic(model, narrow=narrow)
+    images = sorted(scene.images)
+    cameras, poses = [], []
+    for image_id in images:
+        image = scene.images[image_id]
+        camera = scene.cameras[image.camera_id]
+        cameras.append(Camera(camera.model.name, camera.width, camera.height, tuple(camera.params)))
+        pose = image.cam_from_world()
+        poses.append(RigidTransform.from_matrix(pose.rotation.matrix(), np.array(pose.translation)))
+    ids = sorted(scene.points3D)
+    rows = [
+        (number, images.index(element.image_id))
+        for number, point_id in enumerate(ids)
+        for element in scene.points3D[point_id].track.elements
+    ]
+    point_ids, image_ids = np.array(rows).T
+    xyz = np.array([scene.points3D[point_id].xyz for point_id in ids])
+    assert cameras[0].model == model and len(ids) == 300
+    ours = full(point_covariances(xyz, point_ids, image_ids, cameras, poses))
+    theirs = ceres(scene, ids)
+    conditions = np.linalg.cond(theirs)
+    assert conditions.min() > 1e3 if narrow else conditions.max() < 10
+    scale = np.linalg.norm(theirs, axis=(1, 2), keepdims=True)
+    assert np.abs((ours - theirs) / scale).max() < 1e-9
+    deviations = point_deviations(point_covariances(xyz, point_ids, image_ids, cameras, poses))
+    np.testing.assert_allclose(deviations**2, np.linalg.eigvalsh(theirs), rtol=1e-7)
+
+
+def looking_at_origin(centers: Floats) -> list[RigidTransform]:
+    poses = []
+    for center in centers:
+        forward = -center / np.linalg.norm(center)
+        right = np.cross((0.0, 1.0, 0.0), forward)
+        right /= np.linalg.norm(right)
+        rotation = np.stack([right, np.cross(forward, right), forward])
+        poses.append(RigidTransform.from_matrix(rotation, -rotation @ center))
+    return poses
+
+
+CENTERS = np.array([[-1.0, 0.1, -6.0], [0.3, -0.4, -5.0], [1.2, 0.2, -6.5], [0.1, 0.9, -5.5]])
+FISHEYE = Camera("OPENCV_FISHEYE", 640, 480, MODELS["OPENCV_FISHEYE"])
+
+
+def test_points_triangulated_again_and_again_spread_as_foretold() -> None:
+    """Noise of one pixel, least squares by scipy; spread within its own sampling error."""
+    rng = np.random.default_rng(4)
+    truth, poses = np.array([0.2, -0.1, 0.3]), looking_at_origin(CENTERS)
+    exact = np.stack([project(FISHEYE, pose, truth[None])[0] for pose in poses])
+    draws = 600
+    found = []
+    for _ in range(draws):
+        seen = exact + rng.normal(size=exact.shape)
+
+        def residuals(point: Floats, seen: Floats = seen) -> Floats:
+            return np.concatenate(
+                [project(FISHEYE, p, point[None])[0] - s for p, s in zip(poses, seen, strict=True)]
+            )
+
+        found.append(least_squares(residuals, truth).x)
+    measured = np.cov(np.array(found).T)
+    four = np.arange(4)
+    (foretold,) = full(point_covariances(truth[None], 0 * four, four, [FISHEYE] * 4, poses))
+    # whitened by what was foretold it must be the identity; an entry's error is sqrt(2 / draws)
+    root = np.linalg.inv(np.linalg.cholesky(foretold))
+    np.testing.assert_allclose(root @ measured @ root.T, np.eye(3), atol=5 * np.sqrt(2 / draws))
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_information_is_that_of_differences_of_colmaps_pixels(model: str) -> None:
+    camera, poses, four = (
+        Camera(model, 640, 480, MODELS[model]),
+        looking_at_origin(CENTERS),
+        [*range(4)],
+    )
+    theirs = pycolmap.Camera(model=model, width=640, height=480, params=list(MODELS[model]))
+    point, information = np.array([0.3, -0.2, 0.4]), np.zeros((3, 3))
+    for pose in poses:
+
+        def central(step: float, pose: RigidTransform = pose) -> Floats:
+            moved = [pose.apply(point + sign * step * np.eye(3)) for sign in (1, -1)]
+            ahead, behind = (theirs.img_from_cam(points) for points in moved)
+            return (ahead - behind).T / (2 * step)
+
+        jacobian = (4 * central(1e-4) - central(2e-4)) / 3
+        information += jacobian.T @ jacobian
+    (found,) = full(point_covariances(point[None], [0] * 4, four, [camera] * 4, poses))
+    np.testing.assert_allclose(found @ information, np.eye(3), atol=1e-7)
+
+
+def test_a_pinhole_by_hand() -> None:
+    """Two cameras at right angles, f / z = 100: sums of 100^2 along the axes each resolves."""
+    camera = Camera("SIMPLE_PINHOLE", 640, 480, (500.0, 320.0, 240.0))
+    front = RigidTransform.from_matrix(np.eye(3), np.array([0.0, 0.0, 5.0]))
+    turned = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+    side = RigidTransform.from_matrix(turned, np.array([0.0, 0.0, 5.0]))
+    two = np.array([0, 1])
+    found = point_covariances(np.zeros((1, 3)), 0 * two, two, [camera] * 2, [front, side])
+    # x and z are resolved by one camera each, y by both
+    np.testing.assert_allclose(found[0], [1e-4, 0, 0, 0.5e-4, 0, 1e-4], atol=1e-16)
+    deviations = point_deviations(found)
+    np.testing.assert_allclose(deviations, [[0.01 / np.sqrt(2), 0.01, 0.01]], rtol=1e-12)
+
+
+def test_what_the_images_do_not_determine_is_unknown() -> None:
+    poses = looking_at_origin(CENTERS)
+    points = np.zeros((5, 3))
+    # one view; the same view twice; nobody; two views; two views, one of them from behind
+    point_ids = np.array([0, 1, 1, 3, 3, 4, 4])
+    image_ids = np.array([0, 1, 1, 0, 1, 0, 4])
+    away = RigidTransform((0.0, 0.0, 1.0, 0.0), (0.0, 0.0, -9.0))
+    cameras = [Camera("PINHOLE", 640, 480, MODELS["PINHOLE"])] * 5
+    found = point_covariances(points, point_ids, image_ids, cameras, [*poses, away])
+    known = np.isfinite(found).all(axis=1)
+    assert known.tolist() == [False, False, False, True, False]
+    assert np.isnan(found[~known]).all()
+    assert np.isnan(point_deviations(found)[~known]).all()
+
+
+@pytest.mark.parametrize("order", [slice(None, None, -1), [3, 0, 5, 2, 4, 1]])
+def test_the_order_of_observations_does_not_matter(order: slice | list[int]) -> None:
+    poses, cameras = looking_at_origin(CENTERS), [FISHEYE] * 4
+    points = np.array([[0.1, 0.0, 0.2], [-0.3, 0.1, 0.0]])
+    point_ids, image_ids = np.array([0, 0, 0, 1, 1, 1]), np.array([0, 1, 2, 1, 2, 3])
+    straight = point_covariances(points, point_ids, image_ids, cameras, poses)
+    shuffled = point_covariances(points, point_ids[order], image_ids[order], cameras, poses)
+    np.testing.assert_allclose(shuffled, straight, rtol=1e-12)
+
+
+def test_far_from_the_origin() -> None:
+    """Six thousand kilometres away, as on an earth-centred axis."""
+    offset = np.array([4.1e6, 8.5e5, 4.8e6])
+    poses, four = looking_at_origin(CENTERS), np.arange(4)
+    moved = [
+        RigidTransform.from_matrix(
+            p.rotation_matrix(), np.array(p.translation) - p.rotation_matrix() @ offset
+        )
+        for p in poses
+    ]
+    point = np.array([[0.1, -0.2, 0.3]])
+    near = point_covariances(point, 0 * four, four, [FISHEYE] * 4, poses)
+    far = point_covariances(point + offset, 0 * four, four, [FISHEYE] * 4, moved)
+    np.testing.assert_allclose(far, near, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("point_ids", "image_ids"),
+    [([0, 0], [0, 4]), ([0, 0], [-1, 0]), ([0, 1], [0, 1]), ([-1, 0], [0, 1]), ([0, 0], [0])],
+)
+def test_ids_that_are_no_rows_are_refused(point_ids: list[int], image_ids: list[int]) -> None:
+    """The compiled loops check no bounds: they would read what is not theirs."""
+    point, poses = np.zeros((1, 3)), looking_at_origin(CENTERS)
+    points, images = np.array(point_ids), np.array(image_ids)
+    with pytest.raises(DataError):
+        point_covariances(point, points, images, [FISHEYE] * 4, poses)
+
+
+def test_cameras_and_poses_are_as_many() -> None:
+    two = np.array([0, 1])
+    with pytest.raises(DataError, match="1 cameras and 4 poses"):
+        point_covariances(np.zeros((1, 3)), 0 * two, two, [FISHEYE], looking_at_origin(CENTERS))
+
+
+def test_one_centre_determines_nothing_however_many_images_and_however_far() -> None:
+    """Turned about one point there is no parallax: rounding must not look like some."""
+    rng = np.random.default_rng(2)
+    for center in (np.zeros(3), np.array([4.1e6, 8.5e5, 4.8e6])):
+        poses = []
+        for turn in Rotation.from_rotvec(0.2 * rng.normal(size=(500, 3))).as_matrix():
+            exact = RigidTransform.from_matrix(turn, np.zeros(3))
+            away = -exact.rotation_matrix() @ center
+            poses.append(RigidTransform.from_matrix(turn, away))
+        points = center + rng.uniform((-1, -1, 2), (1, 1, 9), (50, 3))
+        point_ids, image_ids = np.repeat(np.arange(50), 500), np.tile(np.arange(500), 50)
+        assert np.isnan(
+            point_covariances(points, point_ids, image_ids, [FISHEYE] * 500, poses)
+        ).all()
+
+
+def test_no_points() -> None:
+    none = np.zeros(0, np.int64)
+    assert point_covariances(np.zeros((0, 3)), none, none, [], []).shape == (0, 6)
+    assert np.isnan(point_covariances(np.zeros((2, 3)), none, none, [], [])).all()
+    assert point_deviations(np.zeros((0, 6))).shape == (0, 3)
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(-5, 3))
+def test_deviations_are_roots_of_eigenvalues(seed: int, spread: float) -> None:
+    rng = np.random.default_rng(seed)
+    axes = Rotation.random(random_state=seed).as_matrix()
+    values = np.sort(10.0 ** rng.uniform(spread, 3, 3))
+    matrix = axes @ np.diag(values) @ axes.T
+    six = matrix[np.triu_indices(3)][None]
+    np.testing.assert_allclose(point_deviations(six)[0], np.sqrt(values), rtol=1e-6)
