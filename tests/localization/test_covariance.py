@@ -1,6 +1,8 @@
-"""The covariance of a pose against COLMAP's, and the Jacobian against the pinhole's formula."""
+"""The covariance of a pose from its normal matrix; that of real poses against COLMAP's."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -8,13 +10,15 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.geometry.cameras import project, px_from_cam
-from megloc_kapture.localization.covariance import pose_covariance, projection_jacobian
-from megloc_kapture.values import Camera, RigidTransform
+from megloc_kapture.geometry.cameras import project
+from megloc_kapture.localization.absolute_pose import absolute_pose
+from megloc_kapture.localization.covariance import center_deviation, pose_covariance
+from megloc_kapture.values import Camera, Pose, RigidTransform
 
 Array = NDArray[np.float64]
 PINHOLE = Camera("PINHOLE", 640, 480, (500.0, 510.0, 320.5, 239.0))
 FISHEYE = Camera("OPENCV_FISHEYE", 640, 480, (400.0, 410.0, 320.0, 240.0, 0.02, -0.01, 0.0, 0.0))
+RADIAL = Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, -0.1))
 
 
 def a_pose() -> RigidTransform:
@@ -26,59 +30,85 @@ def points_in_cam(count: int = 60) -> Array:
     return np.random.default_rng(0).uniform((-2, -1.5, 4), (2, 1.5, 9), (count, 3))
 
 
-def test_the_jacobian_is_the_pinholes() -> None:
-    points = points_in_cam()
-    x, y, z = points.T
-    expected = np.zeros((len(points), 2, 3))
-    expected[:, 0, 0], expected[:, 0, 2] = 500.0 / z, -500.0 * x / z**2
-    expected[:, 1, 1], expected[:, 1, 2] = 510.0 / z, -510.0 * y / z**2
-    np.testing.assert_allclose(projection_jacobian(PINHOLE, points), expected, atol=1e-5)
+def covariance_of(camera: Camera, pixels: Array, world: Array) -> Array:
+    pose = absolute_pose(pixels, world, camera)
+    assert isinstance(pose, Pose) and pose.covariance is not None
+    return pose.covariance
 
 
-@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e5])
-def test_the_jacobians_accuracy_does_not_depend_on_the_unit(scale: float) -> None:
-    points = points_in_cam()
-    at_one = projection_jacobian(FISHEYE, points)
-    scaled = projection_jacobian(FISHEYE, scale * points) * scale
-    np.testing.assert_allclose(scaled, at_one, atol=1e-5)
+def a_normal_matrix(seed: int = 0) -> Array:
+    factor = np.random.default_rng(seed).normal(size=(40, 6))
+    return factor.T @ factor
 
 
-def test_the_jacobian_predicts_small_moves() -> None:
-    points = points_in_cam()
-    move = 1e-3 * np.random.default_rng(1).normal(size=points.shape)
-    moved = px_from_cam(FISHEYE, points + move) - px_from_cam(FISHEYE, points)
-    predicted = np.einsum("nij,nj->ni", projection_jacobian(FISHEYE, points), move)
-    np.testing.assert_allclose(predicted, moved, atol=2e-4)
+def test_it_is_the_inverse_scaled_by_the_variance() -> None:
+    matrix = a_normal_matrix()
+    found = pose_covariance(matrix, 4.0)
+    np.testing.assert_allclose(found, 4.0 * np.linalg.inv(matrix), rtol=1e-9, atol=1e-15)
+    np.testing.assert_array_equal(found, found.T)
+    # a handful of perfect matches is no proof of perfection
+    floor = pose_covariance(matrix, 1e-12)
+    np.testing.assert_allclose(floor, 0.01 * np.linalg.inv(matrix), rtol=1e-9, atol=1e-15)
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+def test_what_is_degenerate_does_not_depend_on_the_unit(unit: float) -> None:
+    scale = np.diag([1.0, 1.0, 1.0, unit, unit, unit])
+    matrix = a_normal_matrix()
+    found = pose_covariance(scale @ matrix @ scale, 1.0)
+    assert found is not None
+    np.testing.assert_allclose(scale @ found @ scale, np.linalg.inv(matrix), rtol=1e-8)
+    factor = np.random.default_rng(1).normal(size=(40, 6))
+    factor[:, 5] = factor[:, 0] - 2.0 * factor[:, 3]  # five directions only
+    singular = scale @ (factor.T @ factor) @ scale
+    assert pose_covariance(singular, 1.0) is None
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 0.0, -1.0])
+def test_no_covariance_of_what_is_no_normal_matrix(value: float) -> None:
+    matrix = a_normal_matrix()
+    matrix[2, 2] = value
+    assert pose_covariance(matrix, 1.0) is None
+
+
+def test_the_largest_deviation_of_the_centre() -> None:
+    turn = Rotation.random(rng=np.random.default_rng(2)).as_matrix()
+    covariance = 100.0 * np.eye(6)
+    covariance[3:, 3:] = turn @ np.diag([1.0, 4.0, 0.25]) @ turn.T
+    assert center_deviation(covariance) == pytest.approx(2.0)
 
 
 def colmaps_covariance(camera: Camera, pose: RigidTransform, pixels: Array, world: Array) -> Array:
     """COLMAP's, of pixels with an error of one pixel, in our convention."""
-    w, x, y, z = pose.quat_wxyz
-    t = np.array(pose.translation)
-    refined = pycolmap.refine_absolute_pose(
-        pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([x, y, z, w])), t),
+    options: Any = pycolmap.AbsolutePoseEstimationOptions()
+    options.ransac.random_seed = 0
+    refinement = pycolmap.AbsolutePoseRefinementOptions()
+    refinement.gradient_tolerance = 1e-8
+    refined = pycolmap.estimate_and_refine_absolute_pose(
         pixels,
         world,
-        np.ones(len(pixels), dtype=bool),
         pycolmap.Camera(
             model=camera.model, width=camera.width, height=camera.height, params=camera.params
         ),
+        options,
+        refinement,
         return_covariance=True,
     )
+    assert refined is not None
     # COLMAP's rotation is half of the angle, and its translation does not turn with it:
     # exp(r, v) x = R(r) x + v, so the translation changes by v + r x t
+    t = pose.translation
     cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
     ours_from_theirs = np.block([[2 * np.eye(3), np.zeros((3, 3))], [2 * cross, np.eye(3)]])
     return np.asarray(ours_from_theirs @ refined["covariance"] @ ours_from_theirs.T)
 
 
-@pytest.mark.parametrize("camera", [PINHOLE, FISHEYE], ids=lambda c: c.model)
+@pytest.mark.parametrize("camera", [PINHOLE, FISHEYE, RADIAL], ids=lambda c: c.model)
 def test_equal_to_colmaps_covariance(camera: Camera) -> None:
     pose = a_pose()
     world = pose.inverse().apply(points_in_cam())
     pixels = project(camera, pose, world)
-    ours = pose_covariance(pose, camera, pixels, world)
-    assert ours is not None
+    ours = covariance_of(camera, pixels, world)
     theirs = colmaps_covariance(camera, pose, pixels, world)
     # without any residual ours takes a tenth of a pixel
     np.testing.assert_allclose(ours, 0.1**2 * theirs, rtol=1e-4, atol=1e-6 * abs(ours).max())
@@ -89,54 +119,19 @@ def test_the_scale_comes_from_the_residuals() -> None:
     world = pose.inverse().apply(points_in_cam(400))
     exact = project(PINHOLE, pose, world)
     noise = np.random.default_rng(2).normal(size=exact.shape)
-    floor = pose_covariance(pose, PINHOLE, exact, world)
-    assert floor is not None
+    floor = covariance_of(PINHOLE, exact, world)
     for sigma_px in (1.0, 3.0):
-        found = pose_covariance(pose, PINHOLE, exact + sigma_px * noise, world)
-        assert found is not None
-        np.testing.assert_allclose(found / floor, (sigma_px / 0.1) ** 2, rtol=0.15)
-
-
-def test_it_is_a_covariance() -> None:
-    pose = a_pose()
-    world = pose.inverse().apply(points_in_cam(12))
-    found = pose_covariance(pose, PINHOLE, project(PINHOLE, pose, world), world)
-    assert found is not None and found.shape == (6, 6)
-    np.testing.assert_allclose(found, found.T, rtol=1e-6)
-    assert (np.linalg.eigvalsh(0.5 * (found + found.T)) > 0).all()
+        found = covariance_of(PINHOLE, exact + sigma_px * noise, world)
+        np.testing.assert_allclose(
+            np.diagonal(found) / np.diagonal(floor), (sigma_px / 0.1) ** 2, rtol=0.15
+        )
 
 
 def test_rotation_in_radians_does_not_change_with_the_unit_and_translation_does() -> None:
     pose = a_pose()
     world = pose.inverse().apply(points_in_cam())
     pixels = project(PINHOLE, pose, world)
-    metres = pose_covariance(pose, PINHOLE, pixels, world)
-    tx, ty, tz = (1000 * t for t in pose.translation)
-    millimetres = pose_covariance(
-        RigidTransform(pose.quat_wxyz, (tx, ty, tz)), PINHOLE, pixels, 1000 * world
-    )
-    assert metres is not None and millimetres is not None
-    np.testing.assert_allclose(millimetres[:3, :3], metres[:3, :3], rtol=1e-4)
-    np.testing.assert_allclose(millimetres[3:, 3:], 1e6 * metres[3:, 3:], rtol=1e-4)
-
-
-def test_degenerate_points_have_none() -> None:
-    pose = a_pose()
-    along = np.linspace(-1, 1, 30)[:, None]
-    on_a_line = np.array([0.2, -0.3, 6.0]) + along * np.array([0.8, 0.3, 0.5])
-    at_one_place = np.repeat([[0.1, 0.2, 5.0]], 30, axis=0)
-    too_few = points_in_cam(3)
-    for in_cam in (on_a_line, at_one_place, too_few, np.zeros((0, 3))):
-        world = pose.inverse().apply(in_cam)
-        assert pose_covariance(pose, PINHOLE, project(PINHOLE, pose, world), world) is None
-
-
-def test_points_behind_the_camera_say_nothing() -> None:
-    pose = a_pose()
-    in_cam = points_in_cam(30)
-    world = pose.inverse().apply(in_cam)
-    pixels = project(PINHOLE, pose, world)
-    expected = pose_covariance(pose, PINHOLE, pixels, world)
-    behind = np.concatenate([world, pose.inverse().apply(-in_cam)])
-    found = pose_covariance(pose, PINHOLE, np.concatenate([pixels, pixels]), behind)
-    np.testing.assert_array_equal(found, expected)
+    metres = covariance_of(PINHOLE, pixels, world)
+    millimetres = covariance_of(PINHOLE, pixels, 1000 * world)
+    np.testing.assert_allclose(millimetres[:3, :3], metres[:3, :3], rtol=1e-4, atol=1e-14)
+    np.testing.assert_allclose(millimetres[3:, 3:], 1e6 * metres[3:, 3:], rtol=1e-4, atol=1e-8)

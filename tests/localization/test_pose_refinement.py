@@ -1,0 +1,444 @@
+"""The refinement: its derivatives, its minimum, its covariance, and what it refuses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import poselib
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.optimize import approx_fprime
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from megloc_kapture.geometry.cameras import bearing_rays, focal_px, project, px_from_cam
+from megloc_kapture.localization import pose_kernels
+from megloc_kapture.localization.absolute_pose import absolute_pose
+from megloc_kapture.localization.estimation import AbsolutePoseOptions, PoseEstimate
+from megloc_kapture.localization.pose_refinement import refine_pose
+from megloc_kapture.localization.views import View, stack_views
+from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, Failure, Pose, RigidTransform
+
+Array = NDArray[np.float64]
+F, CX, CY = 500.0, 321.0, 238.5
+PARAMS = {
+    "SIMPLE_PINHOLE": (F, CX, CY),
+    "PINHOLE": (F, 510.0, CX, CY),
+    "SIMPLE_RADIAL": (F, CX, CY, -0.05),
+    "RADIAL": (F, CX, CY, -0.05, 0.01),
+    "OPENCV": (F, 510.0, CX, CY, -0.05, 0.01, 1e-3, -2e-3),
+    "OPENCV_FISHEYE": (F, 510.0, CX, CY, 0.02, -0.01, 3e-3, -1e-3),
+    "FULL_OPENCV": (F, 510.0, CX, CY, -0.05, 0.01, 1e-3, -2e-3, 1e-3, 0.02, -0.01, 1e-3),
+    "FOV": (F, 510.0, CX, CY, 0.9),
+    "SIMPLE_RADIAL_FISHEYE": (F, CX, CY, 0.02),
+    "RADIAL_FISHEYE": (F, CX, CY, 0.02, -0.01),
+    "THIN_PRISM_FISHEYE": (F, 510.0, CX, CY, 0.02, -0.01, 1e-3, -1e-3, 1e-3, 0.0, 1e-3, -1e-3),
+}
+CAMERAS = {model: Camera(model, 640, 480, params) for model, params in PARAMS.items()}
+PINHOLE = CAMERAS["PINHOLE"]
+AT_ORIGIN = RigidTransform.identity()
+ANY_DEVIATION = AbsolutePoseOptions(max_center_deviation=1e9)
+
+
+def random_pose(rng: np.random.Generator) -> RigidTransform:
+    return RigidTransform.from_matrix(Rotation.random(rng=rng).as_matrix(), 5 * rng.normal(size=3))
+
+
+def moved(pose: RigidTransform, vector: Array) -> RigidTransform:
+    """``exp(rotation, translation) pose``, to first order in the translation."""
+    turn = RigidTransform.from_matrix(Rotation.from_rotvec(vector[:3]).as_matrix(), vector[3:])
+    return turn @ pose
+
+
+def in_unit(pose: RigidTransform, unit: float) -> RigidTransform:
+    return RigidTransform(pose.quat_wxyz, tuple(unit * np.array(pose.translation)))
+
+
+def error_vector(found: RigidTransform, truth: RigidTransform) -> Array:
+    true_from_found = truth @ found.inverse()
+    vector = Rotation.from_matrix(true_from_found.rotation_matrix()).as_rotvec()
+    return np.concatenate([vector, true_from_found.translation])
+
+
+def located(result: Pose | Failure) -> Pose:
+    assert isinstance(result, Pose), result
+    return result
+
+
+def all_good(views: list[View], pose: RigidTransform) -> PoseEstimate:
+    every = np.ones(sum(len(view.points_px) for view in views), dtype=np.bool_)
+    return PoseEstimate(pose, every, every, np.zeros(len(every)))
+
+
+def six(matrices: Array) -> Array:
+    """Symmetric (N, 3, 3) as (N, 6): xx, xy, xz, yy, yz, zz."""
+    return matrices[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+
+
+def random_covariances(rng: np.random.Generator, count: int, size: float) -> Array:
+    """Anisotropic (N, 3, 3): each point has its own long axis, of about ``size``."""
+    factors = rng.normal(size=(count, 3, 3)) * (size * np.array([1.0, 0.3, 0.1]))
+    return factors @ factors.transpose(0, 2, 1)
+
+
+def noisy_view(
+    camera: Camera, pose: RigidTransform, rng: np.random.Generator, count: int, sigma: float = 1.0
+) -> View:
+    world = pose.inverse().apply(rng.uniform((-2, -1.5, 4), (2, 1.5, 9), (count, 3)))
+    pixels = project(camera, pose, world) + sigma * rng.normal(size=(count, 2))
+    return View(camera, AT_ORIGIN, pixels, world)
+
+
+def test_every_model_that_a_camera_can_have_is_tested() -> None:
+    assert set(CAMERAS) == set(CAMERA_MODEL_NUM_PARAMS)
+
+
+@pytest.mark.parametrize("model", CAMERAS)
+def test_derivatives_are_finite_differences(model: str) -> None:
+    """Of a rig's whitened residuals, written here once more with the adapter's projection."""
+    rng = np.random.default_rng(0)
+    pose = random_pose(rng)
+    views, covariances = [], []
+    for camera in (CAMERAS[model], PINHOLE):
+        cam_from_rig = moved(AT_ORIGIN, np.append(rng.normal(size=3), 0.3 * rng.normal(size=3)))
+        seen = noisy_view(camera, cam_from_rig @ pose, rng, 8)
+        matrices = random_covariances(rng, 8, 0.02)
+        covariances.append(matrices)
+        views.append(replace(seen, cam_from_rig=cam_from_rig, point_covariances=six(matrices)))
+    stacked = stack_views(views)
+    here = RigidTransform(
+        pose.quat_wxyz, tuple(pose.translation + pose.rotation_matrix() @ stacked.offset)
+    )
+    rotation, translation = here.rotation_matrix(), np.array(here.translation)
+    whitening = np.empty((16, 3))
+    errors, squared, depths = np.empty(16), np.empty(16), np.empty(16)
+    matches = pose_kernels.matches_of(stacked)
+    pose_kernels.measure(
+        matches, np.ones(16, bool), rotation, translation, errors, whitening, squared, depths
+    )
+
+    def residuals(vector: Array) -> Array:
+        rig_from_world = moved(pose, vector)
+        return np.concatenate(
+            [
+                project(v.camera, v.cam_from_rig @ rig_from_world, v.points_world) - v.points_px
+                for v in views
+            ]
+        )
+
+    # the whitening factors belong to I + J C J^T, J by finite differences
+    cholesky = np.zeros((16, 2, 2))
+    row = 0
+    for view, matrices in zip(views, covariances, strict=True):
+        cam_from_world = view.cam_from_rig @ pose
+        for point, matrix in zip(view.points_world, matrices, strict=True):
+            by_point = approx_fprime(
+                point,
+                lambda p, v=view, c=cam_from_world: project(v.camera, c, p[None])[0],
+                1e-6,
+            )
+            spread = np.eye(2) + by_point @ matrix @ by_point.T
+            cholesky[row] = np.linalg.cholesky(spread)
+            row += 1
+    inverse = np.linalg.inv(cholesky)
+    np.testing.assert_allclose(whitening, inverse[:, [0, 1, 1], [0, 0, 1]], rtol=1e-4, atol=1e-6)
+    plain = residuals(np.zeros(6))
+    np.testing.assert_allclose(errors, np.linalg.norm(plain, axis=1), rtol=1e-7, atol=1e-9)
+    white = np.einsum("nij,nj->ni", inverse, plain)
+    np.testing.assert_allclose(squared, (white**2).sum(axis=1), rtol=1e-3, atol=1e-6)
+    depth = np.concatenate([(v.cam_from_rig @ pose).apply(v.points_world)[:, 2] for v in views])
+    np.testing.assert_allclose(depths, depth, rtol=1e-9)
+
+    def cost(vector: Array, squared_scale: float) -> float:
+        white = np.einsum("nij,nj->ni", inverse, residuals(vector))
+        terms = squared_scale * np.log1p((white**2).sum(axis=1) / squared_scale)
+        return float(0.5 * terms.sum())
+
+    gradient, hessian = np.empty(6), np.empty((6, 6))
+    rows = np.arange(16)
+    found = pose_kernels.normal_equations(
+        matches, rows, inverse[:, [0, 1, 1], [0, 0, 1]].copy(), rotation, translation, 4.0,
+        gradient, hessian,
+    )  # fmt: skip
+    assert found == pytest.approx(cost(np.zeros(6), 4.0), rel=1e-9)
+    steps = 1e-6 * np.eye(6)
+    expected = np.array([(cost(s, 4.0) - cost(-s, 4.0)) / 2e-6 for s in steps])
+    np.testing.assert_allclose(gradient, expected, rtol=1e-5, atol=1e-5 * abs(expected).max())
+    # and the normal matrix of plain least squares is J^T J
+    pose_kernels.normal_equations(
+        matches, rows, inverse[:, [0, 1, 1], [0, 0, 1]].copy(), rotation, translation, np.inf,
+        gradient, hessian,
+    )  # fmt: skip
+    jacobian = np.stack(
+        [
+            np.einsum("nij,nj->ni", inverse, residuals(s) - residuals(-s)).ravel() / 2e-6
+            for s in steps
+        ],
+        axis=1,
+    )
+    information = jacobian.T @ jacobian
+    np.testing.assert_allclose(
+        hessian, np.triu(information), rtol=1e-5, atol=1e-6 * information.max()
+    )
+
+
+def refined_by_poselib(view: View, start: RigidTransform) -> RigidTransform:
+    """Two rounds of poselib's refinement with the same scale rule, on undistorted pixels."""
+    focal = focal_px(view.camera)
+    pinhole = {"model": "PINHOLE", "width": 1, "height": 1, "params": [focal, focal, 0.0, 0.0]}
+    undistorted = np.ascontiguousarray(bearing_rays(view.camera, view.points_px)[:, :2]) * focal
+    found = poselib.CameraPose()
+    found.q, found.t = np.array(start.quat_wxyz), np.array(start.translation)
+    pose = start
+    for _ in range(2):
+        errors = np.linalg.norm(
+            project(view.camera, pose, view.points_world) - view.points_px, axis=1
+        )
+        near = errors <= 12.0
+        sigma = max(float(np.median(errors[near])) / 1.1774, 0.1)
+        found, _ = poselib.refine_absolute_pose(
+            undistorted[near],
+            view.points_world[near],
+            found,
+            pinhole,
+            {"loss_type": "CAUCHY", "loss_scale": 2.385 * sigma},
+        )
+        pose = RigidTransform.from_matrix(found.R, found.t)
+    return pose
+
+
+@pytest.mark.parametrize("sigma_px", [0.05, 1.0, 3.0])
+def test_without_covariances_it_is_poselibs_refinement(sigma_px: float) -> None:
+    """A pinhole camera: undistorted pixels are the pixels, but for the two focal lengths."""
+    rng = np.random.default_rng(1)
+    square = replace(PINHOLE, params=(F, F, CX, CY))
+    for _ in range(20):
+        truth = random_pose(rng)
+        view = noisy_view(square, truth, rng, 100, sigma_px)
+        view.points_px[:10] += 8.0 * rng.normal(size=(10, 2))
+        start = moved(truth, 2e-3 * sigma_px * rng.normal(size=6))
+        theirs = refined_by_poselib(view, start)
+        ours = located(refine_pose([view], all_good([view], start)))
+        assert ours.covariance is not None
+        apart = error_vector(ours.cam_from_world, theirs)
+        # in standard deviations of the pose
+        assert np.sqrt(apart @ np.linalg.solve(ours.covariance, apart)) < 0.01
+
+
+@given(st.sampled_from(sorted(CAMERAS)), st.integers(0, 2**32 - 1), st.sampled_from([1e-3, 1, 1e3]))
+@settings(max_examples=30, deadline=None)
+def test_the_minimum_is_found_from_nearby_under_any_model(
+    model: str, seed: int, unit: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    truth = random_pose(rng)
+    view = noisy_view(CAMERAS[model], truth, rng, 40, 0.0)
+    start = moved(truth, 0.01 * rng.normal(size=6))
+    scaled = replace(view, points_world=unit * view.points_world)
+    grown = in_unit(start, unit)
+    pose = located(
+        refine_pose(
+            [scaled],
+            all_good([scaled], grown),
+            AbsolutePoseOptions(max_error_px=100, map_noise=1.0),
+        )
+    )
+    apart = error_vector(pose.cam_from_world, in_unit(truth, unit))
+    assert np.abs(apart[:3]).max() < 1e-9 and np.abs(apart[3:]).max() < 1e-8 * unit
+    assert pose.num_inliers == 40
+
+
+def normalised_errors(
+    rng: np.random.Generator, size: float, sigma_px: float, known: bool, runs: int = 200
+) -> Array:
+    """Squared errors of poses over their covariance, of points that are wrong by theirs."""
+    truth = random_pose(rng)
+    squared = []
+    for _ in range(runs):
+        view = noisy_view(PINHOLE, truth, rng, 80, sigma_px)
+        matrices = random_covariances(rng, 80, size)
+        offsets = np.einsum(
+            "nij,nj->ni", np.linalg.cholesky(matrices), sigma_px * rng.normal(size=(80, 3))
+        )
+        view = replace(
+            view,
+            points_world=view.points_world + offsets,
+            point_covariances=six(matrices) if known else None,
+        )
+        pose = located(
+            refine_pose(
+                [view],
+                all_good([view], truth),
+                AbsolutePoseOptions(max_error_px=100, map_noise=1.0),
+            )
+        )
+        assert pose.covariance is not None
+        error = error_vector(pose.cam_from_world, truth)
+        squared.append(float(error @ np.linalg.solve(pose.covariance, error)))
+    return np.array(squared)
+
+
+@pytest.mark.parametrize("sigma_px", [0.4, 2.0])
+@pytest.mark.parametrize("size", [1e-9, 0.02])
+def test_the_covariance_is_that_of_repeated_estimates(size: float, sigma_px: float) -> None:
+    """Errors over their covariance follow chi-squared with six degrees of freedom."""
+    squared = normalised_errors(np.random.default_rng(2), size, sigma_px, known=True)
+    assert 5.2 < squared.mean() < 7.2
+    assert (squared < chi2.ppf(0.95, 6)).mean() > 0.9
+    assert (squared < chi2.ppf(0.5, 6)).mean() < 0.62
+
+
+def test_wrong_matches_among_the_inliers_do_not_inflate_the_covariance() -> None:
+    """A tenth of the matches is wrong by up to the threshold."""
+    rng = np.random.default_rng(3)
+    truth = random_pose(rng)
+    squared = []
+    for _ in range(200):
+        view = noisy_view(PINHOLE, truth, rng, 100)
+        view.points_px[:10] += rng.uniform(-8, 8, (10, 2))
+        pose = located(refine_pose([view], all_good([view], truth)))
+        assert pose.covariance is not None
+        error = error_vector(pose.cam_from_world, truth)
+        squared.append(float(error @ np.linalg.solve(pose.covariance, error)))
+    assert 5.0 < np.mean(squared) < 7.2
+
+
+def test_weighting_by_uncertainty_brings_the_pose_closer() -> None:
+    """Paired over random problems: points known well, and points known badly along one axis."""
+    rng = np.random.default_rng(4)
+    with_weights, without = [], []
+    for _ in range(200):
+        truth = random_pose(rng)
+        view = noisy_view(PINHOLE, truth, rng, 60)
+        matrices = random_covariances(rng, 60, 0.03)
+        matrices[::3] *= 1e-4
+        offsets = np.einsum("nij,nj->ni", np.linalg.cholesky(matrices), rng.normal(size=(60, 3)))
+        view = replace(view, points_world=view.points_world + offsets)
+        known = replace(view, point_covariances=six(matrices))
+        for views, distances in (([known], with_weights), ([view], without)):
+            pose = located(
+                refine_pose(
+                    views,
+                    all_good(views, truth),
+                    AbsolutePoseOptions(max_error_px=100, map_noise=1.0),
+                )
+            )
+            distances.append(float(np.linalg.norm(pose.cam_from_world.center() - truth.center())))
+    better = np.array(with_weights) < np.array(without)
+    assert better.mean() > 0.6
+    assert np.mean(with_weights) < 0.75 * np.mean(without)
+
+
+def test_points_count_by_the_noise_of_the_map() -> None:
+    """Half the noise in the map is a quarter of the covariances; none makes the points exact."""
+    rng = np.random.default_rng(8)
+    truth = random_pose(rng)
+    view = noisy_view(PINHOLE, truth, rng, 60)
+    covariances = six(random_covariances(rng, 60, 0.03))
+
+    def pose(of: View, map_noise: float) -> RigidTransform:
+        options = AbsolutePoseOptions(map_noise=map_noise)
+        return located(refine_pose([of], all_good([of], truth), options)).cam_from_world
+
+    known = replace(view, point_covariances=covariances)
+    quarter = replace(view, point_covariances=covariances / 4)
+    assert pose(known, 0.5) == pose(quarter, 1.0) != pose(known, 1.0)
+    assert pose(known, 0.0) == pose(view, 1.0)
+
+
+def test_an_unknown_covariance_counts_as_none() -> None:
+    rng = np.random.default_rng(5)
+    truth = random_pose(rng)
+    view = noisy_view(PINHOLE, truth, rng, 60)
+    plain = located(refine_pose([view], all_good([view], truth)))
+    for unknown in (np.nan, np.inf, 0.0):
+        other = replace(view, point_covariances=np.full((60, 6), unknown))
+        same = located(refine_pose([other], all_good([other], truth)))
+        assert same.cam_from_world == plain.cam_from_world
+        np.testing.assert_array_equal(same.covariance, plain.covariance)
+    mixed = np.zeros((60, 6))
+    mixed[:, [0, 3, 5]] = 1e-3
+    mixed[::2] = np.nan
+    half = replace(view, point_covariances=mixed)
+    zero = replace(view, point_covariances=np.nan_to_num(mixed))
+    first = located(refine_pose([half], all_good([half], truth)))
+    second = located(refine_pose([zero], all_good([zero], truth)))
+    assert first.cam_from_world == second.cam_from_world != plain.cam_from_world
+
+
+def test_inliers_are_counted_in_pixels_whatever_the_uncertainty() -> None:
+    rng = np.random.default_rng(6)
+    truth = random_pose(rng)
+    view = noisy_view(PINHOLE, truth, rng, 80)
+    view.points_px[:5] += 20.0
+    vague = np.zeros((80, 6))
+    vague[:, [0, 3, 5]] = 0.05
+    pose = located(refine_pose([replace(view, point_covariances=vague)], all_good([view], truth)))
+    errors = np.linalg.norm(
+        project(PINHOLE, pose.cam_from_world, view.points_world) - view.points_px, axis=1
+    )
+    np.testing.assert_array_equal(pose.inliers, errors <= 12.0)
+    assert pose.num_inliers == 75
+
+
+def test_what_is_not_usable_takes_no_part() -> None:
+    rng = np.random.default_rng(7)
+    truth = random_pose(rng)
+    view = noisy_view(PINHOLE, truth, rng, 60)
+    usable = np.arange(60) >= 20
+    some = replace(view, points_px=view.points_px[20:], points_world=view.points_world[20:])
+    first = located(refine_pose([view], PoseEstimate(truth, usable, usable, np.zeros(60))))
+    second = located(refine_pose([some], all_good([some], truth)))
+    assert np.abs(error_vector(first.cam_from_world, second.cam_from_world)).max() < 1e-9
+    assert first.inliers is not None and not first.inliers[:20].any()
+
+
+def test_an_unstable_pose_is_a_failure_that_says_so() -> None:
+    """All points within some millimetres of a line: the camera may nearly turn about it."""
+    rng = np.random.default_rng(8)
+    truth = random_pose(rng)
+    along = rng.uniform(-2, 2, (30, 1)) * np.array([0.8, 0.3, 0.5])
+    in_cam = np.array([0.2, -0.3, 6.0]) + along + 0.003 * rng.normal(size=(30, 3))
+    world = truth.inverse().apply(in_cam)
+    pixels = px_from_cam(PINHOLE, in_cam) + rng.normal(size=(30, 2))
+    view = View(PINHOLE, AT_ORIGIN, pixels, world)
+    result = refine_pose([view], all_good([view], truth))
+    assert isinstance(result, Failure)
+    assert result.reason.startswith("the pose is unstable: its centre's standard deviation is ")
+    assert result.num_matches == result.num_inliers == 30
+    pose = located(refine_pose([view], all_good([view], truth), ANY_DEVIATION))
+    assert pose.covariance is not None
+    # the criterion: the centre's deviation over the median depth, whatever the unit
+    deviation = np.sqrt(np.linalg.eigvalsh(pose.covariance[3:, 3:])[-1])
+    depth = np.median(pose.cam_from_world.apply(world)[:, 2])
+    for unit in (1.0, 1e-3, 1e3):
+        scaled = replace(view, points_world=unit * world)
+        estimate = all_good([scaled], in_unit(truth, unit))
+        for factor, stable in ((0.99, False), (1.01, True)):
+            options = AbsolutePoseOptions(max_center_deviation=factor * deviation / depth)
+            assert bool(refine_pose([scaled], estimate, options)) == stable
+
+
+def test_too_few_inliers_after_refinement_say_so() -> None:
+    rng = np.random.default_rng(9)
+    truth = random_pose(rng)
+    view = noisy_view(PINHOLE, truth, rng, 20)
+    view.points_px[:9] += 30.0
+    result = refine_pose([view], all_good([view], truth))
+    assert isinstance(result, Failure)
+    assert result.reason == "11 of 20 2D-3D matches agree, at least 12 are needed"
+    assert (result.num_matches, result.num_inliers) == (20, 11)
+
+
+def test_one_call_uses_the_covariances() -> None:
+    rng = np.random.default_rng(10)
+    view = noisy_view(PINHOLE, random_pose(rng), rng, 60)
+    covariances = six(random_covariances(rng, 60, 0.02))
+    plain = located(absolute_pose(view.points_px, view.points_world, PINHOLE))
+    weighted = located(
+        absolute_pose(view.points_px, view.points_world, PINHOLE, point_covariances=covariances)
+    )
+    assert plain.cam_from_world != weighted.cam_from_world
