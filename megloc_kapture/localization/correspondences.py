@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from megloc_kapture.localization.map_index import MapIndex
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,42 +28,74 @@ class Correspondences:
     support: NDArray[np.int64]
 
 
-def resolve(
-    keypoint_ids: NDArray[np.int64],
-    point_ids: NDArray[np.int64],
-    similarities: NDArray[np.floating],
-) -> Correspondences:
-    """One point per keypoint and one keypoint per point.
+@dataclass(frozen=True, eq=False)
+class ObservedMatches:
+    """Matches of a query with map keypoints that observe a point, conflicts and all.
 
-    The same keypoint can meet several points through different map images, and the reverse. What
-    most images say wins; then the most similar descriptors; then the smaller ids. Conflicts are
-    settled greedily from the best on, so that a loser may still get its second choice.
+    Attributes
+    ----------
+    keypoint_ids : int64 (M,), rows of the query's keypoints, not negative.
+    point_ids : int64 (M,), rows of the map's points, not negative.
+    similarities : float64 (M,), higher is better.
+    image_rows : int64 (M,), which of the map images the match is with, from 0.
+    num_images : int, of the map images, whether they have matches or not.
+    """
+
+    keypoint_ids: NDArray[np.int64]
+    point_ids: NDArray[np.int64]
+    similarities: NDArray[np.float64]
+    image_rows: NDArray[np.int64]
+    num_images: int
+
+    def resolve(self, rows: NDArray[np.bool_] | None = None) -> Correspondences:
+        """One point per keypoint and one keypoint per point, of the matches with some images.
+
+        The same keypoint can meet several points through different map images, and the reverse.
+        What most images say wins; then the most similar descriptors; then the smaller ids.
+        Conflicts are settled greedily from the best on, so that a loser may still get its second
+        choice. Images that are left out have no say.
+
+        Parameters
+        ----------
+        rows : bool (num_images,), the images whose matches count; all where it is None.
+        """
+        from megloc_kapture.localization import index_kernels
+
+        if rows is None:
+            rows = np.ones(self.num_images, dtype=np.bool_)
+        elif rows.shape != (self.num_images,):
+            raise ValueError(f"rows has shape {rows.shape}, expected ({self.num_images},)")
+        found = index_kernels.resolve(
+            self.keypoint_ids, self.point_ids, self.similarities, self.image_rows, rows
+        )
+        return Correspondences(*found)
+
+
+def observed_matches(
+    index: MapIndex,
+    matches: Sequence[tuple[str, NDArray[np.integer[Any]], NDArray[np.floating[Any]]]],
+) -> ObservedMatches:
+    """The matches whose map keypoint observes a point.
 
     Parameters
     ----------
-    keypoint_ids, point_ids : int64 (M,), one row per match with an observed map keypoint.
-    similarities : (M,), higher is better.
+    matches : of each map image: its name, rows of query and map keypoints (K, 2), scores (K,). An
+        image that is not in the map has nothing to say.
     """
-    if len(keypoint_ids) == 0:
+    from megloc_kapture.localization import index_kernels
+
+    if not matches:
         empty = np.zeros(0, dtype=np.int64)
-        return Correspondences(empty, empty, empty)
-    pairs, inverse, support = np.unique(
-        np.stack([keypoint_ids, point_ids], axis=1),
-        axis=0,
-        return_inverse=True,
-        return_counts=True,
+        return ObservedMatches(empty, empty, np.zeros(0), empty, 0)
+    starts = np.zeros(len(matches) + 1, dtype=np.int64)
+    np.cumsum([len(pairs) for _, pairs, _ in matches], out=starts[1:])
+    keypoint_ids, point_ids, similarities, image_rows = index_kernels.observed(
+        index.offsets,
+        index.keypoint_ids,
+        index.point_ids,
+        index.rows_of([image for image, _, _ in matches]),
+        starts,
+        np.concatenate([pairs for _, pairs, _ in matches], dtype=np.int64),
+        np.concatenate([scores for _, _, scores in matches], dtype=np.float64),
     )
-    best = np.full(len(pairs), -np.inf)
-    np.maximum.at(best, inverse.reshape(-1), np.asarray(similarities, dtype=np.float64))
-    order = np.lexsort((pairs[:, 1], pairs[:, 0], -best, -support))
-    taken_keypoints: set[int] = set()
-    taken_points: set[int] = set()
-    chosen = []
-    for row, (keypoint, point) in zip(order.tolist(), pairs[order].tolist(), strict=True):
-        if keypoint in taken_keypoints or point in taken_points:
-            continue
-        taken_keypoints.add(keypoint)
-        taken_points.add(point)
-        chosen.append(row)
-    rows = np.sort(np.array(chosen, dtype=np.int64))
-    return Correspondences(pairs[rows, 0], pairs[rows, 1], support[rows].astype(np.int64))
+    return ObservedMatches(keypoint_ids, point_ids, similarities, image_rows, len(matches))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -58,3 +59,40 @@ def test_points_keep_all_their_digits() -> None:
     xyz = np.array([[4.2e6 + 1e-9, 1.7e5, 4.78e6]])
     empty = np.zeros(0, dtype=np.int64)
     np.testing.assert_array_equal(MapIndex.build(xyz, (), empty, empty, empty).xyz, xyz)
+
+
+@given(observations, st.lists(st.sampled_from("abcdz"), max_size=6))
+def test_shared_points_equal_to_sets(rows: list[tuple[int, int, int]], asked: list[str]) -> None:
+    index = build(rows, ("a", "b", "c", "d"))
+    points = [
+        {p for i, _, p in rows if "abcd"[i] == name} if name != "z" else set() for name in asked
+    ]
+    shared = index.shared_points(asked)
+    assert (shared.dtype, shared.shape) == (np.int64, (len(asked), len(asked)))
+    assert shared.tolist() == [[len(mine & other) for other in points] for mine in points]
+
+
+def test_shared_points_of_images_with_many() -> None:
+    rng = np.random.default_rng(0)
+    images, keypoints = np.repeat(np.arange(30), 500), np.tile(np.arange(500), 30)
+    points = rng.integers(0, 6000, len(images)) * 5000  # ids of many digits
+    names = tuple(f"{i:02}" for i in range(30))
+    xyz = np.zeros((0, 3))
+    index = MapIndex.build(xyz, names, images, keypoints, points)
+    sets = [set(points[images == i].tolist()) for i in range(30)]
+    asked = [3, 1, 29, 0, 17]
+    expected = [[len(sets[i] & sets[j]) for j in asked] for i in asked]
+    assert index.shared_points([names[i] for i in asked]).tolist() == expected
+
+
+def test_nothing_in_it_can_be_written_to() -> None:
+    xyz = np.zeros((3, 3))
+    index = MapIndex.build(xyz, ("a",), *(np.zeros(1, np.int64),) * 3)
+    for array in (index.xyz, index.offsets, index.keypoint_ids, index.point_ids):
+        assert not array.flags.writeable
+    xyz[0] = 1.0  # whose array it is may go on writing
+
+
+def test_an_observation_of_an_image_that_has_no_name() -> None:
+    with pytest.raises(ValueError):
+        build([(1, 0, 0)], ("a",))

@@ -1,0 +1,131 @@
+"""A map's index: read from kapture once, shared by worker processes as memory-mapped arrays.
+
+Parsing a map of a million points takes a second and its arrays 200 MB; worker processes that map
+the same files share both. The arrays are plain ``.npy`` files, the names JSON: nothing is pickled.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.atomic import atomic_write, output_error, write_bytes
+from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.point_covariances import read_point_covariances
+from megloc_kapture.localization.map_index import MapIndex
+
+_IMAGES = "images.json"
+# name -> numbers per row (0: a plain list) and type
+_ARRAYS: dict[str, tuple[int, type[Any]]] = {
+    "xyz": (3, np.float64),
+    "offsets": (0, np.int64),
+    "keypoint_ids": (0, np.int32),
+    "point_ids": (0, np.int32),
+}
+_COVARIANCES = (6, np.float64)
+
+
+def index_map(folder: KaptureFolder, local_type: str) -> MapIndex:
+    """Read the points, their uncertainty and the observations of one keypoints type.
+
+    Raises
+    ------
+    DataError : no observations of the type, or covariances of another map's points.
+    """
+    seen = folder.observations()
+    if local_type not in seen:
+        raise DataError(f"the map has no observations of type {local_type!r}", path=folder.root)
+    observations = seen[local_type]
+    points = folder.points3d()
+    return MapIndex.build(
+        points[:, :3],
+        observations.image_names,
+        observations.image_ids,
+        observations.keypoint_ids,
+        observations.point_ids,
+        read_point_covariances(folder.root, len(points)),
+    )
+
+
+def write_index(index: MapIndex, folder: Path) -> None:
+    """Write an index as files in a folder, which is made where it is missing.
+
+    Raises
+    ------
+    OutputError : cannot be written.
+    """
+    for name in _ARRAYS:
+        _write_array(folder / f"{name}.npy", getattr(index, name))
+    if index.covariances is not None:
+        _write_array(folder / "covariances.npy", index.covariances)
+    names = sorted(index.row_of_image, key=index.row_of_image.__getitem__)
+    write_bytes(folder / _IMAGES, json.dumps(names).encode())
+
+
+def open_index(folder: Path) -> MapIndex:
+    """Open what :func:`write_index` wrote: arrays are mapped, not read, and cannot be written to.
+
+    Raises
+    ------
+    DataError : a file is missing or is not what was written; names it.
+    """
+    arrays = {name: _open_array(folder / f"{name}.npy", *kind) for name, kind in _ARRAYS.items()}
+    covariances = None
+    if (folder / "covariances.npy").is_file():
+        covariances = _open_array(folder / "covariances.npy", *_COVARIANCES)
+    path = folder / _IMAGES
+    try:
+        names = json.loads(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise DataError(f"cannot read: {error}", path=path) from error
+    rows = {name: row for row, name in enumerate(names)}
+    if len(arrays["offsets"]) != len(names) + 1:
+        raise DataError(f"{len(names)} images for {len(arrays['offsets'])} offsets", path=path)
+    return MapIndex(row_of_image=rows, covariances=covariances, **arrays)
+
+
+@contextmanager
+def shared_index(indices: Mapping[str, MapIndex]) -> Iterator[dict[str, Path]]:
+    """Indices by keypoints type as folders for :func:`open_index`; gone after the block.
+
+    Who has one open by then may go on using it.
+
+    Raises
+    ------
+    OutputError : the temporary folder cannot be written to.
+    """
+    try:
+        place = tempfile.TemporaryDirectory(prefix="megloc-index-", ignore_cleanup_errors=True)
+    except OSError as error:
+        raise output_error(tempfile.gettempdir(), error) from error
+    with place as name:
+        folders = {}
+        for number, (keypoints_type, index) in enumerate(indices.items()):
+            folders[keypoints_type] = Path(name) / str(number)
+            write_index(index, folders[keypoints_type])
+        yield folders
+
+
+def _write_array(path: Path, array: NDArray[Any]) -> None:
+    with atomic_write(path) as file:
+        np.lib.format.write_array(file, np.ascontiguousarray(array), allow_pickle=False)
+
+
+def _open_array(path: Path, columns: int, dtype: type[Any]) -> NDArray[Any]:
+    try:
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError) as error:
+        raise DataError(f"cannot read: {error}", path=path) from error
+    expected = (-1, columns) if columns else (-1,)
+    if array.dtype != dtype or (-1, *array.shape[1:]) != expected:
+        raise DataError(f"{array.dtype} {array.shape} is no part of an index", path=path)
+    # a plain view: the compiled loops know no other kind of array
+    return np.asarray(array)

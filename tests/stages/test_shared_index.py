@@ -1,0 +1,162 @@
+"""The index in files: equal to the one in memory, in this process and in others."""
+
+from __future__ import annotations
+
+import multiprocessing
+import shutil
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from megloc_kapture.errors import DataError, OutputError
+from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.point_covariances import write_point_covariances
+from megloc_kapture.localization.map_index import MapIndex
+from megloc_kapture.stages.shared_index import (
+    index_map,
+    open_index,
+    shared_index,
+    write_index,
+)
+
+NAMES = ("a/é.jpg", "b\n.jpg", "c.jpg")
+ARRAYS = ("xyz", "offsets", "keypoint_ids", "point_ids")
+
+
+def make_index(*, covariances: bool = False) -> MapIndex:
+    rng = np.random.default_rng(0)
+    images, keypoints, points = (rng.integers(0, n, 200) for n in (3, 50, 40))
+    known = rng.normal(size=(40, 6)) if covariances else None
+    xyz = rng.normal(size=(40, 3)) + 4e6
+    return MapIndex.build(xyz, NAMES, images, keypoints, points, known)
+
+
+def empty_index() -> MapIndex:
+    none = np.zeros(0, dtype=np.int64)
+    return MapIndex.build(np.zeros((0, 3)), (), none, none, none)
+
+
+@pytest.mark.parametrize(
+    "index", [make_index(), make_index(covariances=True), empty_index()], ids=str
+)
+def test_what_is_written_is_what_is_opened(index: MapIndex, tmp_path: Path) -> None:
+    write_index(index, tmp_path / "index")
+    opened = open_index(tmp_path / "index")
+    assert opened.row_of_image == index.row_of_image
+    for name in ARRAYS:
+        mine, theirs = getattr(opened, name), getattr(index, name)
+        assert (mine.dtype, mine.shape) == (theirs.dtype, theirs.shape)
+        np.testing.assert_array_equal(mine, theirs)
+        assert not mine.flags.writeable
+    if index.covariances is None:
+        assert opened.covariances is None
+    else:
+        assert opened.covariances is not None
+        np.testing.assert_array_equal(opened.covariances, index.covariances)
+
+
+def test_the_arrays_are_mapped_and_not_read(tmp_path: Path) -> None:
+    write_index(make_index(), tmp_path)
+    opened = open_index(tmp_path)
+    for name in ARRAYS:
+        assert isinstance(getattr(opened, name).base, np.memmap)
+
+
+def shared_of(folder: Path) -> Any:
+    return open_index(folder).shared_points(NAMES).tolist()
+
+
+def test_another_process_finds_the_same_and_the_files_go_away() -> None:
+    index = make_index()
+    spawn = multiprocessing.get_context("spawn")
+    with shared_index({"sift": index, "other": empty_index()}) as folders:
+        assert list(folders) == ["sift", "other"]
+        with ProcessPoolExecutor(1, mp_context=spawn) as pool:
+            found = pool.submit(shared_of, folders["sift"]).result()
+        opened = open_index(folders["sift"])
+    assert found == index.shared_points(NAMES).tolist()
+    assert not any(folder.parent.exists() for folder in folders.values())
+    # what is open stays whole
+    assert opened.shared_points(NAMES).tolist() == found
+
+
+def test_the_files_go_away_after_an_error_too() -> None:
+    with pytest.raises(KeyError), shared_index({"sift": make_index()}) as folders:
+        raise KeyError
+    assert not folders["sift"].parent.exists()
+
+
+def damage_nothing_there(folder: Path) -> None:
+    (folder / "point_ids.npy").unlink()
+
+
+def damage_shape(folder: Path) -> None:
+    np.save(folder / "xyz.npy", np.zeros((40, 2)))
+
+
+def damage_type(folder: Path) -> None:
+    np.save(folder / "keypoint_ids.npy", np.zeros(200))
+
+
+def damage_by_cutting(folder: Path) -> None:
+    path = folder / "point_ids.npy"
+    path.write_bytes(path.read_bytes()[:-10])
+
+
+def damage_by_objects(folder: Path) -> None:
+    np.save(folder / "offsets.npy", np.array([object()] * 4), allow_pickle=True)
+
+
+def damage_names(folder: Path) -> None:
+    (folder / "images.json").write_text('["a"]')
+
+
+@pytest.mark.parametrize(
+    ("damage", "file"),
+    [
+        (damage_nothing_there, "point_ids.npy"),
+        (damage_shape, "xyz.npy"),
+        (damage_type, "keypoint_ids.npy"),
+        (damage_by_cutting, "point_ids.npy"),
+        (damage_by_objects, "offsets.npy"),
+        (damage_names, "images.json"),
+    ],
+)
+def test_a_damaged_file_is_named(damage: Any, file: str, tmp_path: Path) -> None:
+    write_index(make_index(), tmp_path)
+    damage(tmp_path)
+    with pytest.raises(DataError, match=file):
+        open_index(tmp_path)
+
+
+def test_a_place_that_cannot_be_written_to_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match="file"):
+        write_index(make_index(), tmp_path / "file" / "index")
+
+
+def test_the_index_is_of_one_keypoints_type(world: Any) -> None:
+    index = index_map(world.map(), "rootsift")
+    observations = world.map().observations()["rootsift"]
+    assert len(index.keypoint_ids) == len(observations.point_ids)
+    rows = observations.image_ids == 2
+    points = index.points_of_keypoints("right/2.png", observations.keypoint_ids[rows])
+    np.testing.assert_array_equal(points, observations.point_ids[rows])
+    assert index.covariances is None
+    with pytest.raises(DataError, match="no observations of type 'other'"):
+        index_map(world.map(), "other")
+
+
+def test_the_covariances_of_the_map_are_taken(world: Any, tmp_path: Path) -> None:
+    folder = KaptureFolder(shutil.copytree(world.map().root, tmp_path / "map"))
+    count = len(folder.points3d())
+    known = np.arange(6.0 * count).reshape(count, 6)
+    write_point_covariances(folder.root, known)
+    index = index_map(folder, "rootsift")
+    np.testing.assert_array_equal(index.covariances, known)
+    write_point_covariances(folder.root, known[1:])
+    with pytest.raises(DataError, match="one row per point"):
+        index_map(folder, "rootsift")
