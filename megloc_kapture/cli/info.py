@@ -7,16 +7,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import tyro
 
 from megloc_kapture.cli.common import Common, existing
 from megloc_kapture.cli.console import Console
+from megloc_kapture.cli.refine_map import report_lines
 from megloc_kapture.cli.stages import FeaturesDirs
 from megloc_kapture.errors import MeglocError
 from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.point_covariances import read_point_covariances
+from megloc_kapture.mapping.uncertainty import point_deviations
 from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
 
 _COLUMN = 18
+_QUANTILES = (0.1, 0.5, 0.9)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,6 +113,23 @@ def describe_content(console: Console, folder: KaptureFolder) -> None:
         line(console, "points", str(points))
         for name, seen in sorted(folder.observations().items()):
             line(console, "observations", f"{name}: {len(seen.point_ids)}")
+        describe_refinement(console, folder)
+
+
+def describe_refinement(console: Console, folder: KaptureFolder) -> None:
+    """Print what the map's refinement removed, and how sure its points are."""
+    for row, text in enumerate(report_lines(folder.root)):
+        line(console, "" if row else "refinement", text)
+    covariances = read_point_covariances(folder.root, len(folder.points3d()))
+    if covariances is None:
+        return
+    largest = point_deviations(covariances)[:, 2]
+    known = largest[np.isfinite(largest)]
+    line(console, "uncertainty", f"known of {len(known)} points")
+    if len(known):
+        at = np.quantile(known, _QUANTILES)
+        text = ", ".join(f"{100 * q:g} %: {d:.3g}" for q, d in zip(_QUANTILES, at, strict=True))
+        line(console, "", f"largest deviation for 1 px in the images, {text}")
 
 
 def describe_descriptors(opened: KaptureMap, extractor: str | None) -> str:

@@ -20,6 +20,7 @@ from megloc_kapture.cli.evaluate import Evaluate
 from megloc_kapture.cli.evaluate_dataset import Eval
 from megloc_kapture.cli.info import Info
 from megloc_kapture.cli.localize import Localize
+from megloc_kapture.cli.refine_map import RefineMap
 from megloc_kapture.cli.stages import (
     ExtractGlobal,
     ExtractLocal,
@@ -54,6 +55,7 @@ COMMANDS: dict[str, type[Any]] = {
     "pairs-query": PairsQuery,
     "match": Match,
     "triangulate": Triangulate,
+    "refine-map": RefineMap,
     "localize": Localize,
     "submit": Submit,
     "check": Check,

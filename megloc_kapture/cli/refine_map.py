@@ -1,0 +1,76 @@
+"""``megloc refine-map``: a map without the points that do it no good."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from megloc_kapture.cli.common import Choosing, Common, Force, Input, Output, Working, existing
+from megloc_kapture.cli.stages import MAP, FeaturesDirs
+from megloc_kapture.io.json_model import read_json_model
+from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.outputs import staged_output
+from megloc_kapture.pipeline.executors import open_executor, single_threaded
+from megloc_kapture.pipeline.presets import DEFAULT_PRESET, options_of_preset
+from megloc_kapture.stages.map_refinement import REPORT_FILE, RefinementReport, refine_map
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefineMap(Choosing, Working, Common):
+    """Take points and observations out of a map that its images, or depth maps, contradict.
+
+    What is rejected is chosen with --set refinement.uncertainty.max_relative_deviation=0.02 and
+    its like; without, by the preset.
+    """
+
+    input: Input
+    """Kapture folder of the map; it stays as it is."""
+    output: Output
+    """Kapture folder of the refined map."""
+    features_dir: FeaturesDirs = ()
+    """Features folder beside the map; may be repeated."""
+    ply: bool = False
+    """Write the kept and the rejected points as PLY files, coloured by uncertainty."""
+    force: Force = False
+    """Write into a folder that has other things in it."""
+
+    def run(self) -> int:
+        """Run it."""
+        console = self.console()
+        changes: dict[str, object] = {"refinement": {"ply": True}} if self.ply else {}
+        options = options_of_preset(
+            self.preset or DEFAULT_PRESET, changes=changes, assignments=self.set
+        ).refinement
+        source = KaptureFolder(self.input, features_dirs=existing(self.features_dir))
+        with (
+            single_threaded(),
+            staged_output(self.output, kind=MAP, force=self.force) as out,
+            open_executor(self.executor, self.workers) as executor,
+        ):
+            refine_map(source, out, options, executor=executor, track=console.track)
+        for row in report_lines(self.output):
+            console.say(row)
+        return 0
+
+
+def report_lines(root: Path) -> list[str]:
+    """What the refinement of a map removed, as a table; empty where it was not refined.
+
+    Raises
+    ------
+    DataError : the report is broken.
+    """
+    path = root / "reconstruction" / REPORT_FILE
+    if not path.is_file():
+        return []
+    report = read_json_model(path, RefinementReport)
+    rows = [
+        ("", "points", "observations"),
+        ("before", str(report.points_before), str(report.observations_before)),
+        *(
+            (removed.name.replace("_", " "), f"-{removed.points}", f"-{removed.observations}")
+            for removed in report.filters
+        ),
+        ("after", str(report.points_after), str(report.observations_after)),
+    ]
+    return [f"{name:22s}{points:>10s}{seen:>14s}" for name, points, seen in rows]

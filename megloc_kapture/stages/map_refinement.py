@@ -1,0 +1,466 @@
+"""Stage: a kapture map without the points that do it no good, and with their uncertainties.
+
+What is wrong is dropped, nothing is moved: points keep their coordinates and colours. What each
+filter removed stands in ``reconstruction/refinement.json`` of the new map, the points' covariances
+in ``reconstruction/point_covariances.npy``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.depth_maps import read_depth_map
+from megloc_kapture.io.json_model import write_json_model
+from megloc_kapture.io.kapture_store import (
+    FeatureReader,
+    KaptureData,
+    KaptureFolder,
+    Observations,
+    write_observations,
+    write_points3d,
+    write_sensors,
+)
+from megloc_kapture.io.links import link_images
+from megloc_kapture.io.ply import write_ply
+from megloc_kapture.io.point_covariances import write_point_covariances
+from megloc_kapture.mapping.depth_verification import (
+    DepthVerificationOptions,
+    contradicted_by_depth,
+)
+from megloc_kapture.mapping.pixel_origin import ObservedImage, find_pixel_origin
+from megloc_kapture.mapping.rejection import (
+    ConsistencyOptions,
+    ObservedPoints,
+    UncertaintyOptions,
+    left_with_too_few,
+    mean_depths,
+    reprojection_errors_px,
+    seen_at_angle,
+    too_uncertain,
+    track_lengths,
+)
+from megloc_kapture.mapping.uncertainty import point_covariances, point_deviations
+from megloc_kapture.stages.lifting import DepthRecord, depth_records
+from megloc_kapture.stages.parallel import FolderSpec, Track, ordered_map, untracked
+from megloc_kapture.stages.triangulation import copy_features
+from megloc_kapture.values import Options
+
+REPORT_FILE = "refinement.json"
+KEPT_FILE, REJECTED_FILE = "refinement_kept.ply", "refinement_rejected.ply"
+
+_SAMPLED_IMAGES = 50
+# from sure to unsure, as viewers show a temperature; and what is not known
+_RAMP = np.array([(49, 54, 149), (116, 173, 209), (255, 255, 191), (244, 109, 67), (165, 0, 38)])
+_UNKNOWN_COLOUR = (128, 128, 128)
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+class MapRefinementOptions(Options):
+    """What is taken out of a map; figures behind the defaults stand in docs/choices.md."""
+
+    depth: DepthVerificationOptions = DepthVerificationOptions()
+    consistency: ConsistencyOptions = ConsistencyOptions()
+    uncertainty: UncertaintyOptions = UncertaintyOptions()
+    min_observations: int = Field(
+        default=2, ge=1, description="a point that lost some goes when it has fewer left"
+    )
+    ply: bool = Field(
+        default=False, description="write the kept and the rejected points as PLY files"
+    )
+
+
+class FilterReport(BaseModel):
+    """What one filter removed; ``checked`` is what it could judge, of observations or points."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str
+    checked: int
+    points: int
+    observations: int
+
+
+class RefinementReport(BaseModel):
+    """``reconstruction/refinement.json``: a map's points and observations before and after."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    points_before: int
+    observations_before: int
+    points_after: int
+    observations_after: int
+    filters: tuple[FilterReport, ...]
+    options: MapRefinementOptions
+
+
+@dataclass(frozen=True)
+class _DepthJob:
+    folder: FolderSpec
+    depth: DepthRecord
+    points_in_image: Floats
+    deviations: Floats
+    options: DepthVerificationOptions
+
+
+def refine_map(
+    source: KaptureFolder,
+    output: Path,
+    options: MapRefinementOptions | None = None,
+    *,
+    link_features: bool = False,
+    executor: Executor | None = None,
+    track: Track = untracked,
+) -> dict[str, float]:
+    """Write a map without the points and observations that the options reject.
+
+    Points of any keypoints type, renumbered without gaps, and of several at once. Observations by
+    images without a pose cannot be judged; they stay as long as their point does.
+
+    Parameters
+    ----------
+    link_features : the features in the source's own folder may become hard links (they are a map
+        of ours, not somebody's data); those beside it always do.
+
+    Returns
+    -------
+    Counts for the log: points and observations after, and what each filter removed.
+
+    Raises
+    ------
+    DataError : no points, or something broken; names the file.
+    """
+    options = options or MapRefinementOptions()
+    if not source.has_points():
+        raise DataError(
+            "no map to refine: reconstruction/points3d.txt or observations.txt is missing",
+            path=source.root,
+        )
+    selection = _Selection(source, options.min_observations)
+    before = selection.covariances() if options.ply else None
+    _verify_depth(selection, options.depth, executor, track)
+    _check_consistency(selection, options.consistency)
+    _reject_uncertain(selection, options.uncertainty)
+    report = selection.report(options)
+
+    write_sensors(output, selection.data)
+    link_images(source.root, output)
+    for type_name in sorted({*source.types("keypoints"), *source.types("descriptors")}):
+        copy_features(source, output, type_name, link_own=link_features)
+    kept = selection.kept_points
+    write_points3d(output, source.points3d()[kept])
+    write_observations(output, selection.observations())
+    covariances = selection.covariances()
+    write_point_covariances(output, covariances[kept])
+    write_json_model(output / "reconstruction" / REPORT_FILE, report)
+    if before is not None:
+        deviations = point_deviations(np.where(kept[:, None], covariances, before))[:, 2]
+        _write_pictures(output / "reconstruction", source.points3d(), deviations, kept)
+    counts: dict[str, float] = {
+        "points": report.points_after,
+        "observations": report.observations_after,
+    }
+    for removed in report.filters:
+        counts[f"points_removed_by_{removed.name}"] = removed.points
+        counts[f"observations_removed_by_{removed.name}"] = removed.observations
+    return counts
+
+
+class _Selection:
+    """A map's points and observations, and which of them are still in."""
+
+    def __init__(self, source: KaptureFolder, min_observations: int) -> None:
+        self.source = source
+        self.data: KaptureData = source.read()
+        self.xyz = np.ascontiguousarray(source.points3d()[:, :3])
+        self._of_type = source.observations()
+        self._min_observations = min_observations
+        types = list(self._of_type.values())
+        self.images = sorted({image for seen in types for image in seen.image_names})
+        poses = self.data.poses()
+        posed = np.array([image in poses for image in self.images], dtype=bool)
+        # images without a pose have one in the list, that no observation refers to
+        self._poses = [poses.get(image) for image in self.images]
+        row_of = {image: row for row, image in enumerate(self.images)}
+        rows = [
+            np.array([row_of[i] for i in seen.image_names], dtype=np.int32)[seen.image_ids]
+            for seen in types
+        ]
+        self._sizes = [len(seen) for seen in types]
+        point_ids = _joined([seen.point_ids for seen in types], np.int64)
+        image_ids = _joined(rows, np.int32)
+        # of several types, sorted by point as those of one are
+        self._order = None if len(types) == 1 else np.argsort(point_ids, kind="stable")
+        self.point_ids, self.image_ids = self._sorted(point_ids), self._sorted(image_ids)
+        self.kept_points = np.ones(len(self.xyz), dtype=bool)
+        self.kept = np.ones(len(self.point_ids), dtype=bool)
+        self._placed = posed[self.image_ids] if len(posed) else self.kept.copy()
+        self._reports: list[FilterReport] = []
+        self._covariances: Floats | None = None
+
+    def _sorted(self, values: NDArray[Any]) -> NDArray[Any]:
+        return values if self._order is None else values[self._order]
+
+    @cached_property
+    def _views(self) -> tuple[list[Any], list[Any]]:
+        posed = next((row for row, pose in enumerate(self._poses) if pose is not None), None)
+        if posed is None:
+            return [], []
+        stand_in = self.data.camera_of(self.images[posed]), self._poses[posed]
+        views = [
+            stand_in if pose is None else (self.data.camera_of(image), pose)
+            for image, pose in zip(self.images, self._poses, strict=True)
+        ]
+        cameras, poses = zip(*views, strict=True)
+        return list(cameras), list(poses)
+
+    def observed(self) -> tuple[ObservedPoints, NDArray[np.int64]]:
+        """What is in and can be judged, and the rows of these observations."""
+        rows = np.flatnonzero(self.kept & self._placed)
+        point_ids, image_ids = self.point_ids, self.image_ids
+        if len(rows) < len(point_ids):
+            point_ids, image_ids = point_ids[rows], image_ids[rows]
+        cameras, poses = self._views
+        return ObservedPoints(self.xyz, point_ids, image_ids, cameras, poses), rows
+
+    def covariances(self) -> Floats:
+        """Covariances (N, 6) from the observations that are in; NaN where not determined."""
+        if self._covariances is None:
+            observed, _ = self.observed()
+            self._covariances = point_covariances(
+                observed.xyz,
+                observed.point_ids,
+                observed.image_ids,
+                observed.cameras,
+                observed.cams_from_world,
+            )
+        return self._covariances
+
+    def drop_observations(self, name: str, dropped: Mask, checked: int) -> None:
+        """Take observations (O,) out, and the points that are left with too few."""
+        dropped = dropped & self.kept
+        ids = self.point_ids[self.kept]
+        gone = left_with_too_few(ids, dropped[self.kept], len(self.xyz), self._min_observations)
+        self._take_out(name, dropped, gone, checked)
+
+    def drop_points(self, name: str, dropped: Mask, checked: int) -> None:
+        """Take points (N,) out, with their observations."""
+        self._take_out(name, np.zeros(len(self.kept), dtype=bool), dropped, checked)
+
+    def _take_out(self, name: str, observations: Mask, points: Mask, checked: int) -> None:
+        gone = self.kept & (observations | points[self.point_ids])
+        self._reports.append(
+            FilterReport(
+                name=name,
+                checked=checked,
+                points=int((points & self.kept_points).sum()),
+                observations=int(gone.sum()),
+            )
+        )
+        if self._covariances is not None and (gone & ~points[self.point_ids]).any():
+            self._covariances = None  # a point that loses some but not all is less sure
+        self.kept &= ~gone
+        self.kept_points &= ~points
+
+    def report(self, options: MapRefinementOptions) -> RefinementReport:
+        """Before, after, and what each filter removed."""
+        return RefinementReport(
+            points_before=len(self.xyz),
+            observations_before=len(self.kept),
+            points_after=int(self.kept_points.sum()),
+            observations_after=int(self.kept.sum()),
+            filters=tuple(self._reports),
+            options=options,
+        )
+
+    def keypoints_px(self) -> NDArray[np.float32]:
+        """Keypoint (O, 2) of every observation, as the cameras have the pixel origin.
+
+        NaN where an image has no pose or no keypoints of the type.
+        """
+        found = []
+        cameras, poses = self._views
+        row_of = {image: row for row, image in enumerate(self.images)}
+        for name, seen in self._of_type.items():
+            rows = [row_of[image] for image in seen.image_names]
+            in_type = ObservedPoints(
+                self.xyz,
+                seen.point_ids,
+                seen.image_ids,
+                [cameras[row] for row in rows] if cameras else [],
+                [poses[row] for row in rows] if poses else [],
+            )
+            posed = [self._poses[row] is not None for row in rows]
+            reader = self.source.keypoints(name) if name in self.source.types("keypoints") else None
+            found.append(_keypoints_of(reader, seen, in_type, posed))
+        return self._sorted(_joined(found, np.float32).reshape(-1, 2))
+
+    def observations(self) -> dict[str, Observations]:
+        """What is in, by type, points renumbered."""
+        kept = self.kept
+        if self._order is not None:
+            kept = np.empty_like(self.kept)
+            kept[self._order] = self.kept
+        number = np.cumsum(self.kept_points) - 1
+        parts = np.split(kept, np.cumsum(self._sizes)[:-1]) if self._sizes else []
+        return {
+            name: replace(
+                seen,
+                point_ids=number[seen.point_ids[part]],
+                image_ids=seen.image_ids[part],
+                keypoint_ids=seen.keypoint_ids[part],
+            )
+            for (name, seen), part in zip(self._of_type.items(), parts, strict=True)
+            if part.any()
+        }
+
+
+def _joined(parts: Sequence[NDArray[Any]], dtype: type) -> NDArray[Any]:
+    return np.concatenate([np.zeros(0, dtype), *(part.ravel() for part in parts)], dtype=dtype)
+
+
+def _keypoints_of(
+    reader: FeatureReader | None,
+    seen: Observations,
+    observed: ObservedPoints,
+    posed: Sequence[bool],
+) -> NDArray[np.float32]:
+    """Keypoints (O, 2) of one type's observations; see :meth:`_Selection.keypoints_px`."""
+    keypoints = np.full((len(seen), 2), np.nan, dtype=np.float32)
+    if reader is None or not observed.cameras:
+        return keypoints
+    usable = [i for i, image in enumerate(seen.image_names) if posed[i] and image in reader]
+    sampled = set(usable[:: max(1, len(usable) // _SAMPLED_IMAGES)])
+    sample = []
+    for image, rows in observed.by_image():
+        if not posed[image] or seen.image_names[image] not in reader:
+            continue
+        keypoints[rows] = reader.read(seen.image_names[image])[seen.keypoint_ids[rows], :2]
+        if image in sampled:
+            sample.append(
+                ObservedImage(
+                    observed.cameras[image],
+                    observed.cams_from_world[image],
+                    keypoints[rows],
+                    observed.xyz[seen.point_ids[rows]],
+                )
+            )
+    origin = find_pixel_origin(sample, cameras=[observed.cameras[image] for image in usable])
+    return keypoints + np.float32(origin.keypoints_shift_px - origin.intrinsics_shift_px)
+
+
+def _verify_depth(
+    selection: _Selection,
+    options: DepthVerificationOptions,
+    executor: Executor | None,
+    track: Track,
+) -> None:
+    records = depth_records(selection.data) if options.max_sigmas is not None else {}
+    folder = selection.source
+    with_depth = {
+        row: records[image]
+        for row, image in enumerate(selection.images)
+        if image in records and folder.depth_path(records[image].path).is_file()
+    }
+    if not with_depth:
+        return
+    covariances = selection.covariances()
+    observed, placed = selection.observed()
+    spec = FolderSpec(folder.root)
+    rows_of = [(image, rows) for image, rows in observed.by_image() if image in with_depth]
+
+    def job(image: int, rows: NDArray[np.int64]) -> _DepthJob:
+        points, depth = observed.point_ids[rows], with_depth[image]
+        pose = observed.cams_from_world[image]
+        axis = (depth.image_from_depth.inverse() @ pose).rotation_matrix()[2]
+        variances = _quadratic_form(covariances[points], axis)
+        return _DepthJob(spec, depth, pose.apply(observed.xyz[points]), np.sqrt(variances), options)
+
+    dropped = np.zeros(len(selection.kept), dtype=bool)
+    num_checked = 0
+    jobs = (job(image, rows) for image, rows in rows_of)
+    results = track(ordered_map(_compare, jobs, executor), len(rows_of), "depth")
+    for (_, rows), (contradicted, checked) in zip(rows_of, results, strict=True):
+        dropped[placed[rows[contradicted]]] = True
+        num_checked += checked
+    selection.drop_observations("depth", dropped, num_checked)
+
+
+def _quadratic_form(covariances: Floats, axis: Floats) -> Floats:
+    """Variances (N,) along an axis (3,) of covariances (N, 6); never negative, NaN stays."""
+    x, y, z = axis
+    weights = np.array([x * x, 2 * x * y, 2 * x * z, y * y, 2 * y * z, z * z])
+    return np.maximum(covariances @ weights, 0.0)
+
+
+def _compare(job: _DepthJob) -> tuple[Mask, int]:
+    camera = job.depth.camera
+    depth_m = read_depth_map(
+        job.folder.open().depth_path(job.depth.path), width=camera.width, height=camera.height
+    )
+    contradicted, checked = contradicted_by_depth(
+        job.points_in_image,
+        depth_m,
+        camera,
+        job.depth.image_from_depth,
+        job.options,
+        deviations=job.deviations,
+    )
+    return contradicted, int(checked.sum())
+
+
+def _check_consistency(selection: _Selection, options: ConsistencyOptions) -> None:
+    if options.max_reprojection_error_px is not None:
+        keypoints = selection.keypoints_px()
+        observed, rows = selection.observed()
+        known = np.isfinite(keypoints[rows]).all(axis=1)
+        errors = reprojection_errors_px(observed, keypoints[rows])
+        dropped = np.zeros(len(selection.kept), dtype=bool)
+        dropped[rows[known & (errors > options.max_reprojection_error_px)]] = True
+        selection.drop_observations("reprojection_error", dropped, int(known.sum()))
+    if options.min_angle_deg is not None:
+        observed, _ = selection.observed()
+        several = track_lengths(observed) > 1
+        narrow = several & ~seen_at_angle(observed, options.min_angle_deg)
+        selection.drop_points("triangulation_angle", narrow, int(several.sum()))
+    if options.min_track_length is not None:
+        lengths = np.bincount(selection.point_ids[selection.kept], minlength=len(selection.xyz))
+        inside = selection.kept_points
+        short = inside & (lengths < options.min_track_length)
+        selection.drop_points("track_length", short, int(inside.sum()))
+
+
+def _reject_uncertain(selection: _Selection, options: UncertaintyOptions) -> None:
+    if not options.needs_deviations():
+        return
+    deviations = point_deviations(selection.covariances())[:, 2]
+    # who is out already has no share in a quantile of the map
+    deviations = np.where(selection.kept_points, deviations, np.nan)
+    rejected = too_uncertain(deviations, mean_depths(selection.observed()[0]), options)
+    selection.drop_points("uncertainty", rejected, int(np.isfinite(deviations).sum()))
+
+
+def _write_pictures(folder: Path, points: Floats, deviations: Floats, kept: Mask) -> None:
+    """Kept and rejected points, coloured by their deviation on a logarithmic scale."""
+    known = np.isfinite(deviations) & (deviations > 0)
+    colours = np.empty((len(points), 3), dtype=np.uint8)
+    colours[:] = _UNKNOWN_COLOUR
+    if known.any():
+        logarithms = np.log(deviations[known])
+        low, high = np.quantile(logarithms, [0.05, 0.95])
+        place = np.clip((logarithms - low) / max(high - low, 1e-12), 0, 1) * (len(_RAMP) - 1)
+        steps = np.arange(len(_RAMP))
+        colours[known] = np.stack([np.interp(place, steps, c) for c in _RAMP.T], axis=1)
+    for name, chosen in ((KEPT_FILE, kept), (REJECTED_FILE, ~kept)):
+        write_ply(folder / name, points[chosen, :3], colours[chosen], deviation=deviations[chosen])
