@@ -176,11 +176,14 @@ class Aachen:
                 f"{left_out} night queries of v1.1 ({ADDITIONAL_NIGHT}) are left out of v1.0."
             )
         if self.options.reference_model and _descriptors(layout, version) is None:
-            remarks.append(
-                "The reference model comes without descriptors: those of v1.0 are in "
-                f"{layout.feature_database.name}, which is not there."
+            where = (
+                f"those of v1.0 are in {layout.feature_database.name}, which is not there"
                 if version == "1.0"
-                else "The reference model comes without descriptors: v1.1 publishes none."
+                else "v1.1 publishes none"
+            )
+            remarks.append(
+                f"The reference model comes without descriptors: {where}. "
+                "With map = given they are extracted again from the images."
             )
         return remarks
 

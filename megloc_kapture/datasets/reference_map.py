@@ -44,7 +44,8 @@ def write_reference_map(
     record are left out, with their observations. Without a database the keypoints of an image are
     those that see points, in the order of their ids in the model, numbered anew without gaps; of
     two places for one feature the first counts. With one they are all keypoints of the database,
-    under its numbers, beside their descriptors. An image that sees a point twice with the same
+    under its numbers, beside their descriptors, and an image that has none there has empty ones,
+    as if they had been extracted. An image that sees a point twice with the same
     feature does so once.
 
     Parameters
@@ -99,6 +100,8 @@ def write_reference_map(
 class _SeenFeatures:
     """The features that see points, numbered without gaps."""
 
+    complete = False
+
     def __init__(self, points: SparsePoints) -> None:
         self._points = points
         self.num_keypoints = 0
@@ -117,6 +120,8 @@ class _SeenFeatures:
 class _DatabaseFeatures:
     """All features of a database, under its numbers; writes the descriptors on the way."""
 
+    complete = True
+
     def __init__(
         self, points: SparsePoints, database: ColmapDatabase, output: Path, keypoints_type: str
     ) -> None:
@@ -128,6 +133,7 @@ class _DatabaseFeatures:
         for name in database.images:
             self._by_stem.setdefault(_without_suffix(name), []).append(name)
         self._writer: FeatureWriter | None = None
+        self._without: list[str] = []
         self.num_keypoints = 0
 
     def of_image(
@@ -143,6 +149,7 @@ class _DatabaseFeatures:
         if name_there is None:
             if len(rows):
                 raise DataError(f"has no image {name!r}", path=self._database.path)
+            self._without.append(name)
             return np.empty((0, 2), np.float32), np.empty(0, np.int64)
         keypoints = self._database.keypoints(name_there)
         numbers = self._points.feature_ids[rows].astype(np.int64)
@@ -150,12 +157,16 @@ class _DatabaseFeatures:
         descriptors = self._database.descriptors(name_there)
         if descriptors is not None:
             self._write_descriptors(name, name_there, descriptors, len(keypoints))
+        elif len(keypoints) == 0:
+            self._without.append(name)
         self.num_keypoints += len(keypoints)
         return keypoints, numbers
 
     def close(self) -> None:
-        """Close what was opened to write descriptors."""
+        """Write empty descriptors where there are no keypoints, and close what was opened."""
         if self._writer is not None:
+            for name in self._without:
+                self._writer.write(name, np.empty((0, self._writer.config.dsize), np.uint8))
             self._writer.close()
 
     def _name_there(self, name: str) -> str | None:
@@ -234,7 +245,7 @@ def _write_features(
         # ascending, as the order among equals is kept
         rows = order[ends[position] : ends[position + 1]]
         keypoints, numbers_of_image = features.of_image(name, rows)
-        if len(keypoints):
+        if len(keypoints) or features.complete:
             writer.write(name, keypoints)
         numbers[rows] = numbers_of_image
         kept[rows] = _first_time(points.point_ids[rows], numbers_of_image)

@@ -121,12 +121,23 @@ class RobotCar:
             names=pose_file_names(selection),
             protocol=protocol(self.name, version),
             summary=summary(selection),
-            remarks=remarks(selection),
+            remarks=remarks(selection) + self._about_reference(layout),
             missing=missing,
             write_more=partial(_write_reference, selection, mapping, links)
             if self.options.reference_model
             else None,
         )
+
+    def _about_reference(self, layout: Layout) -> list[str]:
+        """What a user should know about the reference model."""
+        database = layout.feature_database
+        if not self.options.reference_model or database.is_file():
+            return []
+        return [
+            "The reference model comes without descriptors: they are in "
+            f"{database.relative_to(layout.root)}, which is not there. With map = given they are "
+            "extracted again from the images."
+        ]
 
     def _version(self, layout: Layout) -> int:
         version = self.options.version

@@ -6,15 +6,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.plugins import LocalFeatureExtractor
+from megloc_kapture.stages.found_again import rows_found_again
 from megloc_kapture.stages.local_features import checked_features, read_image_of, read_mask
 
-# a keypoint that is found again is found at the same place but for rounding
-_SAME_PLACE_PX = 0.1
 _MIN_FOUND_AGAIN = 0.5
 
 
@@ -57,27 +55,3 @@ def extract_again(
             path=kapture_map.folder.root,
         )
     return found
-
-
-def rows_found_again(
-    stored: NDArray[np.float32], extracted: NDArray[np.float32]
-) -> NDArray[np.int64]:
-    """Row of ``extracted`` (M, 2) for each row of ``stored`` (N, 2), -1 where there is none.
-
-    Several keypoints may stand at one place with different orientations; they are joined in the
-    order both have them.
-    """
-    if len(stored) == len(extracted) and np.allclose(stored, extracted, atol=1e-3):
-        return np.arange(len(stored), dtype=np.int64)
-    rows = np.full(len(stored), -1, dtype=np.int64)
-    if len(extracted) == 0:
-        return rows
-    near = cKDTree(extracted).query_ball_point(stored, _SAME_PLACE_PX, return_sorted=True)
-    used: set[int] = set()
-    for row, candidates in enumerate(near):
-        for candidate in candidates:
-            if candidate not in used:
-                used.add(candidate)
-                rows[row] = candidate
-                break
-    return rows

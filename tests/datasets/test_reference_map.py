@@ -222,9 +222,12 @@ def test_a_database_gives_all_features_under_its_numbers(tmp_path: Path) -> None
         assert np.array_equal(folder.descriptors("sift").read(f"db/{name}.jpg"), descriptors)
     config = folder.descriptors("sift").config
     assert (config.keypoints_type, config.metric_type) == ("sift", "L2")
-    assert folder.keypoints("sift").names == ["db/a.jpg", "db/b.jpg"]
+    # all images have features, if none: so they can be matched
+    assert folder.keypoints("sift").names == ["db/a.jpg", "db/b.jpg", "db/d.jpg"]
+    assert folder.keypoints("sift").read("db/d.jpg").shape == (0, 2)
+    assert folder.descriptors("sift").read("db/d.jpg").shape == (0, 128)
     read = kapture.io.csv.kapture_from_dir(str(output))
-    assert read.descriptors["sift"] == {"db/a.jpg", "db/b.jpg"}
+    assert read.descriptors["sift"] == {"db/a.jpg", "db/b.jpg", "db/d.jpg"}
     assert read.observations[0, "sift"] == [("db/b.jpg", 900), ("db/a.jpg", 7), ("db/b.jpg", 4)]
 
 
@@ -252,5 +255,7 @@ def test_the_exact_name_comes_before_another_suffix(tmp_path: Path) -> None:
     names = {"db/a.jpg": 10, "db/a.png": 10, "db/b.jpg": 901}
     written = write_database(tmp_path / "d.db", names)
     write_reference_map(tmp_path, data(), {}, NAMES, points(), database=tmp_path / "d.db")
+    # an image that the database does not have
+    assert KaptureFolder(tmp_path).descriptors("sift").read("db/d.jpg").shape == (0, 128)
     found = KaptureFolder(tmp_path).keypoints("sift").read("db/a.jpg")
     assert np.array_equal(found, written["db/a.jpg"][0][:, :2])

@@ -346,6 +346,10 @@ def test_every_file_that_counts_is_an_input(root: Path) -> None:
     assert {str(path.relative_to(root)) for path in RobotCar().input_files(root)} == found
     adapter = RobotCar(RobotCarOptions(reference_model=True))
     assert root / "3D-models/overcast-reference.db" in set(adapter.input_files(root))
+    assert not any("descriptors" in remark for remark in adapter.read(root).remarks)
+    (root / "3D-models/overcast-reference.db").unlink()
+    assert any("overcast-reference.db, which is not" in r for r in adapter.read(root).remarks)
+    assert not any("descriptors" in remark for remark in RobotCar().read(root).remarks)
 
 
 def test_what_is_not_robotcar_is_refused_quickly(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Descriptors of a map that came without: joined to its keypoints by place and order."""
+"""Descriptors of a map that came without are extracted again."""
 
 from __future__ import annotations
 
@@ -12,31 +12,7 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
 from megloc_kapture.io.images import write_image
 from megloc_kapture.pipeline.kapture_map import KaptureMap
-from megloc_kapture.pipeline.map_descriptors import extract_again, rows_found_again
-
-
-def points(*xy: tuple[float, float]) -> np.ndarray:
-    return np.array(xy, dtype=np.float32).reshape(-1, 2)
-
-
-def test_rows_are_found_by_place() -> None:
-    stored = points((1, 1), (5, 5), (9, 9))
-    extracted = points((9, 9.01), (1, 1), (7, 7), (20, 20))
-    assert rows_found_again(stored, extracted).tolist() == [1, -1, 0]
-    assert rows_found_again(stored, stored).tolist() == [0, 1, 2]
-
-
-def test_keypoints_at_one_place_are_joined_in_order() -> None:
-    stored = points((1, 1), (1, 1), (2, 2), (1, 1))
-    extracted = points((2, 2), (1, 1), (3, 3), (1, 1))
-    assert rows_found_again(stored, extracted).tolist() == [1, 3, 0, -1]
-
-
-def test_nothing_to_find() -> None:
-    empty = points()
-    assert rows_found_again(points((1, 1)), empty).tolist() == [-1]
-    assert rows_found_again(empty, points((1, 1))).shape == (0,)
-    assert rows_found_again(empty, empty).dtype == np.int64
+from megloc_kapture.pipeline.map_descriptors import extract_again
 
 
 @pytest.fixture

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
-from functools import partial
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from megloc_kapture.datasets.aachen_layout import Layout
 from megloc_kapture.datasets.grammars.colmap_model import (
     ColmapImage,
     ColmapModel,
@@ -25,13 +25,11 @@ from megloc_kapture.datasets.synthetic.aachen_shots import (
     build_aachen_shots,
     official,
 )
+from megloc_kapture.datasets.synthetic.map_shots import MapShots, draw_map_and_queries
 from megloc_kapture.datasets.synthetic.options import stream
 from megloc_kapture.datasets.synthetic.shots import Shot
-from megloc_kapture.datasets.synthetic.studio import draw_shots
-from megloc_kapture.datasets.synthetic.tracks import exact_tracks
-from megloc_kapture.datasets.synthetic.views import View
+from megloc_kapture.datasets.synthetic.sift_points import write_sift_database
 from megloc_kapture.io.atomic import write_bytes
-from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture_store import KaptureData, Sensor, write_sensors
 from megloc_kapture.stages.parallel import Track, untracked
 
@@ -56,8 +54,9 @@ def write_aachen_twin(
     also ``aachen_v_1_1/`` with a binary COLMAP model), ``queries/`` and ``ground_truth/``. Quirks
     of the original: database images are numbered without order and the NVM has an order of its
     own, features of the NVM are not numbered densely, v1.1's night list stands in the place of
-    v1.0's, lists end without a line end, and some images below ``query/`` are in no list. The
-    bytes depend on the options only, not on the executor.
+    v1.0's, lists end without a line end, and some images below ``query/`` are in no list. With
+    ``model_features`` also ``aachen.db``, the features of v1.0's model; none of v1.1's are
+    published. The bytes depend on the options only, not on the executor.
 
     Parameters
     ----------
@@ -71,19 +70,22 @@ def write_aachen_twin(
     root = Path(root)
     options = options or AachenTwinOptions()
     shots = build_aachen_shots(options)
-    drawn = draw_shots(
+    drawn = draw_map_and_queries(
         options.world(),
-        [*shots.mapping(), *shots.queries(), *shots.unlisted],
-        partial(_write_image, root / _IMAGES, options.jpeg_quality),
-        with_depth=[shot.name for shot in shots.mapping()],
+        shots.mapping(),
+        [*shots.queries(), *shots.unlisted],
+        root / _IMAGES,
+        model_features=options.model_features,
         executor=executor,
         track=track,
     )
-    depths = {name: depth for name, depth in drawn.items() if depth is not None}
-    _write_nvm_model(root / _MODELS, options, official(shots.database), depths)
+    _write_nvm_model(root / _MODELS, options, official(shots.database), drawn)
+    if options.model_features:
+        database = {shot.name: shot for shot in sorted(shots.database, key=attrgetter("name"))}
+        write_sift_database(Layout(root).feature_database, database, drawn.features)
     if options.version == "1.1":
         _write_colmap_model(
-            root / _MODELS / "aachen_v_1_1", options, official(shots.mapping()), depths
+            root / _MODELS / "aachen_v_1_1", options, official(shots.mapping()), drawn
         )
     _write_lists(root / "queries", shots)
     for role, some in (("mapping", shots.mapping()), ("query", shots.queries())):
@@ -95,22 +97,18 @@ def write_aachen_twin(
     }
 
 
-def _write_image(
-    images: Path, jpeg_quality: int, shot: Shot, view: View
-) -> NDArray[np.float32] | None:
-    write_image(images / shot.name, view.image, jpeg_quality=jpeg_quality)
-    return view.depth_m
-
-
 def _write_nvm_model(
     folder: Path,
     options: AachenTwinOptions,
     shots: Sequence[Shot],
-    depths_m: dict[str, NDArray[np.float32]],
+    drawn: MapShots,
 ) -> None:
     """v1.0's model, which knows only focal lengths, and the list that has the whole cameras."""
     rng = stream(options.seed, "aachen", "points", "1.0")
-    points = exact_tracks(shots, depths_m, points_per_shot=options.points_per_image, rng=rng)
+    points = drawn.points(shots, points_per_shot=options.points_per_image, rng=rng)
+    if not drawn.features:
+        # as if the images had more features than see a point
+        points = replace(points, feature_ids=3 * points.feature_ids + 1)
     cameras = {shot.name: shot.camera for shot in shots}
     model = NvmModel(
         names=tuple(cameras),
@@ -118,8 +116,7 @@ def _write_nvm_model(
         quat_wxyz=np.array([shot.cam_from_world.quat_wxyz for shot in shots]),
         centers=np.array([shot.cam_from_world.center() for shot in shots]),
         k_colmap=np.array([camera.params[3] for camera in cameras.values()]),
-        # as if the images had more features than see a point
-        points=replace(points, feature_ids=3 * points.feature_ids + 1),
+        points=points,
     )
     write_nvm(folder / "aachen_cvpr2018_db.nvm", model)
     _write_names(folder / "aachen_cvpr2018_db.list.txt", model.names)
@@ -130,7 +127,7 @@ def _write_colmap_model(
     folder: Path,
     options: AachenTwinOptions,
     shots: Sequence[Shot],
-    depths_m: dict[str, NDArray[np.float32]],
+    drawn: MapShots,
 ) -> None:
     """v1.1's model: image and camera ids have no order, and a sequence shares its camera."""
     rng = stream(options.seed, "aachen", "points", "1.1")
@@ -144,7 +141,7 @@ def _write_colmap_model(
             ColmapImage(image_id, shot.name, camera_ids[shot.sensor_id], shot.cam_from_world)
             for image_id, shot in zip(image_ids, shots, strict=False)
         ),
-        points=exact_tracks(shots, depths_m, points_per_shot=options.points_per_image, rng=rng),
+        points=drawn.points(shots, points_per_shot=options.points_per_image, rng=rng),
     )
     write_colmap_binary(folder, model)
 

@@ -87,6 +87,10 @@ class RobotCarTwinOptions(Options):
         default=1.0, gt=0, description="light that reaches the sensor at night, relative"
     )
     jpeg_quality: int = Field(default=92, ge=1, le=100, description="quality of JPEG images")
+    model_features: bool = Field(
+        default=False,
+        description="sparse models of SIFT of the images, not of exact points, with their database",
+    )
 
     def world(self) -> SyntheticWorldOptions:
         """The rendered world the car drives through."""

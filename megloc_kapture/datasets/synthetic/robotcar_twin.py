@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
-from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -21,6 +20,7 @@ from megloc_kapture.datasets.grammars.sparse_points import SparsePoints
 from megloc_kapture.datasets.official import GROUND_TRUTH
 from megloc_kapture.datasets.robotcar_kapture import RIG_ID
 from megloc_kapture.datasets.robotcar_layout import Layout
+from megloc_kapture.datasets.synthetic.map_shots import MapShots, draw_map_and_queries
 from megloc_kapture.datasets.synthetic.options import stream
 from megloc_kapture.datasets.synthetic.robotcar_shots import (
     CAMERAS,
@@ -34,11 +34,8 @@ from megloc_kapture.datasets.synthetic.robotcar_shots import (
     official,
 )
 from megloc_kapture.datasets.synthetic.shots import Shot
-from megloc_kapture.datasets.synthetic.studio import draw_shots
-from megloc_kapture.datasets.synthetic.tracks import exact_tracks
-from megloc_kapture.datasets.synthetic.views import View
+from megloc_kapture.datasets.synthetic.sift_points import write_sift_database
 from megloc_kapture.io.atomic import write_bytes
-from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture_store import KaptureData, Sensor, write_sensors
 from megloc_kapture.stages.parallel import Track, untracked
 from megloc_kapture.values import Camera, RigidTransform
@@ -50,7 +47,6 @@ ROBOTCAR_TWIN_VERSION = 1
 # moments of these traversals, the last of each, are in neither list of version 2
 _UNLISTED_CONDITIONS = ("rain", "night-rain")
 
-Depths = Mapping[str, NDArray[np.float32]]
 Item = TypeVar("Item")
 
 
@@ -68,6 +64,7 @@ def write_robotcar_twin(
     the models say ``.png`` where the images are ``.jpg``, the NVM puts ``./`` before them, the
     test list leaves out the conditions, some reference images are in no model and some queries
     in neither list of version 2; and lists end in a blank line, with CRLF or without a line end.
+    With ``model_features`` also ``3D-models/overcast-reference.db``, the features of the models.
     The bytes depend on the options only, not on the executor.
 
     Parameters
@@ -83,17 +80,20 @@ def write_robotcar_twin(
     options = options or RobotCarTwinOptions()
     moments = build_robotcar_moments(options)
     mapping = moments.mapping_shots()
-    drawn = draw_shots(
+    drawn = draw_map_and_queries(
         options.world(),
-        [*mapping, *moments.query_shots()],
-        partial(_write_image, layout.images, options.jpeg_quality),
-        with_depth=[shot.name for shot in mapping],
+        mapping,
+        moments.query_shots(),
+        layout.images,
+        model_features=options.model_features,
         executor=executor,
         track=track,
     )
-    depths = {name: depth for name, depth in drawn.items() if depth is not None}
     registered = official(_registered(moments))
-    _write_models(layout, options, registered, depths)
+    _write_models(layout, options, registered, drawn)
+    if options.model_features:
+        named = {_png(shot.name): shot for shot in mapping}
+        write_sift_database(layout.feature_database, dict(sorted(named.items())), drawn.features)
     _write_car(layout, options)
     _write_query_lists(layout, moments)
     _write_version_2(layout, options, moments)
@@ -111,13 +111,6 @@ def location_name(place: int) -> str:
     return f"{place + 1:03d}"
 
 
-def _write_image(
-    images: Path, jpeg_quality: int, shot: Shot, view: View
-) -> NDArray[np.float32] | None:
-    write_image(images / shot.name, view.image, jpeg_quality=jpeg_quality)
-    return view.depth_m
-
-
 def _registered(moments: RobotCarMoments) -> list[Shot]:
     """The reference images that the models have: of each location one is left out."""
     last = {moment.place: moment.timestamp for moment in moments.reference}
@@ -129,7 +122,7 @@ def _registered(moments: RobotCarMoments) -> list[Shot]:
 
 
 def _write_models(
-    layout: Layout, options: RobotCarTwinOptions, shots: Sequence[Shot], depths_m: Depths
+    layout: Layout, options: RobotCarTwinOptions, shots: Sequence[Shot], drawn: MapShots
 ) -> None:
     """One model per location, and all of them in one, in the same world."""
     places = np.array([shot.place for shot in shots])
@@ -138,7 +131,7 @@ def _write_models(
         positions = np.flatnonzero(places == place).tolist()
         here = [shots[position] for position in positions]
         rng = stream(options.seed, "robotcar", "points", place)
-        points = exact_tracks(here, depths_m, points_per_shot=options.points_per_image, rng=rng)
+        points = drawn.points(here, points_per_shot=options.points_per_image, rng=rng)
         folder = layout.individual_model(location_name(place))
         write_colmap_text(folder, _colmap_model(here, points))
         parts.append((points, positions))

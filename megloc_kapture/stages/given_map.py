@@ -1,0 +1,266 @@
+"""Stage: the map a dataset comes with as the map to localize in, alone or beside one of our own.
+
+A published model names the keypoints that see its points; to match queries with them they need
+descriptors. Where these are published (a COLMAP database) they are taken as they are. Where not,
+the images' features are extracted again, and the observations move to those at the same places.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.kapture_store import (
+    FeatureWriter,
+    KaptureFolder,
+    Observations,
+    write_observations,
+    write_points3d,
+    write_sensors,
+)
+from megloc_kapture.io.links import link_images
+from megloc_kapture.stages.found_again import rows_at_their_places
+from megloc_kapture.stages.triangulation import copy_features
+
+# other implementations of a detector differ by some tenths of a pixel; by chance few are so near
+_MAX_SHIFT_PX = 1.0
+_MIN_FOUND_AGAIN = 0.5
+
+
+def given_type(reference: KaptureFolder) -> str:
+    """The keypoints type of a given map.
+
+    Raises
+    ------
+    DataError : no points, or no or several types that observe them.
+    """
+    if not reference.has_points():
+        raise DataError(
+            "no given map: reconstruction/points3d.txt or observations.txt is missing "
+            "(import_options.reference_model=true imports a dataset's own)",
+            path=reference.root,
+        )
+    types = sorted(name for name, seen in reference.observations().items() if len(seen))
+    if len(types) != 1:
+        raise DataError(
+            f"a given map has points of one keypoints type, found: {', '.join(types) or 'none'}",
+            path=reference.root,
+        )
+    return types[0]
+
+
+def has_descriptors(reference: KaptureFolder) -> bool:
+    """Whether every image that sees a point of a given map has descriptors; else the images'
+    features have to be extracted anew for :func:`given_map`.
+
+    Raises
+    ------
+    DataError : see :func:`given_type`.
+    """
+    local_type = given_type(reference)
+    if local_type not in reference.types("descriptors"):
+        return False
+    descriptors = reference.descriptors(local_type)
+    return all(image in descriptors for image in _observing(reference.observations()[local_type]))
+
+
+def given_map(reference: KaptureFolder, mapping: KaptureFolder, output: Path) -> dict[str, float]:
+    """Write a given map as the map to localize in: features, points and observations.
+
+    Features that are extracted again are those that see points, as the published model names them.
+    Points that nothing observes any more are left out.
+
+    Parameters
+    ----------
+    reference : the given map.
+    mapping : its images with what was extracted from them: global features, and local features of
+        the map's type where :func:`has_descriptors` says no.
+
+    Returns
+    -------
+    Counts for the log; ``found_again`` is the share of the observations whose keypoints were.
+
+    Raises
+    ------
+    DataError : no map; features of an image are missing; most observed keypoints are not found
+        again, so that the map was made of other features.
+    """
+    local_type = given_type(reference)
+    seen = reference.observations()[local_type]
+    found_again = 1.0
+    # what is the reference's own comes first
+    source = KaptureFolder(reference.root, features_dirs=mapping.features_dirs)
+    if not has_descriptors(reference):
+        moved = _moved(reference, mapping, seen)
+        found_again = moved.num_found / len(seen)
+        if found_again < _MIN_FOUND_AGAIN:
+            raise DataError(
+                f"the given map has no descriptors, and of its {len(seen)} observations only "
+                f"{found_again:.0%} have a keypoint that extracting {local_type} again finds: it "
+                "was made with another detector, other options or other images",
+                path=reference.root,
+            )
+        seen = moved.observations
+        _write_rows(mapping, local_type, moved.rows, output)
+        source = mapping
+    xyz_rgb = reference.points3d()
+    kept = np.bincount(seen.point_ids, minlength=len(xyz_rgb)) > 0
+    number = np.cumsum(kept) - 1
+    write_sensors(output, reference.read())
+    link_images(reference.root, output)
+    copy_features(source, output, local_type)  # leaves what is there as it is
+    write_points3d(output, xyz_rgb[kept])
+    observations = Observations(
+        local_type, seen.image_names, number[seen.point_ids], seen.image_ids, seen.keypoint_ids
+    )
+    write_observations(output, {local_type: observations})
+    return {
+        "images": len(_observing(seen)),
+        "points": int(kept.sum()),
+        "observations": len(seen),
+        "found_again": round(found_again, 4),
+    }
+
+
+def join_maps(first: KaptureFolder, second: KaptureFolder, output: Path) -> dict[str, float]:
+    """Write two maps as one: the first's images, its points, then the second's.
+
+    The second's images are among the first's (a dataset's model may lack images that were added to
+    the map). Each keypoints type keeps its own points, observations and features. Global features
+    are those of the first, and types that only the second has.
+
+    Returns
+    -------
+    Counts for the log.
+
+    Raises
+    ------
+    DataError : the maps share a keypoints type, the second has another image, or an image differs
+        in camera or pose.
+    """
+    types_of = [sorted(folder.observations()) for folder in (first, second)]
+    shared = sorted(set(types_of[0]).intersection(types_of[1]))
+    if shared:
+        raise DataError(
+            f"both maps have points of keypoints type {', '.join(shared)}; {first.root} has them "
+            "too, and one type has one set of features",
+            path=second.root,
+        )
+    _check_same_images(first, second)
+    shift = len(first.points3d())
+    observations = first.observations()
+    for local_type, seen in second.observations().items():
+        observations[local_type] = Observations(
+            local_type, seen.image_names, seen.point_ids + shift, seen.image_ids, seen.keypoint_ids
+        )
+    write_sensors(output, first.read())
+    link_images(first.root, output)
+    for folder, types in zip((first, second), types_of, strict=True):
+        for local_type in types:
+            copy_features(folder, output, local_type)
+    write_points3d(output, np.concatenate([first.points3d(), second.points3d()]))
+    write_observations(output, observations)
+    return {
+        "images": len(first.read().poses()),
+        "points": shift + len(second.points3d()),
+        "observations": sum(len(seen) for seen in observations.values()),
+    }
+
+
+def _observing(seen: Observations) -> list[str]:
+    """Names of the images that observe something, sorted."""
+    return [seen.image_names[row] for row in np.unique(seen.image_ids).tolist()]
+
+
+@dataclass(frozen=True, eq=False)
+class _Moved:
+    """Observations of keypoints that were extracted again.
+
+    Attributes
+    ----------
+    observations : ``keypoint_ids`` count in the image's ``rows``.
+    rows : image -> rows of its extracted features that see points, ascending.
+    num_found : how many of the stored observations were found.
+    """
+
+    observations: Observations
+    rows: dict[str, NDArray[np.int64]]
+    num_found: int
+
+
+def _moved(reference: KaptureFolder, mapping: KaptureFolder, seen: Observations) -> _Moved:
+    """Move the observations to the keypoints extracted again.
+
+    An observation whose place has several keypoints (one per orientation) becomes one of each: any
+    may be the one that was matched, and all see the point.
+    """
+    local_type = seen.keypoints_type
+    if local_type not in mapping.types("descriptors"):
+        raise DataError(
+            f"the given map has no descriptors of type {local_type!r}, and its images' features "
+            "have not been extracted again",
+            path=mapping.root,
+        )
+    stored, extracted = reference.keypoints(local_type), mapping.keypoints(local_type)
+    order = np.argsort(seen.image_ids, kind="stable")
+    ends = np.cumsum(np.bincount(seen.image_ids, minlength=len(seen.image_names)))
+    point_ids, image_ids, keypoint_ids = [], [], []
+    rows_of, num_found = {}, 0
+    for row, rows in enumerate(np.split(order, ends[:-1])):
+        image = seen.image_names[row]
+        if len(rows) == 0:
+            continue
+        places = stored.read(image)[seen.keypoint_ids[rows], :2]
+        of, keypoints = rows_at_their_places(places, extracted.read(image)[:, :2], _MAX_SHIFT_PX)
+        # two stored keypoints of one place that see one point are the same twice
+        pairs = np.unique(np.stack([seen.point_ids[rows[of]], keypoints], axis=1), axis=0)
+        num_found += len(np.unique(of))
+        rows_of[image], numbers = np.unique(pairs[:, 1], return_inverse=True)
+        point_ids.append(pairs[:, 0])
+        image_ids.append(np.full(len(pairs), row, np.int32))
+        keypoint_ids.append(numbers.astype(np.int32))
+    points = np.concatenate(point_ids)
+    by_point = np.argsort(points, kind="stable")
+    observations = Observations(
+        local_type,
+        seen.image_names,
+        points[by_point],
+        np.concatenate(image_ids)[by_point],
+        np.concatenate(keypoint_ids)[by_point],
+    )
+    return _Moved(observations, rows_of, num_found)
+
+
+def _write_rows(
+    mapping: KaptureFolder, local_type: str, rows: dict[str, NDArray[np.int64]], output: Path
+) -> None:
+    """Write some of the features of the images with a pose, none where ``rows`` has no entry."""
+    none = np.zeros(0, np.int64)
+    for reader in (mapping.keypoints(local_type), mapping.descriptors(local_type)):
+        with FeatureWriter(output, reader.kind, local_type, reader.config) as writer:
+            for image in sorted(mapping.read().poses()):
+                writer.write(image, reader.read(image)[rows.get(image, none)])
+
+
+def _check_same_images(first: KaptureFolder, second: KaptureFolder) -> None:
+    data, other = first.read(), second.read()
+    poses, other_poses = data.poses(), other.poses()
+    unknown = set(other.image_names()) - set(data.image_names())
+    if unknown:
+        raise DataError(
+            f"{min(unknown)} is no image of the map it is joined to, {first.root}",
+            path=second.root,
+        )
+    for image in sorted(other.image_names()):
+        same_camera = data.camera_of(image) == other.camera_of(image)
+        if not same_camera or poses.get(image) != other_poses.get(image):
+            what = "pose" if same_camera else "camera"
+            raise DataError(
+                f"{image} has another {what} than in {first.root}: points of the two maps do not "
+                "fit each other",
+                path=second.root,
+            )

@@ -1,0 +1,306 @@
+"""A published map as the map to localize in: alone, without its descriptors, beside our own."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from kapture.io.csv import kapture_from_dir
+from numpy.typing import NDArray
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.features.colmap_sift import ColmapSift, ColmapSiftOptions
+from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
+from megloc_kapture.io.colmap import TriangulationOptions
+from megloc_kapture.io.kapture_store import (
+    FeatureConfig,
+    FeatureWriter,
+    KaptureFolder,
+    Observations,
+    write_observations,
+    write_points3d,
+    write_sensors,
+)
+from megloc_kapture.io.links import link_images
+from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
+from megloc_kapture.matching.verification import KnownPoseOptions
+from megloc_kapture.stages.given_map import given_map, given_type, has_descriptors, join_maps
+from megloc_kapture.stages.image_pairs import MappingPairsOptions, pair_map_images
+from megloc_kapture.stages.local_features import extract_local_features
+from megloc_kapture.stages.matches import match_pairs
+from megloc_kapture.stages.triangulation import triangulate_map
+from megloc_kapture.values import RigidTransform
+
+TYPE = "rootsift"
+Bytes = Callable[[Path], dict[str, bytes]]
+
+
+def published(source: KaptureFolder, root: Path, *, shift_px: float = 0.0) -> KaptureFolder:
+    """A map as a model is published that names only what sees points: fewer keypoints with other
+    numbers, in another order, and no descriptors."""
+    seen = source.observations()[TYPE]
+    write_sensors(root, source.read())
+    link_images(source.root, root)
+    write_points3d(root, source.points3d())
+    numbers = np.zeros(len(seen), np.int32)
+    rng = np.random.default_rng(0)
+    config = FeatureConfig("published", np.dtype(np.float32), 2)
+    with FeatureWriter(root, "keypoints", TYPE, config) as writer:
+        for row, image in enumerate(seen.image_names):
+            here = np.flatnonzero(seen.image_ids == row)
+            used = rng.permutation(np.unique(seen.keypoint_ids[here]))
+            for number, keypoint in enumerate(used.tolist()):
+                numbers[here[seen.keypoint_ids[here] == keypoint]] = number
+            places = source.keypoints(TYPE).read(image)[used, :2]
+            writer.write(image, places + np.float32(shift_px))
+    again = Observations(TYPE, seen.image_names, seen.point_ids, seen.image_ids, numbers)
+    write_observations(root, {TYPE: again})
+    return KaptureFolder(root)
+
+
+def triples(folder: KaptureFolder, local_type: str = TYPE) -> set[tuple[int, str, int]]:
+    """Point, image, keypoint of every observation."""
+    seen = folder.observations()[local_type]
+    images = [seen.image_names[row] for row in seen.image_ids.tolist()]
+    return set(zip(seen.point_ids.tolist(), images, seen.keypoint_ids.tolist(), strict=True))
+
+
+def stored(folder: Path, kind: str, folder_bytes: Bytes) -> dict[str, bytes]:
+    return folder_bytes(folder / "reconstruction" / kind)
+
+
+def test_a_map_with_descriptors_is_taken_as_it_is(
+    world, tmp_path: Path, folder_bytes: Bytes
+) -> None:
+    reference = KaptureFolder(world.root / "map")
+    assert given_type(reference) == TYPE
+    assert has_descriptors(reference)
+    counts = given_map(reference, world.mapping(), tmp_path / "map")
+    seen = reference.observations()[TYPE]
+    assert counts == {
+        "images": 5,
+        "points": len(reference.points3d()),
+        "observations": len(seen),
+        "found_again": 1.0,
+    }
+    # nothing differs: sensors, points, observations, local and global features
+    for part in ("sensors", "reconstruction"):
+        assert folder_bytes(tmp_path / "map" / part) == folder_bytes(reference.root / part)
+
+
+def test_without_descriptors_the_observations_move_to_the_features_extracted_anew(
+    world, tmp_path: Path, folder_bytes: Bytes
+) -> None:
+    truth = KaptureFolder(world.root / "map")
+    reference = published(truth, tmp_path / "reference")
+    assert not has_descriptors(reference)
+    counts = given_map(reference, world.mapping(), tmp_path / "map")
+    assert counts["found_again"] == 1.0
+    made = KaptureFolder(tmp_path / "map")
+    made.validate()
+    assert has_descriptors(made)
+    assert stored(made.root, "global_features", folder_bytes) == stored(
+        truth.root, "global_features", folder_bytes
+    )
+    np.testing.assert_array_equal(made.points3d(), truth.points3d())
+    # the features that see points, as they were extracted: each one's number there
+    number: dict[tuple[str, int], int] = {}
+    for image in made.keypoints(TYPE).names:
+        both = [
+            np.hstack([folder.keypoints(TYPE).read(image), folder.descriptors(TYPE).read(image)])
+            for folder in (truth, made)
+        ]
+        row_of = {row.tobytes(): index for index, row in enumerate(both[0])}
+        assert len(row_of) == len(both[0]) > len(both[1])
+        number |= {(image, index): row_of[row.tobytes()] for index, row in enumerate(both[1])}
+    expected = triples(truth)
+    found = {(point, image, number[image, keypoint]) for point, image, keypoint in triples(made)}
+    assert expected <= found
+    # what is more are other orientations of the same places
+    where: dict[tuple[int, str], list[NDArray[np.float32]]] = {}
+    for point, image, keypoint in expected:
+        place = truth.keypoints(TYPE).read(image)[keypoint]
+        where.setdefault((point, image), []).append(place)
+    extra = found - expected
+    assert 0 < len(extra) < 0.5 * len(expected)
+    for point, image, keypoint in extra:
+        place = truth.keypoints(TYPE).read(image)[keypoint]
+        assert np.linalg.norm(where[point, image] - place, axis=1).min() < 0.1
+
+
+def test_another_implementation_may_find_them_some_tenths_of_a_pixel_away(
+    world, tmp_path: Path
+) -> None:
+    truth = KaptureFolder(world.root / "map")
+    reference = published(truth, tmp_path / "reference", shift_px=0.3)
+    assert given_map(reference, world.mapping(), tmp_path / "map")["found_again"] == 1.0
+    made = KaptureFolder(tmp_path / "map")
+    expected, found = (
+        {
+            (point, image, tuple(folder.keypoints(TYPE).read(image)[keypoint].tolist()))
+            for point, image, keypoint in triples(folder)
+        }
+        for folder in (truth, made)
+    )
+    assert len(expected - found) < 0.05 * len(expected)
+
+
+@dataclass(frozen=True)
+class Fewer:
+    """The mapping images with fewer features than the map was made of."""
+
+    folder: KaptureFolder
+    kept: dict[str, set[tuple[float, float]]]
+
+
+def fewer(world, root: Path, max_keypoints: int) -> Fewer:
+    extractor = RootSift(RootSiftOptions(max_keypoints=max_keypoints))
+    extract_local_features([KaptureFolder(world.root / "mapping")], extractor, root)
+    folder = KaptureFolder(world.root / "mapping", features_dirs=[root])
+    keypoints = folder.keypoints(TYPE)
+    places = {name: {tuple(xy) for xy in keypoints.read(name).tolist()} for name in keypoints.names}
+    return Fewer(folder, places)
+
+
+def test_what_is_not_found_again_is_left_out(world, tmp_path: Path) -> None:
+    truth = KaptureFolder(world.root / "map")
+    reference = published(truth, tmp_path / "reference")
+    some = fewer(world, tmp_path / "features", 450)
+    counts = given_map(reference, some.folder, tmp_path / "map")
+    made = KaptureFolder(tmp_path / "map")
+    made.validate()
+    there = [
+        (point, image)
+        for point, image, keypoint in triples(truth)
+        if tuple(truth.keypoints(TYPE).read(image)[keypoint].tolist()) in some.kept[image]
+    ]
+    total = len(triples(truth))
+    assert 0.5 < counts["found_again"] < 1
+    assert counts["found_again"] == pytest.approx(len(there) / total, abs=0.02)
+    # points are numbered anew, without those that nothing sees any more
+    points = made.points3d()
+    assert counts["points"] == len(points) < len(truth.points3d())
+    assert set(made.observations()[TYPE].point_ids.tolist()) == set(range(len(points)))
+    # by coordinates, as their numbers are others
+    expected = {(tuple(truth.points3d()[point].tolist()), image) for point, image in there}
+    found = {(tuple(points[point].tolist()), image) for point, image, _ in triples(made)}
+    assert found >= expected
+    assert len(found) < 1.05 * len(expected)
+
+
+def test_a_map_of_other_features_is_refused(world, tmp_path: Path) -> None:
+    reference = published(KaptureFolder(world.root / "map"), tmp_path / "reference")
+    some = fewer(world, tmp_path / "features", 100)
+    with pytest.raises(DataError, match=r"only \d+% have a keypoint that extracting rootsift"):
+        given_map(reference, some.folder, tmp_path / "map")
+    assert not (tmp_path / "map").exists()
+    bare = KaptureFolder(world.root / "mapping")
+    with pytest.raises(DataError, match="have not been extracted again"):
+        given_map(reference, bare, tmp_path / "map")
+
+
+def test_what_is_no_map_to_localize_in_is_refused(world, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="no given map.*import_options.reference_model=true"):
+        given_type(world.mapping())
+    shutil.copytree(world.root / "map", tmp_path / "two", symlinks=True)
+    seen = KaptureFolder(world.root / "map").observations()[TYPE]
+    renamed = Observations(
+        "other", seen.image_names, seen.point_ids, seen.image_ids, seen.keypoint_ids
+    )
+    write_observations(tmp_path / "two", {TYPE: seen, "other": renamed})
+    with pytest.raises(DataError, match="of one keypoints type, found: other, rootsift"):
+        given_type(KaptureFolder(tmp_path / "two"))
+
+
+# ---------------------------------------------------------------------------------- two maps in one
+
+
+@pytest.fixture(scope="module")
+def sift_map(world, tmp_path_factory: pytest.TempPathFactory) -> KaptureFolder:
+    """A map of the same images by COLMAP's SIFT."""
+    root = tmp_path_factory.mktemp("sift")
+    mapping = KaptureFolder(world.root / "mapping", features_dirs=[root])
+    extract_local_features([mapping], ColmapSift(ColmapSiftOptions(first_octave=0)), root)
+    mapping = KaptureFolder(world.root / "mapping", features_dirs=[root])
+    pairs = pair_map_images(mapping, MappingPairsOptions(by=("exhaustive",)), global_type=None)
+    match_pairs(
+        mapping, mapping, pairs, "sift", NearestNeighbours(), KnownPoseOptions(), root / "matches"
+    )
+    matches = KaptureFolder(world.root / "mapping", features_dirs=[root / "matches"])
+    triangulate_map(mapping, matches, "sift", root / "map", TriangulationOptions())
+    return KaptureFolder(root / "map")
+
+
+def test_two_maps_become_one(
+    world,
+    sift_map: KaptureFolder,
+    tmp_path: Path,
+    folder_bytes: Bytes,
+    distance_to_walls: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+) -> None:
+    own = KaptureFolder(world.root / "map")
+    counts = join_maps(sift_map, own, tmp_path / "both")
+    both = KaptureFolder(tmp_path / "both")
+    both.validate(deep=True)
+    num_first, num_second = len(sift_map.points3d()), len(own.points3d())
+    assert num_first > 100
+    assert counts == {
+        "images": 5,
+        "points": num_first + num_second,
+        "observations": len(sift_map.observations()["sift"]) + len(own.observations()[TYPE]),
+    }
+    # read by kapture: each type sees its own points, where they were
+    theirs = kapture_from_dir(str(both.root))
+    points = theirs.points3d.as_array()[:, :3]
+    np.testing.assert_array_equal(points[:num_first], sift_map.points3d()[:, :3])
+    np.testing.assert_array_equal(points[num_first:], own.points3d()[:, :3])
+    assert np.median(distance_to_walls(points)) < 0.02
+    assert set(theirs.keypoints) == set(theirs.descriptors) == {TYPE, "sift"}
+    for point in theirs.observations:
+        assert list(theirs.observations[point]) == ["sift" if point < num_first else TYPE]
+    assert {(p - num_first, *rest) for p, *rest in triples(both)} == triples(own)
+    assert triples(both, "sift") == triples(sift_map, "sift")
+    for source, local_type in ((sift_map, "sift"), (own, TYPE)):
+        for kind in ("keypoints", "descriptors"):
+            place = Path("reconstruction") / kind / local_type
+            assert folder_bytes(both.root / place) == folder_bytes(source.root / place)
+    # global features of either
+    assert both.types("global_features") == own.types("global_features") != []
+
+
+def test_points_keep_the_errors_of_their_map(
+    world, sift_map: KaptureFolder, tmp_path: Path
+) -> None:
+    """The order of the maps is that of the points; the other order gives the other."""
+    own = KaptureFolder(world.root / "map")
+    join_maps(own, sift_map, tmp_path / "both")
+    points = KaptureFolder(tmp_path / "both").points3d()
+    np.testing.assert_array_equal(points[: len(own.points3d())], own.points3d())
+    assert triples(KaptureFolder(tmp_path / "both")) == triples(own)
+
+
+def test_maps_that_do_not_fit_are_refused(world, sift_map: KaptureFolder, tmp_path: Path) -> None:
+    own = KaptureFolder(world.root / "map")
+    with pytest.raises(DataError, match="both maps have points of keypoints type rootsift"):
+        join_maps(own, own, tmp_path / "both")
+    data = sift_map.read()
+
+    def changed(name: str) -> KaptureFolder:
+        place = tmp_path / name
+        shutil.copytree(sift_map.root / "reconstruction", place / "reconstruction")
+        write_sensors(place, data)
+        return KaptureFolder(place)
+
+    key = data.record_of("left/1.png")
+    pose = data.trajectories[key]
+    data.trajectories[key] = RigidTransform(pose.quat_wxyz, (0.0, 0.0, 0.1))
+    with pytest.raises(DataError, match=r"left/1.png has another pose than in"):
+        join_maps(own, changed("pose"), tmp_path / "both")
+    del data.trajectories[key], data.records_camera[key]
+    with pytest.raises(DataError, match=r"not of the same images: left/1.png is in one only"):
+        join_maps(own, changed("image"), tmp_path / "both")
+    assert not (tmp_path / "both").exists()
