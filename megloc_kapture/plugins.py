@@ -6,21 +6,30 @@ in the same way. A class may carry ``Options``, a frozen pydantic model its cons
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 
 from megloc_kapture.errors import MeglocError, PluginError
-from megloc_kapture.values import LocalFeatures
+from megloc_kapture.values import Camera, LocalFeatures, Options, RigidTransform
 
 LOCAL_FEATURES = "megloc_kapture.local_features"
 MATCHERS = "megloc_kapture.matchers"
+POSE_RANKERS = "megloc_kapture.pose_rankers"
 DATASETS = "megloc_kapture.datasets"
+
+
+class PluginChoice(Options):
+    """A plugin by its registered name, and its options."""
+
+    name: str
+    options: dict[str, Any] = Field(default_factory=dict)
 
 
 @runtime_checkable
@@ -45,6 +54,74 @@ class Matcher(Protocol):
         self, descriptors_a: NDArray[Any], descriptors_b: NDArray[Any]
     ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """Matches int64 (K, 2), rows of a and b, each row at most once, and scores (K,)."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class HypothesisView:
+    """One camera of a query under a pose that might be right.
+
+    Attributes
+    ----------
+    name : of the query image.
+    points_px, points_world : float64 (N, 2) and (N, 3), the 2D-3D matches.
+    errors_px : float64 (N,), reprojection errors; infinite behind the camera.
+    inliers : bool (N,).
+    """
+
+    name: str
+    camera: Camera
+    cam_from_world: RigidTransform
+    points_px: NDArray[np.float64]
+    points_world: NDArray[np.float64]
+    errors_px: NDArray[np.float64]
+    inliers: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class PoseHypothesis:
+    """The pose of one cluster of map images.
+
+    Attributes
+    ----------
+    images : the cluster's map images that match the query, best first.
+    views : the cameras of the query: one, or those of a rig.
+    max_error_px : reprojection error of an inlier.
+    """
+
+    images: tuple[str, ...]
+    views: tuple[HypothesisView, ...]
+    max_error_px: float
+
+
+class RankingScene(Protocol):
+    """What a ranker may look at beside the matches; images are read only when asked for."""
+
+    def query_image(self, name: str) -> NDArray[np.uint8]:
+        """RGB pixels (H, W, 3) of a query image; raises DataError where there are none."""
+        ...
+
+    def map_image(self, name: str) -> NDArray[np.uint8]:
+        """RGB pixels (H, W, 3) of a map image; raises DataError where there are none."""
+        ...
+
+    def map_camera(self, name: str) -> Camera:
+        """Camera of a map image."""
+        ...
+
+    def map_pose(self, name: str) -> RigidTransform:
+        """``cam_from_world`` of a map image."""
+        ...
+
+
+@runtime_checkable
+class PoseRanker(Protocol):
+    """Group ``megloc_kapture.pose_rankers``: which of several poses of one query is right."""
+
+    def score(
+        self, hypotheses: Sequence[PoseHypothesis], scene: RankingScene
+    ) -> NDArray[np.float64]:
+        """One score (H,) per hypothesis, higher is better; of equals the first wins."""
         ...
 
 
@@ -77,6 +154,7 @@ class DatasetAdapter(Protocol):
 _PROTOCOLS: dict[str, type] = {
     LOCAL_FEATURES: LocalFeatureExtractor,
     MATCHERS: Matcher,
+    POSE_RANKERS: PoseRanker,
     DATASETS: DatasetAdapter,
 }
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -192,6 +193,27 @@ class LocalFeatures:
     descriptors: NDArray[Any]
 
 
+@dataclass(frozen=True)
+class ClusterPose:
+    """What one cluster of a query's candidates came to.
+
+    Attributes
+    ----------
+    images : map images of the cluster that match the query, best first.
+    num_matches, num_inliers : of its 2D-3D matches.
+    cam_from_world : its pose before the final refinement, of a rig ``rig_from_world``; None where
+        it has none, ``reason`` then says why.
+    score : of the ranking, higher is better; None without a pose.
+    """
+
+    images: tuple[str, ...]
+    num_matches: int = 0
+    num_inliers: int = 0
+    cam_from_world: RigidTransform | None = None
+    score: float | None = None
+    reason: str = ""
+
+
 @dataclass(frozen=True, eq=False)
 class Pose:
     """A query that was localized; truthy.
@@ -204,6 +226,9 @@ class Pose:
     covariance : float64 (6, 6) or None: rotation in radians, then translation in the map's unit,
         of a left perturbation of ``cam_from_world``.
     candidates : map images that took part, best first.
+    clusters : all clusters of candidates that were tried, that of the best candidate first.
+    cluster : the one this pose comes from, an index into ``clusters``.
+    seconds : by step.
     """
 
     cam_from_world: RigidTransform
@@ -212,6 +237,9 @@ class Pose:
     inliers: NDArray[np.bool_] | None = None
     covariance: NDArray[np.float64] | None = None
     candidates: tuple[str, ...] = ()
+    clusters: tuple[ClusterPose, ...] = ()
+    cluster: int | None = None
+    seconds: Mapping[str, float] = field(default_factory=dict)
 
     def __bool__(self) -> bool:
         return True
@@ -219,12 +247,20 @@ class Pose:
 
 @dataclass(frozen=True)
 class Failure:
-    """A query that was not localized; falsy, and says why."""
+    """A query that was not localized; falsy, and says why.
+
+    Attributes
+    ----------
+    num_matches, num_inliers, candidates : of the cluster that came nearest to a pose.
+    clusters, seconds : as of :class:`Pose`.
+    """
 
     reason: str
     num_matches: int = 0
     num_inliers: int = 0
     candidates: tuple[str, ...] = ()
+    clusters: tuple[ClusterPose, ...] = ()
+    seconds: Mapping[str, float] = field(default_factory=dict, compare=False)
 
     def __bool__(self) -> bool:
         return False

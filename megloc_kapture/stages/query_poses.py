@@ -1,41 +1,63 @@
-"""Stage: localize the queries from their matches with map images; kapture trajectories out."""
+"""Stage: localize the queries from their matches with map images, cluster by cluster.
+
+MegLoc, section "Cluster-wise localization": the candidates of a query are divided into places, each
+gives a pose, a ranker says which is right, and that one is refined with its own images alone.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError
-from megloc_kapture.io.csv_table import write_csv_table
-from megloc_kapture.io.kapture_store import (
-    ImagePair,
-    KaptureData,
-    KaptureFolder,
-    write_sensors,
+from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder
+from megloc_kapture.io.status_table import Fallback
+from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions
+from megloc_kapture.localization.cluster_poses import (
+    ClusterLocalization,
+    QueryView,
+    TypedMatches,
+    in_turn,
+    localize_in_clusters,
 )
-from megloc_kapture.io.links import link_images
-from megloc_kapture.io.status_table import STATUS_FILE, Fallback, QueryStatus, write_status
-from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions, absolute_pose
-from megloc_kapture.localization.correspondences import Correspondences, resolve
+from megloc_kapture.localization.clusters import ClusterOptions, cluster_candidates
 from megloc_kapture.localization.map_index import MapIndex
+from megloc_kapture.localization.rig_cameras import poses_of_cameras
+from megloc_kapture.plugins import (
+    POSE_RANKERS,
+    PluginChoice,
+    PoseRanker,
+    RankingScene,
+    load_plugin,
+)
 from megloc_kapture.stages.matches import iterate_candidates
 from megloc_kapture.stages.parallel import FolderSpec, Track, ordered_map, untracked
+from megloc_kapture.stages.query_units import QueryUnit, query_units
+from megloc_kapture.stages.ranking_scene import KaptureScene, query_reader
 from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
-from megloc_kapture.stages.rig_siblings import poses_through_rig
-from megloc_kapture.values import Camera, Failure, Options, Pose, RigidTransform
+from megloc_kapture.stages.shared_index import index_map, open_index, shared_index
+from megloc_kapture.values import Failure, Options, Pose
 
 
 class LocalizationOptions(Options):
     """How a query's pose is found from its matches."""
 
+    clusters: ClusterOptions = ClusterOptions()
+    rank: PluginChoice = PluginChoice(name="distinctive")
     pose: AbsolutePoseOptions = AbsolutePoseOptions()
+    rigs: bool = False
     fallback: Fallback = "none"
+
+    def make_ranker(self) -> PoseRanker:
+        """The ranker of candidate poses; raises PluginError."""
+        ranker: PoseRanker = load_plugin(POSE_RANKERS, self.rank.name, self.rank.options)
+        return ranker
 
 
 @dataclass(frozen=True)
@@ -43,134 +65,136 @@ class _Job:
     map: FolderSpec
     query: FolderSpec
     matches: FolderSpec
-    local_type: str
-    image: str
-    candidates: tuple[str, ...]
+    indices: tuple[tuple[str, Path], ...]  # by keypoints type
+    unit: QueryUnit
+    candidates: tuple[str, ...]  # of all images of the unit
+    own_candidates: tuple[tuple[str, ...], ...]  # of each
     frames: tuple[str, ...]  # of the candidates
-    options: AbsolutePoseOptions
+    options: LocalizationOptions
 
 
-def index_map(folder: KaptureFolder, local_type: str) -> MapIndex:
-    """Read the points and observations of one keypoints type into an index.
-
-    Raises
-    ------
-    DataError : no observations of the type.
-    """
-    seen = folder.observations()
-    if local_type not in seen:
-        raise DataError(f"the map has no observations of type {local_type!r}", path=folder.root)
-    observations = seen[local_type]
-    return MapIndex.build(
-        folder.points3d()[:, :3],
-        observations.image_names,
-        observations.image_ids,
-        observations.keypoint_ids,
-        observations.point_ids,
-    )
-
-
-def gather_correspondences(
-    index: MapIndex,
-    matches: Iterable[tuple[str, NDArray[np.int64], NDArray[np.floating]]],
-) -> Correspondences:
-    """2D-3D matches from (map image, matches (K, 2) query and map keypoints, scores (K,))."""
-    keypoints, points, scores = [], [], []
-    for image, pairs, similarity in matches:
-        point_ids = index.points_of_keypoints(image, pairs[:, 1])
-        observed = point_ids >= 0
-        keypoints.append(pairs[observed, 0])
-        points.append(point_ids[observed])
-        scores.append(similarity[observed])
-    if not keypoints:
-        empty = np.zeros(0, dtype=np.int64)
-        return resolve(empty, empty, np.zeros(0))
-    return resolve(np.concatenate(keypoints), np.concatenate(points), np.concatenate(scores))
-
-
-def pose_in_best_frame(
-    index: MapIndex,
-    keypoints_px: NDArray[np.float32],
-    camera: Camera,
-    matches: Sequence[tuple[str, NDArray[np.int64], NDArray[np.floating]]],
+def localize_views(
+    views: Sequence[QueryView],
+    candidates: Sequence[str],
     frames: Sequence[str],
-    options: AbsolutePoseOptions,
-) -> Pose | Failure:
-    """Localize one query in each coordinate frame its candidates stand in; keep the best.
-
-    Points of different frames never meet in one solver: their coordinates say nothing about
-    each other. The pose with the most inliers is kept, of equals that of the first candidate.
+    options: LocalizationOptions,
+    *,
+    centers: Mapping[str, NDArray[np.float64]],
+    ranker: PoseRanker,
+    scene: RankingScene,
+) -> ClusterLocalization:
+    """Localize one query, or the cameras of a rig, from verified matches.
 
     Parameters
     ----------
-    frames : of the map images of ``matches``, in their order.
+    candidates : map images, best first, and ``frames``, the coordinate frame of each.
+    centers : of the candidates in the world, (3,) each.
     """
-    results = [
-        pose_from_matches(
-            index,
-            keypoints_px,
-            camera,
-            [match for match, own in zip(matches, frames, strict=True) if own == frame],
-            options,
-        )
-        for frame in dict.fromkeys(frames)
-    ]
-    if not results:
-        return pose_from_matches(index, keypoints_px, camera, [], options)
-    return max(results, key=lambda result: (bool(result), result.num_inliers))
-
-
-def pose_from_matches(
-    index: MapIndex,
-    keypoints_px: NDArray[np.float32],
-    camera: Camera,
-    matches: Sequence[tuple[str, NDArray[np.int64], NDArray[np.floating]]],
-    options: AbsolutePoseOptions,
-) -> Pose | Failure:
-    """Localize one query from its verified matches with map images of one coordinate frame."""
-    candidates = tuple(image for image, pairs, _ in matches if len(pairs))
+    none = (0,) * len(views)
     if not candidates:
-        return Failure("no map image matches")
-    found = gather_correspondences(index, matches)
-    result = absolute_pose(
-        keypoints_px[found.keypoint_ids, :2].astype(np.float64),
-        index.xyz[found.point_ids],
-        camera,
-        options,
-    )
-    return replace(result, candidates=candidates)
-
-
-_indices: dict[object, MapIndex] = {}
-
-
-def _localize(job: _Job) -> tuple[Pose | Failure, float]:
+        return ClusterLocalization(Failure("no map image is a candidate"), none)
+    matched = {image for view in views for image in view.matched_images()}
+    frame_of = dict(zip(candidates, frames, strict=True))
+    images = [image for image in candidates if image in matched]
+    if not images:
+        return ClusterLocalization(Failure("no map image matches"), none)
     started = time.perf_counter()
-    if job.map.key not in _indices:
-        _indices.clear()
-        _indices[job.map.key] = index_map(job.map.open(), job.local_type)
-    index = _indices[job.map.key]
-    query = job.query.open()
-    reader = job.matches.open().matches(job.local_type)
-    if not job.candidates:
-        return Failure("no map image is a candidate"), time.perf_counter() - started
-    matched = [
-        (frame, (image, *reader.read(job.image, image)))
-        for image, frame in zip(job.candidates, job.frames, strict=True)
-        if (job.image, image) in reader
-    ]
-    result = pose_in_best_frame(
-        index,
-        query.keypoints(job.local_type).read(job.image),
-        query.read().camera_of(job.image),
-        [match for _, match in matched],
-        [frame for frame, _ in matched],
-        job.options,
+    clusters = cluster_candidates(
+        images,
+        [frame_of[image] for image in images],
+        options.clusters,
+        centers=centers,
+        indices=_indices_of(views),
     )
-    if isinstance(result, Pose):
-        # the mask is for who asked with arrays; the stage writes none of it
-        result = replace(result, inliers=None)
-    return result, time.perf_counter() - started
+    seconds = {"clusters": time.perf_counter() - started}
+    found = localize_in_clusters(
+        views,
+        clusters,
+        options.pose,
+        rank=lambda hypotheses: ranker.score(hypotheses, scene),
+        max_clusters=options.clusters.max_clusters,
+        frames=[frame_of[cluster[0]] for cluster in clusters],
+    )
+    result = replace(found.result, seconds={**seconds, **found.result.seconds})
+    return replace(found, result=result)
+
+
+def _indices_of(views: Sequence[QueryView]) -> list[MapIndex]:
+    by_identity = {id(typed.index): typed.index for view in views for typed in view.matches}
+    return list(by_identity.values())
+
+
+def _localize(job: _Job) -> list[tuple[str, Pose | Failure]]:
+    started = time.perf_counter()
+    views = [_read_view(job, number) for number in range(len(job.unit.images))]
+    reading = (time.perf_counter() - started) / len(views)
+    mapping, query = job.map.open(), job.query.open()
+    centers = {
+        image: pose.center()
+        for image in job.candidates
+        if (pose := mapping.read().cam_from_world(image)) is not None
+    }
+    posed = [pair for pair in zip(job.candidates, job.frames, strict=True) if pair[0] in centers]
+    candidates, frames = [image for image, _ in posed], [frame for _, frame in posed]
+    scene = KaptureScene(mapping, query_reader(query))
+
+    def localize(together: Sequence[QueryView]) -> ClusterLocalization:
+        return localize_views(
+            together,
+            candidates,
+            frames,
+            job.options,
+            centers=centers,
+            ranker=job.options.make_ranker(),
+            scene=scene,
+        )
+
+    results: list[Pose | Failure] = []
+    if len(views) > 1:
+        found = localize(views)
+        if found.result:
+            results = poses_of_cameras(views, found)
+    # a rig without a pose: perhaps one of its cameras has one
+    results = results or [localize([_alone(view)]).result for view in views]
+    return [
+        (image, _for_writing(result, reading))
+        for image, result in zip(job.unit.images, results, strict=True)
+    ]
+
+
+def _alone(view: QueryView) -> QueryView:
+    return QueryView(view.name, view.camera, view.matches)
+
+
+def _for_writing(result: Pose | Failure, reading_s: float) -> Pose | Failure:
+    result = replace(result, seconds={"reading": reading_s, **result.seconds})
+    # the mask is for who asked with arrays; the stage writes none of it
+    return replace(result, inliers=None) if isinstance(result, Pose) else result
+
+
+def _read_view(job: _Job, number: int) -> QueryView:
+    image, query, matches = job.unit.images[number], job.query.open(), job.matches.open()
+    typed = []
+    for local_type, folder in job.indices:
+        reader = matches.matches(local_type)
+        typed.append(
+            TypedMatches(
+                _opened(local_type, folder),
+                query.keypoints(local_type).read(image),
+                [
+                    (other, *reader.read(image, other))
+                    for other in job.own_candidates[number]
+                    if (image, other) in reader
+                ],
+            )
+        )
+    camera = query.read().camera_of(image)
+    return QueryView(image, camera, tuple(typed), job.unit.cams_from_rig[number])
+
+
+@lru_cache(maxsize=8)
+def _opened(local_type: str, folder: Path) -> MapIndex:
+    return open_index(folder)
 
 
 def localize_from_matches(
@@ -178,106 +202,48 @@ def localize_from_matches(
     query: KaptureFolder,
     matches: KaptureFolder,
     pairs: Sequence[ImagePair],
-    local_type: str,
+    local_types: Sequence[str],
     options: LocalizationOptions,
     *,
     restrictions: Restrictions = UNRESTRICTED,
     executor: Executor | None = None,
     track: Track = untracked,
-) -> Iterator[tuple[str, Pose | Failure, float]]:
-    """Localize every query from stored matches: image, result, seconds; in order of names.
+) -> Iterator[tuple[str, Pose | Failure]]:
+    """Localize every query from stored matches: image and result; in order of units' names.
 
     Parameters
     ----------
+    local_types : keypoints types whose matches are used, together.
     restrictions : the coordinate frames of the map's images, which are never mixed.
+
+    Raises
+    ------
+    DataError : the map has no observations of a type.
+    PluginError : there is no such ranker, or it refuses its options.
     """
+    options.make_ranker()  # what is wrong with it is found before the first query
     map_spec, query_spec, matches_spec = (
         FolderSpec(f.root, f.features_dirs) for f in (map_folder, query, matches)
     )
-    candidates = dict(iterate_candidates(pairs))
-    jobs = [
-        _Job(
-            map=map_spec,
-            query=query_spec,
-            matches=matches_spec,
-            local_type=local_type,
-            image=image,
-            candidates=tuple(candidates.get(image, ())),
-            frames=tuple(restrictions.frame(other) for other in candidates.get(image, ())),
-            options=options.pose,
-        )
-        for image in query.read().image_names()
-    ]
-    results = ordered_map(_localize, jobs, executor)
-    tracked = track(results, len(jobs), "localizing")
-    for job, (result, seconds) in zip(jobs, tracked, strict=True):
-        yield job.image, result, seconds
-
-
-def write_localized(
-    output: Path,
-    query: KaptureFolder,
-    results: Iterable[tuple[str, Pose | Failure, float]],
-    *,
-    fallback: Fallback = "none",
-    first_candidates: dict[str, tuple[str, RigidTransform]] | None = None,
-    timing: Path | None = None,
-) -> dict[str, int]:
-    """Write the localized queries as kapture, with ``status.csv`` beside it.
-
-    Parameters
-    ----------
-    fallback : what a query that failed gets: nothing; the pose of its best retrieved image; or its
-        pose through the rig, from another camera of its moment, where that was localized.
-    first_candidates : query -> (best retrieved map image, its pose), needed for "retrieval".
-    timing : where to write seconds per query and step.
-    """
-    data = query.read()
-    named = list(results)
-    guesses: Mapping[str, tuple[str, RigidTransform]] = {}
-    if fallback == "retrieval":
-        guesses = first_candidates or {}
-    elif fallback == "rig":
-        found = {image: result for image, result, _ in named if isinstance(result, Pose)}
-        guesses = poses_through_rig(data, found)
-    poses: dict[tuple[int, str], RigidTransform] = {}
-    statuses = []
-    for image, result, _ in named:
-        guess = None if result else guesses.get(image)
-        statuses.append(
-            QueryStatus(
-                image=image,
-                status="localized" if result else "failed",
-                reason="" if isinstance(result, Pose) else result.reason,
-                num_matches=result.num_matches,
-                num_inliers=result.num_inliers,
-                fallback="none" if guess is None else fallback,
-                candidates=result.candidates,
+    candidates = {name: tuple(images) for name, images in iterate_candidates(pairs)}
+    units = query_units(query.read(), rigs=options.rigs)
+    with shared_index({name: index_map(map_folder, name) for name in local_types}) as indices:
+        jobs = []
+        for unit in units:
+            own = tuple(candidates.get(image, ()) for image in unit.images)
+            together = tuple(in_turn(own))
+            jobs.append(
+                _Job(
+                    map=map_spec,
+                    query=query_spec,
+                    matches=matches_spec,
+                    indices=tuple(indices.items()),
+                    unit=unit,
+                    candidates=together,
+                    own_candidates=own,
+                    frames=tuple(restrictions.frame(image) for image in together),
+                    options=options,
+                )
             )
-        )
-        if isinstance(result, Pose):
-            poses[data.record_of(image)] = result.cam_from_world
-        elif guess is not None:
-            poses[data.record_of(image)] = guess[1]
-    write_sensors(
-        output,
-        KaptureData(
-            sensors=dict(data.sensors),
-            rigs={},
-            trajectories=poses,
-            records_camera=dict(data.records_camera),
-            records_depth={},
-        ),
-    )
-    link_images(query.root, output)
-    write_status(output / STATUS_FILE, statuses)
-    if timing is not None:
-        rows = ((image, "localization", f"{seconds:.4f}") for image, _, seconds in named)
-        write_csv_table(timing, ("image", "step", "seconds"), rows)
-    localized = sum(bool(result) for _, result, _ in named)
-    return {
-        "queries": len(named),
-        "localized": localized,
-        "failed": len(named) - localized,
-        "fallbacks": len(poses) - localized,
-    }
+        for results in track(ordered_map(_localize, jobs, executor), len(jobs), "localizing"):
+            yield from results

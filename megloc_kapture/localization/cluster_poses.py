@@ -1,0 +1,303 @@
+"""Cluster-wise localization: a pose for each cluster of candidates, the best of them refined.
+
+MegLoc, section "Cluster-wise localization". One view or the views of a rig are treated alike; the
+2D-3D matches may be of several keypoints types, each with an index of its own.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import zip_longest
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.localization.correspondences import ObservedMatches, observed_matches
+from megloc_kapture.localization.estimation import (
+    AbsolutePoseOptions,
+    PoseEstimate,
+    estimate_stacked,
+)
+from megloc_kapture.localization.map_index import MapIndex
+from megloc_kapture.localization.pose_refinement import refine_stacked
+from megloc_kapture.localization.same_place import same_place
+from megloc_kapture.localization.views import StackedViews, View, stack_views
+from megloc_kapture.plugins import HypothesisView, PoseHypothesis
+from megloc_kapture.values import Camera, ClusterPose, Failure, Pose, RigidTransform
+
+ImageMatches = tuple[str, NDArray[np.int64], NDArray[np.floating]]
+Rank = Callable[[Sequence[PoseHypothesis]], NDArray[np.float64]]
+
+
+@dataclass(frozen=True, eq=False)
+class TypedMatches:
+    """Matches of one query image in one keypoints type.
+
+    Attributes
+    ----------
+    index : the map's points of the type.
+    keypoints_px : float32 (N, 2 or more), of the query.
+    matches : of each candidate: its name, rows of query and map keypoints (K, 2), scores (K,).
+    """
+
+    index: MapIndex
+    keypoints_px: NDArray[np.float32]
+    matches: Sequence[ImageMatches]
+
+
+@dataclass(frozen=True, eq=False)
+class QueryView:
+    """One camera of a query: its place on the rig, and its matches by keypoints type."""
+
+    name: str
+    camera: Camera
+    matches: tuple[TypedMatches, ...]
+    cam_from_rig: RigidTransform = RigidTransform.identity()
+
+    def matched_images(self) -> list[str]:
+        """Map images with a match, in the order given."""
+        named = (image for own in self.matches for image, pairs, _ in own.matches if len(pairs))
+        return list(dict.fromkeys(named))
+
+
+def in_turn(rankings: Sequence[Sequence[str]]) -> list[str]:
+    """One ranking of several: the first of each, then the second of each; each name once."""
+    ranks = zip_longest(*rankings)
+    return list(dict.fromkeys(name for rank in ranks for name in rank if name is not None))
+
+
+@dataclass(frozen=True, eq=False)
+class ClusterLocalization:
+    """A pose, or why there is none, and the number of 2D-3D matches of each view behind it."""
+
+    result: Pose | Failure
+    matches_of_views: tuple[int, ...]
+
+
+def localize_in_clusters(
+    views: Sequence[QueryView],
+    clusters: Sequence[Sequence[str]],
+    options: AbsolutePoseOptions,
+    *,
+    rank: Rank,
+    max_clusters: int,
+    frames: Sequence[str] | None = None,
+) -> ClusterLocalization:
+    """Localize a query in each cluster by itself, rank the poses, and refine the best.
+
+    Clusters whose poses explain each other are one place after all (images that look to different
+    sides share no points), and are localized in together.
+
+    Parameters
+    ----------
+    views : one camera, or those of a rig.
+    clusters : map images of each, see :func:`cluster_candidates`.
+    rank : scores of poses, higher is better.
+    max_clusters : only those with the most matches are tried.
+    frames : the coordinate frame of each cluster; clusters of different ones are never joined.
+
+    Returns
+    -------
+    The pose, of a rig ``rig_from_world``; the mask of its inliers runs over the views, and in each
+    over the keypoints types, in their order. Or a failure with its reason.
+    """
+    clock = _Clock()
+    gathered = [[observed_matches(m.index, m.matches) for m in view.matches] for view in views]
+    counts = [_num_observed(views, gathered, cluster) for cluster in clusters]
+    by_matches = sorted(range(len(clusters)), key=lambda at: (-counts[at], at))
+    tried = sorted(at for at in by_matches[:max_clusters] if counts[at])
+    clock.lap("correspondences")
+
+    def attempt(cluster: Sequence[str], frame: str) -> _Attempt:
+        problem = stack_views(
+            [_view(view, own, cluster) for view, own in zip(views, gathered, strict=True)]
+        )
+        clock.lap("correspondences")
+        estimate = estimate_stacked(problem, options)
+        hypothesis = None
+        if isinstance(estimate, PoseEstimate):
+            hypothesis = _hypothesis(_matched(views, cluster), views, problem, estimate, options)
+        clock.lap("estimation")
+        return _Attempt(tuple(cluster), frame, problem, estimate, hypothesis)
+
+    attempts = [attempt(clusters[at], frames[at] if frames else "") for at in tried]
+    candidates = in_turn([view.matched_images() for view in views])
+    attempts = _joined(attempts, attempt, candidates.index)
+    if not attempts:
+        failure = Failure("no match is with a point of the map", seconds=clock.seconds)
+        return ClusterLocalization(failure, (0,) * len(views))
+    hypotheses = [each.hypothesis for each in attempts if each.hypothesis is not None]
+    scores = iter(rank(hypotheses).tolist() if hypotheses else ())
+    ranked = tuple(
+        _cluster_pose(each, _matched(views, each.cluster), None if each.failed else next(scores))
+        for each in attempts
+    )
+    clock.lap("ranking")
+    best = _best(ranked)
+    problem, estimate = attempts[best].problem, attempts[best].estimate
+    if isinstance(estimate, Failure):
+        result: Pose | Failure = _failure(ranked, best)
+    else:
+        result = refine_stacked(problem, estimate, options)
+        clock.lap("refinement")
+    result = replace(result, candidates=ranked[best].images, clusters=ranked, seconds=clock.seconds)
+    if isinstance(result, Pose):
+        result = replace(result, cluster=best)
+    return ClusterLocalization(result, tuple(len(view.points_px) for view in problem.views))
+
+
+@dataclass(frozen=True, eq=False)
+class _Attempt:
+    """One cluster, its 2D-3D matches, and what they came to."""
+
+    cluster: tuple[str, ...]
+    frame: str
+    problem: StackedViews
+    estimate: PoseEstimate | Failure
+    hypothesis: PoseHypothesis | None
+
+    @property
+    def failed(self) -> bool:
+        return self.hypothesis is None
+
+
+def _joined(
+    attempts: list[_Attempt],
+    attempt: Callable[[Sequence[str], str], _Attempt],
+    rank_of: Callable[[str], int],
+) -> list[_Attempt]:
+    """Attempts of one place made one, where that does not lose inliers; in their order."""
+    places: list[list[_Attempt]] = []
+    for each in attempts:
+        for place in places:
+            first = place[0]
+            if (
+                each.frame == first.frame
+                and each.hypothesis is not None
+                and first.hypothesis is not None
+                and same_place(each.hypothesis, first.hypothesis)
+            ):
+                place.append(each)
+                break
+        else:
+            places.append([each])
+    found: list[_Attempt] = []
+    for place in places:
+        together = place[0]
+        if len(place) > 1:
+            images = [image for each in place for image in each.cluster]
+            together = attempt(sorted(images, key=rank_of), together.frame)
+        kept = together.estimate.num_inliers >= max(each.estimate.num_inliers for each in place)
+        found += [together] if kept else place
+    return found
+
+
+def _cluster_pose(attempt: _Attempt, images: tuple[str, ...], score: float | None) -> ClusterPose:
+    estimate = attempt.estimate
+    if isinstance(estimate, Failure):
+        counted = (estimate.num_matches, estimate.num_inliers)
+        return ClusterPose(images, *counted, reason=estimate.reason)
+    counted = (len(estimate.inliers), estimate.num_inliers)
+    return ClusterPose(images, *counted, estimate.rig_from_world, score)
+
+
+def _best(clusters: Sequence[ClusterPose]) -> int:
+    """The first of the highest score; without any score the one that came nearest to a pose."""
+
+    def key(at: int) -> tuple[bool, float, int, int, int]:
+        cluster = clusters[at]
+        score = -np.inf if cluster.score is None else cluster.score
+        return cluster.score is not None, score, cluster.num_inliers, cluster.num_matches, -at
+
+    return max(range(len(clusters)), key=key)
+
+
+def _failure(clusters: Sequence[ClusterPose], best: int) -> Failure:
+    nearest = clusters[best]
+    others = f", the best of {len(clusters)} clusters" if len(clusters) > 1 else ""
+    return Failure(nearest.reason + others, nearest.num_matches, nearest.num_inliers)
+
+
+def _matched(views: Sequence[QueryView], cluster: Sequence[str]) -> tuple[str, ...]:
+    matched = {image for view in views for image in view.matched_images()}
+    return tuple(image for image in cluster if image in matched)
+
+
+def _rows(typed: TypedMatches, cluster: Sequence[str]) -> NDArray[np.bool_]:
+    members = set(cluster)
+    return np.array([image in members for image, _, _ in typed.matches], bool)
+
+
+def _num_observed(
+    views: Sequence[QueryView],
+    gathered: Sequence[Sequence[ObservedMatches]],
+    cluster: Sequence[str],
+) -> int:
+    total = 0
+    for view, own in zip(views, gathered, strict=True):
+        for typed, observed in zip(view.matches, own, strict=True):
+            if len(typed.matches):
+                total += int(_rows(typed, cluster)[observed.image_rows].sum())
+    return total
+
+
+def _view(view: QueryView, gathered: Sequence[ObservedMatches], cluster: Sequence[str]) -> View:
+    """The 2D-3D matches of one camera with the images of one cluster, types one after another."""
+    pixels, points, covariances = [np.zeros((0, 2))], [np.zeros((0, 3))], [np.zeros((0, 6))]
+    known = False
+    for typed, observed in zip(view.matches, gathered, strict=True):
+        found = observed.resolve(_rows(typed, cluster))
+        pixels.append(typed.keypoints_px[found.keypoint_ids, :2].astype(np.float64))
+        points.append(typed.index.xyz[found.point_ids])
+        if typed.index.covariances is None:
+            covariances.append(np.full((len(found.point_ids), 6), np.nan))
+        else:
+            known = True
+            covariances.append(np.asarray(typed.index.covariances[found.point_ids]))
+    return View(
+        camera=view.camera,
+        cam_from_rig=view.cam_from_rig,
+        points_px=np.concatenate(pixels),
+        points_world=np.concatenate(points),
+        point_covariances=np.concatenate(covariances) if known else None,
+    )
+
+
+def _hypothesis(
+    images: tuple[str, ...],
+    views: Sequence[QueryView],
+    problem: StackedViews,
+    estimate: PoseEstimate,
+    options: AbsolutePoseOptions,
+) -> PoseHypothesis:
+    posed = []
+    for query, view, start in zip(views, problem.views, problem.starts[:-1].tolist(), strict=True):
+        own = slice(start, start + len(view.points_px))
+        posed.append(
+            HypothesisView(
+                name=query.name,
+                camera=view.camera,
+                cam_from_world=view.cam_from_rig @ estimate.rig_from_world,
+                points_px=problem.points_px[own],
+                points_world=view.points_world,
+                errors_px=estimate.errors_px[own],
+                inliers=estimate.inliers[own],
+            )
+        )
+    return PoseHypothesis(images, tuple(posed), options.max_error_px)
+
+
+class _Clock:
+    """Seconds by step."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, step: str) -> None:
+        """Add the time since the last lap to a step."""
+        now = time.perf_counter()
+        self.seconds[step] = self.seconds.get(step, 0.0) + now - self._last
+        self._last = now

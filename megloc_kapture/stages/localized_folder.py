@@ -1,0 +1,97 @@
+"""The localized queries as a kapture folder, with what became of each beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from megloc_kapture.io.cluster_table import CLUSTERS_FILE, write_clusters
+from megloc_kapture.io.csv_table import write_csv_table
+from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, write_sensors
+from megloc_kapture.io.links import link_images
+from megloc_kapture.io.status_table import STATUS_FILE, Fallback, QueryStatus, write_status
+from megloc_kapture.stages.rig_siblings import poses_through_rig
+from megloc_kapture.values import Failure, Pose, RigidTransform
+
+
+def write_localized(
+    output: Path,
+    query: KaptureFolder,
+    results: Iterable[tuple[str, Pose | Failure]],
+    *,
+    fallback: Fallback = "none",
+    first_candidates: dict[str, tuple[str, RigidTransform]] | None = None,
+    timing: Path | None = None,
+) -> dict[str, int]:
+    """Write the localized queries as kapture, with ``status.csv`` and ``clusters.csv`` beside it.
+
+    Parameters
+    ----------
+    fallback : what a query that failed gets: nothing; the pose of its best retrieved image; or its
+        pose through the rig, from another camera of its moment, where that was localized.
+    first_candidates : query -> (best retrieved map image, its pose), needed for "retrieval".
+    timing : where to write seconds per query and step.
+    """
+    data = query.read()
+    named = sorted(results, key=lambda result: result[0])
+    guesses: Mapping[str, tuple[str, RigidTransform]] = {}
+    if fallback == "retrieval":
+        guesses = first_candidates or {}
+    elif fallback == "rig":
+        found = {image: result for image, result in named if isinstance(result, Pose)}
+        guesses = poses_through_rig(data, found)
+    poses: dict[tuple[int, str], RigidTransform] = {}
+    statuses = []
+    for image, result in named:
+        guess = None if result else guesses.get(image)
+        statuses.append(_status(image, result, "none" if guess is None else fallback))
+        if isinstance(result, Pose):
+            poses[data.record_of(image)] = result.cam_from_world
+        elif guess is not None:
+            poses[data.record_of(image)] = guess[1]
+    write_sensors(
+        output,
+        KaptureData(
+            sensors=dict(data.sensors),
+            rigs={},
+            trajectories=poses,
+            records_camera=dict(data.records_camera),
+            records_depth={},
+        ),
+    )
+    link_images(query.root, output)
+    write_status(output / STATUS_FILE, statuses)
+    write_clusters(
+        output / CLUSTERS_FILE,
+        (
+            (image, result.clusters, result.cluster if isinstance(result, Pose) else None)
+            for image, result in named
+        ),
+    )
+    if timing is not None:
+        rows = (
+            (image, step, f"{seconds:.5f}")
+            for image, result in named
+            for step, seconds in result.seconds.items()
+        )
+        write_csv_table(timing, ("image", "step", "seconds"), rows)
+    localized = sum(bool(result) for _, result in named)
+    return {
+        "queries": len(named),
+        "localized": localized,
+        "failed": len(named) - localized,
+        "fallbacks": len(poses) - localized,
+    }
+
+
+def _status(image: str, result: Pose | Failure, fallback: Fallback) -> QueryStatus:
+    return QueryStatus(
+        image=image,
+        status="localized" if result else "failed",
+        reason="" if isinstance(result, Pose) else result.reason,
+        num_matches=result.num_matches,
+        num_inliers=result.num_inliers,
+        cluster=result.cluster if isinstance(result, Pose) else None,
+        fallback=fallback,
+        candidates=result.candidates,
+    )

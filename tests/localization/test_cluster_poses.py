@@ -1,0 +1,226 @@
+"""Two places that look alike, and a query in one of them: each cluster has its own pose."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from megloc_kapture.geometry.cameras import project
+from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions
+from megloc_kapture.localization.cluster_poses import (
+    ClusterLocalization,
+    ImageMatches,
+    QueryView,
+    TypedMatches,
+    in_turn,
+    localize_in_clusters,
+)
+from megloc_kapture.localization.map_index import MapIndex
+from megloc_kapture.localization.rig_cameras import moved_covariance, poses_of_cameras
+from megloc_kapture.plugins import PoseHypothesis
+from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
+
+CAMERA = Camera("OPENCV", 640, 480, (500.0, 505.0, 320.0, 240.0, -0.1, 0.02, 0.001, -0.001))
+ALONE = RigidTransform.identity()
+PER_PLACE = 100
+FAR = np.array([50.0, 0.0, 0.0])
+TRUTH = RigidTransform.from_matrix(
+    Rotation.from_euler("xyz", [3, -5, 2], degrees=True).as_matrix(), np.array([0.2, -0.1, 0.4])
+)
+PLACES = ("right/1", "right/2"), ("wrong/1", "wrong/2")
+
+
+def points(seed: int = 0) -> NDArray[np.float64]:
+    """Two places of the same points, 50 m apart."""
+    rng = np.random.default_rng(seed)
+    place = rng.uniform((-2, -2, 4), (2, 2, 8), (PER_PLACE, 3))
+    return np.concatenate([place, place + FAR])
+
+
+def index(xyz: NDArray[np.float64]) -> MapIndex:
+    """Every image sees all points of its place, keypoint i of it the i-th."""
+    names = tuple(name for place in PLACES for name in place)
+    rows = np.arange(PER_PLACE)
+    return MapIndex.build(
+        xyz,
+        names,
+        np.repeat(np.arange(4), PER_PLACE),
+        np.tile(rows, 4),
+        np.concatenate([rows, rows, rows + PER_PLACE, rows + PER_PLACE]),
+    )
+
+
+def matches(shares: dict[str, int]) -> list[ImageMatches]:
+    """So many of an image's keypoints match the query's of the same number."""
+    return [
+        (name, np.stack([np.arange(count)] * 2, axis=1), np.full(count, 0.9))
+        for name, count in shares.items()
+    ]
+
+
+def view(
+    shares: dict[str, int],
+    cam_from_rig: RigidTransform = ALONE,
+    name: str = "q",
+) -> QueryView:
+    xyz = points()
+    seen = project(CAMERA, cam_from_rig @ TRUTH, xyz[:PER_PLACE]).astype(np.float32)
+    return QueryView(name, CAMERA, (TypedMatches(index(xyz), seen, matches(shares)),), cam_from_rig)
+
+
+def by_inliers(hypotheses: Sequence[PoseHypothesis]) -> NDArray[np.float64]:
+    return np.array([sum(v.inliers.sum() for v in h.views) for h in hypotheses], np.float64)
+
+
+def localize(
+    *views: QueryView, clusters: Sequence[Sequence[str]] = PLACES, **more: object
+) -> ClusterLocalization:
+    settings: dict[str, object] = {"rank": by_inliers, "max_clusters": 10} | more
+    return localize_in_clusters(views, clusters, AbsolutePoseOptions(), **settings)  # type: ignore[arg-type]
+
+
+SHARES = {"wrong/1": 60, "right/1": 80, "right/2": 90, "wrong/2": 20}
+
+
+def test_each_cluster_has_its_pose_and_the_best_is_kept() -> None:
+    found = localize(view(SHARES))
+    result = found.result
+    assert isinstance(result, Pose)
+    assert np.linalg.norm(result.cam_from_world.center() - TRUTH.center()) < 1e-5
+    assert result.candidates == PLACES[0] and result.cluster == 0
+    right, wrong = result.clusters
+    assert (right.num_matches, right.num_inliers, right.score) == (90, 90, 90.0)
+    assert (wrong.num_matches, wrong.num_inliers, wrong.images) == (60, 60, PLACES[1])
+    assert wrong.cam_from_world is not None
+    # the same view of the other place, 50 m away
+    np.testing.assert_allclose(wrong.cam_from_world.center() - TRUTH.center(), FAR, atol=1e-3)
+    assert found.matches_of_views == (90,)
+    assert result.covariance is not None and set(result.seconds) == {
+        "correspondences",
+        "estimation",
+        "ranking",
+        "refinement",
+    }
+
+
+def test_the_ranker_has_the_last_word() -> None:
+    asked: list[tuple[str, ...]] = []
+
+    def rank(hypotheses: Sequence[PoseHypothesis]) -> NDArray[np.float64]:
+        asked.extend(h.images for h in hypotheses)
+        (shown,) = hypotheses[1].views
+        assert shown.name == "q" and shown.camera == CAMERA
+        assert shown.errors_px[shown.inliers].max() < 0.1
+        return np.array([0.0, 1.0])
+
+    result = localize(view(SHARES), rank=rank).result
+    assert asked == [PLACES[0], PLACES[1]]
+    assert isinstance(result, Pose) and result.cluster == 1
+    np.testing.assert_allclose(result.cam_from_world.center() - TRUTH.center(), FAR, atol=1e-5)
+
+
+def test_of_equals_the_first_wins() -> None:
+    result = localize(view(SHARES), rank=lambda hypotheses: np.ones(len(hypotheses))).result
+    assert isinstance(result, Pose) and result.cluster == 0
+
+
+def test_only_the_clusters_with_the_most_matches_are_tried() -> None:
+    result = localize(view(SHARES), clusters=PLACES[::-1], max_clusters=1).result
+    assert isinstance(result, Pose)
+    assert [cluster.images for cluster in result.clusters] == [PLACES[0]]
+
+
+def test_clusters_of_one_place_are_one() -> None:
+    """Two images of the right place that share no match with the query, split by a clustering."""
+    xyz = points()
+    seen = project(CAMERA, TRUTH, xyz[:PER_PLACE]).astype(np.float32)
+    rows = np.arange(PER_PLACE)
+
+    def part(name: str, chosen: NDArray[np.int64]) -> ImageMatches:
+        return name, np.stack([chosen, chosen], axis=1), np.full(len(chosen), 0.9)
+
+    halves = [part("right/2", rows[50:]), part("wrong/1", rows[:70]), part("right/1", rows[:50])]
+    query = QueryView("q", CAMERA, (TypedMatches(index(xyz), seen, halves),))
+    split = [("right/2",), ("wrong/1",), ("right/1",)]
+    result = localize(query, clusters=split).result
+    assert isinstance(result, Pose) and result.num_inliers == 100
+    assert [cluster.images for cluster in result.clusters] == [("right/2", "right/1"), ("wrong/1",)]
+    apart = localize(query, clusters=split, frames=["a", "a", "b"]).result
+    assert isinstance(apart, Pose) and len(apart.clusters) == 3
+
+
+def test_a_failure_is_that_of_the_cluster_that_came_nearest() -> None:
+    result = localize(view({"wrong/1": 5, "right/1": 9})).result
+    assert isinstance(result, Failure)
+    assert result.reason == "9 2D-3D matches, at least 12 are needed, the best of 2 clusters"
+    assert result.candidates == ("right/1",) and result.num_matches == 9
+    assert [cluster.num_matches for cluster in result.clusters] == [9, 5]
+
+
+def test_without_points_there_is_nothing_to_localize_in() -> None:
+    empty = np.zeros(0, np.int64)
+    bare = MapIndex.build(np.zeros((0, 3)), (), empty, empty, empty)
+    typed = TypedMatches(bare, np.zeros((1, 2), np.float32), matches({"right/1": 1}))
+    result = localize(QueryView("q", CAMERA, (typed,))).result
+    assert result == Failure("no match is with a point of the map")
+
+
+def test_keypoints_types_are_joined_in_one_pose() -> None:
+    one = view({"right/1": 8}).matches[0]
+    result = localize(QueryView("q", CAMERA, (one, one))).result
+    assert isinstance(result, Pose) and result.num_matches == 16
+    alone = localize(QueryView("q", CAMERA, (one,))).result
+    assert isinstance(alone, Failure)
+
+
+SIDE = RigidTransform.from_matrix(
+    Rotation.from_euler("y", 12, degrees=True).as_matrix(), np.array([-0.4, 0.05, 0.1])
+)
+
+
+@pytest.mark.parametrize("dead", [{}, {"wrong/1": 20}])
+def test_a_rig_is_localized_at_once_and_survives_a_dead_camera(dead: dict[str, int]) -> None:
+    good, other = view({"right/1": 90}), view(dead, SIDE, name="side")
+    found = localize(good, other)
+    assert isinstance(found.result, Pose)
+    assert np.linalg.norm(found.result.cam_from_world.center() - TRUTH.center()) < 1e-4
+    front, side = poses_of_cameras((good, other), found)
+    assert isinstance(front, Pose) and front.num_inliers == 90
+    assert not side and "no inlier in this camera" in side.reason  # type: ignore[union-attr]
+
+
+def test_cameras_of_a_rig_get_their_own_poses_and_counts() -> None:
+    views = view({"right/1": 90}), view({"right/2": 30}, SIDE, name="side")
+    front, side = poses_of_cameras(views, localize(*views))
+    assert isinstance(front, Pose) and isinstance(side, Pose)
+    assert (front.num_matches, side.num_matches) == (90, 30)
+    assert np.linalg.norm(side.cam_from_world.center() - (SIDE @ TRUTH).center()) < 1e-4
+    assert front.covariance is not None and side.covariance is not None
+
+
+def test_a_covariance_moves_with_the_camera() -> None:
+    """Against a Monte Carlo of perturbed rigs."""
+    rng = np.random.default_rng(3)
+    root = rng.normal(size=(6, 6)) * 1e-3
+    covariance = root @ root.T
+    draws = []
+    for xi in rng.multivariate_normal(np.zeros(6), covariance, 20_000):
+        rotation = Rotation.from_rotvec(xi[:3]).as_matrix()
+        step = RigidTransform.from_matrix(rotation, xi[3:])
+        # what the same step is, seen from the camera: C step = step_of_camera C
+        own = SIDE @ step @ SIDE.inverse()
+        vector = Rotation.from_matrix(own.rotation_matrix()).as_rotvec()
+        draws.append(np.concatenate([vector, own.translation]))
+    measured = np.cov(np.array(draws).T)
+    moved = moved_covariance(covariance, SIDE)
+    scale = np.sqrt(np.outer(np.diag(moved), np.diag(moved)))
+    np.testing.assert_allclose(measured / scale, moved / scale, atol=0.05)
+
+
+def test_rankings_are_taken_in_turn() -> None:
+    assert in_turn([["a", "b", "c"], ["b", "d"], []]) == ["a", "b", "d", "c"]
+    assert in_turn([]) == []
