@@ -23,11 +23,11 @@ from threadpoolctl import threadpool_limits
 from timing import table
 
 from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
-from megloc_kapture.geometry.cameras import bearing_rays, focal_px
+from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture_store import KaptureFolder
 from megloc_kapture.matching.nearest_neighbours import match_nearest
-from megloc_kapture.matching.verification import sampson_error_px
+from megloc_kapture.matching.verification import ray_slopes, sampson_error_px
 
 Extract = Callable[[NDArray[np.uint8]], tuple[NDArray[np.float32], NDArray[np.float32]]]
 
@@ -94,11 +94,14 @@ def main() -> None:
                 pose_a, pose_b = data.cam_from_world(a), data.cam_from_world(b)
                 if pose_a is None or pose_b is None:
                     continue
+                px_a, px_b = fa[0][matches[:, 0]], fb[0][matches[:, 1]]
+                rays_a, rays_b = bearing_rays(camera_a, px_a), bearing_rays(camera_b, px_b)
                 error = sampson_error_px(
-                    bearing_rays(camera_a, fa[0][matches[:, 0]]),
-                    bearing_rays(camera_b, fb[0][matches[:, 1]]),
+                    rays_a,
+                    ray_slopes(camera_a, px_a, rays_a),
+                    rays_b,
+                    ray_slopes(camera_b, px_b, rays_b),
                     pose_b @ pose_a.inverse(),
-                    focal_px=0.5 * (focal_px(camera_a) + focal_px(camera_b)),
                 )
                 good = error <= 4.0
                 fitting += int(good.sum())

@@ -148,6 +148,8 @@ class PairsMapping(_StageCommand):
     """How; several methods are united."""
     topk: int | None = None
     """Most similar images per image (retrieval)."""
+    covisibility_map: Path | None = None
+    """Kapture map of the same images, for the points they share; the input's own without it."""
     features_dir: FeaturesDirs = ()
     """Features folder with the global features; may be repeated."""
     global_type: str | None = None
@@ -162,12 +164,19 @@ class PairsMapping(_StageCommand):
         if self.topk is not None:
             changes["top_k"] = self.topk
         options = self.options({"mapping_pairs": changes}).mapping_pairs
+        covisible = self.covisibility_map
+        if covisible is not None and not options.needs_points():
+            raise OptionError("--covisibility-map is for --by covisibility, or poses.min_overlap")
         global_type = None
         if "retrieval" in self.by:
             global_type = _only_type(mapping, "global_features", self.global_type)
         with single_threaded():
             pairs = pair_map_images(
-                mapping, options, global_type=global_type, restrictions=_restrictions(self.input)
+                mapping,
+                options,
+                global_type=global_type,
+                restrictions=_restrictions(self.input),
+                covisible=None if covisible is None else KaptureFolder(covisible),
             )
         _write_pairs(self.output, pairs, force=self.force)
         self.console().say(f"{len(pairs)} pairs")
@@ -281,8 +290,8 @@ class Triangulate(_StageCommand):
     """Use the matches of these pairs only."""
     features_dir: FeaturesDirs = ()
     """Features folder with local features and matches; may be repeated."""
-    features: str | None = None
-    """Type of local features; needed where there are several."""
+    features: tuple[str, ...] = ()
+    """Types of local features, each with its own points; needed where there are several."""
     force: Force = False
     """Write into a folder that has other things in it."""
 
@@ -290,7 +299,7 @@ class Triangulate(_StageCommand):
         """Run it."""
         console = self.console()
         mapping = KaptureFolder(self.input, features_dirs=existing(self.features_dir))
-        local_type = _only_type(mapping, "matches", self.features)
+        local_types = [_only_type(mapping, "matches", asked) for asked in self.features or (None,)]
         pairs = None if self.pairs is None else read_pairs(self.pairs)
         if pairs is not None and self.pairs is not None:
             _check_images_of(pairs, mapping, mapping, self.pairs)
@@ -298,13 +307,16 @@ class Triangulate(_StageCommand):
             counts = triangulate_map(
                 mapping,
                 mapping,
-                local_type,
+                local_types,
                 out,
                 self.options().triangulation,
                 pairs=pairs,
                 num_threads=self.workers or available_cores(),
             )
-        console.say(f"{counts['points']:g} points, {counts['observations']:g} observations")
+        for type_name in sorted(set(local_types)) if len(set(local_types)) > 1 else ():
+            points, seen = counts[f"points_{type_name}"], counts[f"observations_{type_name}"]
+            console.say(f"{type_name}: {points} points, {seen} observations")
+        console.say(f"{counts['points']} points, {counts['observations']} observations")
         return 0
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import tempfile
 import zlib  # noqa: F401  pycolmap 4.1.1 to 4.2.1 corrupt the heap when imported before zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, OutputError
 from megloc_kapture.values import Camera, Options, RigidTransform
 
 if TYPE_CHECKING:
@@ -60,6 +60,9 @@ def px_from_cam(camera: Camera, points_in_cam: NDArray[np.float64]) -> NDArray[n
     if front.any():
         out[front] = _colmap_camera(camera).img_from_cam(points[front])
     return out
+
+
+_NEVER = 2**31 - 1
 
 
 class TriangulationOptions(Options):
@@ -173,6 +176,8 @@ def triangulate(
         reconstruction = _write_database(pycolmap, database_path, images, matches, offset)
         pipeline = pycolmap.IncrementalPipelineOptions()
         pipeline.num_threads = num_threads
+        # with many residuals its threads add them up in whatever order they come: other last bits
+        pipeline.ba_min_num_residuals_for_cpu_multi_threading = _NEVER
         pipeline.random_seed = options.seed
         pipeline.triangulation.random_seed = options.seed
         pipeline.triangulation.ignore_two_view_tracks = not options.two_view_tracks
@@ -275,3 +280,80 @@ def _collect(reconstruction: Any, offset: NDArray[np.float64]) -> TriangulatedPo
         image_ids=flat[:, 0],
         keypoint_ids=flat[:, 1],
     )
+
+
+def extract_sift(
+    image: NDArray[np.uint8],
+    *,
+    max_keypoints: int = 8192,
+    first_octave: int = -1,
+    peak_threshold: float = 0.02 / 3,
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """COLMAP's SIFT on the CPU, all else at its defaults, in its order (fine scales first).
+
+    Parameters
+    ----------
+    image : uint8 (H, W, 3), RGB; made grey as COLMAP does when it reads a file.
+    max_keypoints : COLMAP keeps whole scale levels, the coarsest first, up to and with the one that
+        exceeds this number; so there may be half as many again.
+
+    Returns
+    -------
+    keypoints : float32 (N, 4): x, y (the first pixel's centre is (0.5, 0.5)), scale in px,
+        orientation in radians.
+    descriptors : uint8 (N, 128): 512 times the square roots of the L1-normalised histograms.
+    """
+    pycolmap = _pycolmap()
+    options = pycolmap.FeatureExtractionOptions()
+    options.num_threads = 1
+    options.sift.max_num_features = max_keypoints
+    options.sift.first_octave = first_octave
+    options.sift.peak_threshold = peak_threshold
+    bitmap = pycolmap.Bitmap.from_array(np.ascontiguousarray(image)).clone_as_grey()
+    # made anew each time: one has a pyramid of its own, which two threads would share
+    extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
+    found, descriptors = extractor.extract(bitmap)
+    rows = [(k.x, k.y, k.compute_scale(), k.compute_orientation()) for k in found]
+    keypoints = np.array(rows, dtype=np.float32).reshape(-1, 4)
+    return keypoints, np.array(descriptors.data, dtype=np.uint8).reshape(-1, 128)
+
+
+@dataclass(frozen=True, eq=False)
+class DatabaseFeatures:
+    """One image of a COLMAP database: keypoints float32 (N, 2 or 4), descriptors uint8 (N, 128)."""
+
+    name: str
+    camera: Camera
+    keypoints_px: NDArray[np.float32]
+    descriptors: NDArray[np.uint8]
+
+
+def write_feature_database(path: Path, images: Iterable[DatabaseFeatures]) -> None:
+    """Write COLMAP's database of images with SIFT features; equal cameras are one.
+
+    Raises
+    ------
+    OutputError : ``path`` is there already, or cannot be written.
+    """
+    pycolmap = _pycolmap()
+    path = Path(path)
+    if path.exists():
+        raise OutputError(f"{path}: is there already")
+    camera_ids: dict[Camera, int] = {}
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        database = pycolmap.Database.open(str(path))
+        with pycolmap.DatabaseTransaction(database):
+            for image in images:
+                if image.camera not in camera_ids:
+                    camera = _colmap_camera(image.camera)
+                    camera_ids[image.camera] = database.write_camera(camera)
+                entry = pycolmap.Image(name=image.name, camera_id=camera_ids[image.camera])
+                image_id = database.write_image(entry)
+                database.write_keypoints(image_id, np.ascontiguousarray(image.keypoints_px))
+                kind = pycolmap.FeatureExtractorType.SIFT
+                rows = pycolmap.FeatureDescriptors(kind, np.ascontiguousarray(image.descriptors))
+                database.write_descriptors(image_id, rows)
+        database.close()
+    except (OSError, RuntimeError) as error:
+        raise OutputError(f"{path}: cannot be written: {error}") from error

@@ -1,9 +1,16 @@
 """Geometric verification of matches: with known poses, or by a two-view model.
 
 Known poses (mapping pairs): the essential matrix is given, so verification is one vectorised
-Sampson distance (Hartley and Zisserman, Multiple View Geometry, eq. 11.9) and a test that the
-rays meet in front of both cameras; no sampling. Unknown pose (query pairs): LO-RANSAC of the
-relative pose by poselib.
+Sampson distance and a test that the rays meet in front of both cameras; no sampling. The distance
+is in pixels of the images as they were taken: how far both measurements together have to move, to
+first order, until their rays meet. Unknown pose (query pairs): LO-RANSAC of the relative pose by
+poselib.
+
+With rays r = (x, y, 1), the epipolar constraint is C = r_b . E r_a. Its derivatives with respect to
+the four measured coordinates follow from those of C with respect to x and y and from the inverse of
+d px / d (x, y), which is the derivative of the camera's own projection; the distance is |C| over
+their norm (Hartley and Zisserman, Multiple View Geometry, eq. 4.13; for one focal length and no
+distortion it is their eq. 11.9 times the focal length).
 """
 
 from __future__ import annotations
@@ -17,11 +24,16 @@ from pydantic import Field
 from megloc_kapture.geometry.cameras import bearing_rays, focal_px
 from megloc_kapture.values import Camera, Options, RigidTransform
 
+Floats = NDArray[np.float64]
+
+# a ray that is seen this far from its pixel is none of this pixel
+_MAX_RAY_ERROR_PX = 0.1
+
 
 class KnownPoseOptions(Options):
     """Options of verification with the known poses."""
 
-    max_error_px: float = Field(default=4.0, gt=0, description="Sampson distance")
+    max_error_px: float = Field(default=4.0, gt=0, description="Sampson distance in the images")
     min_matches: int = Field(default=15, ge=0, description="a pair with fewer left has none")
 
 
@@ -36,46 +48,73 @@ class TwoViewOptions(Options):
     seed: int = Field(default=0, ge=0)
 
 
-def cross_matrix(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+def cross_matrix(vector: Floats) -> Floats:
     """``[v]_x`` (3, 3) with ``[v]_x w = v x w``."""
     x, y, z = vector
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
-def essential_matrix(b_from_a: RigidTransform) -> NDArray[np.float64]:
+def essential_matrix(b_from_a: RigidTransform) -> Floats:
     """E (3, 3) with ``ray_b . E ray_a = 0``."""
     return cross_matrix(np.array(b_from_a.translation)) @ b_from_a.rotation_matrix()
 
 
+def ray_slopes(camera: Camera, keypoints_px: NDArray[np.floating[Any]], rays: Floats) -> Floats:
+    """How rays turn with their pixels, under the camera's own model.
+
+    Parameters
+    ----------
+    keypoints_px : (N, 2).
+    rays : float64 (N, 3), their homogeneous rays, last component 1.
+
+    Returns
+    -------
+    float64 (N, 2, 2), d (x, y) / d px. NaN where a ray is not that of its pixel: the distortion
+    cannot be undone there, or the pixel looks sideways or back, as pixels of a fisheye may.
+    """
+    from megloc_kapture.geometry.projection import project_with_jacobian
+
+    px, jacobian = project_with_jacobian(camera, rays)
+    a, b, c, d = (jacobian[:, row, column] for row in (0, 1) for column in (0, 1))
+    determinant = a * d - b * c
+    error = np.abs(px - keypoints_px).max(axis=1)
+    # beyond the radius where a distortion turns back, it is mirrored
+    good = (error <= _MAX_RAY_ERROR_PX) & (determinant > 0)
+    slopes = np.stack([d, -b, -c, a], axis=1).reshape(-1, 2, 2)
+    slopes /= np.where(good, determinant, np.nan)[:, None, None]
+    return slopes
+
+
 def sampson_error_px(
-    rays_a: NDArray[np.float64],
-    rays_b: NDArray[np.float64],
+    rays_a: Floats,
+    slopes_a: Floats,
+    rays_b: Floats,
+    slopes_b: Floats,
     b_from_a: RigidTransform,
-    *,
-    focal_px: float,
-) -> NDArray[np.float64]:
-    """Sampson distance in pixels of homogeneous rays (N, 3) with last component 1; (N,)."""
+) -> Floats:
+    """Sampson distance in pixels of matched rays (N, 3), last component 1, see above; (N,).
+
+    Parameters
+    ----------
+    slopes_a, slopes_b : float64 (N, 2, 2), see :func:`ray_slopes`.
+
+    Returns
+    -------
+    float64 (N,); infinite where there is no epipolar line, NaN where a slope is.
+    """
     essential = essential_matrix(b_from_a)
     line_b = rays_a @ essential.T
     line_a = rays_b @ essential
-    numerator = np.einsum("nd,nd->n", rays_b, line_b)
-    denominator = np.sqrt(
-        line_a[:, 0] ** 2 + line_a[:, 1] ** 2 + line_b[:, 0] ** 2 + line_b[:, 1] ** 2
-    )
-    return np.asarray(
-        focal_px
-        * np.divide(
-            np.abs(numerator),
-            denominator,
-            out=np.full(len(numerator), np.inf),
-            where=denominator > 0,
-        )
+    numerator = np.abs(np.einsum("nd,nd->n", rays_b, line_b))
+    slope_a = np.einsum("nd,ndk->nk", line_a[:, :2], slopes_a)
+    slope_b = np.einsum("nd,ndk->nk", line_b[:, :2], slopes_b)
+    squared = np.einsum("nk,nk->n", slope_a, slope_a) + np.einsum("nk,nk->n", slope_b, slope_b)
+    return np.divide(
+        numerator, np.sqrt(squared), out=np.full(len(numerator), np.inf), where=squared != 0
     )
 
 
-def in_front_of_both(
-    rays_a: NDArray[np.float64], rays_b: NDArray[np.float64], b_from_a: RigidTransform
-) -> NDArray[np.bool_]:
+def in_front_of_both(rays_a: Floats, rays_b: Floats, b_from_a: RigidTransform) -> NDArray[np.bool_]:
     """Whether the midpoint of two rays' common perpendicular is in front of both cameras; (N,).
 
     Rays so close to parallel that the point is at infinity pass: they do no harm.
@@ -95,11 +134,11 @@ def in_front_of_both(
 
 
 def verify_with_poses(
-    rays_a: NDArray[np.float64],
-    rays_b: NDArray[np.float64],
+    rays_a: Floats,
+    slopes_a: Floats,
+    rays_b: Floats,
+    slopes_b: Floats,
     b_from_a: RigidTransform,
-    *,
-    focal_px: float,
     options: KnownPoseOptions | None = None,
 ) -> NDArray[np.bool_]:
     """Which matches agree with a known relative pose.
@@ -107,8 +146,8 @@ def verify_with_poses(
     Parameters
     ----------
     rays_a, rays_b : float64 (N, 3), matched homogeneous rays, last component 1.
+    slopes_a, slopes_b : float64 (N, 2, 2), see :func:`ray_slopes`; a match with NaN is refused.
     b_from_a : the known pose.
-    focal_px : mean focal length of the two cameras.
 
     Returns
     -------
@@ -117,8 +156,8 @@ def verify_with_poses(
     options = options or KnownPoseOptions()
     if len(rays_a) == 0:
         return np.zeros(0, dtype=bool)
-    good = sampson_error_px(rays_a, rays_b, b_from_a, focal_px=focal_px) <= options.max_error_px
-    good &= in_front_of_both(rays_a, rays_b, b_from_a)
+    error = sampson_error_px(rays_a, slopes_a, rays_b, slopes_b, b_from_a)
+    good = (error <= options.max_error_px) & in_front_of_both(rays_a, rays_b, b_from_a)
     if good.sum() < options.min_matches:
         good[:] = False
     return good

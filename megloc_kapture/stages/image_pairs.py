@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -10,18 +11,25 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.kapture_store import FeatureReader, ImagePair, KaptureFolder
-from megloc_kapture.mapping.pairs import (
-    PairsByPosesOptions,
-    exhaustive_pairs,
-    pairs_by_poses,
-    unique_pairs,
+from megloc_kapture.io.kapture_store import (
+    FeatureReader,
+    ImagePair,
+    KaptureData,
+    KaptureFolder,
 )
+from megloc_kapture.mapping.frustum_overlap import frustum_overlap
+from megloc_kapture.mapping.pairs import exhaustive_pairs
+from megloc_kapture.mapping.pairs_by_covisibility import (
+    PairsByCovisibilityOptions,
+    pairs_by_covisibility,
+)
+from megloc_kapture.mapping.pairs_by_poses import PairsByPosesOptions, pairs_by_poses
+from megloc_kapture.mapping.pairs_by_sequence import PairsBySequenceOptions, pairs_by_sequence
 from megloc_kapture.retrieval.search import rank_by_similarity
 from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
-from megloc_kapture.values import Options
+from megloc_kapture.values import Options, RigidTransform
 
-PairingMethod = Literal["poses", "retrieval", "exhaustive"]
+PairingMethod = Literal["poses", "covisibility", "retrieval", "sequence", "exhaustive"]
 
 
 class MappingPairsOptions(Options):
@@ -30,6 +38,13 @@ class MappingPairsOptions(Options):
     by: tuple[PairingMethod, ...] = Field(default=("retrieval",), min_length=1)
     top_k: int = Field(default=20, gt=0, description="most similar images per image (retrieval)")
     poses: PairsByPosesOptions = PairsByPosesOptions()
+    covisibility: PairsByCovisibilityOptions = PairsByCovisibilityOptions()
+    sequence: PairsBySequenceOptions = PairsBySequenceOptions()
+
+    def needs_points(self) -> bool:
+        """Whether a method looks at points that are there already."""
+        overlap = "poses" in self.by and self.poses.min_overlap is not None
+        return overlap or "covisibility" in self.by
 
 
 class QueryPairsOptions(Options):
@@ -64,46 +79,133 @@ def unit_rows(rows: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.divide(rows, norm, out=np.zeros_like(rows), where=norm > 0)
 
 
+@dataclass(frozen=True, eq=False)
+class _SeenPoints:
+    """Points (N, 3), and the observations (O,) of them by the images that are looked at."""
+
+    xyz: NDArray[np.float64]
+    point_ids: NDArray[np.int64]
+    image_ids: NDArray[np.int64]
+
+    @classmethod
+    def read(cls, folder: KaptureFolder, images: Sequence[str]) -> _SeenPoints:
+        if not folder.has_points():
+            raise DataError("co-visibility and overlap need a map's points", path=folder.root)
+        row_of = {image: row for row, image in enumerate(images)}
+        points, seeing = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
+        for _, observations in sorted(folder.observations().items()):
+            rows = np.array([row_of.get(name, -1) for name in observations.image_names], np.int64)
+            image_ids = rows[observations.image_ids]
+            points.append(observations.point_ids[image_ids >= 0])
+            seeing.append(image_ids[image_ids >= 0])
+        found = cls(folder.points3d()[:, :3], np.concatenate(points), np.concatenate(seeing))
+        if len(found.point_ids) == 0:
+            raise DataError("no image to be paired observes its points", path=folder.root)
+        return found
+
+    def of(self, members: NDArray[np.int64], num_images: int) -> _SeenPoints:
+        """What some of the images observe, by their place among these."""
+        row_of = np.full(num_images, -1, dtype=np.int64)
+        row_of[members] = np.arange(len(members))
+        rows = row_of[self.image_ids]
+        return _SeenPoints(self.xyz, self.point_ids[rows >= 0], rows[rows >= 0])
+
+
+_NOTHING_SEEN = _SeenPoints(np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0, np.int64))
+
+
 def pair_map_images(
     mapping: KaptureFolder,
     options: MappingPairsOptions,
     *,
     global_type: str | None,
     restrictions: Restrictions = UNRESTRICTED,
+    covisible: KaptureFolder | None = None,
 ) -> list[ImagePair]:
     """Pairs of map images with a pose, each once, first name before second, sorted.
 
     Images of different coordinate frames are never paired. The score is the cosine similarity
     where retrieval named the pair, else 1.
+
+    Parameters
+    ----------
+    covisible : a map of the same images in the same frames, whose points co-visibility and overlap
+        look at; by default those of ``mapping`` itself.
+
+    Raises
+    ------
+    DataError : global features or points are needed and not there.
     """
     data = mapping.read()
     poses = data.poses()
     images = sorted(poses)
-    scores: dict[tuple[int, int], float] = {}
-    similarities: dict[tuple[int, int], float] = {}
+    seen = _NOTHING_SEEN
+    if options.needs_points():
+        seen = _SeenPoints.read(covisible or mapping, images)
+    found = [np.zeros((0, 2), dtype=np.int64)]
+    similarities = [np.zeros(0)]
     for members in restrictions.frames(images):
         names = [images[member] for member in members]
+        within = seen.of(members, len(images))
         for method in options.by:
+            similarity = None
             if method == "retrieval":
                 if global_type is None:
                     raise DataError("pairs by retrieval need global features of the map")
                 vectors = read_global_features(mapping.global_features(global_type), names)
-                for pair, score in _most_similar(vectors, options.top_k):
-                    i, j = (int(member) for member in members[pair])
-                    similarities[i, j] = max(score, similarities.get((i, j), -1.0))
-                continue
-            if method == "exhaustive":
-                found = exhaustive_pairs(len(names))
+                pairs, similarity = _most_similar(vectors, options.top_k)
+            elif method == "poses":
+                pairs = _by_poses(data, [poses[name] for name in names], names, within, options)
+            elif method == "sequence":
+                records = [data.record_of(name) for name in names]
+                cameras, timestamps = [sensor for _, sensor in records], [t for t, _ in records]
+                pairs = pairs_by_sequence(cameras, timestamps, options.sequence)
+            elif method == "covisibility":
+                pairs = pairs_by_covisibility(
+                    len(names), within.point_ids, within.image_ids, options.covisibility
+                )
             else:
-                found = pairs_by_poses([poses[name] for name in names], options.poses)
-            for i, j in members[unique_pairs(found)].tolist():
-                scores[i, j] = 1.0
-    scores.update(similarities)
-    return [ImagePair(images[i], images[j], score) for (i, j), score in sorted(scores.items())]
+                pairs = exhaustive_pairs(len(names))
+            found.append(members[pairs])
+            similarities.append(np.full(len(pairs), -np.inf) if similarity is None else similarity)
+    return _united(images, np.concatenate(found), np.concatenate(similarities))
 
 
-def _most_similar(vectors: NDArray[np.float32], top_k: int) -> list[tuple[list[int], float]]:
-    """Pairs (i, j), i < j, of each row and its ``top_k`` most similar others, and similarities."""
+def _by_poses(
+    data: KaptureData,
+    poses: list[RigidTransform],
+    names: list[str],
+    seen: _SeenPoints,
+    options: MappingPairsOptions,
+) -> NDArray[np.int64]:
+    pairs = pairs_by_poses(poses, options.poses)
+    if options.poses.min_overlap is None:
+        return pairs
+    cameras = [data.camera_of(name) for name in names]
+    overlap = frustum_overlap(pairs, cameras, poses, seen.xyz, seen.point_ids, seen.image_ids)
+    # where neither image observes anything nobody knows
+    return pairs[~(overlap < options.poses.min_overlap)]
+
+
+def _united(
+    images: Sequence[str], pairs: NDArray[np.int64], similarities: NDArray[np.float64]
+) -> list[ImagePair]:
+    """Each pair of ``pairs`` (P, 2), i < j, once, with its best similarity, 1 for -infinity."""
+    keys, place = np.unique(pairs[:, 0] * len(images) + pairs[:, 1], return_inverse=True)
+    scores = np.full(len(keys), -np.inf)
+    np.maximum.at(scores, place, similarities)
+    scores[np.isneginf(scores)] = 1.0
+    first, second = np.divmod(keys, max(len(images), 1))
+    return [
+        ImagePair(images[i], images[j], score)
+        for i, j, score in zip(first.tolist(), second.tolist(), scores.tolist(), strict=True)
+    ]
+
+
+def _most_similar(
+    vectors: NDArray[np.float32], top_k: int
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Pairs (P, 2), i < j, of each row and its ``top_k`` most similar others, and similarities."""
     index, similarity = rank_by_similarity(vectors, vectors, top_k + 1)
     rows = np.repeat(np.arange(len(vectors)), index.shape[1])
     both = np.stack([rows, index.ravel()], axis=1)
@@ -111,8 +213,7 @@ def _most_similar(vectors: NDArray[np.float32], top_k: int) -> list[tuple[list[i
     others = both[:, 0] != both[:, 1]
     rank = np.cumsum(others.reshape(index.shape), axis=1).ravel()
     keep = others & (rank <= top_k) & (both[:, 1] >= 0)
-    pairs = np.sort(both[keep], axis=1).tolist()
-    return list(zip(pairs, similarity.ravel()[keep].tolist(), strict=True))
+    return np.sort(both[keep], axis=1), similarity.ravel()[keep].astype(np.float64)
 
 
 def pair_queries(

@@ -10,6 +10,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import groupby
 from pathlib import Path
 from typing import Any, Literal
@@ -17,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.geometry.cameras import bearing_rays, focal_px
+from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.io.kapture_store import (
     FeatureReader,
     ImagePair,
@@ -27,6 +28,7 @@ from megloc_kapture.io.kapture_store import (
 from megloc_kapture.matching.verification import (
     KnownPoseOptions,
     TwoViewOptions,
+    ray_slopes,
     verify_two_view,
     verify_with_poses,
 )
@@ -54,6 +56,11 @@ class Features:
     keypoints_px: NDArray[np.float32]
     rays: NDArray[np.float64]
     descriptors: NDArray[Any]
+
+    @cached_property
+    def slopes(self) -> NDArray[np.float64]:
+        """``ray_slopes`` of the keypoints (N, 2, 2), worked out when first asked for."""
+        return ray_slopes(self.camera, self.keypoints_px[:, :2], self.rays)
 
 
 @dataclass(frozen=True)
@@ -167,12 +174,14 @@ def _relative_verification(
     def verify(a: Features, b: Features, matches: NDArray[np.int64]) -> NDArray[np.bool_]:
         if a_from_world is None or b_from_world is None:
             return np.zeros(len(matches), dtype=bool)
+        rows_a, rows_b = matches.T
         return verify_with_poses(
-            a.rays[matches[:, 0]],
-            b.rays[matches[:, 1]],
+            a.rays[rows_a],
+            a.slopes[rows_a],
+            b.rays[rows_b],
+            b.slopes[rows_b],
             b_from_world @ a_from_world.inverse(),
-            focal_px=0.5 * (focal_px(a.camera) + focal_px(b.camera)),
-            options=options,
+            options,
         )
 
     return verify
@@ -215,7 +224,9 @@ class FeatureCache:
 
 
 def _size(features: Features) -> int:
-    return features.descriptors.nbytes + features.keypoints_px.nbytes + features.rays.nbytes
+    slopes = 4 * features.rays.itemsize * len(features.rays)  # there or not
+    arrays = (features.descriptors, features.keypoints_px, features.rays)
+    return sum(array.nbytes for array in arrays) + slopes
 
 
 _cache = FeatureCache()

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -128,6 +129,56 @@ def test_the_same_call_gives_the_same_bits_whatever_the_threads() -> None:
     rows = np.stack([first.point_ids, first.image_ids, first.keypoint_ids], axis=1)
     tracks = [rows[rows[:, 0] == k, 1:].tolist() for k in range(len(first.xyz))]
     assert tracks == sorted(tracks)
+
+
+def test_neither_poses_nor_cameras_move_and_no_bit_depends_on_the_threads(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """With as many residuals as COLMAP's bundle adjustment shares between threads."""
+    import pycolmap
+
+    rng = np.random.default_rng(2)
+    count, num_points = 25, 1100
+    camera = CAMERAS["OPENCV_FISHEYE"]
+    xyz = rng.uniform((-2, -1.5, -1), (2, 1.5, 1), (num_points, 3))
+    images = []
+    for k in range(count):
+        turn = Rotation.from_rotvec([0.002 * k, 0.01 * (k - count / 2), 0.1]).as_matrix()
+        pose = RigidTransform.from_matrix(turn, np.array([0.06 * (k - count / 2), 0.01 * k, 8.0]))
+        pixels = px_from_cam(camera, pose.apply(xyz)) + rng.normal(0, 0.7, (num_points, 2))
+        images.append(MapImage(f"{k}.jpg", camera, pose, pixels.astype(np.float32)))
+    matches = {}
+    for i, j in combinations(range(count), 2):
+        if j <= i + 5:
+            matches[i, j] = rows = np.repeat(np.arange(num_points)[:, None], 2, axis=1)
+            wrong = rng.random(num_points) < 0.1
+            rows[wrong, 1] = rng.permutation(rows[wrong, 1])
+    states: list[list[Any]] = []
+    original = pycolmap.triangulate_points
+
+    def state(reconstruction: Any) -> list[Any]:
+        poses = [
+            reconstruction.images[k].cam_from_world().matrix().tolist()
+            for k in sorted(reconstruction.images)
+        ]
+        return [poses, [camera.params.tolist() for camera in reconstruction.cameras.values()]]
+
+    def recorded(reconstruction: Any, *arguments: Any) -> Any:
+        states.append(state(reconstruction))
+        found = original(reconstruction, *arguments)
+        states.append(state(found))
+        return found
+
+    monkeypatch.setattr(pycolmap, "triangulate_points", recorded)
+    first = triangulate(images, matches)
+    assert 2 * len(first.point_ids) > 50_000
+    assert equal(first, triangulate(images, matches, num_threads=4))
+    for poses, cameras in states[1:]:
+        # COLMAP makes unit quaternions of unit quaternions on the way: the last digit
+        np.testing.assert_allclose(poses, states[0][0], rtol=0, atol=1e-15)
+        assert cameras == states[0][1]
+    assert len(states) == 4
+    assert len(states[0][0]) == count
 
 
 def test_poses_and_cameras_are_not_adjusted() -> None:

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.geometry.cameras import bearing_rays, project
@@ -17,6 +18,7 @@ from megloc_kapture.matching.verification import (
     cross_matrix,
     essential_matrix,
     in_front_of_both,
+    ray_slopes,
     sampson_error_px,
     verify_two_view,
     verify_with_poses,
@@ -37,6 +39,23 @@ def pose(rotation_vector: list[float], translation: list[float]) -> RigidTransfo
     tx, ty, tz = translation
     return RigidTransform((w, x, y, z), (tx, ty, tz))
 
+
+def seen(camera: Camera, pixels: Array) -> tuple[Array, Array]:
+    """Rays and slopes of pixels."""
+    rays = bearing_rays(camera, pixels)
+    return rays, ray_slopes(camera, pixels, rays)
+
+
+def plain(rays: Array, focal_px: float) -> tuple[Array, Array]:
+    """Rays, and their slopes in a camera without distortion."""
+    return rays, np.repeat(np.eye(2)[None] / focal_px, len(rays), axis=0)
+
+
+# what the old measure, normalised coordinates times the focal length, got wrong
+WIDE = [
+    Camera("OPENCV_FISHEYE", 900, 900, (280.0, 280.0, 450.0, 450.0, 0.02, -0.005, 0.0, 0.0)),
+    Camera("OPENCV", 900, 700, (350.0, 340.0, 450.0, 350.0, -0.25, 0.08, 2e-3, -1e-3)),
+]
 
 B_FROM_A = pose([0.02, -0.15, 0.05], [-1.0, 0.1, 0.2])
 
@@ -83,50 +102,92 @@ def test_essential_matrix_is_colmaps() -> None:
 
 
 def test_the_sampson_distance_is_colmaps() -> None:
+    """Of cameras without distortion and of one focal length; in normalised coordinates."""
     rng = np.random.default_rng(1)
     a, b = rng.normal(size=(50, 2)), rng.normal(size=(50, 2))
     expected = pycolmap.compute_squared_sampson_error(a, b, essential_matrix(B_FROM_A))
-    ours = sampson_error_px(
-        np.column_stack([a, np.ones(50)]),
-        np.column_stack([b, np.ones(50)]),
-        B_FROM_A,
-        focal_px=500.0,
-    )
+    camera = Camera("SIMPLE_PINHOLE", 640, 480, (500.0, 320.0, 240.0))
+    pixels = [500.0 * xy + np.array([320.0, 240.0]) for xy in (a, b)]
+    ours = sampson_error_px(*seen(camera, pixels[0]), *seen(camera, pixels[1]), B_FROM_A)
     np.testing.assert_allclose((ours / 500.0) ** 2, expected, rtol=1e-9)
     assert np.median(ours) > 10  # random matches are far from the epipolar lines
 
 
-@given(st.integers(0, 2**32 - 1))
-@settings(deadline=None)
-def test_the_sampson_distance_is_the_smallest_correction_to_first_order(seed: int) -> None:
-    """Moved off its epipolar line by a little, a match has that distance shared by both images."""
-    points, in_a, in_b = scene(PINHOLE, PINHOLE, count=20, seed=seed)
-    rays_a, rays_b = bearing_rays(PINHOLE, in_a), bearing_rays(PINHOLE, in_b)
-    line_b = rays_a @ essential_matrix(B_FROM_A).T
-    line_a = rays_b @ essential_matrix(B_FROM_A)
-    normal_b = line_b[:, :2] / np.linalg.norm(line_b[:, :2], axis=1, keepdims=True)
-    moved = rays_b.copy()
-    moved[:, :2] += 1e-4 * normal_b
-    ours = sampson_error_px(rays_a, moved, B_FROM_A, focal_px=1.0)
-    share = np.linalg.norm(line_b[:, :2], axis=1) / np.hypot(
-        np.linalg.norm(line_a[:, :2], axis=1), np.linalg.norm(line_b[:, :2], axis=1)
+@pytest.mark.parametrize("camera", [PINHOLE, *DISTORTED, *WIDE], ids=lambda c: c.model)
+def test_slopes_are_the_derivative_of_the_ray_by_the_pixel(camera: Camera) -> None:
+    _, in_a, _ = scene(camera, PINHOLE, count=50)
+    _, slopes = seen(camera, in_a)
+    step = 1e-3
+    for column, shift in enumerate(np.eye(2) * step):
+        ahead, behind = bearing_rays(camera, in_a + shift), bearing_rays(camera, in_a - shift)
+        expected = (ahead - behind)[:, :2] / (2 * step)
+        np.testing.assert_allclose(slopes[:, :, column], expected, rtol=1e-5, atol=1e-9)
+
+
+def smallest_correction_px(
+    camera_a: Camera, px_a: Array, camera_b: Camera, px_b: Array, start: Array
+) -> float:
+    """How far two measurements have to move until one point explains them; by least squares."""
+
+    def residuals(point: Array) -> Array:
+        in_a = project(camera_a, RigidTransform.identity(), point[None])[0]
+        in_b = project(camera_b, B_FROM_A, point[None])[0]
+        return np.concatenate([in_a - px_a, in_b - px_b])
+
+    found = least_squares(residuals, start, x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    return float(np.linalg.norm(found.fun))
+
+
+@pytest.mark.parametrize("camera_b", [PINHOLE, *DISTORTED, *WIDE], ids=lambda c: c.model)
+@pytest.mark.parametrize("camera_a", WIDE, ids=lambda c: c.model)
+def test_the_error_is_that_of_optimal_triangulation_to_first_order(
+    camera_a: Camera, camera_b: Camera
+) -> None:
+    rng = np.random.default_rng(7)
+    points, in_a, in_b = scene(camera_a, camera_b, count=20)
+    in_a, in_b = in_a + rng.normal(size=in_a.shape), in_b + rng.normal(size=in_b.shape)
+    ours = sampson_error_px(*seen(camera_a, in_a), *seen(camera_b, in_b), B_FROM_A)
+    expected = np.array(
+        [
+            smallest_correction_px(camera_a, px_a, camera_b, px_b, point)
+            for px_a, px_b, point in zip(in_a, in_b, points, strict=True)
+        ]
     )
-    np.testing.assert_allclose(ours, 1e-4 * share, rtol=1e-2)
+    assert np.median(expected) > 0.2
+    np.testing.assert_allclose(ours, expected, rtol=0.01, atol=0.01)
 
 
-@pytest.mark.parametrize("camera", [PINHOLE, *DISTORTED], ids=lambda c: c.model)
+def test_pixels_at_the_rim_of_a_fisheye_count_as_pixels() -> None:
+    """In normalised coordinates they would count several times as much."""
+    camera = WIDE[0]
+    angles = np.radians(np.linspace(60, 80, 20))
+    points = 5 * np.stack([np.sin(angles), 0 * angles, np.cos(angles)], axis=1)
+    along = pose([0.0, 0.0, 0.0], [-0.5, 0.0, 0.0])
+    in_a = project(camera, RigidTransform.identity(), points)
+    in_b = project(camera, along, points)
+    in_b[:, 1] += 5.0  # across the epipolar lines: more than 3.5 px of both together
+    rays = [seen(camera, px) for px in (in_a, in_b)]
+    good = verify_with_poses(*rays[0], *rays[1], along, KnownPoseOptions(max_error_px=3.4))
+    assert not good.any()
+    assert verify_with_poses(*rays[0], *rays[1], along).all()
+    focal = camera.params[0]
+    as_before = sampson_error_px(*plain(rays[0][0], focal), *plain(rays[1][0], focal), along)
+    assert as_before.min() > 4.0
+
+
+@pytest.mark.parametrize("camera", [PINHOLE, *DISTORTED, *WIDE], ids=lambda c: c.model)
 def test_exact_matches_pass_and_others_do_not(camera: Camera) -> None:
     points, in_a, in_b = scene(camera, camera)
-    rays_a, rays_b = bearing_rays(camera, in_a), bearing_rays(camera, in_b)
-    assert verify_with_poses(rays_a, rays_b, B_FROM_A, focal_px=500.0).all()
+    matches = (*seen(camera, in_a), *seen(camera, in_b))
+    assert verify_with_poses(*matches, B_FROM_A).all()
     # the same matches under another pose do not
     wrong = pose([0.02, -0.05, 0.05], [-1.0, 0.9, 0.2])
-    assert not verify_with_poses(rays_a, rays_b, wrong, focal_px=500.0).any()
+    assert not verify_with_poses(*matches, wrong, KnownPoseOptions(max_error_px=2.0)).any()
 
 
 def test_only_errors_across_the_epipolar_line_count() -> None:
     points, in_a, in_b = scene(PINHOLE, PINHOLE, count=100)
-    rays_a = bearing_rays(PINHOLE, in_a)
+    rays_a, slopes_a = seen(PINHOLE, in_a)
     line = rays_a @ essential_matrix(B_FROM_A).T
     focal = np.array([520.0, 510.0])
     normal = line[:, :2] / focal
@@ -134,8 +195,7 @@ def test_only_errors_across_the_epipolar_line_count() -> None:
     along = np.stack([-normal[:, 1], normal[:, 0]], axis=1)
 
     def verified(shift_px: Array) -> NDArray[np.bool_]:
-        rays = bearing_rays(PINHOLE, in_b + shift_px)
-        return verify_with_poses(rays_a, rays, B_FROM_A, focal_px=515.0)
+        return verify_with_poses(rays_a, slopes_a, *seen(PINHOLE, in_b + shift_px), B_FROM_A)
 
     # the distance is shared by both images: sqrt(2) of a shift of one where both lines are alike
     assert verified(3.0 * normal).all()
@@ -151,12 +211,11 @@ def test_points_behind_a_camera_do_not_pass() -> None:
     in_b_frame = B_FROM_A.apply(behind)
     rays_b = np.column_stack([in_b_frame[:, :2] / in_b_frame[:, 2:], np.ones(100)])
     # all of them lie on their epipolar lines exactly
-    assert sampson_error_px(rays_a, rays_b, B_FROM_A, focal_px=500.0).max() < 1e-9
+    matches = (*plain(rays_a, 500.0), *plain(rays_b, 500.0))
+    assert sampson_error_px(*matches, B_FROM_A).max() < 1e-9
     expected = (behind[:, 2] > 0) & (in_b_frame[:, 2] > 0)
     np.testing.assert_array_equal(in_front_of_both(rays_a, rays_b, B_FROM_A), expected)
-    np.testing.assert_array_equal(
-        verify_with_poses(rays_a, rays_b, B_FROM_A, focal_px=500.0), expected
-    )
+    np.testing.assert_array_equal(verify_with_poses(*matches, B_FROM_A), expected)
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -188,29 +247,47 @@ def test_cameras_at_one_place_verify_nothing() -> None:
     # no baseline: no epipolar line, and nothing that could be triangulated
     rays = bearing_rays(PINHOLE, np.random.default_rng(0).uniform(0, 480, (50, 2)))
     turned = pose([0.1, 0.0, 0.0], [0.0, 0.0, 0.0])
-    seen = rays @ turned.rotation_matrix().T
-    good = verify_with_poses(rays, seen / seen[:, 2:], turned, focal_px=500.0)
+    moved = rays @ turned.rotation_matrix().T
+    good = verify_with_poses(*plain(rays, 500.0), *plain(moved / moved[:, 2:], 500.0), turned)
     assert not good.any()
 
 
 def test_too_few_good_matches_are_none() -> None:
     points, in_a, in_b = scene(PINHOLE, PINHOLE, count=40)
     in_b[10:] += (0.0, 60.0)
-    rays_a, rays_b = bearing_rays(PINHOLE, in_a), bearing_rays(PINHOLE, in_b)
+    matches = (*seen(PINHOLE, in_a), *seen(PINHOLE, in_b))
     for min_matches, expected in ((10, 10), (11, 0)):
         options = KnownPoseOptions(min_matches=min_matches)
-        good = verify_with_poses(rays_a, rays_b, B_FROM_A, focal_px=515.0, options=options)
+        good = verify_with_poses(*matches, B_FROM_A, options)
         assert good.sum() == expected
-    none = np.zeros((0, 3))
-    assert verify_with_poses(none, none, B_FROM_A, focal_px=515.0).shape == (0,)
+    none = plain(np.zeros((0, 3)), 515.0)
+    assert verify_with_poses(*none, *none, B_FROM_A).shape == (0,)
 
 
 def test_rays_that_do_not_exist_do_not_pass() -> None:
-    points, in_a, in_b = scene(PINHOLE, PINHOLE, count=40)
-    rays_a, rays_b = bearing_rays(PINHOLE, in_a), bearing_rays(PINHOLE, in_b)
-    rays_a[3] = np.nan
-    good = verify_with_poses(rays_a, rays_b, B_FROM_A, focal_px=515.0)
+    strong = Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, -0.3))
+    points, in_a, in_b = scene(strong, PINHOLE, count=40)
+    in_a[3] = 0.0  # in the corner, where nothing is seen
+    good = verify_with_poses(*seen(strong, in_a), *seen(PINHOLE, in_b), B_FROM_A)
     assert not good[3] and good.sum() == 39
+
+
+def test_what_a_fisheye_sees_sideways_or_behind_is_refused() -> None:
+    """Such a pixel has no ray (x, y, 1); COLMAP gives one, of another pixel."""
+    camera = WIDE[0]
+    radius = np.linspace(1.0, 630.0, 300)
+    pixels = 450.0 + np.stack([radius, radius], axis=1) * np.sqrt(0.5)
+    theta = np.linspace(0, 2.6, 100_000)
+    k1, k2, _, _ = camera.params[4:]
+    distorted = theta + k1 * theta**3 + k2 * theta**5
+    rising = np.diff(distorted, append=np.inf) > 0
+    largest = 280.0 * distorted[rising & (theta < np.pi / 2)].max()
+    _, slopes = seen(camera, pixels)
+    inside = radius < largest - 3
+    outside = radius > largest + 1
+    assert inside.sum() > 50 and outside.sum() > 50
+    assert np.isfinite(slopes[inside]).all()
+    assert np.isnan(slopes[outside]).all()
 
 
 @pytest.mark.parametrize("camera", [PINHOLE, *DISTORTED], ids=lambda c: c.model)

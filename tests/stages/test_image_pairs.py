@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from itertools import combinations
+import shutil
+from dataclasses import replace
+from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +12,20 @@ import numpy as np
 import pytest
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.kapture_store import FeatureConfig, FeatureWriter, KaptureFolder
-from megloc_kapture.mapping.pairs import PairsByPosesOptions
+from megloc_kapture.geometry.cameras import project
+from megloc_kapture.io.kapture_store import (
+    FeatureConfig,
+    FeatureWriter,
+    KaptureData,
+    KaptureFolder,
+    write_observations,
+    write_points3d,
+    write_sensors,
+)
+from megloc_kapture.io.side_tables import ImageGroup
+from megloc_kapture.mapping.pairs_by_covisibility import PairsByCovisibilityOptions
+from megloc_kapture.mapping.pairs_by_poses import PairsByPosesOptions
+from megloc_kapture.mapping.pairs_by_sequence import PairsBySequenceOptions
 from megloc_kapture.stages.image_pairs import (
     MappingPairsOptions,
     QueryPairsOptions,
@@ -19,6 +33,7 @@ from megloc_kapture.stages.image_pairs import (
     pair_queries,
     read_global_features,
 )
+from megloc_kapture.stages.restrictions import Restrictions
 
 VECTORS = {
     # two copies, one near them, one across, one opposite
@@ -123,6 +138,174 @@ def test_methods_add_up_and_retrieval_gives_the_score(
     expected = float(np.dot(unit(VECTORS["left/0.png"]), unit(VECTORS["right/2.png"])))
     assert scores["left/0.png", "right/2.png"] == pytest.approx(expected, abs=1e-6)
     assert scores["left/0.png", "right/4.png"] == 1.0  # named by no retrieval
+
+
+def shared_points(folder: KaptureFolder) -> dict[tuple[str, str], int]:
+    """Number of points that two images observe both, counted with sets."""
+    seen: dict[str, set[int]] = {}
+    for observations in folder.observations().values():
+        for point, image in zip(observations.point_ids, observations.image_ids, strict=True):
+            seen.setdefault(observations.image_names[image], set()).add(int(point))
+    return {(a, b): len(seen[a] & seen[b]) for a, b in combinations(sorted(seen), 2)}
+
+
+def test_map_pairs_by_covisibility(world: Any) -> None:
+    shared = shared_points(world.map())
+    least = sorted(shared.values())[5]
+    options = MappingPairsOptions(
+        by=("covisibility",), covisibility=PairsByCovisibilityOptions(min_shared_points=least)
+    )
+    expected = sorted(pair for pair, count in shared.items() if count >= least)
+    assert 0 < len(expected) < 10
+    found = pair_map_images(world.map(), options, global_type=None)
+    assert names(found) == expected and {pair.score for pair in found} == {1.0}
+    # images of one kapture, points of another
+    mapping = world.mapping()
+    assert pair_map_images(mapping, options, global_type=None, covisible=world.map()) == found
+    with pytest.raises(DataError, match="mapping: co-visibility and overlap need a map's points"):
+        pair_map_images(mapping, options, global_type=None)
+
+
+def test_points_of_all_types_count(world: Any, tmp_path: Path) -> None:
+    """Two images that share points of two types share the sum."""
+    shutil.copytree(world.root / "map" / "reconstruction", tmp_path / "reconstruction")
+    shutil.copytree(
+        world.root / "map" / "sensors", tmp_path / "sensors", ignore=lambda *_: ["records_data"]
+    )
+    observations = world.map().observations()["rootsift"]
+    num_points = len(world.map().points3d())
+    again = replace(
+        observations, keypoints_type="other", point_ids=observations.point_ids + num_points
+    )
+    write_points3d(tmp_path, np.concatenate([world.map().points3d()] * 2))
+    write_observations(tmp_path, {"rootsift": observations, "other": again})
+    shared = shared_points(world.map())
+    most = max(shared.values())
+    covisibility = PairsByCovisibilityOptions(min_shared_points=2 * most)
+    options = MappingPairsOptions(by=("covisibility",), covisibility=covisibility)
+    found = pair_map_images(KaptureFolder(tmp_path), options, global_type=None)
+    assert names(found) == sorted(pair for pair, count in shared.items() if count == most)
+
+
+def test_a_map_of_other_images_is_refused(world: Any, tmp_path: Path) -> None:
+    shutil.copytree(world.root / "map" / "reconstruction", tmp_path / "reconstruction")
+    strangers = replace(
+        world.map().observations()["rootsift"], image_names=tuple(f"{k}.jpg" for k in range(5))
+    )
+    write_observations(tmp_path, {"rootsift": strangers})
+    options = MappingPairsOptions(by=("covisibility",))
+    with pytest.raises(DataError, match="no image to be paired observes its points"):
+        pair_map_images(
+            world.mapping(), options, global_type=None, covisible=KaptureFolder(tmp_path)
+        )
+
+
+def test_near_images_that_see_other_things_are_no_pairs(world: Any) -> None:
+    folder = world.map()
+    near = MappingPairsOptions(by=("poses",))
+    assert len(pair_map_images(folder, near, global_type=None)) == 10
+    shares = {}
+    xyz = folder.points3d()[:, :3]
+    observations = folder.observations()["rootsift"]
+    for a, b in combinations(observations.image_names, 2):
+        of_pair = []
+        for image, other in ((a, b), (b, a)):
+            own = observations.image_ids == observations.image_names.index(image)
+            points = xyz[np.unique(observations.point_ids[own])]
+            pixels = project(folder.read().camera_of(other), world.map_poses[other], points)
+            of_pair.append(((pixels >= 0) & (pixels < (400, 300))).all(axis=1).mean())
+        shares[a, b] = max(of_pair)
+    least = sorted(shares.values())[4]
+    assert least > min(shares.values())
+    by_overlap = MappingPairsOptions(by=("poses",), poses=PairsByPosesOptions(min_overlap=least))
+    expected = sorted(pair for pair, share in shares.items() if share >= least)
+    found = pair_map_images(
+        world.mapping(), by_overlap, global_type=None, covisible=KaptureFolder(folder.root)
+    )
+    assert names(found) == expected
+    with pytest.raises(DataError, match="need a map's points"):
+        pair_map_images(world.mapping(), by_overlap, global_type=None)
+
+
+def test_map_pairs_by_sequence_are_within_a_camera(world: Any, tmp_path: Path) -> None:
+    images = sorted(world.map_poses)
+    sequence = PairsBySequenceOptions(window=1)
+    options = MappingPairsOptions(by=("sequence",), sequence=sequence)
+    # the images were taken in the order of their names
+    found = pair_map_images(world.mapping(), options, global_type=None)
+    assert names(found) == list(pairwise(images))
+    data = world.mapping().read()
+    sensors, taken = {**data.sensors, "other": data.sensors["cam"]}, {}
+    for (timestamp, sensor), image in data.records_camera.items():
+        taken[10 - timestamp, "other" if image.startswith("right") else sensor] = image
+    poses = {key: world.map_poses[image] for key, image in taken.items()}
+    write_sensors(tmp_path, KaptureData(sensors=sensors, trajectories=poses, records_camera=taken))
+    looped = MappingPairsOptions(
+        by=("sequence",), sequence=PairsBySequenceOptions(window=1, loop=True)
+    )
+    backwards = KaptureFolder(tmp_path)
+    left, right = images[:2], images[2:]
+    expected = [tuple(left), *pairwise(right)]
+    assert names(pair_map_images(backwards, options, global_type=None)) == expected
+    assert names(pair_map_images(backwards, looped, global_type=None)) == [
+        tuple(left),
+        *combinations(right, 2),
+    ]
+
+
+FRAMES = Restrictions(
+    groups={
+        image: ImageGroup(frame="a" if k % 2 else "b") for k, image in enumerate(sorted(VECTORS))
+    }
+)
+
+
+@pytest.mark.parametrize(
+    "by", [("exhaustive",), ("poses",), ("retrieval",), ("sequence",), ("covisibility",)]
+)
+def test_frames_never_mix(
+    world: Any, folders: tuple[KaptureFolder, KaptureFolder], by: Any
+) -> None:
+    found = pair_map_images(
+        folders[0],
+        MappingPairsOptions(
+            by=by, covisibility=PairsByCovisibilityOptions(top_k=1, min_shared_points=1)
+        ),
+        global_type="toy",
+        restrictions=FRAMES,
+        covisible=world.map(),
+    )
+    images = sorted(world.map_poses)
+    within = [pair for pair in combinations(images, 2) if len({*map(FRAMES.frame, pair)}) == 1]
+    assert 0 < len(within) < 10
+    assert set(names(found)) <= set(within)
+    # the best of its own frame is found though a better one stands in the other
+    assert {image for pair in names(found) for image in pair} == set(images)
+
+
+def test_all_methods_together_name_each_pair_once(
+    world: Any, folders: tuple[KaptureFolder, KaptureFolder]
+) -> None:
+    each = {}
+    for method in ("sequence", "covisibility", "poses", "retrieval"):
+        options = {
+            "top_k": 1,
+            "covisibility": {"top_k": 1},
+            "sequence": {"window": 1},
+            "poses": {"num_neighbours": 1},
+        }
+        for by in ((method,), ("sequence", "covisibility", "poses", "retrieval")):
+            found = pair_map_images(
+                folders[0],
+                MappingPairsOptions(by=by, **options),
+                global_type="toy",
+                covisible=world.map(),
+            )
+            each[by] = found
+    together = each["sequence", "covisibility", "poses", "retrieval"]
+    alone = [found for by, found in each.items() if len(by) == 1]
+    assert names(together) == sorted({pair for found in alone for pair in names(found)})
+    assert len(names(together)) > max(len(found) for found in alone)
 
 
 def test_query_pairs_are_best_first(folders: tuple[KaptureFolder, KaptureFolder]) -> None:
