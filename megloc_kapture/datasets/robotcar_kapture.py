@@ -12,6 +12,7 @@ from megloc_kapture.datasets.grammars.robotcar_files import (
 )
 from megloc_kapture.datasets.official import Missing, with_poses
 from megloc_kapture.datasets.robotcar_layout import CAMERAS
+from megloc_kapture.datasets.robotcar_rig import rig_of_model
 from megloc_kapture.datasets.robotcar_selection import Selection
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.images import image_size
@@ -33,6 +34,9 @@ class Car:
 
 def read_car(selection: Selection, missing: Missing) -> Car:
     """Read intrinsics and extrinsics; an image of each camera tells its size.
+
+    The rig is the one that the model's poses show; the published extrinsics stand in where the
+    model has too few moments of all cameras.
 
     Raises
     ------
@@ -56,11 +60,14 @@ def read_car(selection: Selection, missing: Missing) -> Car:
         path = layout.extrinsics(camera)
         if missing.require(path) and camera in sensors:
             members[camera] = read_extrinsics(path).inverse()
+    of_model = rig_of_model(selection.reference.poses)
+    if of_model and set(of_model) <= set(sensors):
+        members = of_model
     return Car(sensors, members)
 
 
 def mapping_data(selection: Selection, car: Car) -> KaptureData:
-    """The map's images; each camera has its own pose, as the rig does not fit the models well."""
+    """The map's images; each camera has its own pose, which no rig fits exactly."""
     images = {**selection.map_images, **selection.train_images}
     poses = {**selection.reference.poses, **selection.queries.train}
     return with_poses(_data(images, car), {_record(image): poses[image] for image in images})

@@ -111,8 +111,9 @@ def remarks(selection: Selection) -> list[str]:
     """What a user should know about this import."""
     layout = selection.layout
     said = [
-        "The rig is that of extrinsics/, which does not agree well with the reference model: "
-        "every map image has the model's pose, none goes through the rig."
+        "The rig is the one that the reference model's poses show, as extrinsics/ does not agree "
+        "well with them; where the model has fewer than ten moments of all cameras, it is that of "
+        "extrinsics/. Every map image has the model's pose, none goes through the rig."
     ]
     unknown = sum(image not in selection.reference.locations for image in selection.map_images)
     if unknown:

@@ -138,7 +138,7 @@ def _parse_features(path: Path, line: Line, *, compiled: bool) -> NDArray[np.flo
         from megloc_kapture.datasets.grammars import track_kernels as kernels
 
         bits = np.empty(2 * (len(line.content) // 6 + 1), np.uint64)
-        read = int(kernels.parse_image_features(line.chunk.text, line.begin, bits))
+        read = int(kernels.parse_model_features(line.chunk.text, line.begin, bits))
         if read >= 0:
             return bits[: 2 * read].view(np.float64).reshape(-1, 2)
     fields = Fields(path, line)
