@@ -1,4 +1,4 @@
-"""A compiled loop that is kept on disk is made anew when a loop of another file that it calls is."""
+"""A compiled loop on disk is made anew when a loop of another file that it calls changes."""
 
 from __future__ import annotations
 

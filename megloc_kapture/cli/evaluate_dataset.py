@@ -18,15 +18,11 @@ from megloc_kapture.evaluation.without_truth_outputs import AGREEMENT_TEXT
 from megloc_kapture.io.status_table import STATUS_FILE, read_status
 from megloc_kapture.pipeline.benchmarks import BenchmarkFile, find_benchmark, read_benchmark
 from megloc_kapture.pipeline.datasets import TWIN_PREFIX, DatasetChoice, choose_dataset
-from megloc_kapture.pipeline.evaluation_plan import (
-    EVALUATION,
-    LOCALIZED,
-    Run,
-    plan_evaluation,
-)
+from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
 from megloc_kapture.pipeline.executors import available_cores, open_executor, single_threaded
 from megloc_kapture.pipeline.plan import StageReport, all_kept, run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
+from megloc_kapture.pipeline.run import EVALUATION, LOCALIZED, Run
 from megloc_kapture.pipeline.workspace import Workspace
 
 BELOW_RECALL = 3

@@ -18,8 +18,8 @@ from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, options_of_preset
 from megloc_kapture.pipeline.queries import KaptureQueries, Query
+from megloc_kapture.stages.localized_folder import write_localized
 from megloc_kapture.stages.matches import iterate_candidates
-from megloc_kapture.stages.query_poses import write_localized
 from megloc_kapture.values import RigidTransform
 
 LOCALIZED = "localized"
@@ -83,7 +83,7 @@ class Localize(Choosing, Common):
             counts = write_localized(
                 out,
                 folder,
-                ((name, result, 0.0) for name, result in named),
+                named,
                 fallback=fallback,
                 first_candidates=best,
             )

@@ -29,6 +29,7 @@ from megloc_kapture.values import RigidTransform
 
 _LARGE = (400, 300)
 _SMALL = (190, 143)
+_CLUSTERS_TOLD = 4
 _CANDIDATES_SHOWN = 4
 # of the candidates, those looked at for the one with most matches
 _CANDIDATES_COMPARED = 50
@@ -125,7 +126,7 @@ class Gallery:
         pictures = [(i, f, _picture(self._around.mapping, i, _SMALL)) for i, f in others]
         return Exhibit(
             name=chosen.name,
-            facts=chosen.facts,
+            facts=(*chosen.facts, *self._clusters(chosen.image)),
             picture=picture,
             best=best if caption else "",
             caption=caption,
@@ -135,6 +136,20 @@ class Gallery:
                 if small is not None
             ),
         )
+
+    def _clusters(self, query: str) -> tuple[str, ...]:
+        """One line on the clusters of candidates, the chosen one first; none where all are one."""
+        rows = self._around.clusters.get(query, ())
+        if len(rows) < 2:
+            return ()
+        ranked = sorted(rows, key=lambda row: (row.chosen != "yes", -row.num_inliers, row.cluster))
+        said = [
+            f"{counted(len(row.images), 'image', 'images')} ({row.images[0]} first), "
+            f"{row.num_inliers} inliers of {row.num_matches}"
+            for row in ranked[:_CLUSTERS_TOLD]
+        ]
+        more = f"; and {len(rows) - _CLUSTERS_TOLD} more" if len(rows) > _CLUSTERS_TOLD else ""
+        return (f"{len(rows)} clusters of candidates: {'; '.join(said)}{more}",)
 
     def _beside(self, chosen: Chosen, query: Picture, best: str) -> tuple[Markup, str]:
         """The query beside the map image ``best``, and what is said of the two."""

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from megloc_kapture.io.cluster_table import CLUSTERS_FILE, ClusterRow, read_clusters
 from megloc_kapture.io.kapture_store import KaptureFolder
 from megloc_kapture.io.side_tables import PROTOCOL_FILE, SIDE_TABLES, read_groups
 from megloc_kapture.values import RigidTransform
 
 # parts of a workspace; datasets and the pipeline write them
-_MAPPING, _QUERY, _QUERY_MATCHES = "mapping", "query", "matches/query"
+# the map's own keypoints are what queries were matched with; before there is one, its images do
+_MAPS, _QUERY, _QUERY_MATCHES = ("map", "mapping"), "query", "matches/query"
 _SENSORS = "sensors/sensors.txt"
 
 
@@ -24,11 +26,13 @@ class Surroundings:
     queries : images and cameras of the queries, their keypoints, their matches with the map.
     mapping : images, cameras and poses of the map.
     frames : map image or query -> its coordinate frame, where a dataset has several.
+    clusters : query -> the clusters of candidates it was tried in.
     """
 
     queries: KaptureFolder | None = None
     mapping: KaptureFolder | None = None
     frames: Mapping[str, str] = field(default_factory=dict)
+    clusters: Mapping[str, Sequence[ClusterRow]] = field(default_factory=dict)
 
     def map_poses(self) -> dict[str, RigidTransform]:
         """``cam_from_world`` of the map's images; empty without a map.
@@ -74,18 +78,21 @@ def surroundings_of(result: Path | str, *, mapping: Path | str | None = None) ->
 
     Raises
     ------
-    DataError : broken side tables.
+    DataError : broken side tables, or a broken table of clusters.
     """
+    clusters = Path(result) / CLUSTERS_FILE
     workspace = workspace_of(result)
     features = [] if workspace is None else [workspace, workspace / _QUERY_MATCHES]
     candidates = [Path(result)] if workspace is None else [workspace / _QUERY, Path(result)]
     queries = next((place for place in candidates if (place / _SENSORS).is_file()), None)
     map_place = None if mapping is None else Path(mapping)
-    if map_place is None and workspace is not None and (workspace / _MAPPING / _SENSORS).is_file():
-        map_place = workspace / _MAPPING
+    if map_place is None and workspace is not None:
+        places = (workspace / name for name in _MAPS)
+        map_place = next((place for place in places if (place / _SENSORS).is_file()), None)
     groups = {} if workspace is None else read_groups(workspace / SIDE_TABLES)
     return Surroundings(
         queries=None if queries is None else KaptureFolder(queries, features_dirs=features),
         mapping=None if map_place is None else KaptureFolder(map_place, features_dirs=features),
         frames={image: group.frame for image, group in groups.items() if group.frame},
+        clusters=read_clusters(clusters) if clusters.is_file() else {},
     )

@@ -20,7 +20,7 @@ from megloc_kapture.datasets.kapture_folders import (
     input_files,
 )
 from megloc_kapture.datasets.official import OfficialDataset, write_official
-from megloc_kapture.errors import OptionError
+from megloc_kapture.errors import OptionError, PluginError
 from megloc_kapture.evaluation.protocols import TWIN_PREFIX
 from megloc_kapture.io.atomic import write_bytes
 from megloc_kapture.io.side_tables import SIDE_TABLES, Protocol
@@ -189,6 +189,30 @@ def choose_dataset(
     if root is None:
         choice = replace(choice, root=_root_in_environment(name, adapter))
     return choice
+
+
+def with_model(choice: DatasetChoice) -> DatasetChoice:
+    """The dataset, imported with the model that it comes with.
+
+    Raises
+    ------
+    OptionError : it comes with none.
+    """
+    if choice.adapter is None:
+        raise OptionError(
+            f"map = given takes the model that a dataset comes with; dataset {choice.name} has "
+            "none (megloc localize takes any kapture map)"
+        )
+    options = {**choice.import_options, "reference_model": True}
+    layout = choice.name.removeprefix(TWIN_PREFIX)
+    try:
+        adapter: DatasetAdapter = load_plugin(DATASETS, layout, options)
+    except PluginError as error:
+        raise OptionError(f"map = given: dataset {layout} comes with no model") from error
+    twin = None
+    if choice.twin is not None:
+        twin = twin_of(layout, **{**choice.twin.options.model_dump(), "model_features": True})
+    return replace(choice, adapter=adapter, import_options=options, twin=twin)
 
 
 def _root_in_environment(name: str, adapter: DatasetAdapter | None) -> Path:

@@ -4,17 +4,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from megloc_kapture.datasets.kapture_folders import (
-    MAPPING,
-    QUERY,
-    QUERY_GT,
-)
-from megloc_kapture.datasets.official import REFERENCE
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.folders import evaluate_folders, results_without_truth
 from megloc_kapture.evaluation.outputs import write_evaluation
@@ -24,63 +17,36 @@ from megloc_kapture.evaluation.surroundings import surroundings_of
 from megloc_kapture.evaluation.without_truth_outputs import write_without_truth
 from megloc_kapture.io.atomic import write_bytes
 from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder, read_pairs, write_pairs
-from megloc_kapture.io.side_tables import SIDE_TABLES, Protocol, read_protocol
-from megloc_kapture.pipeline.benchmarks import BenchmarkFile
-from megloc_kapture.pipeline.datasets import DatasetChoice, ProtocolChange
+from megloc_kapture.io.side_tables import SIDE_TABLES, Protocol
+from megloc_kapture.pipeline.datasets import ProtocolChange, with_model
 from megloc_kapture.pipeline.manifests import FileHashes
+from megloc_kapture.pipeline.map_plan import check_given, map_images, matched_images, plan_map
 from megloc_kapture.pipeline.plan import Stage
-from megloc_kapture.pipeline.presets import PipelineOptions
-from megloc_kapture.pipeline.submission import place_of, write_submission
-from megloc_kapture.pipeline.workspace import HASHES, Workspace
+from megloc_kapture.pipeline.run import (
+    EVALUATION,
+    LOCALIZED,
+    MAP,
+    MAPPING,
+    QUERY,
+    QUERY_GT,
+    QUERY_MATCHES,
+    QUERY_PAIRS,
+    REFERENCE,
+    SUBMISSIONS,
+    TIMING,
+    Run,
+)
+from megloc_kapture.pipeline.submission import write_submission
+from megloc_kapture.pipeline.workspace import HASHES
+from megloc_kapture.plugins import LocalFeatureExtractor
+from megloc_kapture.stages.given_map import has_descriptors
 from megloc_kapture.stages.global_vlad import extract_vlad, vlad_type
-from megloc_kapture.stages.image_pairs import pair_map_images, pair_queries
-from megloc_kapture.stages.lifting import lift_map
+from megloc_kapture.stages.image_pairs import pair_queries
 from megloc_kapture.stages.local_features import extract_local_features
+from megloc_kapture.stages.localized_folder import write_localized
 from megloc_kapture.stages.matches import iterate_candidates, match_pairs
-from megloc_kapture.stages.parallel import Track, untracked
-from megloc_kapture.stages.query_poses import localize_from_matches, write_localized
-from megloc_kapture.stages.restrictions import Restrictions
-from megloc_kapture.stages.triangulation import triangulate_map
+from megloc_kapture.stages.query_poses import localize_from_matches
 from megloc_kapture.values import RigidTransform
-
-MAPPING_PAIRS, QUERY_PAIRS = "pairs/mapping.txt", "pairs/query.txt"
-MAPPING_MATCHES, QUERY_MATCHES = "matches/mapping", "matches/query"
-MAP, LOCALIZED, SUBMISSIONS, EVALUATION = "map", "localized", "submissions", "evaluation"
-TIMING = "timing.csv"
-
-
-@dataclass(frozen=True)
-class Run:
-    """What a run works on and with.
-
-    Attributes
-    ----------
-    benchmark : what it wants different in the dataset's protocol.
-    """
-
-    source: DatasetChoice
-    preset: str
-    options: PipelineOptions
-    workspace: Workspace
-    benchmark: BenchmarkFile | None = None
-    executor: Executor | None = None
-    track: Track = untracked
-    num_threads: int = 1
-
-    @property
-    def dataset(self) -> str:
-        """The dataset's name."""
-        return self.source.name
-
-    def submission_below(self, folder: Path) -> Path:
-        """Where, below ``folder``, the pose file stands; a folder where it is several files."""
-        protocol = read_protocol(self.workspace.path(SIDE_TABLES))
-        stem = f"{self.dataset}_eval_megloc-{self.preset}"
-        return place_of(folder / SUBMISSIONS, stem, protocol)
-
-    def restrictions(self) -> Restrictions:
-        """What the dataset's side tables permit."""
-        return Restrictions.read(self.workspace.path(SIDE_TABLES))
 
 
 def plan_evaluation(run: Run) -> list[Stage]:
@@ -90,15 +56,19 @@ def plan_evaluation(run: Run) -> list[Stage]:
     ------
     MeglocError : the dataset or the options cannot be used; nothing has been written by then.
     """
-    options, local_type = run.options, run.options.make_extractor().name
-    run.options.make_matcher()
+    options = run.options
+    options.make_matcher()
+    options.localization.make_ranker()
+    given = options.uses_given_map()
+    if given:
+        run = replace(run, source=with_model(run.source))
     dump = options.model_dump(mode="json")
     stages = [
         *_dataset_stages(run),
         Stage(
             "local_features",
             1,
-            {"local_features": dump["local_features"]},
+            _features_used(run, dump),
             ("import",),
             ("local_features",),
             lambda out: _local_features(run, out),
@@ -106,39 +76,40 @@ def plan_evaluation(run: Run) -> list[Stage]:
         Stage(
             "global_features",
             1,
-            {"vlad": dump["vlad"], "local_type": local_type},
+            {"vlad": dump["vlad"], "local_type": options.main_type()},
             ("local_features",),
             ("global_features",),
-            lambda out: _global_features(run, out, local_type),
+            lambda out: _global_features(run, out),
         ),
-        *_map_stages(run, dump, local_type),
+        *plan_map(run, dump),
         Stage(
             "query_pairs",
             2,
             {"query_pairs": dump["query_pairs"]},
             ("import", "global_features"),
             (QUERY_PAIRS,),
-            lambda out: _query_pairs(run, out, local_type),
+            lambda out: _query_pairs(run, out),
         ),
         Stage(
             "query_matches",
-            1,
+            2,
             {
+                "local_types": options.local_types(),
                 "matching": dump["matching"],
                 "verification": dump["verification"],
                 "two_view": dump["query_verification"],
             },
-            ("import", "local_features", "query_pairs"),
+            ("import", "local_features", "query_pairs", *(["map"] if given else [])),
             (QUERY_MATCHES,),
-            lambda out: _matches(run, out, local_type, for_queries=True),
+            lambda out: _query_matches(run, out),
         ),
         Stage(
             "localization",
-            2,
+            3,
             {"localization": dump["localization"]},
             ("import", "local_features", "map", "query_pairs", "query_matches"),
             (LOCALIZED, TIMING),
-            lambda out: _localization(run, out, local_type),
+            lambda out: _localization(run, out),
         ),
         Stage(
             "submission",
@@ -160,56 +131,12 @@ def plan_evaluation(run: Run) -> list[Stage]:
     return stages
 
 
-def _map_stages(run: Run, dump: Mapping[str, Any], local_type: str) -> list[Stage]:
-    """How the map gets its points; the last of them is called ``map``."""
-    if run.options.map == "lift":
-        return [
-            Stage(
-                "map",
-                1,
-                {"by": "lift", "lifting": dump["lifting"]},
-                ("import", "local_features", "global_features"),
-                (MAP,),
-                lambda out: lift_map(
-                    run.workspace.folder(MAPPING, ""),
-                    local_type,
-                    out / MAP,
-                    run.options.lifting,
-                    executor=run.executor,
-                    track=run.track,
-                ),
-            )
-        ]
-    return [
-        Stage(
-            "mapping_pairs",
-            2,
-            {"mapping_pairs": dump["mapping_pairs"]},
-            ("import", "global_features"),
-            (MAPPING_PAIRS,),
-            lambda out: _mapping_pairs(run, out, local_type),
-        ),
-        Stage(
-            "mapping_matches",
-            1,
-            {
-                "matching": dump["matching"],
-                "verification": dump["verification"],
-                "known_poses": dump["mapping_verification"],
-            },
-            ("import", "local_features", "mapping_pairs"),
-            (MAPPING_MATCHES,),
-            lambda out: _matches(run, out, local_type, for_queries=False),
-        ),
-        Stage(
-            "map",
-            1,
-            {"by": "triangulate", "triangulation": dump["triangulation"]},
-            ("import", "local_features", "global_features", "mapping_matches"),
-            (MAP,),
-            lambda out: _triangulation(run, out, local_type),
-        ),
-    ]
+def _features_used(run: Run, dump: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of the features that are extracted at all."""
+    used = {"local_features": dump["local_features"]} if run.options.makes_points() else {}
+    if run.options.uses_given_map():
+        used["given_features"] = dump["given_features"]
+    return used
 
 
 def _dataset_stages(run: Run) -> list[Stage]:
@@ -268,17 +195,30 @@ def _import(run: Run, root: Path, out: Path, change: ProtocolChange) -> dict[str
 
 
 def _local_features(run: Run, out: Path) -> dict[str, int]:
-    folders = [run.workspace.folder(MAPPING), run.workspace.folder(QUERY)]
-    return extract_local_features(
-        folders, run.options.make_extractor(), out, executor=run.executor, track=run.track
-    )
+    mapping, query = run.workspace.folder(MAPPING), run.workspace.folder(QUERY)
+    work: list[tuple[LocalFeatureExtractor, list[KaptureFolder]]] = []
+    if run.options.makes_points():
+        work.append((run.options.make_extractor(), [mapping, query]))
+    if run.options.uses_given_map():
+        check_given(run)
+        described = has_descriptors(run.workspace.folder(REFERENCE))
+        folders = [query] if described else [mapping, query]
+        work.append((run.options.make_given_extractor(), folders))
+    counts: dict[str, int] = {}
+    for extractor, folders in work:
+        found = extract_local_features(
+            folders, extractor, out, executor=run.executor, track=run.track
+        )
+        counts = {name: counts.get(name, 0) + count for name, count in found.items()}
+    return counts
 
 
-def _global_features(run: Run, out: Path, local_type: str) -> dict[str, int]:
-    mapping, query = run.workspace.folder(MAPPING, ""), run.workspace.folder(QUERY, "")
+def _global_features(run: Run, out: Path) -> dict[str, int]:
+    local_type = run.options.main_type()
+    mapping = map_images(run, local_type)
     return extract_vlad(
         mapping,
-        [mapping, query],
+        [mapping, run.workspace.folder(QUERY, "")],
         local_type,
         out,
         run.options.vlad,
@@ -287,20 +227,10 @@ def _global_features(run: Run, out: Path, local_type: str) -> dict[str, int]:
     )
 
 
-def _mapping_pairs(run: Run, out: Path, local_type: str) -> dict[str, int]:
-    pairs = pair_map_images(
-        run.workspace.folder(MAPPING, ""),
-        run.options.mapping_pairs,
-        global_type=vlad_type(local_type),
-        restrictions=run.restrictions(),
-    )
-    write_pairs(out / MAPPING_PAIRS, pairs)
-    return {"pairs": len(pairs)}
-
-
-def _query_pairs(run: Run, out: Path, local_type: str) -> dict[str, int]:
+def _query_pairs(run: Run, out: Path) -> dict[str, int]:
+    local_type = run.options.main_type()
     pairs = pair_queries(
-        run.workspace.folder(MAPPING, ""),
+        map_images(run, local_type),
         run.workspace.folder(QUERY, ""),
         run.options.query_pairs,
         global_type=vlad_type(local_type),
@@ -310,35 +240,28 @@ def _query_pairs(run: Run, out: Path, local_type: str) -> dict[str, int]:
     return {"pairs": len(pairs)}
 
 
-def _matches(run: Run, out: Path, local_type: str, *, for_queries: bool) -> dict[str, int]:
-    mapping = run.workspace.folder(MAPPING, "")
-    first = run.workspace.folder(QUERY, "") if for_queries else mapping
-    options = run.options
-    return match_pairs(
-        first,
-        mapping,
-        read_pairs(run.workspace.path(QUERY_PAIRS if for_queries else MAPPING_PAIRS)),
-        local_type,
-        options.make_matcher(),
-        options.verify_queries() if for_queries else options.verify_mapping(),
-        out / (QUERY_MATCHES if for_queries else MAPPING_MATCHES),
-        executor=run.executor,
-        track=run.track,
-    )
+def _query_matches(run: Run, out: Path) -> dict[str, int]:
+    counts: dict[str, int] = {}
+    pairs = read_pairs(run.workspace.path(QUERY_PAIRS))
+    for local_type in run.options.local_types():
+        mapping = matched_images(run, local_type)
+        described = mapping.descriptors(local_type)
+        found = match_pairs(
+            run.workspace.folder(QUERY, ""),
+            mapping,
+            [pair for pair in pairs if pair.map in described],
+            local_type,
+            run.options.make_matcher(),
+            run.options.verify_queries(),
+            out / QUERY_MATCHES,
+            executor=run.executor,
+            track=run.track,
+        )
+        counts = {name: counts.get(name, 0) + count for name, count in found.items()}
+    return counts
 
 
-def _triangulation(run: Run, out: Path, local_type: str) -> dict[str, float]:
-    return triangulate_map(
-        run.workspace.folder(MAPPING, ""),
-        run.workspace.folder(MAPPING, MAPPING_MATCHES),
-        local_type,
-        out / MAP,
-        run.options.triangulation,
-        num_threads=run.num_threads,
-    )
-
-
-def _localization(run: Run, out: Path, local_type: str) -> dict[str, int]:
+def _localization(run: Run, out: Path) -> dict[str, int]:
     query = run.workspace.folder(QUERY, "")
     pairs = read_pairs(run.workspace.path(QUERY_PAIRS))
     options = run.options.localization
@@ -347,7 +270,7 @@ def _localization(run: Run, out: Path, local_type: str) -> dict[str, int]:
         query,
         run.workspace.folder(QUERY, QUERY_MATCHES),
         pairs,
-        local_type,
+        run.options.local_types(),
         options,
         restrictions=run.restrictions(),
         executor=run.executor,

@@ -23,8 +23,8 @@ from megloc_kapture.mapping.pixel_origin import (
     find_pixel_origin,
 )
 from megloc_kapture.plugins import LOCAL_FEATURES, plugin_names
-from megloc_kapture.stages.query_poses import index_map
 from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
+from megloc_kapture.stages.shared_index import index_map
 from megloc_kapture.values import Camera, RigidTransform
 
 PixelOriginChoice = Literal["auto", "corner", "centre"]
@@ -42,6 +42,7 @@ class KaptureMap:
     ----------
     folder : the kapture folder; nothing is ever written to it.
     local_type : the keypoints type that is localized with.
+    index : points and observations of that type, as arrays.
     pixel_origin : where the map puts its pixel origin, and why we think so.
     restrictions : coordinate frames of its images, and priors of queries, where it lies in a
         workspace whose dataset has them.
@@ -49,6 +50,7 @@ class KaptureMap:
 
     folder: KaptureFolder
     local_type: str
+    index: MapIndex
     pixel_origin: PixelOrigin
     restrictions: Restrictions = UNRESTRICTED
 
@@ -98,7 +100,8 @@ class KaptureMap:
                 f"{folder.root}: no points of keypoints type {local_type!r}; there are: "
                 f"{', '.join(types)}"
             )
-        found = _find_origin(folder, local_type)
+        index = index_map(folder, local_type)
+        found = _find_origin(folder, local_type, index)
         if pixel_origin != "auto":
             given: Origin = pixel_origin
             found = replace(found, intrinsics=given, reason="as asked for")
@@ -107,12 +110,7 @@ class KaptureMap:
         restrictions = UNRESTRICTED
         if (tables / PROTOCOL_FILE).is_file():
             restrictions = Restrictions.read(tables)
-        return cls(folder, local_type, found, restrictions)
-
-    @cached_property
-    def index(self) -> MapIndex:
-        """Points and observations as arrays."""
-        return index_map(self.folder, self.local_type)
+        return cls(folder, local_type, index, found, restrictions)
 
     @cached_property
     def poses(self) -> dict[str, RigidTransform]:
@@ -228,10 +226,9 @@ def extractor_of(folder: KaptureFolder, local_type: str) -> str | None:
     return None
 
 
-def _find_origin(folder: KaptureFolder, local_type: str) -> PixelOrigin:
+def _find_origin(folder: KaptureFolder, local_type: str, index: MapIndex) -> PixelOrigin:
     data = folder.read()
     poses = data.poses()
-    index = index_map(folder, local_type)
     images = [image for image in sorted(index.row_of_image) if image in poses]
     keypoints = folder.keypoints(local_type)
     for image in images:

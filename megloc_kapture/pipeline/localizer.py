@@ -21,7 +21,12 @@ from megloc_kapture.features.vlad import (
 )
 from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.io.kapture_store import KaptureFolder
-from megloc_kapture.localization.rig_pose import RigView, rig_pose
+from megloc_kapture.localization.cluster_poses import (
+    ClusterLocalization,
+    QueryView,
+    TypedMatches,
+    in_turn,
+)
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.map_descriptors import extract_again
@@ -39,7 +44,8 @@ from megloc_kapture.stages.matches import (
     two_view_verification,
 )
 from megloc_kapture.stages.parallel import ordered_map
-from megloc_kapture.stages.query_poses import gather_correspondences, pose_in_best_frame
+from megloc_kapture.stages.query_poses import localize_views
+from megloc_kapture.stages.ranking_scene import KaptureScene
 from megloc_kapture.values import Camera, Failure, LocalFeatures, Pose, RigidTransform
 
 # a map this small is matched whole where nothing can rank its images
@@ -82,6 +88,7 @@ class Localizer:
         self.map = kapture_map
         self.options = options or options_of_preset(preset)
         self._matcher = self.options.make_matcher()
+        self._ranker = self.options.localization.make_ranker()
         self._descriptors: dict[str, NDArray[Any]] | None = None
         if not kapture_map.has_descriptors():
             self._descriptors = extract_again(kapture_map, self._extractor)
@@ -148,15 +155,7 @@ class Localizer:
     def localize_query(self, query: Query) -> Pose | Failure:
         """Localize a query that may bring its features."""
         with single_threaded():
-            features, matches = self._match(query)
-            return pose_in_best_frame(
-                self.map.index,
-                features.keypoints_px,
-                query.camera,
-                matches,
-                [self.map.restrictions.frame(image) for image, _, _ in matches],
-                self.options.localization.pose,
-            )
+            return self._localize([(query, RigidTransform.identity())]).result
 
     def localize_rig(self, views: Sequence[tuple[Query, RigidTransform]]) -> Pose | Failure:
         """Localize several cameras of a rig at once.
@@ -169,31 +168,28 @@ class Localizer:
         -------
         Pose whose ``cam_from_world`` is ``rig_from_world``, or Failure.
         """
-        frame_of = self.map.restrictions.frame
         with single_threaded():
-            matched = [(*self._match(query), query, cam_from_rig) for query, cam_from_rig in views]
-            frames = dict.fromkeys(
-                frame_of(image) for _, matches, _, _ in matched for image, _, _ in matches
-            )
-            results = []
-            # as for one camera: points of different frames never meet in one solver
-            for frame in frames or {"": None}:
-                rig_views, candidates = [], []
-                for features, matches, query, cam_from_rig in matched:
-                    own = [match for match in matches if frame_of(match[0]) == frame]
-                    found = gather_correspondences(self.map.index, own)
-                    candidates += [image for image, pairs, _ in own if len(pairs)]
-                    rig_views.append(
-                        RigView(
-                            camera=query.camera,
-                            cam_from_rig=cam_from_rig,
-                            points_px=features.keypoints_px[found.keypoint_ids].astype(np.float64),
-                            points_world=self.map.index.xyz[found.point_ids],
-                        )
-                    )
-                result = rig_pose(rig_views, self.options.localization.pose)
-                results.append(replace(result, candidates=tuple(dict.fromkeys(candidates))))
-            return max(results, key=lambda result: (bool(result), result.num_inliers))
+            return self._localize(views).result
+
+    def _localize(self, views: Sequence[tuple[Query, RigidTransform]]) -> ClusterLocalization:
+        matched = []
+        for query, cam_from_rig in views:
+            features, matches = self._match(query)
+            typed = TypedMatches(self.map.index, features.keypoints_px, matches)
+            matched.append(QueryView(query.name, query.camera, (typed,), cam_from_rig))
+        candidates = in_turn(
+            [[image for image, _, _ in typed.matches] for view in matched for typed in view.matches]
+        )
+        named = {query.name: query for query, _ in views}
+        return localize_views(
+            matched,
+            candidates,
+            [self.map.restrictions.frame(image) for image in candidates],
+            self.options.localization,
+            centers={image: self.map.poses[image].center() for image in candidates},
+            ranker=self._ranker,
+            scene=KaptureScene(self.map.folder, lambda name: named[name].read_image()),
+        )
 
     # ------------------------------------------------------------------ the steps
 

@@ -13,19 +13,13 @@ from megloc_kapture.features.vlad import VladOptions
 from megloc_kapture.io.colmap import TriangulationOptions
 from megloc_kapture.mapping.lifting import LiftingOptions
 from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
-from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS, Matcher, load_plugin
+from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS, Matcher, PluginChoice, load_plugin
 from megloc_kapture.plugins import LocalFeatureExtractor as Extractor
 from megloc_kapture.stages.image_pairs import MappingPairsOptions, QueryPairsOptions
+from megloc_kapture.stages.map_refinement import MapRefinementOptions
 from megloc_kapture.stages.matches import NoVerification, Verification
 from megloc_kapture.stages.query_poses import LocalizationOptions
 from megloc_kapture.values import Options
-
-
-class PluginChoice(Options):
-    """A plugin by its registered name, and its options."""
-
-    name: str
-    options: dict[str, Any] = Field(default_factory=dict)
 
 
 class PipelineOptions(Options):
@@ -41,13 +35,18 @@ class PipelineOptions(Options):
     )
     mapping_verification: KnownPoseOptions = KnownPoseOptions()
     query_verification: TwoViewOptions = TwoViewOptions()
-    map: Literal["triangulate", "lift"] = Field(
+    map: Literal["triangulate", "lift", "given", "given+triangulate"] = Field(
         default="triangulate",
-        description="points of the map: triangulated from matches, or keypoints lifted through "
-        "the map images' depth maps",
+        description="points of the map: triangulated from matches; keypoints lifted through the "
+        "map images' depth maps; those of the model the dataset comes with; or the model's and "
+        "triangulated ones, of two keypoints types",
+    )
+    given_features: PluginChoice = Field(
+        default=PluginChoice(name="sift"), description="what a given model was made of"
     )
     triangulation: TriangulationOptions = TriangulationOptions()
     lifting: LiftingOptions = LiftingOptions()
+    refinement: MapRefinementOptions = MapRefinementOptions()
     localization: LocalizationOptions = LocalizationOptions()
 
     def make_extractor(self) -> Extractor:
@@ -56,6 +55,43 @@ class PipelineOptions(Options):
             LOCAL_FEATURES, self.local_features.name, self.local_features.options
         )
         return extractor
+
+    def make_given_extractor(self) -> Extractor:
+        """The extractor of a given map's features; raises PluginError."""
+        extractor: Extractor = load_plugin(
+            LOCAL_FEATURES, self.given_features.name, self.given_features.options
+        )
+        return extractor
+
+    def uses_given_map(self) -> bool:
+        """Whether the model that the dataset comes with is localized in."""
+        return self.map.startswith("given")
+
+    def makes_points(self) -> bool:
+        """Whether the map has points of features that are extracted here."""
+        return self.map != "given"
+
+    def local_types(self) -> list[str]:
+        """Keypoints types that queries are localized with, the one retrieval uses first.
+
+        Raises
+        ------
+        PluginError : an extractor cannot be made.
+        OptionError : two types of one name.
+        """
+        types = [self.make_extractor().name] if self.makes_points() else []
+        if self.uses_given_map():
+            types.append(self.make_given_extractor().name)
+        if len(set(types)) < len(types):
+            raise OptionError(
+                f"map = {self.map} needs local_features of another type than the given map's "
+                f"{types[0]!r}"
+            )
+        return types
+
+    def main_type(self) -> str:
+        """The keypoints type that retrieval uses; see :meth:`local_types`."""
+        return self.local_types()[0]
 
     def make_matcher(self) -> Matcher:
         """The matcher; raises PluginError."""

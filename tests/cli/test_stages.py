@@ -140,6 +140,23 @@ def test_ways_to_pair(megloc: Any, finished: Path, tmp_path: Path) -> None:
         *("--by", "retrieval", "poses", "--topk", "1", "--features-dir", finished),
     )
     assert nearest <= both <= 21
+    # the images stand in the order in which they were taken
+    window = ("--set", "mapping_pairs.sequence.window=1")
+    assert count("--by", "sequence", *window) == 6
+    assert count("--by", "sequence", *window, "--set", "mapping_pairs.sequence.loop=true") == 7
+    shared = count("--by", "covisibility", "--covisibility-map", finished / "map")
+    assert 0 < shared <= 21
+    together = count("--by", "covisibility", "sequence", "--covisibility-map", finished / "map")
+    assert max(shared, 6) <= together <= 21
+    own = megloc("pairs-mapping", "-i", finished / "map", "-o", pairs, "--by", "covisibility", "-f")
+    assert own.err == f"{shared} pairs\n"
+    megloc("pairs-mapping", "-i", mapping, "-o", pairs, "--by", "covisibility", "-f").refused(
+        "mapping: co-visibility and overlap need a map's points"
+    )
+    place = ("--covisibility-map", finished / "map")
+    megloc("pairs-mapping", "-i", mapping, "-o", pairs, "--by", "sequence", *place, "-f").refused(
+        "--covisibility-map is for --by covisibility"
+    )
     done = megloc("pairs-mapping", "-i", mapping, "-o", pairs, "--by", "exhaustive")
     done.refused(r"pairs\.txt exists; -f overwrites it")
     megloc("pairs-mapping", "-i", mapping, "-o", tmp_path / "new.txt").refused(
@@ -148,6 +165,34 @@ def test_ways_to_pair(megloc: Any, finished: Path, tmp_path: Path) -> None:
     query = ["pairs-query", "-i", mapping, "--query", finished / "query", "--exhaustive", "-q"]
     assert megloc(*query, "-o", tmp_path / "query.txt").status == 0
     assert len(read_pairs(tmp_path / "query.txt")) == 28
+
+
+def test_a_map_of_two_types_of_features(megloc: Any, scene: Path, tmp_path: Path) -> None:
+    features, mapping, pairs = tmp_path / "features", scene / "mapping", tmp_path / "pairs.txt"
+    place = ("-i", mapping, "--features-dir", features)
+    few = ("--set", "local_features.options.max_keypoints=500")
+    both = ("--features", "rootsift", "sift")
+    commands = [
+        ["extract-local", "-i", mapping, "-o", features, *both, *few, *INLINE],
+        ["pairs-mapping", "-i", mapping, "-o", pairs, "--by", "sequence"],
+        *(
+            ["match", *place, "--pairs", pairs, "-o", features, "--features", name, *INLINE]
+            for name in ("rootsift", "sift")
+        ),
+    ]
+    for command in commands:
+        done = megloc(*command, "-q")
+        assert done.status == 0, done
+    megloc("triangulate", *place, "-o", tmp_path / "map").refused("several types of matches")
+    done = megloc("triangulate", *place, "-o", tmp_path / "map", *both)
+    lines = [line.split() for line in done.err.splitlines()][-3:]
+    assert [line[0] for line in lines[:2]] == ["rootsift:", "sift:"]
+    folder = KaptureFolder(tmp_path / "map")
+    folder.validate()
+    found = folder.observations()
+    assert [int(line[3]) for line in lines[:2]] == [len(found["rootsift"]), len(found["sift"])]
+    assert min(len(seen) for seen in found.values()) > 100
+    assert int(lines[2][0]) == len(folder.points3d())
 
 
 def test_pairs_of_images_that_are_not_there(megloc: Any, finished: Path, tmp_path: Path) -> None:

@@ -10,11 +10,8 @@ from kloc import kloc, merged, needs_kapture_localization, pose_errors, proxy
 
 from megloc_kapture.io.colmap import TriangulationOptions
 from megloc_kapture.io.kapture_store import KaptureFolder, read_pairs
-from megloc_kapture.stages.query_poses import (
-    LocalizationOptions,
-    localize_from_matches,
-    write_localized,
-)
+from megloc_kapture.stages.localized_folder import write_localized
+from megloc_kapture.stages.query_poses import LocalizationOptions, localize_from_matches
 from megloc_kapture.stages.triangulation import triangulate_map
 
 pytestmark = needs_kapture_localization
@@ -119,6 +116,6 @@ def test_our_stages_run_on_its_pairs_and_matches(
     pairs = read_pairs(theirs.query_pairs)
     places = [theirs.workspace, theirs.query_matches]
     query = KaptureFolder(fountain / "query", features_dirs=places)
-    found = localize_from_matches(KaptureFolder(our_map), query, query, pairs, LOCAL, options)
+    found = localize_from_matches(KaptureFolder(our_map), query, query, pairs, [LOCAL], options)
     write_localized(result, query, found)
     assert_all_localized(result, fountain / "query_gt")

@@ -15,12 +15,12 @@ from megloc_kapture.evaluation.folders import load_poses
 from megloc_kapture.evaluation.pose_errors import pose_errors
 from megloc_kapture.geometry.cameras import bearing_rays, project, shift_principal_point
 from megloc_kapture.io.kapture_store import FeatureWriter, KaptureFolder, Sensor, write_sensors
+from megloc_kapture.localization.correspondences import observed_matches
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.queries import KaptureQueries
 from megloc_kapture.stages.matches import Features, match_and_verify, two_view_verification
-from megloc_kapture.stages.query_poses import gather_correspondences
 from megloc_kapture.values import Camera, Pose
 
 
@@ -101,7 +101,7 @@ def residuals_px(opened: KaptureMap, queries: KaptureFolder, truth: Path) -> lis
                 opened.camera(image), opened.keypoints_px(image), opened.descriptors(image)
             )
             matches.append((image, *match_and_verify(ours, theirs, matcher, verify)))
-        pairs = gather_correspondences(opened.index, matches)
+        pairs = observed_matches(opened.index, matches).resolve()
         seen = project(query.camera, poses[query.name], opened.index.xyz[pairs.point_ids])
         distances = np.linalg.norm(seen - keypoints[pairs.keypoint_ids], axis=1)
         found.append(float(np.median(distances)))

@@ -13,10 +13,11 @@ from megloc_kapture.evaluation.check.checking import check_submission
 from megloc_kapture.evaluation.check.reference import read_reference
 from megloc_kapture.pipeline.benchmarks import find_benchmark
 from megloc_kapture.pipeline.datasets import TWIN_PREFIX, choose_dataset, twin_of
-from megloc_kapture.pipeline.evaluation_plan import Run, plan_evaluation
+from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
 from megloc_kapture.pipeline.plan import all_kept, run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
+from megloc_kapture.pipeline.run import Run
 from megloc_kapture.pipeline.workspace import Workspace
 
 SMALL: dict[str, dict[str, Any]] = {

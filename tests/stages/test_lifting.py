@@ -17,7 +17,7 @@ from megloc_kapture.io.kapture_store import KaptureFolder, write_sensors
 from megloc_kapture.mapping.lifting import LiftingOptions
 from megloc_kapture.stages.lifting import depth_records, lift_map
 from megloc_kapture.stages.local_features import extract_local_features
-from megloc_kapture.stages.query_poses import index_map
+from megloc_kapture.stages.shared_index import index_map
 from megloc_kapture.values import RigidTransform
 
 OPTIONS = SyntheticWorldOptions(

@@ -1,0 +1,211 @@
+"""The stages that make the map: its points from images, from depth, or as the dataset gives them.
+
+``map_unrefined/`` is what triangulation, lifting or the dataset's own model gives, ``map/`` is that
+without the points that refinement rejects; the stage that writes it is always the last.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.io.kapture_store import KaptureFolder, read_pairs, write_pairs
+from megloc_kapture.pipeline.plan import Stage
+from megloc_kapture.pipeline.run import (
+    MAP,
+    MAPPING,
+    MAPPING_MATCHES,
+    MAPPING_PAIRS,
+    REFERENCE,
+    UNREFINED,
+    Run,
+)
+from megloc_kapture.stages.given_map import given_map, given_type, has_descriptors, join_maps
+from megloc_kapture.stages.global_vlad import vlad_type
+from megloc_kapture.stages.image_pairs import pair_map_images
+from megloc_kapture.stages.lifting import lift_map
+from megloc_kapture.stages.map_refinement import refine_map
+from megloc_kapture.stages.matches import match_pairs
+from megloc_kapture.stages.triangulation import triangulate_map
+
+_OWN, _GIVEN = "map_own", "map_given"
+
+
+def plan_map(run: Run, dump: Mapping[str, Any]) -> list[Stage]:
+    """How the map gets its points; the last stage is called ``map``.
+
+    Parameters
+    ----------
+    dump : the options as plain JSON values.
+    """
+    by = run.options.map
+    stages: list[Stage] = []
+    if by in ("triangulate", "given+triangulate"):
+        stages += _matching_stages(run, dump)
+    after = ["import", "local_features", "global_features"]
+    options: dict[str, Any] = {"by": by}
+    write: Callable[[Run, Path], Mapping[str, float]] = _triangulate
+    if by == "lift":
+        write, options["lifting"] = _lift, dump["lifting"]
+    elif by == "given":
+        write = _given
+    else:
+        after.append("mapping_matches")
+        options["triangulation"] = dump["triangulation"]
+    stages.append(Stage("points", 1, options, tuple(after), (UNREFINED,), partial(write, run)))
+    stages.append(
+        Stage(
+            "map",
+            2,
+            {"refinement": dump["refinement"]},
+            ("points",),
+            (MAP,),
+            lambda out: refine_map(
+                run.workspace.folder(UNREFINED),
+                out / MAP,
+                run.options.refinement,
+                link_features=True,
+                executor=run.executor,
+                track=run.track,
+            ),
+        )
+    )
+    return stages
+
+
+def check_given(run: Run) -> str:
+    """The keypoints type of the given map, once it is imported.
+
+    Raises
+    ------
+    DataError : none was imported, or it is not of the type that ``given_features`` extracts.
+    """
+    found = given_type(run.workspace.folder(REFERENCE))
+    expected = run.options.make_given_extractor().name
+    if found != expected:
+        raise DataError(
+            f"the given map is of keypoints type {found!r}, given_features extracts {expected!r}",
+            path=run.workspace.path(REFERENCE),
+        )
+    return found
+
+
+def map_images(run: Run, local_type: str) -> KaptureFolder:
+    """The map's images with their features of a type, before there is a map."""
+    # descriptors of its own: those that were extracted for it lie in the workspace
+    if _is_given(run, local_type) and has_descriptors(run.workspace.folder(REFERENCE)):
+        return run.workspace.folder(REFERENCE, "")
+    return run.workspace.folder(MAPPING, "")
+
+
+def matched_images(run: Run, local_type: str) -> KaptureFolder:
+    """The map's images with the features of a type that queries are matched with.
+
+    A given map has keypoints of its own, which are not all that its images' extraction gives.
+    """
+    return (
+        run.workspace.folder(MAP)
+        if _is_given(run, local_type)
+        else run.workspace.folder(MAPPING, "")
+    )
+
+
+def _is_given(run: Run, local_type: str) -> bool:
+    options = run.options
+    return options.uses_given_map() and local_type == options.make_given_extractor().name
+
+
+def _matching_stages(run: Run, dump: Mapping[str, Any]) -> list[Stage]:
+    if run.options.mapping_pairs.needs_points() and not run.options.uses_given_map():
+        raise OptionError(
+            "mapping_pairs by covisibility or overlap need points before there are any; "
+            "map = given+triangulate takes those of the dataset's own model"
+        )
+    return [
+        Stage(
+            "mapping_pairs",
+            3,
+            {"mapping_pairs": dump["mapping_pairs"]},
+            ("import", "global_features"),
+            (MAPPING_PAIRS,),
+            lambda out: _mapping_pairs(run, out),
+        ),
+        Stage(
+            "mapping_matches",
+            2,
+            {
+                "matching": dump["matching"],
+                "verification": dump["verification"],
+                "known_poses": dump["mapping_verification"],
+            },
+            ("import", "local_features", "mapping_pairs"),
+            (MAPPING_MATCHES,),
+            lambda out: _mapping_matches(run, out),
+        ),
+    ]
+
+
+def _mapping_pairs(run: Run, out: Path) -> dict[str, int]:
+    options = run.options.mapping_pairs
+    pairs = pair_map_images(
+        run.workspace.folder(MAPPING, ""),
+        options,
+        global_type=vlad_type(run.options.main_type()),
+        restrictions=run.restrictions(),
+        covisible=run.workspace.folder(REFERENCE) if run.options.uses_given_map() else None,
+    )
+    write_pairs(out / MAPPING_PAIRS, pairs)
+    return {"pairs": len(pairs)}
+
+
+def _mapping_matches(run: Run, out: Path) -> dict[str, int]:
+    mapping = run.workspace.folder(MAPPING, "")
+    return match_pairs(
+        mapping,
+        mapping,
+        read_pairs(run.workspace.path(MAPPING_PAIRS)),
+        run.options.main_type(),
+        run.options.make_matcher(),
+        run.options.verify_mapping(),
+        out / MAPPING_MATCHES,
+        executor=run.executor,
+        track=run.track,
+    )
+
+
+def _lift(run: Run, out: Path) -> dict[str, float]:
+    return lift_map(
+        run.workspace.folder(MAPPING, ""),
+        run.options.main_type(),
+        out / UNREFINED,
+        run.options.lifting,
+        executor=run.executor,
+        track=run.track,
+    )
+
+
+def _given(run: Run, out: Path, name: str = UNREFINED) -> dict[str, float]:
+    check_given(run)
+    mapping = run.workspace.folder(MAPPING, "")
+    return given_map(run.workspace.folder(REFERENCE), mapping, out / name)
+
+
+def _triangulate(run: Run, out: Path) -> dict[str, float]:
+    joined = run.options.uses_given_map()
+    own = out / (_OWN if joined else UNREFINED)
+    counts = triangulate_map(
+        run.workspace.folder(MAPPING, ""),
+        run.workspace.folder(MAPPING, MAPPING_MATCHES),
+        run.options.main_type(),
+        own,
+        run.options.triangulation,
+        num_threads=run.num_threads,
+    )
+    if not joined:
+        return counts
+    _given(run, out, _GIVEN)
+    both = join_maps(KaptureFolder(own), KaptureFolder(out / _GIVEN), out / UNREFINED)
+    return {**both, "points_triangulated": counts["points"]}

@@ -1,0 +1,76 @@
+"""What a run of ``megloc eval`` works on and with, and where in its workspace things stand."""
+
+from __future__ import annotations
+
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from pathlib import Path
+
+from megloc_kapture.datasets.kapture_folders import MAPPING, QUERY, QUERY_GT
+from megloc_kapture.datasets.official import REFERENCE
+from megloc_kapture.io.side_tables import SIDE_TABLES, read_protocol
+from megloc_kapture.pipeline.benchmarks import BenchmarkFile
+from megloc_kapture.pipeline.datasets import DatasetChoice
+from megloc_kapture.pipeline.presets import PipelineOptions
+from megloc_kapture.pipeline.submission import place_of
+from megloc_kapture.pipeline.workspace import Workspace
+from megloc_kapture.stages.parallel import Track, untracked
+from megloc_kapture.stages.restrictions import Restrictions
+
+__all__ = [
+    "EVALUATION",
+    "LOCALIZED",
+    "MAP",
+    "MAPPING",
+    "MAPPING_MATCHES",
+    "MAPPING_PAIRS",
+    "QUERY",
+    "QUERY_GT",
+    "QUERY_MATCHES",
+    "QUERY_PAIRS",
+    "REFERENCE",
+    "SUBMISSIONS",
+    "TIMING",
+    "UNREFINED",
+    "Run",
+]
+
+MAPPING_PAIRS, QUERY_PAIRS = "pairs/mapping.txt", "pairs/query.txt"
+MAPPING_MATCHES, QUERY_MATCHES = "matches/mapping", "matches/query"
+UNREFINED, MAP = "map_unrefined", "map"
+LOCALIZED, SUBMISSIONS, EVALUATION = "localized", "submissions", "evaluation"
+TIMING = "timing.csv"
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a run works on and with.
+
+    Attributes
+    ----------
+    benchmark : what it wants different in the dataset's protocol.
+    """
+
+    source: DatasetChoice
+    preset: str
+    options: PipelineOptions
+    workspace: Workspace
+    benchmark: BenchmarkFile | None = None
+    executor: Executor | None = None
+    track: Track = untracked
+    num_threads: int = 1
+
+    @property
+    def dataset(self) -> str:
+        """The dataset's name."""
+        return self.source.name
+
+    def submission_below(self, folder: Path) -> Path:
+        """Where, below ``folder``, the pose file stands; a folder where it is several files."""
+        protocol = read_protocol(self.workspace.path(SIDE_TABLES))
+        stem = f"{self.dataset}_eval_megloc-{self.preset}"
+        return place_of(folder / SUBMISSIONS, stem, protocol)
+
+    def restrictions(self) -> Restrictions:
+        """What the dataset's side tables permit."""
+        return Restrictions.read(self.workspace.path(SIDE_TABLES))

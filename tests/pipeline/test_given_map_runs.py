@@ -1,0 +1,121 @@
+"""Runs that localize in the model a dataset comes with, alone and beside points of our own."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from megloc_kapture.errors import OptionError
+from megloc_kapture.io.kapture_store import KaptureFolder, read_pairs
+from megloc_kapture.pipeline.datasets import choose_dataset, twin_of
+from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
+from megloc_kapture.pipeline.executors import open_executor, single_threaded
+from megloc_kapture.pipeline.plan import run_plan
+from megloc_kapture.pipeline.presets import options_of_preset
+from megloc_kapture.pipeline.run import Run
+from megloc_kapture.pipeline.workspace import Workspace
+
+SMALL = {
+    "num_places": 1,
+    "stations_per_place": 6,
+    "day_queries": 3,
+    "night_queries": 1,
+    "width": 400,
+    "height": 300,
+}
+CHEAP = ["local_features.options.max_keypoints=800", "vlad.num_clusters=16"]
+BOTH = ["map=given+triangulate", 'mapping_pairs.by=["covisibility"]']
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Workspace]:
+    """Runs the twin with some options in one workspace; renders once."""
+    workspace = Workspace(tmp_path_factory.mktemp("given") / "workspace")
+    source = choose_dataset("synthetic-aachen", None)
+    source = replace(source, twin=twin_of("aachen", **SMALL))
+
+    def run_with(*assignments: str) -> Workspace:
+        options = options_of_preset(assignments=[*CHEAP, *assignments])
+        with workspace.lock(), single_threaded(), open_executor("processes", 2) as executor:
+            of = Run(source, "classic", options, workspace, executor=executor)
+            run_plan(plan_evaluation(of), workspace)
+        return workspace
+
+    return run_with
+
+
+def day_recall(workspace: Workspace) -> float:
+    found = json.loads(workspace.path("evaluation/recall.json").read_text())
+    (day,) = (row for row in found["rows"] if row["name"] == "day")
+    return float(day["recall"][1]["recall"])
+
+
+def test_the_model_alone(run: Callable[..., Workspace]) -> None:
+    workspace = run("map=given")
+    assert day_recall(workspace) == 1.0
+    assert not workspace.path("matches/mapping").exists()  # nothing of our own was matched
+    reference, found = workspace.folder("reference"), workspace.folder("map")
+    assert (
+        list(found.observations()) == ["sift"] == workspace.folder("query", "").types("keypoints")
+    )
+    assert len(found.points3d()) == len(reference.points3d())
+
+
+def test_the_model_and_points_of_our_own(run: Callable[..., Workspace]) -> None:
+    workspace = run(*BOTH)
+    assert day_recall(workspace) == 1.0
+    found = workspace.folder("map")
+    observations = found.observations()
+    assert sorted(observations) == ["rootsift", "sift"]
+    given, own = (set(observations[name].point_ids.tolist()) for name in ("sift", "rootsift"))
+    assert given and own and not given & own  # every point is of one type
+    assert len(given | own) == len(found.points3d())
+    # pairs come from the model's co-visibility: every pair sees points of it in common
+    seen = KaptureFolder(workspace.path("reference")).observations()["sift"]
+    points = {
+        name: set(seen.point_ids[seen.image_ids == row].tolist())
+        for row, name in enumerate(seen.image_names)
+    }
+    pairs = read_pairs(workspace.path("pairs/mapping.txt"))
+    assert pairs and all(points[pair.query] & points[pair.map] for pair in pairs)
+
+
+def test_a_dataset_without_a_model_is_refused(tmp_path: Path) -> None:
+    workspace = Workspace(tmp_path / "workspace")
+    for name, root in (("synthetic", None), ("synthetic-inloc", None), ("kapture", tmp_path)):
+        run = Run(
+            choose_dataset(name, root),
+            "classic",
+            options_of_preset(assignments=["map=given"]),
+            workspace,
+        )
+        with pytest.raises(OptionError, match="map = given"):
+            plan_evaluation(run)
+
+
+def test_both_need_features_of_two_types(tmp_path: Path) -> None:
+    options = options_of_preset(assignments=["map=given+triangulate", "local_features.name=sift"])
+    run = Run(
+        choose_dataset("synthetic-aachen", None),
+        "classic",
+        options,
+        Workspace(tmp_path / "workspace"),
+    )
+    with pytest.raises(OptionError, match="another type than the given map's 'sift'"):
+        plan_evaluation(run)
+
+
+def test_covisibility_needs_points(tmp_path: Path) -> None:
+    options = options_of_preset(assignments=['mapping_pairs.by=["covisibility"]'])
+    run = Run(
+        choose_dataset("synthetic-aachen", None),
+        "classic",
+        options,
+        Workspace(tmp_path / "workspace"),
+    )
+    with pytest.raises(OptionError, match="given\\+triangulate"):
+        plan_evaluation(run)
