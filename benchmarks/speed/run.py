@@ -31,6 +31,10 @@ def main() -> None:
     run("map_reading.py")
     run("nvm_reading.py")
     run("evaluation.py")
+    run("localization.py")
+    run("large_map.py")
+    run("uncertainty.py")
+    run("pairs.py")
     scene = ("--scene", str(options.scene))
     run("end_to_end.py", *scene, *arguments)
     if options.kloc_python:

@@ -1,0 +1,170 @@
+"""Recall and median errors of real scenes over several seeds; and two such results compared.
+
+    .venv/bin/python benchmarks/scenes.py --scene DIR --scene DIR -o now.csv
+    .venv/bin/python benchmarks/scenes.py --read now.csv --against before.csv
+
+A scene is a folder with mapping/, query/ and query_gt/ in kapture, which is mapped and localized
+in, or with map/, query/ and query_gt/, where the map is given. A seed changes all that draws random
+numbers: the vocabulary, the verification of query pairs, triangulation, pose estimation. Arguments
+that are not known here go to ``megloc eval`` and ``megloc localize``.
+
+The comparison is paired by query: of every query the mean over the seeds, and a bootstrap over the
+queries of the difference of these means.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+sys.path.append(str(Path(__file__).resolve().parent / "speed"))
+from timing import table  # noqa: E402
+
+SEEDED = (
+    "vlad.seed",
+    "query_verification.seed",
+    "triangulation.seed",
+    "localization.pose.seed",
+)
+THRESHOLDS = ((0.05, 5.0), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
+COLUMNS = ("scene", "seed", "query", "error_m", "error_deg")
+DRAWS = 10_000
+
+
+def megloc(*arguments: str) -> None:
+    """Run the ``megloc`` beside this Python; a failure ends this run with its exit code."""
+    program = str(Path(sys.executable).with_name("megloc"))
+    quiet = subprocess.DEVNULL
+    done = subprocess.run([program, *arguments, "-q"], stdout=quiet, check=False)
+    if done.returncode != 0:
+        sys.exit(done.returncode)
+
+
+def measure(scene: Path, seed: int, workspace: Path, arguments: Sequence[str]) -> pd.DataFrame:
+    """Errors of every query of a scene; those of a query without a pose are infinite."""
+    seeds = [part for key in SEEDED for part in ("--set", f"{key}={seed}")]
+    if (scene / "map").is_dir():
+        found, report = workspace / f"localized-{seed}", workspace / f"evaluation-{seed}"
+        query = ("--query", str(scene / "query"))
+        megloc(
+            "localize", "-i", str(scene / "map"), *query, "-o", str(found), "-f", *seeds, *arguments
+        )
+        truth = ("--gt", str(scene / "query_gt"))
+        megloc("evaluate", "-i", str(found), *truth, "-o", str(report), "-f")
+    else:
+        places = ("--root", str(scene), "--workspace", str(workspace))
+        megloc("eval", "kapture", *places, *seeds, *arguments)
+        report = workspace / "evaluation"
+    rows = pd.read_csv(report / "per_query.csv")
+    errors = pd.DataFrame(
+        {
+            "scene": scene.name,
+            "seed": seed,
+            "query": rows["image"],
+            "error_m": rows["position_error_m"].fillna(np.inf),
+            "error_deg": rows["angle_error_deg"].fillna(np.inf),
+        }
+    )
+    return errors[list(COLUMNS)]
+
+
+def hits(errors: pd.DataFrame) -> pd.DataFrame:
+    """One column per threshold: whether the query is within it, in percent."""
+    return pd.DataFrame(
+        {
+            f"{m:g} m, {deg:g} deg": 100.0
+            * ((errors.error_m <= m) & (errors.error_deg <= deg)).astype(float)
+            for m, deg in THRESHOLDS
+        }
+    )
+
+
+def summary(errors: pd.DataFrame) -> str:
+    """Recall, mean and standard deviation over the seeds, and the mean of the medians."""
+    rows: list[tuple[str, ...]] = []
+    for scene, of_scene in errors.groupby("scene", sort=False):
+        recall = hits(of_scene).groupby(of_scene.seed).mean()
+        medians = of_scene.groupby("seed")[["error_m", "error_deg"]].median()
+        queries = of_scene["query"].nunique()
+        if not rows:
+            rows.append(("scene", "queries", "seeds", *recall.columns, "median m", "median deg"))
+        cells = [f"{recall[c].mean():.1f} +- {recall[c].std(ddof=0):.1f}" for c in recall.columns]
+        m, deg = medians.error_m.mean(), medians.error_deg.mean()
+        rows.append((str(scene), str(queries), str(len(recall)), *cells, f"{m:.4f}", f"{deg:.4f}"))
+    return table(rows)
+
+
+def comparison(now: pd.DataFrame, before: pd.DataFrame) -> str:
+    """Differences now minus before per scene and threshold, with 95 % bootstrap intervals."""
+    rows: list[tuple[str, ...]] = [("scene", "figure", "before", "now", "difference", "verdict")]
+    for scene in now.scene.unique():
+        ours, theirs = (d[d.scene == scene] for d in (now, before))
+        if theirs.empty:
+            continue
+        means = [hits(d).groupby(d["query"]).mean().sort_index() for d in (ours, theirs)]
+        if not means[0].index.equals(means[1].index):
+            sys.exit(f"{scene}: the two results are not of the same queries")
+        difference = (means[0] - means[1]).to_numpy()
+        draws = np.random.default_rng(0).integers(0, len(difference), (DRAWS, len(difference)))
+        low, high = np.quantile(difference[draws].mean(axis=1), (0.025, 0.975), axis=0)
+        for column, name in enumerate(means[0].columns):
+            verdict = "better" if low[column] > 0 else "worse" if high[column] < 0 else "equal"
+            rows.append(
+                (
+                    scene,
+                    name,
+                    f"{means[1][name].mean():.1f}",
+                    f"{means[0][name].mean():.1f}",
+                    f"{difference[:, column].mean():+.1f} "
+                    f"[{low[column]:+.1f}, {high[column]:+.1f}]",
+                    verdict,
+                )
+            )
+        for name in ("error_m", "error_deg"):
+            a, b = (float(d.groupby("seed")[name].median().mean()) for d in (theirs, ours))
+            ratio = b / a
+            verdict = "worse" if ratio > 1.03 else "better" if ratio < 0.97 else "within 3 %"
+            rows.append(
+                (scene, f"median {name}", f"{a:.4f}", f"{b:.4f}", f"{ratio - 1:+.1%}", verdict)
+            )
+    return table(rows)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--scene", type=lambda text: Path(text).resolve(), action="append")
+    parser.add_argument("--seeds", type=int, nargs="+", default=list(range(5)))
+    parser.add_argument("--workspace", type=Path, help="keep the runs here")
+    parser.add_argument("--read", type=Path, help="a result written before, instead of scenes")
+    parser.add_argument("--against", type=Path, help="compare with this result")
+    parser.add_argument("-o", "--output", type=Path, help="write the errors of every query here")
+    options, arguments = parser.parse_known_args()
+    if (options.read is None) == (options.scene is None):
+        parser.error("give scenes or --read")
+    if options.read is not None:
+        errors = pd.read_csv(options.read)
+    else:
+        with tempfile.TemporaryDirectory(prefix="megloc-scenes-") as temporary:
+            root = options.workspace or Path(temporary)
+            parts = []
+            for scene in options.scene:
+                for seed in options.seeds:
+                    parts.append(measure(scene, seed, root / scene.name, arguments))
+                    if options.output is not None:
+                        pd.concat(parts).to_csv(options.output, index=False)
+            errors = pd.concat(parts)
+    print(f"{os.linesep}{summary(errors)}")
+    if options.against is not None:
+        print(f"{os.linesep}{comparison(errors, pd.read_csv(options.against))}")
+
+
+if __name__ == "__main__":
+    main()
