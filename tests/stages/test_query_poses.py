@@ -11,8 +11,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from megloc_kapture.errors import PluginError
+from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder
 from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions
+from megloc_kapture.plugins import PluginChoice
 from megloc_kapture.stages.image_pairs import QueryPairsOptions, pair_queries
 from megloc_kapture.stages.query_poses import (
     LocalizationOptions,
@@ -89,6 +92,48 @@ def test_a_query_with_too_few_inliers_fails_and_keeps_its_numbers(world: Any) ->
         assert isinstance(result, Failure)
         assert "at least 5000 are needed" in result.reason
         assert result.num_matches > 100 and result.candidates
+
+
+RANKER = """
+import numpy as np
+
+class Brightness:
+    def score(self, hypotheses, scene):
+        found = []
+        for hypothesis in hypotheses:
+            (view,) = hypothesis.views
+            first = hypothesis.images[0]
+            assert scene.map_image(first).shape == (300, 400, 3)
+            assert scene.map_camera(first).width == 400
+            assert scene.map_pose(first) is not None
+            found.append(scene.query_image(view.name).mean())
+        return np.array(found)
+"""
+
+
+def test_a_ranker_of_another_package_sees_poses_and_images(
+    world: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "outside_ranker.py").write_text(RANKER)
+    metadata = tmp_path / "outside_ranker-1.0.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: outside_ranker\nVersion: 1.0\n"
+    )
+    (metadata / "entry_points.txt").write_text(
+        "[megloc_kapture.pose_rankers]\nbrightness = outside_ranker:Brightness\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    options = LocalizationOptions(rank=PluginChoice(name="brightness"))
+    for image, result in localize(world, options=options):
+        assert isinstance(result, Pose)
+        pixels = read_image_rgb(world.query().image_path(image))
+        assert result.clusters[0].score == pytest.approx(pixels.mean())
+
+
+def test_an_unknown_ranker_is_refused_before_the_first_query(world: Any) -> None:
+    with pytest.raises(PluginError, match="no plugin 'no-such' in megloc_kapture.pose_rankers"):
+        localize(world, options=LocalizationOptions(rank=PluginChoice(name="no-such")))
 
 
 @pytest.fixture(scope="module")
