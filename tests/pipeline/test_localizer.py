@@ -178,7 +178,7 @@ def test_a_prior_restricts_the_candidates(
     assert set(found.candidates) == {"0003.jpg", "0005.jpg"}
     metres, _ = errors(found, truth.cam_from_world("0004.jpg"))
     assert metres < 0.05
-    assert localizer.localize(path, camera, prior=[]) == Failure("no map image matches")
+    assert localizer.localize(path, camera, prior=[]) == Failure("no map image is a candidate")
     with pytest.raises(DataError, match=r"0004\.jpg is to be matched with 0001\.jpg, which is no"):
         localizer.localize(path, camera, prior=["0003.jpg", "0001.jpg"])
 
@@ -215,7 +215,7 @@ def test_given_candidates_are_all_taken_in_their_order(
     chosen = ["0005.jpg", "0003.jpg", "0002.jpg"]
     given = {query.name: chosen for query in queries[1:]}
     found = list(narrow.localize_many(queries, candidates=given))
-    assert found[0] == Failure("no map image matches")
+    assert found[0] == Failure("no map image is a candidate")
     assert found[1].candidates == tuple(chosen)
 
 
