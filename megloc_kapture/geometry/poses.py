@@ -124,6 +124,12 @@ def rotation_angles_deg(quats_a: Float64Array, quats_b: Float64Array) -> Float64
     return np.rad2deg(2.0 * np.linalg.norm(scale[..., None] * vector, axis=-1))
 
 
+def cross_matrix(vector: Float64Array) -> Float64Array:
+    """``[v]_x`` (3, 3) with ``[v]_x w = v x w``."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
 def _conjugate(quats: Float64Array) -> Float64Array:
     return quats * np.array([1.0, -1.0, -1.0, -1.0])
 

@@ -23,7 +23,7 @@ from megloc_kapture.localization.estimation import (
 from megloc_kapture.localization.map_index import MapIndex
 from megloc_kapture.localization.pose_refinement import refine_stacked
 from megloc_kapture.localization.same_place import same_place
-from megloc_kapture.localization.views import StackedViews, View, stack_views
+from megloc_kapture.localization.views import StackedViews, View, split_by_view, stack_views
 from megloc_kapture.plugins import HypothesisView, PoseHypothesis
 from megloc_kapture.values import Camera, ClusterPose, Failure, Pose, RigidTransform
 
@@ -104,6 +104,9 @@ def localize_in_clusters(
     over the keypoints types, in their order. Or a failure with its reason.
     """
     clock = _Clock()
+    matched = in_turn([view.matched_images() for view in views])
+    rank_of = {image: rank for rank, image in enumerate(matched)}
+    clusters = [[image for image in cluster if image in rank_of] for cluster in clusters]
     gathered = [[observed_matches(m.index, m.matches) for m in view.matches] for view in views]
     counts = [_num_observed(views, gathered, cluster) for cluster in clusters]
     by_matches = sorted(range(len(clusters)), key=lambda at: (-counts[at], at))
@@ -118,22 +121,18 @@ def localize_in_clusters(
         estimate = estimate_stacked(problem, options)
         hypothesis = None
         if isinstance(estimate, PoseEstimate):
-            hypothesis = _hypothesis(_matched(views, cluster), views, problem, estimate, options)
+            hypothesis = _hypothesis(tuple(cluster), views, problem, estimate, options)
         clock.lap("estimation")
         return _Attempt(tuple(cluster), frame, problem, estimate, hypothesis)
 
     attempts = [attempt(clusters[at], frames[at] if frames else "") for at in tried]
-    candidates = in_turn([view.matched_images() for view in views])
-    attempts = _joined(attempts, attempt, candidates.index)
+    attempts = _joined(attempts, attempt, rank_of.__getitem__)
     if not attempts:
         failure = Failure("no match is with a point of the map", seconds=clock.seconds)
         return ClusterLocalization(failure, (0,) * len(views))
     hypotheses = [each.hypothesis for each in attempts if each.hypothesis is not None]
     scores = iter(rank(hypotheses).tolist() if hypotheses else ())
-    ranked = tuple(
-        _cluster_pose(each, _matched(views, each.cluster), None if each.failed else next(scores))
-        for each in attempts
-    )
+    ranked = tuple(_cluster_pose(each, None if each.failed else next(scores)) for each in attempts)
     clock.lap("ranking")
     best = _best(ranked)
     problem, estimate = attempts[best].problem, attempts[best].estimate
@@ -194,7 +193,8 @@ def _joined(
     return found
 
 
-def _cluster_pose(attempt: _Attempt, images: tuple[str, ...], score: float | None) -> ClusterPose:
+def _cluster_pose(attempt: _Attempt, score: float | None) -> ClusterPose:
+    images = attempt.cluster
     estimate = attempt.estimate
     if isinstance(estimate, Failure):
         counted = (estimate.num_matches, estimate.num_inliers)
@@ -218,11 +218,6 @@ def _failure(clusters: Sequence[ClusterPose], best: int) -> Failure:
     nearest = clusters[best]
     others = f", the best of {len(clusters)} clusters" if len(clusters) > 1 else ""
     return Failure(nearest.reason + others, nearest.num_matches, nearest.num_inliers)
-
-
-def _matched(views: Sequence[QueryView], cluster: Sequence[str]) -> tuple[str, ...]:
-    matched = {image for view in views for image in view.matched_images()}
-    return tuple(image for image in cluster if image in matched)
 
 
 def _rows(typed: TypedMatches, cluster: Sequence[str]) -> NDArray[np.bool_]:
@@ -273,17 +268,22 @@ def _hypothesis(
     options: AbsolutePoseOptions,
 ) -> PoseHypothesis:
     posed = []
-    for query, view, start in zip(views, problem.views, problem.starts[:-1].tolist(), strict=True):
-        own = slice(start, start + len(view.points_px))
+    parts = (
+        split_by_view(problem.views, of_matches)
+        for of_matches in (problem.points_px, estimate.errors_px, estimate.inliers)
+    )
+    for query, view, points_px, errors_px, inliers in zip(
+        views, problem.views, *parts, strict=True
+    ):
         posed.append(
             HypothesisView(
                 name=query.name,
                 camera=view.camera,
                 cam_from_world=view.cam_from_rig @ estimate.rig_from_world,
-                points_px=problem.points_px[own],
+                points_px=points_px,
                 points_world=view.points_world,
-                errors_px=estimate.errors_px[own],
-                inliers=estimate.inliers[own],
+                errors_px=errors_px,
+                inliers=inliers,
             )
         )
     return PoseHypothesis(images, tuple(posed), options.max_error_px)

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from megloc_kapture.geometry.poses import cross_matrix
 from megloc_kapture.localization.cluster_poses import ClusterLocalization, QueryView
 from megloc_kapture.values import Failure, Pose, RigidTransform
 
@@ -23,10 +24,9 @@ def poses_of_cameras(
     result = found.result
     if not isinstance(result, Pose) or result.inliers is None:
         raise ValueError("the rig has no pose, or its inliers are not known")
-    starts = np.cumsum((0, *found.matches_of_views))
+    masks = np.split(result.inliers, np.cumsum(found.matches_of_views)[:-1])
     cameras: list[Pose | Failure] = []
-    for view, start, stop in zip(views, starts[:-1], starts[1:], strict=True):
-        inliers = result.inliers[start:stop]
+    for view, inliers in zip(views, masks, strict=True):
         num_inliers = int(inliers.sum())
         if num_inliers == 0:
             cameras.append(
@@ -63,9 +63,7 @@ def moved_covariance(
     ``Ad_C covariance Ad_C^T`` (Barfoot, State Estimation for Robotics, section 7.1.4).
     """
     rotation = cam_from_rig.rotation_matrix()
-    x, y, z = cam_from_rig.translation
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     adjoint = np.zeros((6, 6))
     adjoint[:3, :3] = adjoint[3:, 3:] = rotation
-    adjoint[3:, :3] = cross @ rotation
+    adjoint[3:, :3] = cross_matrix(np.array(cam_from_rig.translation)) @ rotation
     return np.asarray(adjoint @ covariance @ adjoint.T)

@@ -51,7 +51,7 @@ class View:
             )
 
 
-def split_by_view(views: Sequence[View], per_match: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
+def split_by_view(views: Sequence[View], per_match: NDArray[Any]) -> list[NDArray[Any]]:
     """One part for each view of what runs over the matches of all views, such as inliers (N,)."""
     return np.split(per_match, np.cumsum([len(view.points_px) for view in views])[:-1])
 

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.geometry.cameras import bearing_rays, focal_px
+from megloc_kapture.geometry.poses import cross_matrix
 from megloc_kapture.values import Camera, Options, RigidTransform
 
 Floats = NDArray[np.float64]
@@ -46,12 +47,6 @@ class TwoViewOptions(Options):
     min_iterations: int = Field(default=100, gt=0)
     confidence: float = Field(default=0.999, gt=0, lt=1)
     seed: int = Field(default=0, ge=0)
-
-
-def cross_matrix(vector: Floats) -> Floats:
-    """``[v]_x`` (3, 3) with ``[v]_x w = v x w``."""
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def essential_matrix(b_from_a: RigidTransform) -> Floats:

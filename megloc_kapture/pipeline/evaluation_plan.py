@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -204,12 +205,12 @@ def _local_features(run: Run, out: Path) -> dict[str, int]:
         described = has_descriptors(run.workspace.folder(REFERENCE))
         folders = [query] if described else [mapping, query]
         work.append((run.options.make_given_extractor(), folders))
-    counts: dict[str, int] = {}
+    counts: Counter[str] = Counter()
     for extractor, folders in work:
         found = extract_local_features(
             folders, extractor, out, executor=run.executor, track=run.track
         )
-        counts = {name: counts.get(name, 0) + count for name, count in found.items()}
+        counts.update(found)
     return counts
 
 
@@ -241,7 +242,7 @@ def _query_pairs(run: Run, out: Path) -> dict[str, int]:
 
 
 def _query_matches(run: Run, out: Path) -> dict[str, int]:
-    counts: dict[str, int] = {}
+    counts: Counter[str] = Counter()
     pairs = read_pairs(run.workspace.path(QUERY_PAIRS))
     for local_type in run.options.local_types():
         mapping = matched_images(run, local_type)
@@ -257,7 +258,7 @@ def _query_matches(run: Run, out: Path) -> dict[str, int]:
             executor=run.executor,
             track=run.track,
         )
-        counts = {name: counts.get(name, 0) + count for name, count in found.items()}
+        counts.update(found)
     return counts
 
 

@@ -76,8 +76,8 @@ def plan_map(run: Run, dump: Mapping[str, Any]) -> list[Stage]:
     return stages
 
 
-def check_given(run: Run) -> str:
-    """The keypoints type of the given map, once it is imported.
+def check_given(run: Run) -> None:
+    """Check the given map, once it is imported.
 
     Raises
     ------
@@ -90,7 +90,6 @@ def check_given(run: Run) -> str:
             f"the given map is of keypoints type {found!r}, given_features extracts {expected!r}",
             path=run.workspace.path(REFERENCE),
         )
-    return found
 
 
 def map_images(run: Run, local_type: str) -> KaptureFolder:

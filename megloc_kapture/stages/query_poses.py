@@ -71,6 +71,7 @@ class _Job:
     own_candidates: tuple[tuple[str, ...], ...]  # of each
     frames: tuple[str, ...]  # of the candidates
     options: LocalizationOptions
+    ranker: PoseRanker
 
 
 def localize_views(
@@ -145,7 +146,7 @@ def _localize(job: _Job) -> list[tuple[str, Pose | Failure]]:
             frames,
             job.options,
             centers=centers,
-            ranker=job.options.make_ranker(),
+            ranker=job.ranker,
             scene=scene,
         )
 
@@ -221,7 +222,7 @@ def localize_from_matches(
     DataError : the map has no observations of a type.
     PluginError : there is no such ranker, or it refuses its options.
     """
-    options.make_ranker()  # what is wrong with it is found before the first query
+    ranker = options.make_ranker()
     map_spec, query_spec, matches_spec = (
         FolderSpec(f.root, f.features_dirs) for f in (map_folder, query, matches)
     )
@@ -243,6 +244,7 @@ def localize_from_matches(
                     own_candidates=own,
                     frames=tuple(restrictions.frame(image) for image in together),
                     options=options,
+                    ranker=ranker,
                 )
             )
         for results in track(ordered_map(_localize, jobs, executor), len(jobs), "localizing"):

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from megloc_kapture.geometry.poses import (
     camera_centers,
     compose,
+    cross_matrix,
     invert,
     invert_quats,
     multiply_quats,
@@ -149,3 +150,9 @@ def test_stacking_and_back() -> None:
 
 def test_a_zero_quaternion_has_no_direction() -> None:
     assert np.isnan(normalize_quats(np.zeros((1, 4)))).all()
+
+
+@given(st.lists(st.floats(-10, 10), min_size=6, max_size=6))
+def test_cross_matrix_is_the_cross_product(values: list[float]) -> None:
+    a, b = np.array(values[:3]), np.array(values[3:])
+    np.testing.assert_allclose(cross_matrix(a) @ b, np.cross(a, b), atol=1e-12)

@@ -15,7 +15,6 @@ from megloc_kapture.geometry.cameras import bearing_rays, project
 from megloc_kapture.matching.verification import (
     KnownPoseOptions,
     TwoViewOptions,
-    cross_matrix,
     essential_matrix,
     in_front_of_both,
     ray_slopes,
@@ -80,12 +79,6 @@ def scene(
         seen &= (pixels > 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
     assert seen.sum() >= count
     return points[seen][:count], in_a[seen][:count], in_b[seen][:count]
-
-
-@given(st.lists(st.floats(-10, 10), min_size=6, max_size=6))
-def test_cross_matrix_is_the_cross_product(values: list[float]) -> None:
-    a, b = np.array(values[:3]), np.array(values[3:])
-    np.testing.assert_allclose(cross_matrix(a) @ b, np.cross(a, b), atol=1e-12)
 
 
 def test_essential_matrix_is_colmaps() -> None:
