@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -23,3 +24,11 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no shared test data at {folder} (set MEGLOC_SHARED_DATA)")
     return folder
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_weights(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """What the machine's user has of weights changes nothing; tests that need some say where."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MEGLOC_WEIGHTS", str(tmp_path_factory.mktemp("no-weights")))
+        yield

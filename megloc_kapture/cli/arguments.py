@@ -54,7 +54,7 @@ def summary(drawn: str) -> str:
             sections[-1].append(text)
     told = [_joined(s) for s in sections if s and not s[0].startswith(_BESIDES)]
     told = told or [title]
-    helped = re.search(r"megloc(?: [a-z-]+)? --help", drawn)
+    helped = re.search(r"megloc(?: [a-z-]+){0,2} --help", drawn)
     if not told[0].startswith((title, "Missing", "Error", "invalid")):
         told[0] = f"{title}: {told[0]}"
     told.append(f"see {helped[0] if helped else 'megloc --help'}")

@@ -6,6 +6,7 @@ import importlib.util
 from dataclasses import dataclass
 
 from megloc_kapture.cli.common import Common
+from megloc_kapture.cli.weights import summary
 from megloc_kapture.errors import MeglocError
 from megloc_kapture.evaluation.provenance import installed_version
 
@@ -24,7 +25,7 @@ _PACKAGES = (
 
 @dataclass(frozen=True, kw_only=True)
 class Doctor(Common):
-    """Check the environment: versions, known-bad combinations, GPU."""
+    """Check the environment: versions, known-bad combinations, GPU, weights."""
 
     def run(self) -> int:
         """Print what there is; exit status 2 when something is wrong."""
@@ -32,6 +33,7 @@ class Doctor(Common):
         for package in _PACKAGES:
             console.result(f"{package:24s}{installed_version(package) or 'not installed'}")
         console.result(f"{'GPU':24s}{gpu()}")
+        console.result(f"{'weights':24s}{summary()}")
         problems = find_problems()
         for problem in problems:
             console.result(f"problem: {problem}")

@@ -1,0 +1,248 @@
+"""``megloc weights``: what each network needs, where it is published, what its licence allows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from megloc_kapture.cli.common import Common, Force, Output
+from megloc_kapture.cli.console import Console
+from megloc_kapture.errors import MeglocError, OptionError, OutputError
+from megloc_kapture.io.weights import (
+    MissingWeightsError,
+    WeightsFile,
+    describe,
+    how_to_get,
+    places,
+    read_weights,
+    sha256_of,
+    weights_folder,
+)
+from megloc_kapture.io.weights_adding import add_weights, prove
+from megloc_kapture.io.weights_conversion import convert_weights
+from megloc_kapture.io.weights_fetch import fetch
+from megloc_kapture.io.weights_registry import PublishedFile, Weights, lookup, registry
+
+WRONG_FILES = 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class List(Common):
+    """List all networks: file, size, licence, whether it is there and its sha256 known."""
+
+    def run(self) -> int:
+        """Print the table."""
+        console = self.console()
+        rows: list[tuple[str, ...]] = [
+            ("name", "what for", "file", "size", "licence", "state", "sha256")
+        ]
+        rows += [_row(weights) for weights in registry().values()]
+        for line in _aligned(rows):
+            console.result(line)
+        console.result(f"\nfolder of weights: {weights_folder()}")
+        console.result("(!) megloc weights fetch asks for consent: --accept-licence")
+        console.result("* not confirmed on the original file:")
+        for weights in registry().values():
+            if weights.unverified:
+                console.result(f"  {weights.name}: {weights.unverified}")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fetch(Common):
+    """Download weights from where they are published, check them, and keep them."""
+
+    names: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="NAME...")]
+    """Networks, by their names in the list."""
+    accept_licence: bool = False
+    """Agree to a licence that does not plainly allow commercial use."""
+    force: Force = False
+    """Replace a different file that stands in its place."""
+
+    def run(self) -> int:
+        """Run it."""
+        console = self.console()
+        if not self.names:
+            raise OptionError(f"say which weights to fetch: {', '.join(registry())}")
+        wanted = [_fetchable(lookup(name), self.accept_licence) for name in self.names]
+        for weights, file, url in wanted:
+            self._fetch(console, weights, file, url)
+        return 0
+
+    def _fetch(self, console: Console, weights: Weights, file: PublishedFile, url: str) -> None:
+        place = weights_folder() / file.name
+        if place.is_file() and not self.force:
+            if file.sha256 in (None, sha256_of(describe(weights.name, place))):
+                console.result(f"{weights.name}: already there, {place}")
+                return
+            raise OutputError(f"{place}: stands there, but is not the published file; -f fetches")
+
+        def watch(chunks: Iterator[bytes], total: int) -> Iterable[bytes]:
+            return console.track(chunks, total, f"{file.name}, MiB")
+
+        console.say(f"{weights.name}: {url}")
+        console.say(f"  licence: {weights.licence}: {weights.terms}")
+        found = fetch(url, place, size=file.size, sha256=file.sha256, watch=watch)
+        told = "sha256 right" if file.sha256 else f"sha256 {found}, which the registry cannot check"
+        if file.sha256 is None and place.suffix != ".mat":
+            read_weights(describe(weights.name, place))
+        console.result(f"{weights.name}: {place} ({place.stat().st_size} bytes, {told})")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Add(Common):
+    """Copy a file that was downloaded by hand into the folder of weights, once it is proven."""
+
+    file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
+    """File; of a TensorFlow checkpoint its .index or the published tar."""
+    name: str | None = None
+    """Network that it is for; told by its sha256 or its name unless given."""
+    force: Force = False
+    """Replace a different file that stands in its place."""
+
+    def run(self) -> int:
+        """Run it."""
+        added = add_weights(self.file, name=self.name, force=self.force)
+        self.console().result(f"{added.name}: {added.path} ({_trust(added)})")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Convert(Common):
+    """Write the tensors of any checkpoint that can be read safely as safetensors."""
+
+    file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
+    """Checkpoint: .pth, .pt, .npz, .onnx, TensorFlow's .index, or a tar with one."""
+    output: Output
+    """File to write; must end in .safetensors."""
+    force: Force = False
+    """Replace a file that stands there."""
+
+    def run(self) -> int:
+        """Run it."""
+        count = convert_weights(self.file, self.output, force=self.force)
+        self.console().result(f"{self.output}: {count} tensors")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check(Common):
+    """Check the files that are there: sha256 where it is known, and that they load safely."""
+
+    names: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[NAME...]")] = ()
+    """Networks, by their names in the list; all whose files are there unless given."""
+
+    def run(self) -> int:
+        """Run it; returns 2 where a file is wrong."""
+        console = self.console()
+        wrong = sum(_wrong(console, lookup(name)) for name in self.names)
+        if not self.names:
+            wrong = sum(_wrong(console, w) for w in registry().values() if _state(w) != "missing")
+        console.result(f"wrong files: {wrong}" if wrong else "no file is wrong")
+        return WRONG_FILES if wrong else 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class WeightsCommand:
+    """List, fetch, add, convert and check the weights of networks."""
+
+    action: (
+        Annotated[List, tyro.conf.subcommand("list", description=List.__doc__)]
+        | Annotated[Fetch, tyro.conf.subcommand("fetch", description=Fetch.__doc__)]
+        | Annotated[Add, tyro.conf.subcommand("add", description=Add.__doc__)]
+        | Annotated[Convert, tyro.conf.subcommand("convert", description=Convert.__doc__)]
+        | Annotated[Check, tyro.conf.subcommand("check", description=Check.__doc__)]
+    )
+
+    @property
+    def debug(self) -> bool:
+        """Whether to show the traceback of an error."""
+        return self.action.debug
+
+    def run(self) -> int:
+        """Run what was chosen."""
+        return self.action.run()
+
+
+def summary() -> str:
+    """How many networks have their weights, and where; for ``megloc doctor``."""
+    there = [weights.name for weights in registry().values() if _state(weights) == "there"]
+    names = f": {', '.join(there)}" if there else ""
+    return f"{len(there)} of {len(registry())} in {weights_folder()}{names}"
+
+
+def _fetchable(weights: Weights, accepted: bool) -> tuple[Weights, PublishedFile, str]:
+    file = weights.to_fetch
+    if file is None or file.url is None:
+        raise MissingWeightsError(
+            f"{weights.name} cannot be fetched by a program: download it from {weights.page} and "
+            "run: megloc weights add FILE"
+        )
+    if not (weights.commercial or accepted):
+        raise MeglocError(
+            f"{weights.name} has a licence to agree to: {weights.licence}: {weights.terms} "
+            f"(whole text at {weights.page}); if you do, add --accept-licence"
+        )
+    return weights, file, file.url
+
+
+def _wrong(console: Console, weights: Weights) -> int:
+    """Print the state of each file of a network; the number that are wrong."""
+    wrong = 0
+    try:
+        paths = list(places(weights))
+        if not paths:
+            raise MissingWeightsError(how_to_get(weights))
+    except MeglocError as error:
+        console.result(f"wrong: {error}")
+        return 1
+    for path in paths:
+        file = describe(weights.name, path)
+        try:
+            prove(file, sha256_of(file), file.published, weights)
+            console.result(f"{weights.name}: {path} ({_trust(file)})")
+        except MeglocError as error:
+            wrong += 1
+            console.result(f"wrong: {error}")
+    return wrong
+
+
+def _trust(file: WeightsFile) -> str:
+    if file.published and file.published.sha256:
+        return "sha256 right"
+    return f"loads; sha256 {sha256_of(file)} cannot be checked"
+
+
+def _state(weights: Weights) -> str:
+    try:
+        return "there" if next(places(weights), None) else "missing"
+    except MeglocError:
+        return "wrong"
+
+
+def _row(weights: Weights) -> tuple[str, ...]:
+    file = next((f for f in weights.files if _is_there(weights, f)), weights.files[0])
+    size = "?" if file.size is None else f"{file.size / 1e6:.2f} MB"
+    name = f"{weights.name} *" if weights.unverified else weights.name
+    licence = weights.licence if weights.commercial else f"{weights.licence} (!)"
+    known = "known" if file.sha256 else "not known"
+    names = " | ".join(f.name for f in weights.files)
+    return name, weights.purpose, names, size, licence, _state(weights), known
+
+
+def _is_there(weights: Weights, file: PublishedFile) -> bool:
+    try:
+        return any(describe(weights.name, path).published == file for path in places(weights))
+    except MeglocError:
+        return False
+
+
+def _aligned(rows: Sequence[Sequence[str]]) -> Iterator[str]:
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
+        yield "  ".join(cells).rstrip()

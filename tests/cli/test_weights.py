@@ -1,0 +1,185 @@
+"""``megloc weights`` as its users meet it, with a registry whose places are on this machine."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import re
+import threading
+from collections.abc import Iterator
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from megloc_kapture.io import weights_registry
+
+BUNDLE = Path(__file__).parents[1] / "io" / "data" / "tensor_bundle"
+
+
+def saved(value: float) -> bytes:
+    out = io.BytesIO()
+    torch.save({"a": torch.tensor([value])}, out)
+    return out.getvalue()
+
+
+FREE, BOUND, UNKNOWN = saved(1.0), saved(2.0), saved(3.0)
+
+
+class Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@pytest.fixture
+def served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Folder that a server gives out, and a registry of what is in it."""
+    folder = tmp_path / "served"
+    folder.mkdir()
+    for name, content in (("free.pth", FREE), ("bound.pth", BOUND), ("unknown.pth", UNKNOWN)):
+        (folder / name).write_bytes(content)
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
+    monkeypatch.setenv("MEGLOC_WEIGHTS", str(tmp_path / "weights"))
+    running = ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(folder)))
+    thread = threading.Thread(target=running.serve_forever, kwargs={"poll_interval": 0.01})
+    thread.start()
+    table = tmp_path / "registry.toml"
+    table.write_text(registry_text(f"http://127.0.0.1:{running.server_port}"))
+    monkeypatch.setattr(weights_registry, "_TABLE", table)
+    weights_registry.registry.cache_clear()
+    yield folder
+    weights_registry.registry.cache_clear()
+    running.shutdown()
+    thread.join()
+    running.server_close()
+
+
+def registry_text(address: str) -> str:
+    def entry(name: str, content: bytes | None, *, commercial: bool, url: bool = True) -> str:
+        lines = [
+            *(f"[{name}]", 'purpose = "finds"', f'page = "{address}/page"'),
+            *('licence = "SHORT"', 'terms = "for looking at only"'),
+            f"commercial = {str(commercial).lower()}",
+            *(f"[[{name}.files]]", f'name = "{name}.pth"'),
+        ]
+        if url:
+            lines.append(f'url = "{address}/{name}.pth"')
+        if content is not None:
+            lines.append(f"size = {len(content)}")
+            lines.append(f'sha256 = "{hashlib.sha256(content).hexdigest()}"')
+        return "\n".join(lines) + "\n"
+
+    return (
+        entry("free", FREE, commercial=True)
+        + entry("bound", BOUND, commercial=False)
+        + entry("unknown", None, commercial=True)
+        + entry("by-hand", None, commercial=True, url=False)
+    )
+
+
+@pytest.fixture
+def folder(served: Path) -> Path:
+    """The folder of weights."""
+    return served.parent / "weights"
+
+
+def test_fetch(megloc: Any, folder: Path) -> None:
+    done = megloc("weights", "fetch", "free", "unknown")
+    assert done.status == 0
+    free, unknown = done.out.splitlines()
+    assert free == f"free: {folder}/free.pth ({len(FREE)} bytes, sha256 right)"
+    assert unknown.endswith(
+        f"sha256 {hashlib.sha256(UNKNOWN).hexdigest()}, which the registry cannot check)"
+    )
+    assert "licence: SHORT: for looking at only" in done.err
+    assert (folder / "free.pth").read_bytes() == FREE
+    again = megloc("weights", "fetch", "free", "-q")
+    assert (again.out, again.err) == (f"free: already there, {folder}/free.pth\n", "")
+
+
+def test_consent(megloc: Any, folder: Path) -> None:
+    told = megloc("weights", "fetch", "free", "bound").refused(
+        r"bound has a licence to agree to: SHORT: for looking at only \(whole text at http",
+        "add --accept-licence",
+    )
+    assert "free has" not in told
+    assert not folder.exists()  # asked before anything is fetched
+    assert megloc("weights", "fetch", "bound", "--accept-licence").status == 0
+    assert (folder / "bound.pth").read_bytes() == BOUND
+
+
+def test_fetch_refuses(megloc: Any, served: Path, folder: Path) -> None:
+    megloc("weights", "fetch").refused("say which weights to fetch: free, bound")
+    megloc("weights", "fetch", "fre").refused("no weights 'fre' in the registry; there are free")
+    megloc("weights", "fetch", "by-hand").refused(
+        "by-hand cannot be fetched by a program: download it from http.*/page and run: megloc "
+        "weights add FILE"
+    )
+    folder.mkdir()
+    (folder / "free.pth").write_bytes(BOUND)
+    megloc("weights", "fetch", "free", "-q").refused("stands there, but is not the published file")
+    assert megloc("weights", "fetch", "free", "-f", "-q").status == 0
+    (served / "unknown.pth").write_bytes(b"something else")
+    megloc("weights", "fetch", "unknown", "-q").refused("no file of weights that can be read")
+    (served / "free.pth").write_bytes(BOUND)
+    megloc("weights", "fetch", "free", "-f", "-q").refused(
+        f"sha256 {hashlib.sha256(BOUND).hexdigest()} instead of {hashlib.sha256(FREE).hexdigest()}"
+    )
+    assert (folder / "free.pth").read_bytes() == FREE
+    (served / "free.pth").unlink()
+    megloc("weights", "fetch", "free", "-f", "-q").refused("the server answers 404")
+
+
+def test_add_check_list(megloc: Any, folder: Path, tmp_path: Path) -> None:
+    source = tmp_path / "my download.bin"
+    source.write_bytes(FREE)
+    done = megloc("weights", "add", source)
+    assert (done.status, done.out) == (0, f"free: {folder}/free.pth (sha256 right)\n")
+    source.write_bytes(UNKNOWN)
+    megloc("weights", "add", source).refused("say what it is with --name")
+    source = source.rename(tmp_path / "model.pth")
+    done = megloc("weights", "add", source, "--name", "by-hand")
+    assert done.out.startswith(f"by-hand: {folder}/by-hand.pth (loads; sha256 ")
+    assert megloc("weights", "check").out.endswith("no file is wrong\n")
+    assert megloc("weights", "check", "free").status == 0
+    rows = [line.split() for line in megloc("weights", "list").out.splitlines()]
+    states = {row[0]: row[-2:] for row in rows[1:5]}
+    assert states["free"] == ["there", "known"] and states["bound"] == ["missing", "known"]
+    assert rows[4][-3:] == ["there", "not", "known"]
+    (folder / "free.pth").write_bytes(FREE[:-1])
+    done = megloc("weights", "check")
+    assert done.status == 2 and done.out.endswith("wrong files: 1\n")
+    assert re.search(r"wrong: .*free\.pth: is not the published free\.pth of free", done.out)
+    done = megloc("weights", "check", "bound")
+    assert done.status == 2 and "run: megloc weights fetch bound --accept-licence" in done.out
+
+
+def test_check_goes_on_after_a_link_that_leaves(megloc: Any, folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "free.pth").write_bytes(FREE)
+    folder.mkdir()
+    (folder / "free.pth").symlink_to(tmp_path / "free.pth")
+    (folder / "bound.pth").write_bytes(BOUND)
+    done = megloc("weights", "check")
+    assert done.status == 2 and "a link that leaves" in done.out and "bound.pth (sha256" in done.out
+    assert re.search("^free .* wrong ", megloc("weights", "list").out, re.MULTILINE)
+
+
+def test_convert(megloc: Any, tmp_path: Path) -> None:
+    place = tmp_path / "aslfeat.safetensors"
+    done = megloc("weights", "convert", BUNDLE / "object.index", "-o", place)
+    assert (done.status, done.out) == (0, f"{place}: 5 tensors\n")
+    megloc("weights", "convert", BUNDLE / "object.index", "-o", place).refused("-f replaces it")
+    megloc("weights", "convert", BUNDLE / "sliced.index", "-o", place, "-f").refused("in slices")
+
+
+def test_the_shipped_registry(megloc: Any) -> None:
+    done = megloc("weights", "list")
+    assert done.status == 0 and done.err == ""
+    header, *rows = done.out.splitlines()
+    assert header.split() == ["name", "what", "for", "file", "size", "licence", "state", "sha256"]
+    names = [row.split()[0] for row in rows[: len(weights_registry.registry())]]
+    assert names == list(weights_registry.registry())
+    assert "weights" in megloc("doctor").out
