@@ -1,7 +1,10 @@
 """The protocols of plugins, and how a plugin is found by name.
 
 A plugin is a class registered under one of the entry-point groups below; our own are registered
-in the same way. A class may carry ``Options``, a frozen pydantic model its constructor takes.
+in the same way. A class may carry ``Options``, a frozen pydantic model its constructor takes, and
+``weights() -> dict[str, str]``, the sha256 of each file of weights it uses by name: part of what a
+stage's result depends on, and kept in its manifest. Plugins are sent to worker processes, so they
+must be picklable.
 """
 
 from __future__ import annotations
@@ -17,10 +20,17 @@ from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
 from megloc_kapture.errors import MeglocError, PluginError
-from megloc_kapture.values import Camera, LocalFeatures, Options, RigidTransform
+from megloc_kapture.values import (
+    Camera,
+    ImageFeatures,
+    LocalFeatures,
+    Options,
+    RigidTransform,
+)
 
 LOCAL_FEATURES = "megloc_kapture.local_features"
 MATCHERS = "megloc_kapture.matchers"
+SEGMENTERS = "megloc_kapture.segmenters"
 POSE_RANKERS = "megloc_kapture.pose_rankers"
 DATASETS = "megloc_kapture.datasets"
 
@@ -48,12 +58,32 @@ class LocalFeatureExtractor(Protocol):
 
 @runtime_checkable
 class Matcher(Protocol):
-    """Group ``megloc_kapture.matchers``: two sets of descriptors to matches."""
+    """Group ``megloc_kapture.matchers``: the features of two images to matches.
+
+    A matcher that is faster on several pairs at once may have ``match_many(a, others)``, the
+    matches of one image with each of several, as a list in their order.
+    """
 
     def match(
-        self, descriptors_a: NDArray[Any], descriptors_b: NDArray[Any]
+        self, a: ImageFeatures, b: ImageFeatures
     ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """Matches int64 (K, 2), rows of a and b, each row at most once, and scores (K,)."""
+        ...
+
+
+@runtime_checkable
+class Segmenter(Protocol):
+    """Group ``megloc_kapture.segmenters``: image to a class per pixel."""
+
+    name: str
+    """The network, for reports."""
+    classes: tuple[str, ...]
+    """Name of each label."""
+    dynamic: frozenset[str]
+    """Classes whose pixels are masked unless the options say otherwise."""
+
+    def segment(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Labels uint8 (H, W) of an RGB image, uint8 (H, W, 3)."""
         ...
 
 
@@ -154,6 +184,7 @@ class DatasetAdapter(Protocol):
 _PROTOCOLS: dict[str, type] = {
     LOCAL_FEATURES: LocalFeatureExtractor,
     MATCHERS: Matcher,
+    SEGMENTERS: Segmenter,
     POSE_RANKERS: PoseRanker,
     DATASETS: DatasetAdapter,
 }
@@ -210,6 +241,12 @@ def load_plugin(group: str, name: str, options: dict[str, Any] | None = None) ->
     except Exception as error:  # whatever a foreign constructor raises
         reason = " ".join(str(error).split())
         raise PluginError(f"plugin {name!r} refuses its options: {reason}") from error
+
+
+def weights_of(plugin: object) -> dict[str, str]:
+    """File name to sha256 of the weights a plugin uses; none where it has none."""
+    weights = getattr(plugin, "weights", None)
+    return dict(weights()) if callable(weights) else {}
 
 
 def _members(protocol: type) -> list[str]:

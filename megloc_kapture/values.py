@@ -186,11 +186,31 @@ class LocalFeatures:
     keypoints_px : float32 (N, 2 or more); x, y first. The first pixel's centre is (0.5, 0.5).
     scores : float32 (N,), higher is better; keypoints are sorted by it, best first.
     descriptors : (N, D), float32 or uint8.
+    num_masked : keypoints that the mask removed before the best were selected.
     """
 
     keypoints_px: NDArray[np.float32]
     scores: NDArray[np.float32]
     descriptors: NDArray[Any]
+    num_masked: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class ImageFeatures:
+    """What a matcher gets of one image.
+
+    Parameters
+    ----------
+    keypoints_px : float32 (N, 2 or more); x, y first, then what the type stores beside (SuperPoint
+        and its like: the score). The first pixel's centre is (0.5, 0.5).
+    descriptors : (N, D).
+    width, height : of the image that the keypoints stand in, pixels.
+    """
+
+    keypoints_px: NDArray[np.float32]
+    descriptors: NDArray[Any]
+    width: int
+    height: int
 
 
 @dataclass(frozen=True)

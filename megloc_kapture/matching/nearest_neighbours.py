@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.values import Options
+from megloc_kapture.values import ImageFeatures, Options
 
 _BLOCK_ROWS = 512
 
@@ -118,7 +118,7 @@ class NearestNeighbours:
         self.options = options or NearestNeighbourOptions()
 
     def match(
-        self, descriptors_a: NDArray[Any], descriptors_b: NDArray[Any]
+        self, a: ImageFeatures, b: ImageFeatures
     ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """See :func:`match_nearest`."""
-        return match_nearest(descriptors_a, descriptors_b, self.options)
+        return match_nearest(a.descriptors, b.descriptors, self.options)

@@ -17,6 +17,7 @@ from megloc_kapture.matching.nearest_neighbours import (
     NearestNeighbours,
     match_nearest,
 )
+from megloc_kapture.values import ImageFeatures
 
 
 def by_loops(
@@ -175,10 +176,14 @@ def test_different_dimensions_are_refused() -> None:
 
 def test_the_plugin_passes_its_options_on() -> None:
     rng = np.random.default_rng(5)
-    a, b = rng.normal(size=(30, 4)), rng.normal(size=(20, 4))
+    a, b = (
+        ImageFeatures(np.zeros((count, 2), np.float32), rng.normal(size=(count, 4)), 640, 480)
+        for count in (30, 20)
+    )
     options = NearestNeighbourOptions(mutual=False)
     np.testing.assert_array_equal(
-        NearestNeighbours(options).match(a, b)[0], match_nearest(a, b, options)[0]
+        NearestNeighbours(options).match(a, b)[0],
+        match_nearest(a.descriptors, b.descriptors, options)[0],
     )
     assert len(NearestNeighbours(options).match(a, b)[0]) == 30
     assert len(NearestNeighbours().match(a, b)[0]) < 30

@@ -1,0 +1,236 @@
+"""ALIKED (Zhao et al., IEEE TIM 2023), with the keys of the official checkpoints.
+
+The network is run as it is defined, but nothing of its 128 channels is ever made in the image's own
+resolution: the score head's first layer is a matrix product with each pixel, so it is applied to
+every level before that is enlarged, and the descriptor head reads features where it looks for them
+(:mod:`megloc_kapture.nets.aliked_descriptors`). Batch normalisation is folded into the
+convolutions, so the module is for inference only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.nets.aliked_descriptors import DescriptorHead
+from megloc_kapture.nets.bilinear import pixel_table, read_bilinear
+from megloc_kapture.nets.deformable import deform_conv2d
+from megloc_kapture.nets.loading import load_strictly
+
+_MULTIPLE = 32  # image sides are padded to multiples of it, the coarsest level's stride
+_STRIP_ROWS = 2  # of the image, at once in the score head's first layer: what a cache holds
+
+
+@dataclass(frozen=True)
+class AlikedSizes:
+    """What tells the variants apart.
+
+    Attributes
+    ----------
+    channels : of the four blocks; the last one is that of the descriptors.
+    positions : number of places that a descriptor is gathered from.
+    """
+
+    channels: tuple[int, int, int, int]
+    positions: int
+
+
+class AlikedNet(nn.Module):
+    """Image to score map and features; the keys are those of ``aliked-*.pth``."""
+
+    def __init__(self, sizes: AlikedSizes) -> None:
+        super().__init__()
+        first, *others = sizes.channels
+        self.descriptor_size = sizes.channels[-1]
+        self.block1 = _Block(3, first, deformable=False, residual=False)
+        self.block2 = _Block(first, others[0], deformable=False)
+        self.block3 = _Block(others[0], others[1], deformable=True)
+        self.block4 = _Block(others[1], others[2], deformable=True)
+        quarter = self.descriptor_size // 4
+        self.conv1 = nn.Conv2d(first, quarter, 1, bias=False)
+        self.conv2 = nn.Conv2d(others[0], quarter, 1, bias=False)
+        self.conv3 = nn.Conv2d(others[1], quarter, 1, bias=False)
+        self.conv4 = nn.Conv2d(others[2], quarter, 1, bias=False)
+        self.score_head = nn.Sequential(
+            nn.Conv2d(self.descriptor_size, 8, 1, bias=False),
+            nn.SELU(inplace=True),
+            nn.Conv2d(8, 4, 3, padding=1, bias=False),
+            nn.SELU(inplace=True),
+            nn.Conv2d(4, 4, 3, padding=1, bias=False),
+            nn.SELU(inplace=True),
+            nn.Conv2d(4, 1, 3, padding=1, bias=False),
+        )
+        self.desc_head = DescriptorHead(self.descriptor_size, sizes.positions)
+
+    def forward(self, image: torch.Tensor) -> AlikedMaps:
+        """The maps of one RGB image, (1, 3, H, W) in [0, 1]."""
+        height, width = image.shape[2:]
+        extra_y, extra_x = -height % _MULTIPLE, -width % _MULTIPLE
+        top, left = extra_y // 2, extra_x // 2
+        margins = (left, extra_x - left, top, extra_y - top)
+        padded = functional.pad(image, margins, mode="replicate")
+        level1 = self.block1(padded.contiguous(memory_format=torch.channels_last))
+        level2 = self.block2(functional.avg_pool2d(level1, 2))
+        level3 = self.block3(functional.avg_pool2d(level2, 4))
+        level4 = self.block4(functional.avg_pool2d(level3, 4))
+        coarse = [
+            functional.selu(tap(level), inplace=True)
+            for tap, level in (
+                (self.conv2, level2),
+                (self.conv3, level3),
+                (self.conv4, level4),
+            )
+        ]
+        fine = _level(level1)
+        scores = torch.sigmoid(self._score_logits(fine, coarse)[0, 0].float())
+        return AlikedMaps(
+            self,
+            scores[top : top + height, left : left + width],
+            (top, left),
+            fine,
+            [_level(features) for features in coarse],
+        )
+
+    def _score_logits(self, fine: _Level, coarse: list[torch.Tensor]) -> torch.Tensor:
+        # the first layer's weights, apart for the channels of each level
+        first, *others = (
+            weight[:, :, 0, 0].T
+            for weight in self.get_parameter("score_head.0.weight").chunk(4, dim=1)
+        )
+        sums: torch.Tensor | None = None
+        for level, weight in zip(coarse, others, strict=True):
+            reduced = (level.permute(0, 2, 3, 1) @ weight).permute(0, 3, 1, 2)
+            enlarged = functional.interpolate(
+                reduced.float(), fine.size, mode="bilinear", align_corners=True
+            )
+            sums = enlarged if sums is None else sums.add_(enlarged)
+        assert sums is not None
+        by_pixel = sums.permute(0, 2, 3, 1).reshape(len(fine.table), -1)
+        at_once = _STRIP_ROWS * fine.size[1]
+        for strip, into in zip(
+            torch.split(fine.table, at_once), torch.split(by_pixel, at_once), strict=True
+        ):
+            into += self.fine_tap(strip) @ first
+        return self.score_head[1:](by_pixel.view(1, *fine.size, -1).permute(0, 3, 1, 2))
+
+    def fine_tap(self, level1: torch.Tensor) -> torch.Tensor:
+        """Features (N, D / 4) of the finest level for rows of the first block's, (N, C)."""
+        return functional.selu(level1 @ self.conv1.weight[:, :, 0, 0].T, inplace=True)
+
+
+@dataclass(frozen=True, eq=False)
+class _Level:
+    """Features of one level: (h w, channels), and (h, w)."""
+
+    table: torch.Tensor
+    size: tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class AlikedMaps:
+    """What the network sees in one image.
+
+    Attributes
+    ----------
+    scores : float32 (H, W), in (0, 1).
+    """
+
+    _net: AlikedNet
+    scores: torch.Tensor
+    _origin: tuple[int, int]  # row and column of the image's first pixel in the padded levels
+    _fine: _Level  # before its 1x1 convolution, which is cheap where only some pixels are asked for
+    _coarse: list[_Level]
+
+    def features_at(self, rows: torch.Tensor, columns: torch.Tensor) -> torch.Tensor:
+        """Unit features (N, D) of pixels of the image, int64 (N,) rows and columns."""
+        row, column = rows + self._origin[0], columns + self._origin[1]
+        height, width = self._fine.size
+        parts = [self._net.fine_tap(self._fine.table[row * width + column])]
+        for level in self._coarse:
+            h, w = level.size
+            # corners aligned: the first and last pixels of both maps lie on one another
+            y = row.to(level.table.dtype) * ((h - 1) / (height - 1))
+            x = column.to(level.table.dtype) * ((w - 1) / (width - 1))
+            parts.append(read_bilinear(level.table, y.clamp(max=h - 1), x.clamp(max=w - 1), (h, w)))
+        return functional.normalize(torch.cat(parts, dim=1), dim=1)
+
+
+def _level(features: torch.Tensor) -> _Level:
+    return _Level(pixel_table(features[0]), (features.shape[2], features.shape[3]))
+
+
+class _Block(nn.Module):
+    """Two convolutions, each batch-normalised, with SELU; residual but for the first block."""
+
+    def __init__(
+        self, inputs: int, outputs: int, *, deformable: bool, residual: bool = True
+    ) -> None:
+        super().__init__()
+        kind = _DeformableConv if deformable else _Conv
+        self.conv1 = kind(inputs, outputs)
+        self.bn1 = nn.BatchNorm2d(outputs)
+        self.conv2 = kind(outputs, outputs)
+        self.bn2 = nn.BatchNorm2d(outputs)
+        self.downsample = nn.Conv2d(inputs, outputs, 1) if residual else None
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        inner = functional.selu(self.conv1.normalised(x, self.bn1), inplace=True)
+        result = self.conv2.normalised(inner, self.bn2)
+        if self.downsample is not None:
+            result = result + self.downsample(x)
+        return functional.selu(result, inplace=True)
+
+
+class _Conv(nn.Conv2d):
+    """3x3 convolution without bias."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__(inputs, outputs, 3, padding=1, bias=False)
+
+    def normalised(self, x: torch.Tensor, norm: nn.BatchNorm2d) -> torch.Tensor:
+        """The convolution and the batch normalisation after it, in one."""
+        return functional.conv2d(x, *_folded(self.weight, norm), padding=1)
+
+
+class _DeformableConv(nn.Module):
+    """3x3 deformable convolution without amplitudes."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        self.offset_conv = nn.Conv2d(inputs, 18, 3, padding=1)
+        self.regular_conv = nn.Conv2d(inputs, outputs, 3, padding=1, bias=False)
+
+    def normalised(self, x: torch.Tensor, norm: nn.BatchNorm2d) -> torch.Tensor:
+        """The convolution and the batch normalisation after it, in one."""
+        limit = max(x.shape[2:]) / 4
+        offset = self.offset_conv(x).clamp(-limit, limit)
+        return deform_conv2d(x, offset, *_folded(self.regular_conv.weight, norm), padding=1)
+
+
+def _folded(weight: torch.Tensor, norm: nn.BatchNorm2d) -> tuple[torch.Tensor, torch.Tensor]:
+    assert norm.running_mean is not None and norm.running_var is not None
+    scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
+    return weight * scale[:, None, None, None], norm.bias - norm.running_mean * scale
+
+
+def aliked_from(tensors: Mapping[str, torch.Tensor], where: str) -> AlikedNet:
+    """The network of a checkpoint, its variant read from the shapes; in eval mode.
+
+    Raises
+    ------
+    DataError : keys are missing, unexpected or of another shape.
+    """
+    try:
+        first = tensors["block1.conv1.weight"].shape[0]
+        second, third, fourth = (tensors[f"conv{level}.weight"].shape[1] for level in (2, 3, 4))
+        positions = tensors["desc_head.agg_weights"].shape[0]
+    except (KeyError, IndexError) as error:
+        raise DataError(f"this file is no ALIKED checkpoint: {error}", path=where) from error
+    net = AlikedNet(AlikedSizes((first, second, third, fourth), positions))
+    load_strictly(net, tensors, where)
+    return net.eval()

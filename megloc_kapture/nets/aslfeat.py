@@ -1,0 +1,249 @@
+"""ASLFeat's network (Luo et al., CVPR 2020), with the variables of the TensorFlow checkpoint.
+
+The published checkpoint is TensorFlow's. The module's keys are its variables' names with dots for
+slashes, and torch's words for the last part:
+
+    conv0/kernel                            conv0.weight, (in, out last) -> (out, in first)
+    conv0/bn/moving_mean, moving_variance   conv0.bn.running_mean, running_var
+    deform_param/conv6/offset/kernel, bias  deform_param.conv6.offset.weight, bias
+    tower/conv1/instance_max                tower.conv1.instance_max
+
+Batch normalisation is folded into the convolutions, so the module is for inference only.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.nets.aslfeat_detection import peakiness, resize_as_tensorflow_1
+from megloc_kapture.nets.deformable import deform_conv2d
+from megloc_kapture.nets.loading import load_strictly
+
+DESCRIPTOR_SIZE = 128
+STRIDE = 4  # of the features; their pixel (i, j) is read at the image's (4 i, 4 j)
+
+# layers whose raw outputs are scored: dilation of the neighbourhood, and weight in the sum
+_SCORED = {"conv1": (3, 1 / 6), "conv3": (2, 2 / 6), "conv6": (1, 3 / 6)}
+_DEFORMABLE = ("conv6_0", "conv6_1", "conv6")
+_NORM_EPSILON = 1e-5
+
+# what optimisers keep beside a variable, under its name, and beside all of them
+_SLOTS = ("Adam", "Adam_1", "Momentum", "RMSProp", "RMSProp_1", "ExponentialMovingAverage")
+_COUNTERS = ("global_step", "beta1_power", "beta2_power", "learning_rate")
+_TORCH_WORDS = {
+    "kernel": "weight",
+    "moving_mean": "running_mean",
+    "moving_variance": "running_var",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class AslFeatMaps:
+    """What the network sees in one image.
+
+    Attributes
+    ----------
+    scores : float32 (H, W), of the image's size, not negative.
+    features : (128, ceil(ceil(H / 2) / 2), the same of W), the descriptors before normalisation.
+    """
+
+    scores: torch.Tensor
+    features: torch.Tensor
+
+
+class AslFeatNet(nn.Module):
+    """Gray image to score map and features; 821,745 weights in kernels and biases."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.conv0 = _Conv(1, 32)
+        self.conv1 = _Conv(32, 32)
+        self.conv2 = _Conv(32, 64, stride=2)
+        self.conv3 = _Conv(64, 64)
+        self.conv4 = _Conv(64, 128, stride=2)
+        self.conv5 = _Conv(128, 128)
+        self.conv6_0 = _Conv(128, 128)
+        self.conv6_1 = _Conv(128, 128)
+        self.conv6 = _Conv(128, 128, normalised=False)
+        self.deform_param = nn.ModuleDict({name: _Deformation(128) for name in _DEFORMABLE})
+        self.tower = nn.ModuleDict({name: _Scale() for name in _SCORED})
+
+    def forward(self, image: torch.Tensor) -> AslFeatMaps:
+        """The maps of one gray image, (1, 1, H, W) in 0 to 255, of at least 11 pixels a side."""
+        height, width = image.shape[2:]
+        variance, mean = torch.var_mean(image, correction=0)
+        x = (image - mean) * torch.rsqrt(variance + 1e-5)
+        x = x.contiguous(memory_format=torch.channels_last)
+        scores = image.new_zeros(height, width)
+        x = self.conv0.normalised(x)
+        for scored, strided in (("conv1", self.conv2), ("conv3", self.conv4)):
+            conv: _Conv = getattr(self, scored)
+            x = conv(x)
+            assert conv.bn is not None
+            scores += self._scores(scored, x, (height, width))
+            x = strided.normalised(conv.bn.rectified_(x))
+        x = self.conv5.normalised(x)
+        for name in _DEFORMABLE:
+            x = self._deformable(name, x)
+        return AslFeatMaps(scores + self._scores("conv6", x, (height, width)), x[0])
+
+    def _deformable(self, name: str, x: torch.Tensor) -> torch.Tensor:
+        conv: _Conv = getattr(self, name)
+        offset, amplitude = self.deform_param[name](x)
+        if conv.bn is None:
+            return deform_conv2d(x, offset, conv.weight, None, amplitude, padding=1)
+        weight, bias = conv.bn.folded_into(conv.weight)
+        return deform_conv2d(x, offset, weight, bias, amplitude, padding=1).relu_()
+
+    def _scores(self, name: str, features: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
+        dilation, weight = _SCORED[name]
+        scale = self.get_buffer(f"tower.{name}.instance_max")
+        return weight * resize_as_tensorflow_1(peakiness(features[0], dilation, scale), size)
+
+
+class _Norm(nn.Module):
+    """Batch normalisation without scale and offset, as it is used after the training."""
+
+    running_mean: torch.Tensor
+    running_var: torch.Tensor
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.register_buffer("running_mean", torch.zeros(channels))
+        self.register_buffer("running_var", torch.ones(channels))
+
+    def folded_into(self, weight: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Weight and bias of a convolution that normalises what one of this weight gives."""
+        scale, shift = self._line()
+        return weight * scale[:, None, None, None], shift
+
+    def rectified_(self, x: torch.Tensor) -> torch.Tensor:
+        """Normalise and rectify (B, C, H, W) in its own memory."""
+        scale, shift = self._line()
+        return x.mul_(scale[:, None, None]).add_(shift[:, None, None]).relu_()
+
+    def _line(self) -> tuple[torch.Tensor, torch.Tensor]:
+        scale = torch.rsqrt(self.running_var + _NORM_EPSILON)
+        return scale, -self.running_mean * scale
+
+
+class _Conv(nn.Module):
+    """3x3 convolution without bias, padded as TensorFlow's SAME, and the normalisation after it."""
+
+    def __init__(
+        self, inputs: int, outputs: int, *, stride: int = 1, normalised: bool = True
+    ) -> None:
+        super().__init__()
+        self.stride = stride
+        self.weight = nn.Parameter(torch.zeros(outputs, inputs, 3, 3))
+        self.bn = _Norm(outputs) if normalised else None
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """The convolution alone."""
+        return conv_same(x, self.weight, None, self.stride)
+
+    def normalised(self, x: torch.Tensor) -> torch.Tensor:
+        """Convolution, normalisation and rectification in one."""
+        assert self.bn is not None
+        return conv_same(x, *self.bn.folded_into(self.weight), self.stride).relu_()
+
+
+class _Deformation(nn.Module):
+    """Offsets and amplitudes of a deformable convolution's nine readings."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.offset = nn.Conv2d(channels, 18, 3, padding=1)
+        self.amplitude = nn.Conv2d(channels, 9, 3, padding=1)
+
+    def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return self.offset(x), torch.sigmoid(self.amplitude(x))
+
+
+class _Scale(nn.Module):
+    """What a layer's outputs are divided by before they are scored."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("instance_max", torch.ones(()))
+
+
+def conv_same(
+    x: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None, stride: int
+) -> torch.Tensor:
+    """Convolution with TensorFlow's padding SAME, which depends on the image's size.
+
+    A 3x3 kernel of stride 2 pads an odd size at both ends, an even one only at the lower and the
+    right end.
+    """
+    margins: list[int] = []
+    for size, kernel in zip(x.shape[:1:-1], weight.shape[:1:-1], strict=True):
+        total = max((-(-size // stride) - 1) * stride + kernel - size, 0)
+        margins += [total // 2, total - total // 2]
+    left, right, top, bottom = margins
+    if left == right and top == bottom:
+        return functional.conv2d(x, weight, bias, stride, padding=(top, left))
+    return functional.conv2d(functional.pad(x, margins), weight, bias, stride)
+
+
+def aslfeat_state(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """A state dict for :class:`AslFeatNet` of a TensorFlow checkpoint's variables.
+
+    Names and layouts are changed as the module's text says, what an optimiser keeps is left out;
+    a name without slashes stays as it is, so that a state dict of the module passes unchanged.
+
+    Parameters
+    ----------
+    tensors : variable name -> values.
+    """
+    left_out = set(optimiser_variables(tensors))
+    state = {}
+    for name, values in tensors.items():
+        if name in left_out:
+            continue
+        scope, _, word = name.rpartition("/")
+        if word == "kernel" and values.ndim == 4:
+            values = values.permute(3, 2, 0, 1).contiguous()
+        key = f"{scope}/{_TORCH_WORDS.get(word, word)}" if scope else name
+        state[key.replace("/", ".")] = values
+    return state
+
+
+def optimiser_variables(names: Iterable[str]) -> list[str]:
+    """Those of a checkpoint's variables that only its training needs, sorted."""
+    return sorted(
+        name
+        for name in names
+        if name.rpartition("/")[2] in _SLOTS or name.rpartition("/")[2] in _COUNTERS
+    )
+
+
+def aslfeat_from(tensors: Mapping[str, torch.Tensor], where: str) -> AslFeatNet:
+    """The network of a checkpoint, in eval mode; a note in the log names what was left out.
+
+    Parameters
+    ----------
+    tensors : see :func:`aslfeat_state`.
+
+    Raises
+    ------
+    DataError : variables are missing, unexpected or of another shape, or a scale is not positive.
+    """
+    if left_out := optimiser_variables(tensors):
+        logging.getLogger(__name__).info(
+            "%s: left out, needed in training only: %s", where, ", ".join(left_out)
+        )
+    net = AslFeatNet()
+    load_strictly(net, aslfeat_state(tensors), where)
+    for name in _SCORED:
+        scale = float(net.get_buffer(f"tower.{name}.instance_max"))
+        if not 0 < scale < float("inf"):
+            raise DataError(f"tower/{name}/instance_max is {scale}, not positive", path=where)
+    return net.eval()

@@ -1,0 +1,197 @@
+"""LightGlue (Lindenberger et al., ICCV 2023): kornia's layers with official checkpoints.
+
+kornia's modules are taken as they are; what joins them is written here, because a batch of pairs
+with different numbers of keypoints has to be padded, and because a pair's matches must not depend
+on the pairs it is batched with: there is neither early stopping nor pruning of points.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from threading import Lock
+from typing import Any
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.nets.loading import load_strictly
+
+_BLOCK = re.compile(r"^(self_attn|cross_attn)\.(\d+)\.")
+_building = Lock()
+
+
+@dataclass(frozen=True)
+class LightGlueShape:
+    """What a checkpoint's tensors do not show by themselves."""
+
+    width: int
+    num_heads: int
+
+
+@dataclass(frozen=True, eq=False)
+class KeypointBatch:
+    """Keypoints of one side of several pairs.
+
+    Parameters
+    ----------
+    points : float32 (B, N, 2), normalised to [-1, 1].
+    descriptors : float32 (B, N, D).
+    present : bool (B, N, 1), False where a row is padding; None: all are there.
+    """
+
+    points: torch.Tensor
+    descriptors: torch.Tensor
+    present: torch.Tensor | None = None
+
+
+def require_kornia() -> None:
+    """Raise OptionError where kornia is not installed."""
+    if importlib.util.find_spec("kornia") is None:
+        raise OptionError(
+            "LightGlue and LighterGlue need kornia: pip install 'megloc-kapture[kornia]'"
+        )
+
+
+class LightGlueNetwork(nn.Module):
+    """LightGlue of kornia's layers, at full depth and width.
+
+    Parameters
+    ----------
+    parts : an instance of kornia's LightGlue.
+    descriptor_size : number of values of the descriptors it takes.
+    """
+
+    parts: Any
+
+    def __init__(self, parts: nn.Module, descriptor_size: int) -> None:
+        super().__init__()
+        self.parts = parts
+        self.descriptor_size = descriptor_size
+
+    def forward(self, a: KeypointBatch, b: KeypointBatch) -> torch.Tensor:
+        """Logarithm of the probability that two keypoints match, float32 (B, M, N).
+
+        Sections 3.1 to 3.3 of the paper; minus infinity where there is padding. Under autocast the
+        layers run in half precision, positions and the assignment do not.
+        """
+        masks = _masks(a, b)
+        x, y = self.parts.input_proj(a.descriptors), self.parts.input_proj(b.descriptors)
+        with torch.autocast(x.device.type, enabled=False):
+            where_x, where_y = self.parts.posenc(a.points), self.parts.posenc(b.points)
+        of_heads = [mask[:, None] for mask in masks]
+        for layer in self.parts.transformers:
+            x, y = layer(x, y, where_x, where_y, *of_heads)
+        with torch.autocast(x.device.type, enabled=False):
+            return _assignment(self.parts.log_assignment[-1], x.float(), y.float(), masks)
+
+
+def load_lightglue(
+    tensors: Mapping[str, torch.Tensor],
+    where: str,
+    shape: LightGlueShape,
+) -> LightGlueNetwork:
+    """kornia's LightGlue with the tensors of a checkpoint, for inference.
+
+    The number of layers and the size of descriptors are the checkpoint's. What only early stopping
+    and pruning would use may be absent.
+
+    Parameters
+    ----------
+    tensors : by kornia's names; see :func:`renamed_blocks`.
+
+    Raises
+    ------
+    DataError : the tensors do not fit; names their keys.
+    OptionError : kornia is not installed.
+    """
+    require_kornia()
+    layers = {int(key.split(".")[1]) for key in tensors if key.startswith("transformers.")}
+    if not layers:
+        raise DataError("this file does not fit LightGlue: it has no layers", path=where)
+    projection = tensors.get("input_proj.weight")
+    descriptor_size = shape.width if projection is None else projection.shape[-1]
+    parts = _untrained(
+        input_dim=descriptor_size,
+        descriptor_dim=shape.width,
+        n_layers=max(layers) + 1,
+        num_heads=shape.num_heads,
+    )
+    last = f"log_assignment.{max(layers)}."
+    unused = [
+        key
+        for key in parts.state_dict()
+        if key.startswith(("token_confidence.", "confidence_thresholds", "log_assignment."))
+        and not key.startswith(last)
+    ]
+    load_strictly(parts, tensors, where, may_lack=unused)
+    return LightGlueNetwork(parts, descriptor_size).eval()
+
+
+def _untrained(**conf: int) -> nn.Module:
+    kornia: Any = importlib.import_module("kornia.feature")
+    cuda: Any = torch.backends.cuda
+    with _building:
+        flash = cuda.flash_sdp_enabled()
+        try:
+            parts: nn.Module = kornia.LightGlue(None, flash=False, **conf)
+        finally:
+            cuda.enable_flash_sdp(flash)  # kornia's attention sets it for the whole process
+    return parts
+
+
+def renamed_blocks(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Official checkpoints' ``self_attn.3.x`` as kornia's ``transformers.3.self_attn.x``."""
+    return {_BLOCK.sub(r"transformers.\2.\1.", key): value for key, value in tensors.items()}
+
+
+def _assignment(
+    head: Any, x: torch.Tensor, y: torch.Tensor, masks: tuple[torch.Tensor, ...]
+) -> torch.Tensor:
+    """Equations 6 to 8 of the paper, for descriptors (B, M, D) and (B, N, D)."""
+    # the square root of the width: the authors divide each side by its fourth root
+    product = head.final_proj(x) @ head.final_proj(y).mT / x.shape[-1] ** 0.5
+    matchable = functional.logsigmoid(head.matchability(x)) + (
+        functional.logsigmoid(head.matchability(y)).mT
+    )
+    absent = ~(masks[0] & masks[1].mT) if masks else None
+    if absent is not None:
+        product = product.masked_fill(absent, -torch.inf)
+    both = functional.log_softmax(product, 2) + functional.log_softmax(product, 1) + matchable
+    # rows that are padding as a whole have become not a number
+    return both if absent is None else both.masked_fill(absent, -torch.inf)
+
+
+def mutual_matches(
+    log_probability: torch.Tensor, threshold: float
+) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+    """For each pair of a batch (B, M, N) the matches int64 (K, 2), by row, and scores (K,).
+
+    A match is the largest of its row and of its column, and its probability above the threshold.
+    """
+    best_of_row, column = log_probability.max(dim=2)
+    row_of_column = log_probability.argmax(dim=1)
+    rows = torch.arange(log_probability.shape[1], device=log_probability.device)
+    probability = best_of_row.exp()
+    found = (row_of_column.gather(1, column) == rows) & (probability > threshold)
+    for pair in range(len(log_probability)):
+        chosen = torch.nonzero(found[pair])[:, 0]
+        yield torch.stack([chosen, column[pair, chosen]], dim=1), probability[pair, chosen]
+
+
+def _masks(a: KeypointBatch, b: KeypointBatch) -> tuple[torch.Tensor, ...]:
+    """None where nothing is padded: attention is faster without."""
+    if a.present is None and b.present is None:
+        return ()
+    sides = (a, b)
+    return tuple(
+        torch.ones_like(side.points[..., :1], dtype=torch.bool)
+        if side.present is None
+        else side.present
+        for side in sides
+    )

@@ -1,0 +1,115 @@
+"""R2D2's network (Revaud et al., NeurIPS 2019, section 3), with the official checkpoints' keys.
+
+An L2-Net whose strides became dilations, so that all maps have the image's resolution; a last
+convolution 8 by 8 is replaced by three of 2 by 2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.nets.loading import load_strictly
+
+DESCRIPTOR_SIZE = 128
+
+_MEAN = (0.485, 0.456, 0.406)
+_DEVIATION = (0.229, 0.224, 0.225)
+
+# kernel, width in units of the base width, dilation; ReLU after those of 3 by 3
+_LAYERS = (
+    (3, 1, 1),
+    (3, 1, 1),
+    (3, 2, 1),
+    (3, 2, 2),
+    (3, 4, 2),
+    (3, 4, 4),
+    (2, 4, 4),
+    (2, 4, 8),
+)
+
+
+class R2D2Maps(NamedTuple):
+    """What the network says of images (B, 3, H, W).
+
+    Attributes
+    ----------
+    features : (B, 128, H, W); a descriptor is one pixel of it, normalised.
+    reliability : (B, 1, H, W), in [0, 1]: how surely the pixel's descriptor will be matched.
+    repeatability : (B, 1, H, W), in [0, 1]: how surely a local maximum is found again.
+    """
+
+    features: torch.Tensor
+    reliability: torch.Tensor
+    repeatability: torch.Tensor
+
+
+class R2D2Network(nn.Module):
+    """Dense features, reliability and repeatability.
+
+    Parameters
+    ----------
+    base_width : channels of the first layer, 32 or, in the big model, 48.
+    """
+
+    mean: torch.Tensor
+    deviation: torch.Tensor
+
+    def __init__(self, base_width: int = 32) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        inputs = 3
+        for kernel, width, dilation in _LAYERS:
+            outputs = width * base_width
+            layers += [
+                nn.Conv2d(
+                    inputs,
+                    outputs,
+                    kernel,
+                    padding=dilation * (kernel - 1) // 2,
+                    dilation=dilation,
+                ),
+                nn.BatchNorm2d(outputs, affine=False),
+            ]
+            if kernel == 3:
+                layers.append(nn.ReLU(inplace=True))
+            inputs = outputs
+        layers.append(nn.Conv2d(inputs, DESCRIPTOR_SIZE, 2, padding=8, dilation=16))
+        self.ops = nn.Sequential(*layers)
+        self.clf = nn.Conv2d(DESCRIPTOR_SIZE, 2, 1)
+        self.sal = nn.Conv2d(DESCRIPTOR_SIZE, 1, 1)
+        self.register_buffer("mean", torch.tensor(_MEAN).view(3, 1, 1), persistent=False)
+        self.register_buffer("deviation", torch.tensor(_DEVIATION).view(3, 1, 1), persistent=False)
+
+    def forward(self, images: torch.Tensor) -> R2D2Maps:
+        """Maps of RGB images, float (B, 3, H, W) in [0, 1]."""
+        features = self.ops((images - self.mean) / self.deviation)
+        squared = features**2
+        positive = functional.softplus(self.sal(squared).float())
+        return R2D2Maps(
+            features,
+            self.clf(squared).float().softmax(dim=1)[:, 1:],
+            positive / (1 + positive),
+        )
+
+
+def load_r2d2(tensors: Mapping[str, torch.Tensor], where: str) -> R2D2Network:
+    """The network with the tensors of a checkpoint, for inference; its width is the file's.
+
+    Raises
+    ------
+    DataError : the tensors do not fit; names their keys.
+    """
+    first = tensors.get("ops.0.weight")
+    if first is None or first.ndim != 4:
+        raise DataError(
+            "this file does not fit R2D2Network; 1 missing keys: ops.0.weight", path=where
+        )
+    network = R2D2Network(base_width=len(first))
+    load_strictly(network, tensors, where)
+    return network.eval()

@@ -1,0 +1,148 @@
+"""XFeat's network (Potje et al., CVPR 2024, section 3), with the official checkpoint's keys.
+
+The fine matcher of the semi-dense variant is left out: nothing here refines matches by offsets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+from megloc_kapture.nets.loading import load_strictly
+
+STRIDE = 32
+"""Width and height of an input are multiples of it."""
+CELL = 8
+"""Side in pixels of the cells of the coarse maps."""
+DESCRIPTOR_SIZE = 64
+
+
+class BasicLayer(nn.Module):
+    """Convolution without bias, normalisation without affine part, ReLU."""
+
+    def __init__(self, inputs: int, outputs: int, *, kernel: int = 3, stride: int = 1) -> None:
+        super().__init__()
+        self.layer = nn.Sequential(
+            nn.Conv2d(inputs, outputs, kernel, stride, padding=kernel // 2, bias=False),
+            nn.BatchNorm2d(outputs, affine=False),
+            nn.ReLU(inplace=True),
+        )
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return self.layer(x)
+
+
+class XFeatNetwork(nn.Module):
+    """Descriptors, keypoints and reliability of images, all on a grid of 8 by 8 pixels."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.norm = nn.InstanceNorm2d(1)
+        self.skip1 = nn.Sequential(nn.AvgPool2d(4, stride=4), nn.Conv2d(1, 24, 1))
+        self.block1 = nn.Sequential(
+            BasicLayer(1, 4),
+            BasicLayer(4, 8, stride=2),
+            BasicLayer(8, 8),
+            BasicLayer(8, 24, stride=2),
+        )
+        self.block2 = nn.Sequential(BasicLayer(24, 24), BasicLayer(24, 24))
+        self.block3 = nn.Sequential(
+            BasicLayer(24, 64, stride=2), BasicLayer(64, 64), BasicLayer(64, 64, kernel=1)
+        )
+        self.block4 = nn.Sequential(
+            BasicLayer(64, 64, stride=2), BasicLayer(64, 64), BasicLayer(64, 64)
+        )
+        self.block5 = nn.Sequential(
+            BasicLayer(64, 128, stride=2),
+            BasicLayer(128, 128),
+            BasicLayer(128, 128),
+            BasicLayer(128, 64, kernel=1),
+        )
+        self.block_fusion = nn.Sequential(
+            BasicLayer(64, 64), BasicLayer(64, 64), nn.Conv2d(64, DESCRIPTOR_SIZE, 1)
+        )
+        self.heatmap_head = nn.Sequential(
+            BasicLayer(64, 64, kernel=1),
+            BasicLayer(64, 64, kernel=1),
+            nn.Conv2d(64, 1, 1),
+            nn.Sigmoid(),
+        )
+        self.keypoint_head = nn.Sequential(
+            *(BasicLayer(CELL**2, CELL**2, kernel=1) for _ in range(3)),
+            nn.Conv2d(CELL**2, CELL**2 + 1, 1),
+        )
+
+    def forward(self, images: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Dense maps of images.
+
+        Parameters
+        ----------
+        images : float (B, C, H, W), H and W multiples of 32; the channels are averaged.
+
+        Returns
+        -------
+        features : (B, 64, H/8, W/8), not normalised.
+        logits : (B, 65, H/8, W/8), of each pixel of a cell (channel 8 y + x), and of no keypoint.
+        reliability : (B, 1, H/8, W/8), in [0, 1].
+        """
+        grey = self.norm(images.mean(dim=1, keepdim=True))
+        x3 = self.block3(self.block2(self.block1(grey) + self.skip1(grey)))
+        x4 = self.block4(x3)
+        x5 = self.block5(x4)
+        features = self.block_fusion(x3 + _enlarged(x4, x3) + _enlarged(x5, x3))
+        logits = self.keypoint_head(functional.pixel_unshuffle(grey, CELL))
+        return features, logits, self.heatmap_head(features)
+
+
+def load_xfeat(tensors: Mapping[str, torch.Tensor], where: str) -> XFeatNetwork:
+    """The network with the tensors of a checkpoint, for inference.
+
+    Files without ``num_batches_tracked`` (ONNX) fit, and so do those with a fine matcher.
+
+    Raises
+    ------
+    DataError : the tensors do not fit; names their keys.
+    """
+    network = XFeatNetwork()
+    used = {key: value for key, value in tensors.items() if not key.startswith("fine_matcher.")}
+    counters = [key for key in network.state_dict() if key.endswith("num_batches_tracked")]
+    load_strictly(network, used, where, may_lack=counters)
+    return network.eval()
+
+
+def keypoint_scores(logits: torch.Tensor) -> torch.Tensor:
+    """Probability of a keypoint at each pixel, (B, 1, H, W), of logits (B, 65, H/8, W/8)."""
+    return functional.pixel_shuffle(logits.float().softmax(dim=1)[:, :-1], CELL)
+
+
+def sample_at_pixels(
+    values: torch.Tensor, xy: torch.Tensor, size: tuple[int, int], *, mode: str
+) -> torch.Tensor:
+    """Values of a coarse map at pixels, as XFeat samples them.
+
+    The pixel (x, y) of an image (H, W) is read at w x / (W - 1) - 0.5 and h y / (H - 1) - 0.5 of
+    the map, half a pixel of the image from where it belongs; the network was trained so.
+
+    Parameters
+    ----------
+    values : (1, C, h, w).
+    xy : (N, 2), pixels of the image, the first pixel's centre at (0, 0).
+    size : (H, W) of the image.
+    mode : "bilinear" or "bicubic".
+
+    Returns
+    -------
+    (N, C)
+    """
+    height, width = size
+    last = torch.tensor([width - 1, height - 1], dtype=torch.float32, device=values.device)
+    grid = 2 * xy.to(last) / last - 1
+    found = functional.grid_sample(values.float(), grid[None, None], mode=mode, align_corners=False)
+    return found[0, :, 0].T
+
+
+def _enlarged(values: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
+    return functional.interpolate(values, like.shape[-2:], mode="bilinear", align_corners=False)
