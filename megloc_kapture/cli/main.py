@@ -20,6 +20,7 @@ from megloc_kapture.cli.evaluate import Evaluate
 from megloc_kapture.cli.evaluate_dataset import Eval
 from megloc_kapture.cli.info import Info
 from megloc_kapture.cli.localize import Localize
+from megloc_kapture.cli.preprocess import Preprocess
 from megloc_kapture.cli.refine_map import RefineMap
 from megloc_kapture.cli.stages import (
     ExtractGlobal,
@@ -30,6 +31,7 @@ from megloc_kapture.cli.stages import (
     Triangulate,
 )
 from megloc_kapture.cli.submit import Submit
+from megloc_kapture.cli.weights import WeightsCommand
 from megloc_kapture.errors import MeglocError
 
 DONE, DEFECT, USER_ERROR, INTERRUPTED = 0, 1, 2, 130
@@ -49,6 +51,7 @@ COMMANDS: dict[str, type[Any]] = {
     "eval": Eval,
     "import": Import,
     "synth": Synth,
+    "preprocess": Preprocess,
     "extract-local": ExtractLocal,
     "extract-global": ExtractGlobal,
     "pairs-mapping": PairsMapping,
@@ -60,6 +63,7 @@ COMMANDS: dict[str, type[Any]] = {
     "submit": Submit,
     "check": Check,
     "evaluate": Evaluate,
+    "weights": WeightsCommand,
     "info": Info,
     "doctor": Doctor,
 }

@@ -62,6 +62,21 @@ def px_from_cam(camera: Camera, points_in_cam: NDArray[np.float64]) -> NDArray[n
     return out
 
 
+def undistorted_pinhole(camera: Camera, *, blank_pixels: float = 0.0) -> Camera:
+    """The PINHOLE camera with the same focal lengths that COLMAP undistorts an image to.
+
+    Parameters
+    ----------
+    blank_pixels : 0: no pixel that the distorted image does not show; 1: all that it shows; in
+        between, in between. The sides stay between 0.2 and 2 times the old ones.
+    """
+    pycolmap = _pycolmap()
+    options = pycolmap.UndistortCameraOptions()
+    options.blank_pixels = blank_pixels
+    found = pycolmap.undistort_camera(options, _colmap_camera(camera))
+    return Camera(found.model.name, found.width, found.height, tuple(found.params))
+
+
 _NEVER = 2**31 - 1
 
 

@@ -17,7 +17,8 @@ from megloc_kapture.io.atomic import write_bytes
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-_WRITABLE = (".png", ".jpg", ".jpeg")
+WRITABLE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".tif", ".tiff")
+_JPEG = (".jpg", ".jpeg")
 
 
 def read_image_rgb(path: Path | str) -> NDArray[np.uint8]:
@@ -68,21 +69,21 @@ def image_size(path: Path | str) -> tuple[int, int]:
 
 
 def write_image(path: Path | str, image: NDArray[np.uint8], *, jpeg_quality: int = 95) -> None:
-    """Write uint8 (H, W, 3) RGB or (H, W) grey as .png or .jpg, atomically.
+    """Write uint8 (H, W, 3) RGB or (H, W) grey as its suffix says, atomically.
 
     The same pixels give the same bytes: no dates, no metadata.
 
     Raises
     ------
-    ValueError : the array is not such an image or the suffix is none of .png, .jpg, .jpeg.
+    ValueError : the array is not such an image or the suffix is none of WRITABLE_SUFFIXES.
     OutputError : the file cannot be written.
     """
     import cv2
 
     path = Path(path)
     suffix = path.suffix.lower()
-    if suffix not in _WRITABLE:
-        raise ValueError(f"{path}: suffix must be one of {', '.join(_WRITABLE)}")
+    if suffix not in WRITABLE_SUFFIXES:
+        raise ValueError(f"{path}: suffix must be one of {', '.join(WRITABLE_SUFFIXES)}")
     pixels = np.asarray(image)
     if pixels.dtype != np.uint8 or pixels.ndim not in (2, 3) or 0 in pixels.shape:
         raise ValueError(f"expected uint8 (H, W, 3) or (H, W), got {pixels.dtype} {pixels.shape}")
@@ -90,7 +91,7 @@ def write_image(path: Path | str, image: NDArray[np.uint8], *, jpeg_quality: int
         if pixels.shape[2] != 3:
             raise ValueError(f"expected 3 channels, got {pixels.shape[2]}")
         pixels = pixels[:, :, ::-1]
-    options = [] if suffix == ".png" else [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality]
+    options = [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality] if suffix in _JPEG else []
     done, encoded = cv2.imencode(suffix, np.ascontiguousarray(pixels), options)
     if not done:
         raise ValueError(f"{path}: cannot encode an image of shape {image.shape}")

@@ -48,3 +48,18 @@ def link_records(output_root: Path, links: Mapping[str, Path]) -> None:
             place.symlink_to(Path(folder).resolve(), target_is_directory=True)
         except OSError as error:
             raise output_error(place, error) from error
+
+
+def link_file(source: Path, place: Path) -> None:
+    """Make ``place`` a link to one file.
+
+    Raises
+    ------
+    OutputError : the link cannot be made.
+    """
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.unlink(missing_ok=True)
+        place.symlink_to(Path(source).resolve())
+    except OSError as error:
+        raise output_error(place, error) from error

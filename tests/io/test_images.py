@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from megloc_kapture.errors import DataError, OutputError
-from megloc_kapture.io.images import image_size, read_image_rgb, write_image
+from megloc_kapture.io.images import WRITABLE_SUFFIXES, image_size, read_image_rgb, write_image
 
 RNG = np.random.default_rng(0)
 PIXELS = RNG.integers(0, 256, (40, 60, 3), dtype=np.uint8)
@@ -25,6 +25,14 @@ def test_png_returns_the_same_rgb(tmp_path: Path) -> None:
     assert np.array_equal(read_image_rgb(tmp_path / "a.png"), PIXELS)
     assert np.array_equal(np.asarray(Image.open(tmp_path / "a.png")), PIXELS)  # RGB, not BGR
     assert image_size(tmp_path / "a.png") == (60, 40)
+
+
+@pytest.mark.parametrize("suffix", sorted({*WRITABLE_SUFFIXES} - {".jpg", ".jpeg"}))
+def test_other_formats_lose_nothing_either(tmp_path: Path, suffix: str) -> None:
+    for name in ("a", "b"):
+        write_image(tmp_path / (name + suffix), PIXELS)
+    assert np.array_equal(read_image_rgb(tmp_path / ("a" + suffix)), PIXELS)
+    assert (tmp_path / ("a" + suffix)).read_bytes() == (tmp_path / ("b" + suffix)).read_bytes()
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".JPEG"])

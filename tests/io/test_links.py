@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from megloc_kapture.errors import OutputError
-from megloc_kapture.io.links import link_images
+from megloc_kapture.io.links import link_file, link_images
 
 
 @pytest.fixture
@@ -64,3 +64,15 @@ def test_a_folder_is_not_replaced(source: Path, tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="records_data: cannot write: File exists"):
         link_images(source, tmp_path / "new")
     assert (place / "b.jpg").read_bytes() == b"mine"
+
+
+def test_one_file_is_linked_in_the_place_of_an_older_one(source: Path, tmp_path: Path) -> None:
+    image = source / "sensors" / "records_data" / "a.jpg"
+    place = tmp_path / "new" / "deep" / "a.jpg"
+    place.parent.mkdir(parents=True)
+    place.write_bytes(b"older")
+    link_file(image, place)
+    assert place.readlink() == image
+    place.parent.joinpath("file").touch()
+    with pytest.raises(OutputError, match="file/a.jpg"):
+        link_file(image, place.parent / "file" / "a.jpg")

@@ -1,0 +1,160 @@
+"""``megloc preprocess``: images resized, undistorted and masked, as a kapture of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from pydantic import ValidationError
+
+from megloc_kapture.cli.common import Common, Force, Input, Output, Working, existing
+from megloc_kapture.errors import OptionError
+from megloc_kapture.io.atomic import replace_directory
+from megloc_kapture.io.json_model import first_problem
+from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.outputs import staged_output
+from megloc_kapture.pipeline.executors import open_executor, single_threaded
+from megloc_kapture.pipeline.presets import assigned
+from megloc_kapture.stages.preprocessing import PreprocessingOptions, preprocess_images
+from megloc_kapture.stages.preprocessing_report import (
+    REPORT_FILE,
+    PreprocessingReport,
+    read_report,
+)
+
+PREPROCESSED = "preprocessed"
+
+_SOURCES = {
+    "own": "masks of the kapture",
+    "user": "masks brought along",
+    "fixed": "fixed masks",
+    "unchanging": "unchanging regions",
+    "classes": "dynamic classes",
+    "unseen": "outside the original",
+    "all": "together",
+}
+
+Several = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Preprocess(Working, Common):
+    """Resize, undistort and mask the images of a kapture; poses stay, cameras follow."""
+
+    input: Input
+    """Kapture folder; it stays as it is."""
+    output: Output
+    """Kapture folder of the new images."""
+    resize: int | None = None
+    """The larger side of larger images, px; both sides are then cropped to multiples of 8."""
+    undistort: bool = False
+    """Make images that a pinhole camera would have taken."""
+    segmenter: str | None = None
+    """Segmenter plugin whose dynamic classes (people, vehicles) are masked."""
+    dynamic: tuple[str, ...] = ()
+    """Classes to mask; the segmenter's own choice unless given."""
+    bottom_share: Several = ()
+    """Mask the bottom of a camera's images: CAMERA=0.2, a sensor id or a pattern of image names."""
+    polygon: Several = ()
+    """Mask a polygon: CAMERA="x,y x,y x,y", corners in shares of width and height."""
+    mask_file: Several = ()
+    """Mask what is 0 in an image of the camera's size: CAMERA=FILE."""
+    unchanging: bool = False
+    """Mask the region at the bottom that never changes (the car's bonnet), found per camera."""
+    sequence: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = ()
+    """Kapture folder whose images of the same cameras help to find it; may be repeated."""
+    user_masks: Path | None = None
+    """Folder of masks IMAGE.png, 0 where the image is ignored."""
+    set: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
+    """Change another option: key=value (upscale, multiple_of, blank_pixels); may be repeated."""
+    force: Force = False
+    """Write into a folder that has other things in it."""
+
+    def run(self) -> int:
+        """Run it."""
+        console = self.console()
+        options = self.options()
+        source = KaptureFolder(self.input)
+        sequences = [KaptureFolder(path) for path in existing(self.sequence)]
+        with (
+            single_threaded(),
+            staged_output(self.output, kind=PREPROCESSED, force=self.force) as out,
+            open_executor(self.executor, self.workers) as executor,
+        ):
+            preprocess_images(
+                source, out, options, sequences=sequences, executor=executor, track=console.track
+            )
+            report = read_report(out)
+            # masks and images of an earlier run would be taken for this one's
+            if (self.output / "sensors" / REPORT_FILE).is_file():
+                replace_directory(out / "sensors", self.output / "sensors")
+        for line in () if report is None else report_lines(report):
+            console.say(line)
+        return 0
+
+    def options(self) -> PreprocessingOptions:
+        """The options that the flags make.
+
+        Raises
+        ------
+        OptionError : one has a value that it cannot have.
+        """
+        masks: dict[str, Any] = {
+            "segmenter": None if self.segmenter is None else {"name": self.segmenter},
+            "dynamic": self.dynamic or None,
+            "fixed": tuple(self._fixed_masks()),
+            "unchanging": self.unchanging,
+            "user_masks": self.user_masks,
+        }
+        tree: dict[str, Any] = {
+            "max_size_px": self.resize,
+            "undistort": self.undistort,
+            **assigned(self.set),
+        }
+        changes = tree.pop("masks", {})
+        try:
+            return PreprocessingOptions.model_validate({**tree, "masks": {**masks, **changes}})
+        except ValidationError as error:
+            raise OptionError(f"option {first_problem(error)}") from error
+
+    def _fixed_masks(self) -> Iterator[dict[str, Any]]:
+        for camera, value in _assignments("--bottom-share", self.bottom_share):
+            yield {"camera": camera, "bottom_share": value}
+        for camera, value in _assignments("--polygon", self.polygon):
+            yield {"camera": camera, "polygon": [corner.split(",") for corner in value.split()]}
+        for camera, value in _assignments("--mask-file", self.mask_file):
+            yield {"camera": camera, "file": value}
+
+
+def report_lines(report: PreprocessingReport) -> list[str]:
+    """What was done, for people: cameras, then the share of pixels masked by each source."""
+    lines = [f"{report.images} images, {report.images_changed} of them changed"]
+    changes: dict[str, int] = {}
+    for camera in report.cameras.values():
+        before, after = ("{} {}x{}".format(*row[:3]) for row in (camera.original, camera.processed))
+        change = before if camera.original == camera.processed else f"{before} -> {after}"
+        changes[change] = changes.get(change, 0) + 1
+    lines += [
+        f"{'cameras' if number > 1 else 'camera'}: {number} {change}"
+        for change, number in sorted(changes.items())
+    ]
+    lines += [f"remark: {remark}" for remark in report.remarks]
+    if report.images_masked:
+        lines.append(f"masks of {report.images_masked} images; share of all pixels masked:")
+        lines += [
+            f"  {_SOURCES[source]:24s}{100 * report.masked[source]:7.2f} %"
+            for source in _SOURCES
+            if source in report.masked
+        ]
+    return lines
+
+
+def _assignments(flag: str, texts: Sequence[str]) -> Iterator[tuple[str, str]]:
+    for text in texts:
+        camera, equals, value = text.rpartition("=")
+        if not (camera and equals and value):
+            raise OptionError(f"{flag} takes CAMERA=VALUE, got {text!r}")
+        yield camera, value

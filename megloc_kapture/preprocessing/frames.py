@@ -1,0 +1,133 @@
+"""Images and masks as a :class:`FramePlan` has them.
+
+An image is resampled once. Where it is undistorted, each pixel of the result is the mean of a
+square of samples taken from the original, as many as it spans pixels there: undistorting first and
+resizing then would blur it twice.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.geometry.cameras import bearing_rays, px_from_cam
+from megloc_kapture.preprocessing.frame_plan import FramePlan
+from megloc_kapture.preprocessing.pixel_map import sees
+from megloc_kapture.preprocessing.resizing import resized
+
+# what lies between two points that belong to each other does so too: the models fold slowly
+_CHECKED_EVERY = 16
+# original pixels between which a map is interpolated, which costs it less than 0.005 px; the
+# library's own interpolation rounds positions to 1/32 px
+_INTERPOLATED_PX = 4
+
+Float32 = NDArray[np.float32]
+
+
+def processed_image(image: NDArray[np.uint8], plan: FramePlan) -> NDArray[np.uint8]:
+    """The image (H, W, 3) of the processed camera; black where the original does not reach."""
+    if not plan.warps:
+        width, height = plan.resized
+        whole = resized(image, width, height)
+        return np.ascontiguousarray(whole[: plan.processed.height, : plan.processed.width])
+    import cv2
+
+    samples = max(1, math.ceil(plan.shrink - 1e-9))
+    interpolation = cv2.INTER_LINEAR if samples > 1 else cv2.INTER_CUBIC
+    x, y = _sampled_at(plan, samples)
+    seen = cv2.remap(image, x, y, interpolation, borderMode=cv2.BORDER_REPLICATE)
+    if samples > 1:
+        size = (plan.processed.width, plan.processed.height)
+        seen = cv2.resize(seen, size, interpolation=cv2.INTER_AREA)
+    reached = reached_region(plan)
+    if reached is not None:
+        seen[~reached] = 0
+    return np.asarray(seen)
+
+
+def processed_mask(mask: NDArray[np.bool_], plan: FramePlan) -> NDArray[np.bool_]:
+    """The mask (H, W) of the processed image: that of the pixel under each pixel's centre.
+
+    Where the original does not reach, that of its nearest pixel; see :func:`reached_region`.
+    """
+    size = (plan.processed.height, plan.processed.width)
+    if not plan.changes_pixels:
+        return mask
+    if not plan.warps:
+        # not the library's nearest neighbour, which looks up the pixel's corner
+        rows = _nearest(size[0], mask.shape[0], plan.resized[1])
+        columns = _nearest(size[1], mask.shape[1], plan.resized[0])
+        return np.ascontiguousarray(mask[np.ix_(rows, columns)])
+    x, y = _sampled_at(plan, 1)
+    column = np.clip(np.floor(x + 0.5), 0, mask.shape[1] - 1).astype(np.int32)
+    row = np.clip(np.floor(y + 0.5), 0, mask.shape[0] - 1).astype(np.int32)
+    return np.asarray(mask[row, column])
+
+
+@lru_cache(maxsize=2)
+def reached_region(plan: FramePlan) -> NDArray[np.bool_] | None:
+    """Where the processed image shows what the original does, bool (H, W); None: everywhere."""
+    if not plan.warps:
+        return None
+    width, height = plan.processed.width, plan.processed.height
+    coarse = _reaches(plan, *(_every(side) for side in (width, height)))
+    if coarse.all():
+        return None
+    full = _reaches(plan, np.arange(width) + 0.5, np.arange(height) + 0.5)
+    full.setflags(write=False)
+    return full
+
+
+def _nearest(number: int, old_side: int, side: int) -> NDArray[np.int64]:
+    """Index of the old pixel under the centre of each of the first pixels of a resized side."""
+    return (2 * np.arange(number, dtype=np.int64) + 1) * old_side // (2 * side)
+
+
+def _every(side: int) -> NDArray[np.float64]:
+    """Pixel centres along a side, not all, but the first and the last."""
+    return np.append(np.arange(0, side - 1, _CHECKED_EVERY), side - 1) + 0.5
+
+
+def _reaches(
+    plan: FramePlan, x: NDArray[np.floating[Any]], y: NDArray[np.floating[Any]]
+) -> NDArray[np.bool_]:
+    rays = bearing_rays(plan.processed, _grid(x, y))
+    found = px_from_cam(plan.original, rays)
+    inside = ((found >= 0) & (found <= [plan.original.width, plan.original.height])).all(axis=1)
+    return np.asarray((inside & sees(plan.original, rays, found)).reshape(len(y), len(x)))
+
+
+def _grid(x: NDArray[np.floating[Any]], y: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+    """Points (len(y) * len(x), 2), row by row."""
+    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2).astype(np.float64)
+
+
+@lru_cache(maxsize=4)
+def _sampled_at(plan: FramePlan, samples: int) -> tuple[Float32, Float32]:
+    """Where the original is sampled, float32 (samples * H, samples * W) x and y.
+
+    The first pixel's centre is at (0, 0), as OpenCV has it.
+    """
+    import cv2
+
+    width, height = plan.processed.width, plan.processed.height
+    # computed at the middles of squares of pixels, one square more on each side, and interpolated
+    # between: the map is that smooth
+    square = max(1, round(_INTERPOLATED_PX / max(plan.shrink, 1.0)))
+    columns, rows = -(-width // square) + 2, -(-height // square) + 2
+    x, y = ((np.arange(number) - 0.5) * square for number in (columns, rows))
+    found = px_from_cam(plan.original, bearing_rays(plan.processed, _grid(x, y))) - 0.5
+    found = found.reshape(rows, columns, 2).astype(np.float32)
+    margin = square * samples
+    if margin > 1:
+        size = (margin * columns, margin * rows)
+        found = np.asarray(cv2.resize(found, size, interpolation=cv2.INTER_LINEAR))
+    found = found[margin:, margin:][: samples * height, : samples * width]
+    maps = tuple(np.ascontiguousarray(found[..., k], np.float32) for k in (0, 1))
+    for one in maps:
+        one.setflags(write=False)
+    return maps[0], maps[1]

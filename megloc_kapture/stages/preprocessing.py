@@ -1,0 +1,216 @@
+"""Stage: images resized, undistorted and masked, as a kapture of its own.
+
+Names, poses, rigs and records stay; a camera becomes the one that would have taken the new images,
+under its old id. What does not change is linked. Depth maps stay as they are: they are of sensors
+of their own, whose cameras are theirs. Features, matches and points are not carried along: they
+belong to the old pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+
+from megloc_kapture.errors import DataError, OptionError, OutputError
+from megloc_kapture.io.atomic import output_error
+from megloc_kapture.io.images import WRITABLE_SUFFIXES
+from megloc_kapture.io.json_model import write_json, write_json_model
+from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, Sensor, write_sensors
+from megloc_kapture.io.links import link_file, link_records
+from megloc_kapture.plugins import SEGMENTERS, Segmenter, load_plugin
+from megloc_kapture.preprocessing.frame_plan import FrameOptions, FramePlan, plan_frame
+from megloc_kapture.preprocessing.unchanging_region import UnchangingRegion
+from megloc_kapture.stages.class_masks import ClassMasks
+from megloc_kapture.stages.image_masks import MaskOptions, StandingMasks, mask_files
+from megloc_kapture.stages.parallel import Track, ordered_map, untracked
+from megloc_kapture.stages.preprocessing_report import (
+    REPORT_FILE,
+    PreprocessingReport,
+    camera_reports,
+)
+from megloc_kapture.stages.processed_frames import CLASSES, FrameJob, process_frame
+from megloc_kapture.stages.unchanging_regions import find_unchanging_regions
+
+CLASSES_FILE = "classes.json"
+
+
+class PreprocessingOptions(FrameOptions):
+    """What is done to images before anything looks at them; by default nothing."""
+
+    masks: MaskOptions = MaskOptions()
+
+
+def preprocess_images(
+    folder: KaptureFolder,
+    output: Path,
+    options: PreprocessingOptions | None = None,
+    *,
+    segmenter: Segmenter | None = None,
+    sequences: Sequence[KaptureFolder] = (),
+    root: Path | None = None,
+    executor: Executor | None = None,
+    track: Track = untracked,
+) -> dict[str, float]:
+    """Write a kapture with the images, cameras and masks that the options make of one.
+
+    ``sensors/masks/IMAGE.png`` (0 = ignore) for every image that has some source of masks or
+    shows what its original does not; ``sensors/classes`` what a segmenter saw; and
+    ``sensors/preprocessing.json``, a :class:`PreprocessingReport`.
+
+    Parameters
+    ----------
+    segmenter : the plugin; made of ``options.masks.segmenter`` unless given.
+    sequences : more folders to find the cameras' unchanging regions in; the map's, for queries.
+    root : of the options' relative paths.
+    executor : its processes write the images, so they must see the same files.
+
+    Returns
+    -------
+    Counts for the log: images, how many of them changed and have a mask, and the shares of
+    pixels masked by each source.
+
+    Raises
+    ------
+    OptionError : a class that the segmenter does not have, an image too small to be cropped, or no
+        camera with enough images for its unchanging region.
+    DataError : an image or a mask is absent, broken, or not of its camera's size.
+    OutputError : the output lies in the folder it is made from, or cannot be written.
+    """
+    options = options or PreprocessingOptions()
+    output = Path(output)
+    if output.resolve().is_relative_to(folder.root.resolve()):
+        raise OutputError(f"{output}: lies in the kapture that is read, which stays as it is")
+    classes = _class_masks(options.masks, segmenter)
+    data = folder.read()
+    plans = _plans(data, options)
+    user_masks = options.masks.user_masks
+    if user_masks is not None and root is not None:
+        user_masks = root / user_masks
+    files = mask_files(folder, data.image_names(), user_masks)
+    regions: dict[str, UnchangingRegion] = {}
+    if options.masks.unchanging:
+        regions = find_unchanging_regions(folder, sequences, executor=executor, track=track)
+    remarks = _remarks(regions)
+    standing = StandingMasks(options.masks.fixed, regions, root)
+
+    _unlink_folders(output)
+    write_sensors(output, _with_cameras(data, plans))
+    linked = _link_records(folder, output, plans)
+    if classes is not None:
+        what = {"classes": list(classes.segmenter.classes), "dynamic": list(classes.dynamic)}
+        write_json(output / "sensors" / CLASSES / CLASSES_FILE, what)
+
+    def jobs() -> Iterator[FrameJob]:
+        for image in data.image_names():
+            sensor_id = data.record_of(image)[1]
+            plan = plans[sensor_id]
+            yield FrameJob(
+                image=image,
+                source=folder.image_path(image),
+                output=output,
+                plan=plan,
+                link=not (linked or plan.changes_pixels),
+                files=files[image],
+                standing=standing.of(sensor_id, image, plan.original),
+                classes=classes,
+            )
+
+    shares: dict[str, float] = {}
+    num_images = len(data.records_camera)
+    num_masked = 0
+    results = ordered_map(process_frame, jobs(), executor)
+    for found in track(results, num_images, "pre-processing"):
+        num_masked += bool(found)
+        for source, share in found.items():
+            shares[source] = shares.get(source, 0.0) + share
+    remarks += [f"a fixed mask fits no image: {one.camera}" for one in standing.unused()]
+    report = PreprocessingReport(
+        images=num_images,
+        images_changed=sum(plans[s].changes_pixels for _, s in data.records_camera),
+        images_masked=num_masked,
+        cameras=camera_reports(data, plans),
+        masked={source: shares[source] / num_images for source in sorted(shares)},
+        remarks=tuple(remarks),
+    )
+    write_json_model(output / "sensors" / REPORT_FILE, report)
+    return {
+        "images": report.images,
+        "images_changed": report.images_changed,
+        "images_masked": report.images_masked,
+        **{f"masked_{source}": share for source, share in report.masked.items()},
+    }
+
+
+def _class_masks(options: MaskOptions, segmenter: Segmenter | None) -> ClassMasks | None:
+    if segmenter is None and options.segmenter is not None:
+        segmenter = load_plugin(SEGMENTERS, options.segmenter.name, options.segmenter.options)
+    if segmenter is not None:
+        return ClassMasks.of(segmenter, options.dynamic)
+    if options.dynamic is not None:
+        raise OptionError("dynamic classes are named, but no segmenter that tells them apart")
+    return None
+
+
+def _plans(data: KaptureData, options: FrameOptions) -> dict[str, FramePlan]:
+    """What becomes of each camera that took an image, by sensor id."""
+    plans: dict[str, FramePlan] = {}
+    for (_, sensor_id), image in sorted(data.records_camera.items()):
+        if sensor_id not in plans:
+            plans[sensor_id] = plan_frame(data.camera_of(image), options)
+        suffix = PurePosixPath(image).suffix.lower()
+        if plans[sensor_id].changes_pixels and suffix not in WRITABLE_SUFFIXES:
+            raise DataError(
+                f"image {image!r} changes, but what its name says it is cannot be written; "
+                f"can be: {', '.join(WRITABLE_SUFFIXES)}"
+            )
+    return plans
+
+
+def _remarks(regions: Mapping[str, UnchangingRegion]) -> list[str]:
+    """Of cameras without an unchanging region; refuses when none has the images to find one."""
+    remarks = [f"camera {name}: {r.reason}" for name, r in sorted(regions.items()) if not r]
+    if regions and not any(region.frontier for region in regions.values()):
+        raise OptionError(f"no unchanging region can be found: {remarks[0]}")
+    return remarks
+
+
+def _with_cameras(data: KaptureData, plans: Mapping[str, FramePlan]) -> KaptureData:
+    """The same data with the processed cameras; one that stays keeps its very digits."""
+    sensors = dict(data.sensors)
+    for sensor_id, plan in plans.items():
+        if plan.processed != plan.original:
+            name = data.sensors[sensor_id].name
+            sensors[sensor_id] = Sensor.from_camera(plan.processed, name=name)
+    return replace(data, sensors=sensors)
+
+
+def _unlink_folders(output: Path) -> None:
+    """Take away folders that are links: what is written below them would be somebody else's."""
+    for name in ("records_data", "masks", CLASSES):
+        place = output / "sensors" / name
+        try:
+            if place.is_symlink():
+                place.unlink()
+        except OSError as error:
+            raise output_error(place, error) from error
+
+
+def _link_records(folder: KaptureFolder, output: Path, plans: Mapping[str, FramePlan]) -> bool:
+    """Link all records at once where no image changes; else the depth maps, one by one.
+
+    Returns
+    -------
+    Whether the images are linked.
+    """
+    records = folder.root / "sensors" / "records_data"
+    if records.is_dir() and not any(plan.changes_pixels for plan in plans.values()):
+        link_records(output, {"": records})
+        return True
+    for name in sorted(folder.read().records_depth.values()):
+        source = folder.depth_path(name)
+        if not source.is_file():
+            raise DataError("no such depth map", path=source)
+        link_file(source, output / "sensors" / "records_data" / name)
+    return False

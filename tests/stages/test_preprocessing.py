@@ -1,0 +1,550 @@
+"""Pre-processing as a stage: what is written and linked, what masks say, what is refused."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import shutil
+from collections.abc import Callable
+from concurrent.futures import Executor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import kapture.io.csv
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from megloc_kapture.errors import DataError, OptionError, OutputError, PluginError
+from megloc_kapture.evaluation.mask_pictures import SegmentedClasses
+from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
+from megloc_kapture.io.depth_maps import read_depth_map
+from megloc_kapture.io.images import image_size, read_image_rgb, write_image
+from megloc_kapture.io.json_model import read_json_model
+from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, Sensor, write_sensors
+from megloc_kapture.mapping.lifting import lift_keypoints
+from megloc_kapture.preprocessing.fixed_masks import FixedMask
+from megloc_kapture.stages.image_masks import MaskOptions
+from megloc_kapture.stages.lifting import depth_records
+from megloc_kapture.stages.local_features import extract_local_features, read_mask
+from megloc_kapture.stages.preprocessing import PreprocessingOptions, preprocess_images
+from megloc_kapture.stages.preprocessing_report import PreprocessingReport, pixel_maps, read_report
+from megloc_kapture.values import Camera, RigidTransform
+
+Image = NDArray[np.uint8]
+FISHEYE = Camera("OPENCV_FISHEYE", 240, 180, (120.0, 121.0, 119.0, 92.0, -0.02, 0.004, 0.0, 0.0))
+
+
+def cloudy(seed: int, height: int = 180, width: int = 240) -> Image:
+    rough = np.random.default_rng(seed).normal(size=(height, width, 3))
+    smooth = cv2.GaussianBlur(rough, (0, 0), 2.5)
+    return np.clip(128 + 45 * smooth / smooth.std(), 0, 255).astype(np.uint8)
+
+
+class Halves:
+    """A segmenter: sky above, then a car at the left and a road at the right."""
+
+    name = "halves"
+    classes = ("road", "sky", "car")
+    dynamic = frozenset({"car"})
+
+    def segment(self, image: Image) -> NDArray[np.uint8]:
+        labels = np.zeros(image.shape[:2], np.uint8)
+        labels[: len(labels) // 2] = 1
+        labels[len(labels) // 2 :, : labels.shape[1] // 2] = 2
+        return labels
+
+
+class Returning(Halves):
+    """A segmenter that returns what it was given."""
+
+    def __init__(self, labels: Any) -> None:
+        self.labels = labels
+
+    def segment(self, image: Image) -> Any:
+        return self.labels
+
+
+@pytest.fixture
+def street(tmp_path: Path) -> KaptureFolder:
+    """Two cameras on a rig, one of them a fisheye, with poses, depth and a mask of its own."""
+    root = tmp_path / "street"
+    data = KaptureData(
+        sensors={
+            "front": Sensor.from_camera(
+                Camera("PINHOLE", 320, 200, (250.0, 251.0, 160.0, 99.0)), name="the front"
+            ),
+            "side": Sensor.from_camera(FISHEYE),
+            "depth": Sensor.from_camera(
+                Camera("SIMPLE_PINHOLE", 64, 48, (60.0, 32.0, 24.0)), sensor_type="depth"
+            ),
+            "gps": Sensor("", "gnss", ("EPSG:4326",)),
+        },
+        rigs={
+            "car": {
+                "front": RigidTransform.identity(),
+                "side": RigidTransform((0.0, 0.0, 1.0, 0.0), (0.1, 0.2, 0.3)),
+                "depth": RigidTransform.identity(),
+            }
+        },
+    )
+    records = root / "sensors" / "records_data"
+    for t in range(3):
+        data.records_camera[t, "front"] = f"front/{t}.png"
+        data.records_camera[t, "side"] = f"side/{t}.jpg"
+        data.records_depth[t, "depth"] = f"depth/{t}.depth"
+        data.trajectories[t, "car"] = RigidTransform((1.0, 0.0, 0.0, 0.0), (float(t), 0.5, 0.0))
+        write_image(records / "front" / f"{t}.png", cloudy(t, 200, 320))
+        write_image(records / "side" / f"{t}.jpg", cloudy(10 + t))
+        (records / "depth").mkdir(exist_ok=True)
+        np.full((48, 64), 2.0 + t, "<f4").tofile(records / "depth" / f"{t}.depth")
+    own = np.full((200, 320), 255, np.uint8)
+    own[:, :80] = 0
+    write_image(root / "sensors" / "masks" / "front/1.png.png", own)
+    write_sensors(root, data)
+    return KaptureFolder(root)
+
+
+def run(
+    folder: KaptureFolder, output: Path, masks: dict[str, Any] | None = None, **options: Any
+) -> tuple[KaptureFolder, PreprocessingReport]:
+    """Pre-process; keyword arguments that are no options go to the stage."""
+    stage = {
+        name: options.pop(name)
+        for name in ("segmenter", "sequences", "root", "executor")
+        if name in options
+    }
+    chosen = PreprocessingOptions(masks=MaskOptions(**masks or {}), **options)
+    preprocess_images(folder, output, chosen, **stage)
+    report = read_report(output)
+    assert report is not None
+    return KaptureFolder(output), report
+
+
+def mask_of(folder: KaptureFolder, image: str) -> NDArray[np.bool_] | None:
+    camera = folder.read().camera_of(image)
+    path = folder.root / "sensors" / "masks" / f"{image}.png"
+    return read_mask(path, (camera.height, camera.width))
+
+
+def test_by_default_everything_is_linked(street: KaptureFolder, tmp_path: Path) -> None:
+    new, report = run(street, tmp_path / "new")
+    place = tmp_path / "new" / "sensors" / "records_data"
+    assert (
+        place.is_symlink()
+        and place.resolve() == (street.root / "sensors" / "records_data").resolve()
+    )
+    for name in ("sensors.txt", "rigs.txt", "trajectories.txt", "records_camera.txt"):
+        there = (new.root / "sensors" / name).read_bytes()
+        assert there == (street.root / "sensors" / name).read_bytes()
+    # the kapture's own mask is there again
+    expected = mask_of(street, "front/1.png")
+    assert expected is not None
+    np.testing.assert_array_equal(mask_of(new, "front/1.png"), expected)
+    assert mask_of(new, "front/0.png") is None
+    assert report.images_changed == 0 and report.images_masked == 1
+    assert report.masked == {"all": pytest.approx(0.25 / 6), "own": pytest.approx(0.25 / 6)}
+
+
+def test_kapture_reads_what_is_written(street: KaptureFolder, tmp_path: Path) -> None:
+    run(street, tmp_path / "new", max_size_px=160, undistort=True, segmenter=Halves())
+    theirs = kapture.io.csv.kapture_from_dir(str(tmp_path / "new"))
+    assert {len(theirs.records_camera), len(theirs.records_depth), len(theirs.trajectories)} == {3}
+    assert theirs.sensors["front"].sensor_params[:3] == ["PINHOLE", "160", "96"]
+    assert theirs.sensors["side"].sensor_params[0] == "PINHOLE"
+    assert theirs.sensors["front"].name == "the front"
+    assert "gps" in theirs.sensors
+    for _, _, image in kapture.flatten(theirs.records_camera):
+        path = kapture.io.records.get_image_fullpath(str(tmp_path / "new"), image)
+        params = theirs.sensors[image.split("/")[0]].sensor_params
+        assert image_size(path) == (int(params[1]), int(params[2]))
+
+
+def test_poses_rigs_and_depth_stay(street: KaptureFolder, tmp_path: Path) -> None:
+    new, _ = run(street, tmp_path / "new", max_size_px=160, undistort=True)
+    before, after = street.read(), new.read()
+    assert after.poses() == before.poses() and len(after.poses()) == 6
+    assert after.rigs == before.rigs and after.records_depth == before.records_depth
+    assert after.sensors["depth"] == before.sensors["depth"]
+    place = new.depth_path("depth/2.depth")
+    assert place.is_symlink()
+    assert (read_depth_map(place, width=64, height=48) == 4.0).all()
+
+
+def test_only_images_that_change_are_written(street: KaptureFolder, tmp_path: Path) -> None:
+    new, report = run(street, tmp_path / "new", undistort=True)
+    assert new.image_path("front/0.png").is_symlink()
+    assert not new.image_path("side/0.jpg").is_symlink()
+    assert report.images_changed == 3
+    assert new.read().sensors["front"] == street.read().sensors["front"]
+    assert new.read().camera_of("side/0.jpg").model == "PINHOLE"
+    new.validate(deep=True)
+
+
+def test_png_keeps_the_very_pixels(street: KaptureFolder, tmp_path: Path) -> None:
+    new, _ = run(street, tmp_path / "new", max_size_px=320, multiple_of=16)
+    original = read_image_rgb(street.image_path("front/2.png"))
+    np.testing.assert_array_equal(read_image_rgb(new.image_path("front/2.png")), original[:192])
+
+
+def test_grey_images_stay_grey(small_kapture: Callable[..., KaptureFolder], tmp_path: Path) -> None:
+    grey = np.repeat(cloudy(0)[..., :1], 3, axis=2)
+    folder = small_kapture({"a.png": grey, "b.jpg": grey})
+    new, _ = run(folder, tmp_path / "new", max_size_px=120)
+    for image in ("a.png", "b.jpg"):
+        stored = cv2.imread(str(new.image_path(image)), cv2.IMREAD_UNCHANGED)
+        assert stored.shape == (88, 120)
+    pixels = read_image_rgb(new.image_path("a.png"))
+    np.testing.assert_array_equal(pixels[..., 0], pixels[..., 2])
+
+
+def test_a_jpeg_loses_next_to_nothing(
+    small_kapture: Callable[..., KaptureFolder], tmp_path: Path
+) -> None:
+    folder = small_kapture({"a.jpg": cloudy(0), "a.png": read_image_rgb_of_jpeg(cloudy(0))})
+    new, _ = run(folder, tmp_path / "new", max_size_px=200)
+    found, lossless = (
+        cv2.cvtColor(read_image_rgb(new.image_path(image)), cv2.COLOR_RGB2GRAY)
+        for image in ("a.jpg", "a.png")
+    )
+    assert cv2.PSNR(found, lossless) > 45
+
+
+def read_image_rgb_of_jpeg(image: Image) -> Image:
+    """The pixels that an image has after it was a JPEG, as write_image makes them."""
+    done, encoded = cv2.imencode(".jpg", image[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
+    assert done
+    return np.ascontiguousarray(cv2.imdecode(encoded, cv2.IMREAD_COLOR)[:, :, ::-1])
+
+
+def test_keypoints_are_carried_back_by_the_report_alone(
+    street: KaptureFolder, tmp_path: Path
+) -> None:
+    new, report = run(street, tmp_path / "new", max_size_px=160, undistort=True)
+    for image in ("front/0.png", "side/0.jpg"):
+        pixels = pixel_maps(report)[image.split("/")[0]]
+        assert pixels.original == street.read().camera_of(image)
+        assert pixels.processed == new.read().camera_of(image)
+        points = np.random.default_rng(0).random((100, 2)) * [
+            pixels.processed.width,
+            pixels.processed.height,
+        ]
+        back = pixels.processed_from_original(pixels.original_from_processed(points))
+        np.testing.assert_allclose(back, points, rtol=0, atol=1e-6)
+
+
+def test_features_of_the_new_images_are_those_of_the_old(
+    street: KaptureFolder, tmp_path: Path
+) -> None:
+    """What is found in the undistorted image lies where it is found in the original."""
+    extractor = RootSift(RootSiftOptions(max_keypoints=300))
+    new, report = run(street, tmp_path / "new", undistort=True)
+    pixels = pixel_maps(report)["side"]
+    old = extractor.extract(read_image_rgb(street.image_path("side/1.jpg"))).keypoints_px
+    found = extractor.extract(read_image_rgb(new.image_path("side/1.jpg"))).keypoints_px
+    carried = pixels.original_from_processed(found)
+    distances = np.linalg.norm(carried[:, None] - old[None], axis=2).min(axis=1)
+    assert len(found) > 150
+    close = distances < 1
+    assert close.mean() > 0.5
+    offsets = carried[close] - old[np.linalg.norm(carried[close, None] - old, axis=2).argmin(1)]
+    np.testing.assert_allclose(offsets.mean(axis=0), 0, atol=0.12)
+
+
+def test_real_photographs_keep_their_geometry(shared_data: Path, tmp_path: Path) -> None:
+    """A point at a keypoint's ray is seen at the keypoint carried over: no pose can move."""
+    folder = KaptureFolder(shared_data / "scenes" / "fountain_p11" / "query")
+    new, report = run(folder, tmp_path / "new", max_size_px=1000)
+    extractor = RootSift(RootSiftOptions(max_keypoints=1500))
+    image = folder.read().image_names()[0]
+    camera = folder.read().camera_of(image)
+    assert (camera.width, camera.height) == (1536, 1024)
+    processed = new.read().camera_of(image)
+    assert (processed.width, processed.height) == (1000, 664)
+    pixels = pixel_maps(report)[folder.read().record_of(image)[1]]
+    old, found = (
+        extractor.extract(read_image_rgb(where.image_path(image))).keypoints_px
+        for where in (folder, new)
+    )
+    carried = pixels.original_from_processed(found)
+    nearest = np.linalg.norm(carried[:, None] - old[None], axis=2)
+    pairs = nearest.argmin(axis=1)
+    close = nearest.min(axis=1) < 1.0
+    assert close.mean() > 0.4
+    offset = (carried[close] - old[pairs[close]]).mean(axis=0)
+    # half a pixel's error would be 0.27 px here
+    np.testing.assert_allclose(offset, 0, atol=0.03)
+
+
+def test_lifting_through_depth_is_as_before(shared_data: Path, tmp_path: Path) -> None:
+    """The depth camera is its own: keypoints of the smaller image find the same points."""
+    root = tmp_path / "kitchen"
+    source = shared_data / "scenes" / "redkitchen_rgbd"
+    data = KaptureFolder(source / "query").read()
+    image = data.image_names()[0]
+    timestamp, colour = data.record_of(image)
+    small = KaptureData(
+        sensors={
+            colour: data.sensors[colour],
+            "depth": Sensor.from_camera(
+                Camera("PINHOLE", 640, 480, (585.0, 585.0, 320.0, 240.0)), sensor_type="depth"
+            ),
+        },
+        rigs={"kinect": {colour: RigidTransform.identity(), "depth": RigidTransform.identity()}},
+        records_camera={(timestamp, colour): image},
+        records_depth={(timestamp, "depth"): "a.depth"},
+    )
+    write_sensors(root, small)
+    records = root / "sensors" / "records_data"
+    (records / image).parent.mkdir(parents=True, exist_ok=True)
+    shutil.copy(source / "query" / "sensors" / "records_data" / image, records / image)
+    png = source / "depth_png" / image.replace(".color.jpg", ".depth.png")
+    depth = cv2.imread(str(png), cv2.IMREAD_UNCHANGED).astype("<f4") / 1000
+    depth.tofile(records / "a.depth")
+    new, report = run(KaptureFolder(root), tmp_path / "new", max_size_px=400)
+    keypoints = np.random.default_rng(0).random((400, 2)) * [640, 460]
+    lifted = []
+    for folder, points in (
+        (KaptureFolder(root), keypoints),
+        (new, pixel_maps(report)[colour].processed_from_original(keypoints)),
+    ):
+        record = depth_records(folder.read())[image]
+        lifted.append(
+            lift_keypoints(
+                points,
+                read_depth_map(folder.depth_path(record.path), width=640, height=480),
+                folder.read().camera_of(image),
+                record.camera,
+                record.image_from_depth,
+            )
+        )
+    np.testing.assert_array_equal(lifted[0][1], lifted[1][1])
+    assert lifted[0][1].mean() > 0.5
+    np.testing.assert_allclose(lifted[0][0], lifted[1][0], atol=1e-9)
+
+
+def test_all_masks_are_combined(street: KaptureFolder, tmp_path: Path) -> None:
+    user = tmp_path / "user"
+    top = np.full((200, 320), 255, np.uint8)
+    top[:20] = 0
+    write_image(user / "front/1.png.png", top)
+    new, report = run(
+        street,
+        tmp_path / "new",
+        {"user_masks": user, "fixed": (FixedMask(camera="front", bottom_share=0.1),)},
+        segmenter=Halves(),
+    )
+    expected = np.ones((200, 320), bool)
+    expected[100:, :160] = False
+    expected[180:] = False
+    np.testing.assert_array_equal(mask_of(new, "front/0.png"), expected)
+    expected[:20] = False
+    expected[:, :80] = False
+    np.testing.assert_array_equal(mask_of(new, "front/1.png"), expected)
+    side = mask_of(new, "side/0.jpg")
+    assert side is not None and side[90:, :120].sum() == 0 and side[:90].all()
+    assert report.masked["user"] == pytest.approx(0.1 / 6)
+    assert report.masked["own"] == pytest.approx(0.25 / 6)
+    assert report.masked["fixed"] == pytest.approx(0.1 / 2)
+    assert report.masked["classes"] == pytest.approx(0.25)
+    assert report.images_masked == 6
+
+
+def test_masks_are_8_bit_and_0_is_ignored(street: KaptureFolder, tmp_path: Path) -> None:
+    """COLMAP's convention; and the features' stage obeys what this one wrote."""
+    fixed = (FixedMask(camera="front", polygon=((0, 0), (0.5, 0), (0.5, 1), (0, 1))),)
+    new, _ = run(street, tmp_path / "new", {"fixed": fixed}, max_size_px=160)
+    path = new.root / "sensors" / "masks" / "front/0.png.png"
+    stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert stored.dtype == np.uint8 and stored.shape == (96, 160)
+    assert (stored[:, :80] == 0).all() and (stored[:, 80:] == 255).all()
+    extractor = RootSift(RootSiftOptions(max_keypoints=200))
+    extract_local_features([new], extractor, tmp_path / "features")
+    seen = KaptureFolder(new.root, features_dirs=[tmp_path / "features"]).keypoints("rootsift")
+    assert seen.read("front/0.png")[:, 0].min() >= 80
+    assert seen.read("side/0.jpg")[:, 0].min() < 80
+
+
+def test_drawn_masks_of_a_pattern_of_images(street: KaptureFolder, tmp_path: Path) -> None:
+    drawn = np.full((180, 240), 255, np.uint8)
+    drawn[:, 200:] = 0
+    write_image(tmp_path / "drawn" / "side.png", drawn)
+    fixed = (
+        FixedMask(camera="side/[01].jpg", file=Path("side.png")),
+        FixedMask(camera="rear", bottom_share=0.5),
+    )
+    new, report = run(street, tmp_path / "new", {"fixed": fixed}, root=tmp_path / "drawn")
+    np.testing.assert_array_equal(mask_of(new, "side/0.jpg"), drawn > 0)
+    assert mask_of(new, "side/2.jpg") is None and mask_of(new, "front/0.png") is None
+    assert report.remarks == ("a fixed mask fits no image: rear",)
+
+
+def test_what_lies_outside_the_original_is_masked(street: KaptureFolder, tmp_path: Path) -> None:
+    new, report = run(street, tmp_path / "new", undistort=True, blank_pixels=1.0)
+    mask = mask_of(new, "side/0.jpg")
+    assert mask is not None and 0.5 < mask.mean() < 0.99
+    image = read_image_rgb(new.image_path("side/0.jpg"))
+    # JPEG rings beside an edge
+    away = cv2.erode((~mask).astype(np.uint8), np.ones((17, 17)), borderValue=1) == 1
+    assert (image[away] < 10).all()
+    assert report.masked["unseen"] == pytest.approx((1 - mask.mean()) / 2)
+
+
+def test_classes_are_kept_for_reports(street: KaptureFolder, tmp_path: Path) -> None:
+    new, _ = run(street, tmp_path / "new", {"dynamic": ("sky",)}, segmenter=Halves())
+    folder = new.root / "sensors" / "classes"
+    labels = cv2.imread(str(folder / "side/1.jpg.png"), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(labels, Halves().segment(cloudy(0)))
+    mask = mask_of(new, "side/1.jpg")
+    np.testing.assert_array_equal(mask, labels != 1)
+    named = read_json_model(folder / "classes.json", SegmentedClasses)
+    assert named == SegmentedClasses(classes=Halves.classes, dynamic=frozenset({"sky"}))
+
+
+def test_a_bonnet_is_found_with_the_maps_images(tmp_path: Path) -> None:
+    """Two queries are too few; with the map's images of the same camera there are enough."""
+
+    def drive(root: Path, count: int, seed: int) -> KaptureFolder:
+        camera = Camera("PINHOLE", 240, 180, (200.0, 200.0, 120.0, 90.0))
+        data = KaptureData(sensors={"cam": Sensor.from_camera(camera)})
+        for t in range(count):
+            image = cloudy(seed + t)
+            image[150:] = cloudy(7)[150:]
+            data.records_camera[t, "cam"] = f"{t}.png"
+            write_image(root / "sensors" / "records_data" / f"{t}.png", image)
+        write_sensors(root, data)
+        return KaptureFolder(root)
+
+    mapping = drive(tmp_path / "mapping", 12, 100)
+    query = drive(tmp_path / "query", 2, 200)
+    with pytest.raises(OptionError, match="camera cam: it has 2 images, and at least 10"):
+        run(query, tmp_path / "few", {"unchanging": True})
+    new, report = run(query, tmp_path / "new", {"unchanging": True}, sequences=[mapping])
+    mask = mask_of(new, "1.png")
+    assert mask is not None and not mask[150:].any() and mask[:140].all()
+    assert report.remarks == ()
+    assert report.masked["unchanging"] == pytest.approx(1 - mask.mean())
+
+
+def test_a_camera_without_bonnet_is_remarked(
+    small_kapture: Callable[..., KaptureFolder], tmp_path: Path
+) -> None:
+    folder = small_kapture({f"{k}.png": cloudy(k, 120, 160) for k in range(11)})
+    data = folder.read()
+    records = {(t, "cam0"): image for (t, _), image in data.records_camera.items()}
+    write_sensors(folder.root, replace(data, records_camera=records))
+    new, report = run(KaptureFolder(folder.root), tmp_path / "new", {"unchanging": True})
+    assert report.images_masked == 0
+    assert not (new.root / "sensors" / "masks").exists()
+    assert len(report.remarks) == 1 and "nothing stays the same" in report.remarks[0]
+
+
+def test_the_executor_changes_no_byte(
+    street: KaptureFolder,
+    tmp_path: Path,
+    two_processes: Executor,
+    folder_bytes: Callable[[Path], dict[str, bytes]],
+) -> None:
+    options: dict[str, Any] = {"max_size_px": 160, "undistort": True, "blank_pixels": 0.5}
+    masks = {"fixed": (FixedMask(camera="side", bottom_share=0.2),)}
+    run(street, tmp_path / "a", masks, **options)
+    run(street, tmp_path / "b", masks, **options, executor=two_processes)
+    first, second = folder_bytes(tmp_path / "a"), folder_bytes(tmp_path / "b")
+    assert first == second and "sensors/masks/side/2.jpg.png" in first
+
+
+def test_the_original_is_never_touched(street: KaptureFolder, tmp_path: Path) -> None:
+    before = {p: (p.read_bytes(), p.stat().st_mtime_ns) for p in street.root.rglob("*.*")}
+    out = tmp_path / "new"
+    run(street, out)
+    assert (out / "sensors" / "records_data").is_symlink()
+    # the second run writes images where the first left a link to the originals
+    new, _ = run(street, out, max_size_px=160)
+    assert image_size(new.image_path("front/0.png")) == (160, 96)
+    assert before == {p: (p.read_bytes(), p.stat().st_mtime_ns) for p in street.root.rglob("*.*")}
+
+
+def test_an_output_within_the_input_is_refused(street: KaptureFolder) -> None:
+    for place in (street.root, street.root / "sensors"):
+        with pytest.raises(OutputError, match="lies in the kapture that is read"):
+            run(street, place)
+
+
+def test_broken_inputs_are_named(street: KaptureFolder, tmp_path: Path) -> None:
+    numbers = itertools.count()
+
+    def refused(message: str, masks: dict[str, Any] | None = None, **options: Any) -> DataError:
+        with pytest.raises(DataError, match=message) as caught:
+            run(street, tmp_path / f"new{next(numbers)}", masks, **options)
+        return caught.value
+
+    mask = street.root / "sensors" / "masks" / "front/1.png.png"
+    content = mask.read_bytes()
+    write_image(mask, np.zeros((10, 20), np.uint8))
+    assert refused("mask is 20x10, its image 320x200").path == mask
+    mask.write_bytes(content[: len(content) // 2])
+    assert refused("not an image").path == mask
+    mask.write_bytes(content)
+    assert refused("no such mask", {"fixed": (FixedMask(camera="side", file="x.png"),)}).path
+    assert refused("no such folder of masks", {"user_masks": tmp_path / "absent"}).path
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    assert "front/0.png.png" in str(refused("no mask of any image", {"user_masks": empty}))
+    image = street.image_path("side/1.jpg")
+    picture = image.read_bytes()
+    image.write_bytes(picture[:-100])
+    assert refused("broken", undistort=True).path == image
+    write_image(image, cloudy(0, 90, 120))
+    for options in ({}, {"undistort": True}):
+        assert refused("image is 120x90, its camera says 240x180", **options).path == image
+    os.unlink(image)
+    assert refused("no such image").path == image
+    image.write_bytes(picture)
+    os.unlink(street.depth_path("depth/1.depth"))
+    assert "depth/1.depth" in str(refused("no such depth map", undistort=True))
+
+
+def test_an_uncalibrated_camera_is_refused(street: KaptureFolder, tmp_path: Path) -> None:
+    data = street.read()
+    data.sensors["side"] = Sensor("", "camera", ("UNKNOWN_CAMERA", "240", "180"))
+    write_sensors(street.root, data)
+    with pytest.raises(DataError, match="'side' of image 'side/0.jpg': camera is not calibrated"):
+        run(KaptureFolder(street.root), tmp_path / "new", undistort=True)
+
+
+def test_a_name_that_no_image_is_written_under(street: KaptureFolder, tmp_path: Path) -> None:
+    data = street.read()
+    data.records_camera[0, "front"] = "front/0.gif"
+    write_sensors(street.root, data)
+    street.image_path("front/0.png").rename(street.image_path("front/0.gif"))
+    folder = KaptureFolder(street.root)
+    run(folder, tmp_path / "linked", undistort=True)
+    with pytest.raises(DataError, match=r"'front/0.gif' changes, .*can be: \.png"):
+        run(folder, tmp_path / "new", max_size_px=160)
+
+
+@pytest.mark.parametrize(
+    ("labels", "message"),
+    [
+        (None, "segment returned None None"),
+        (np.zeros((4, 4), np.uint8), r"uint8 \(4, 4\), not uint8 \(200, 320\)"),
+        (np.zeros((200, 320), np.int64), r"segment returned int64"),
+        (np.full((200, 320), 3, np.uint8), "label 3, but there are 3 classes"),
+    ],
+)
+def test_what_a_segmenter_must_not_return(
+    street: KaptureFolder, tmp_path: Path, labels: Any, message: str
+) -> None:
+    with pytest.raises(PluginError, match=rf"'halves' on image front/0\.png: .*{message}"):
+        run(street, tmp_path / "new", segmenter=Returning(labels))
+
+
+def test_classes_that_nobody_knows(street: KaptureFolder, tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="no class 'bicycle'; it has: road, sky, car"):
+        run(street, tmp_path / "new", {"dynamic": ("car", "bicycle")}, segmenter=Halves())
+    with pytest.raises(OptionError, match="no segmenter"):
+        run(street, tmp_path / "new", {"dynamic": ("car",)})
+    with pytest.raises(PluginError, match="no plugin 'nobody'"):
+        run(street, tmp_path / "new", {"segmenter": {"name": "nobody"}})
