@@ -1,0 +1,388 @@
+"""SuperPoint and SuperGlue beside transformers' implementations, on the same random weights.
+
+    .venv/bin/python benchmarks/speed/superpoint_superglue.py
+    .venv/bin/python benchmarks/speed/superpoint_superglue.py --device cuda
+
+On a processor: seconds of both, in turns in one process, and whether their results agree; peak
+memory of a pair. On a GPU: scores there against those of the processor on weights whose attention
+is peaky, in float32 and in half precision, and images and pairs per second. Random weights cost
+what trained ones do, except that they find more candidates for keypoints.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import os
+import resource
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from timing import table
+from torch.nn import functional
+
+from megloc_kapture.features.superpoint import SuperPoint, SuperPointOptions
+from megloc_kapture.matching.superglue import SuperGlue, SuperGlueOptions
+from megloc_kapture.nets.runtime import Device, inference
+from megloc_kapture.nets.score_maps import select_pixels, suppress_non_maxima
+from megloc_kapture.nets.superglue import ImageKeypoints, SuperGlueNet, mutual_matches
+from megloc_kapture.nets.superpoint import SuperPointNet, pixel_scores, sample_descriptors
+from megloc_kapture.values import ImageFeatures
+
+WIDTH, HEIGHT = 1600, 1200
+THRESHOLD = 0.2
+CPU = torch.device("cpu")
+
+Weights = dict[str, torch.Tensor]
+
+
+@dataclass(frozen=True)
+class Seconds:
+    """Medians of one function. ``cpu`` (all threads) tells a busy machine from slow code."""
+
+    wall: float
+    cpu: float
+
+
+def in_turns(functions: dict[str, Callable[[], Any]], repeat: int) -> dict[str, Seconds]:
+    """Medians of each, one after the other ``repeat`` times; once before to warm up."""
+    wall: dict[str, list[float]] = {name: [] for name in functions}
+    cpu: dict[str, list[float]] = {name: [] for name in functions}
+    for turn in range(repeat + 1):
+        for name, function in functions.items():
+            start, cpu_start = time.perf_counter(), time.process_time()
+            function()
+            if turn > 0:
+                wall[name].append(time.perf_counter() - start)
+                cpu[name].append(time.process_time() - cpu_start)
+    return {n: Seconds(statistics.median(wall[n]), statistics.median(cpu[n])) for n in functions}
+
+
+def superpoint_weights() -> Weights:
+    torch.manual_seed(0)
+    net = SuperPointNet()
+    for name, value in net.named_parameters():
+        if name.endswith("weight"):
+            torch.nn.init.kaiming_normal_(value)  # activations keep their size with the depth
+    return net.state_dict()
+
+
+def superglue_weights() -> Weights:
+    """Attention that looks at few keypoints, and descriptors that correspond are found."""
+    torch.manual_seed(0)
+    weights = SuperGlueNet().state_dict()
+    for key, value in weights.items():
+        if value.ndim == 3:
+            value.normal_(std=value.shape[1] ** -0.5)
+        if ".proj.0." in key or ".proj.1." in key:
+            value.mul_(12.0)
+        elif ".mlp.3." in key:
+            value.mul_(0.2)
+    weights["final_proj.weight"] += 11.0 * torch.eye(256)[:, :, None]
+    return weights
+
+
+def random_pair(num: int, seed: int = 0) -> tuple[ImageFeatures, ImageFeatures]:
+    """Three quarters of the keypoints are seen twice."""
+    rng = np.random.default_rng(seed)
+    xy = rng.uniform(0, [WIDTH, HEIGHT], (2, num, 2))
+    descriptors = rng.standard_normal((2, num, 256))
+    scores = rng.uniform(0.01, 0.9, (2, num))
+    both = num * 3 // 4
+    xy[1, :both] = np.clip(xy[0, :both] + 20 * rng.standard_normal((both, 2)), 0, HEIGHT)
+    descriptors[1, :both] = descriptors[0, :both] + 0.7 * rng.standard_normal((both, 256))
+    descriptors /= np.linalg.norm(descriptors, axis=2, keepdims=True)
+    a, b = (
+        ImageFeatures(
+            np.column_stack([xy[k], scores[k]]).astype(np.float32),
+            descriptors[k].astype(np.float32),
+            WIDTH,
+            HEIGHT,
+        )
+        for k in (0, 1)
+    )
+    return a, b
+
+
+def random_image() -> torch.Tensor:
+    """Gray noise with structure at several scales, (1, 1, HEIGHT, WIDTH)."""
+    generator = torch.Generator().manual_seed(0)
+    image = torch.zeros(1, 1, HEIGHT, WIDTH)
+    for side in (4, 16, 64):
+        noise = torch.rand((1, 1, HEIGHT // side, WIDTH // side), generator=generator)
+        image += functional.interpolate(noise, size=(HEIGHT, WIDTH), mode="bicubic") / 3
+    return image.clamp(0, 1)
+
+
+def their_superpoint(weights: Weights, num: int) -> Any:
+    from transformers import SuperPointConfig, SuperPointForKeypointDetection
+
+    # without borders: transformers puts the right and the lower one outside the image
+    config = SuperPointConfig(max_keypoints=num, border_removal_distance=0)
+    model: Any = SuperPointForKeypointDetection(config)
+    model.eval()
+    # both list the same layers in the same order
+    model.load_state_dict(dict(zip(model.state_dict(), weights.values(), strict=True)))
+    return model
+
+
+def superpoint_rows(num: int, repeat: int) -> list[tuple[str, ...]]:
+    weights = superpoint_weights()
+    theirs = their_superpoint(weights, num)
+    ours = SuperPointNet().eval()
+    ours.load_state_dict(weights)
+    ours.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    gray = random_image()
+
+    def their_dense() -> tuple[torch.Tensor, torch.Tensor]:
+        features = theirs.encoder(gray)[0]
+        points, described = theirs.keypoint_decoder, theirs.descriptor_decoder
+        logits = points.conv_score_b(points.relu(points.conv_score_a(features)))
+        maps = described.conv_descriptor_b(described.relu(described.conv_descriptor_a(features)))
+        return pixel_scores(logits), functional.normalize(maps, dim=1)
+
+    def keypoints(
+        dense: tuple[torch.Tensor, torch.Tensor],
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        found = select_pixels(
+            suppress_non_maxima(dense[0][0], 4), threshold=0.005, max_keypoints=num
+        )
+        return found.xy, found.scores, sample_descriptors(dense[1][0], found.xy, "official")
+
+    with inference(CPU):
+        seconds = in_turns(
+            {
+                "theirs dense": their_dense,
+                "ours dense": lambda: ours(gray),
+                "theirs with our post-processing": lambda: keypoints(their_dense()),
+                "theirs": lambda: theirs(gray.expand(1, 3, -1, -1)),
+                "ours": lambda: keypoints(ours(gray)),
+            },
+            repeat,
+        )
+        dense = [(a - b).abs().max() for a, b in zip(their_dense(), ours(gray), strict=True)]
+        xy, scores, descriptors = keypoints(ours(gray))
+        expected = theirs(gray.expand(1, 3, -1, -1))
+    their_xy = (expected.keypoints[0] * torch.tensor([WIDTH, HEIGHT])).round().long()
+    same = _jaccard(xy.tolist(), their_xy.tolist())
+    ranked = (xy == their_xy).all(dim=1)  # others have scores that differ by the last bits
+    worst = (descriptors - expected.descriptors[0])[ranked].abs().max()
+    dense_text = f"scores differ by {dense[0]:.0e}, descriptors by {dense[1]:.0e}"
+    found_text = f"{len(xy)} keypoints, Jaccard {same:.4f}, descriptors differ by {worst:.0e}"
+    compared = (
+        ("dense", "theirs dense", "ours dense", dense_text),
+        ("post-processing ours in both", "theirs with our post-processing", "ours", ""),
+        ("each with its own", "theirs", "ours", found_text),
+    )
+    return [
+        _row(f"SuperPoint, {label}", seconds[a], seconds[b], text) for label, a, b, text in compared
+    ]
+
+
+def _row(label: str, theirs: Seconds, ours: Seconds, text: str) -> tuple[str, ...]:
+    return (
+        label,
+        f"{theirs.wall:.2f}",
+        f"{ours.wall:.2f}",
+        f"{ours.wall / theirs.wall:.2f}",
+        f"{theirs.cpu:.2f}",
+        f"{ours.cpu:.2f}",
+        f"{ours.cpu / theirs.cpu:.2f}",
+        text,
+    )
+
+
+def their_superglue(weights: Weights) -> Any:
+    from transformers import SuperGlueConfig, SuperGlueForKeypointMatching
+
+    by_head = torch.arange(256).view(64, 4).T.flatten()  # theirs are one after the other
+    names = {
+        "attn.proj.0": "attention.self.query",
+        "attn.proj.1": "attention.self.key",
+        "attn.proj.2": "attention.self.value",
+        "attn.merge": "attention.output.dense",
+        "mlp.0": "mlp.0.linear",
+        "mlp.1": "mlp.0.batch_norm",
+        "mlp.3": "mlp.1",
+        "final_proj": "final_projection.final_proj",
+        "kenc.encoder.12": "keypoint_encoder.encoder.4",
+    }
+    for layer in range(4):
+        names[f"kenc.encoder.{3 * layer}"] = f"keypoint_encoder.encoder.{layer}.linear"
+        names[f"kenc.encoder.{3 * layer + 1}"] = f"keypoint_encoder.encoder.{layer}.batch_norm"
+    renamed = {}
+    for key, value in weights.items():
+        value = value[:, :, 0] if value.ndim == 3 else value
+        if ".attn.proj." in key:
+            value = value[by_head]
+        elif key.endswith("merge.weight"):
+            value = value[:, by_head]
+        name = f".{key}"
+        for ours, theirs in names.items():
+            name = name.replace(f".{ours}.", f".{theirs}.")
+        renamed[name[1:]] = value
+    config: Any = SuperGlueConfig
+    model: Any = SuperGlueForKeypointMatching(
+        config(matching_threshold=THRESHOLD, attn_implementation="eager")
+    )
+    model.eval()
+    refused = model.load_state_dict(renamed, strict=False)
+    assert not refused.unexpected_keys
+    assert all(key.startswith("keypoint_detector.") for key in refused.missing_keys)
+    return model
+
+
+def superglue_row(num: int, repeat: int) -> tuple[str, ...]:
+    weights = superglue_weights()
+    theirs = their_superglue(weights)
+    ours = SuperGlueNet().eval()
+    ours.load_state_dict(weights)
+    pair = random_pair(num)
+    tables = torch.stack([torch.from_numpy(side.keypoints_px) for side in pair])
+    described = torch.stack([torch.from_numpy(side.descriptors) for side in pair])
+    half = torch.tensor([WIDTH, HEIGHT]) / 2
+    places = (tables[:, :, :2] - half) / (0.7 * WIDTH)
+    a, b = (ImageKeypoints(places[k], tables[k, :, 2], described[k]) for k in (0, 1))
+
+    def match() -> tuple[torch.Tensor, torch.Tensor]:
+        return mutual_matches(ours([(a, b)], 100)[0], THRESHOLD)
+
+    def their_match() -> Any:
+        return theirs._match_image_pair(
+            tables[None, :, :, :2], described[None], tables[None, :, :, 2], HEIGHT, WIDTH
+        )
+
+    with inference(CPU):
+        seconds = in_turns({"theirs": their_match, "ours": match}, repeat)
+        matches, scores = match()
+        partner, their_scores, _, _ = their_match()
+    rows = torch.nonzero(partner[0, 0] >= 0)[:, 0]
+    expected = torch.stack([rows, partner[0, 0, rows]], dim=1)
+    same = _jaccard(matches.tolist(), expected.tolist())
+    worst = (scores - their_scores[0, 0, matches[:, 0]]).abs().max()
+    text = f"{len(matches)} matches, Jaccard {same:.4f}, scores differ by {worst:.0e}"
+    return _row(f"SuperGlue, {num} keypoints", seconds["theirs"], seconds["ours"], text)
+
+
+def _jaccard(a: list[list[int]], b: list[list[int]]) -> float:
+    first, second = set(map(tuple, a)), set(map(tuple, b))
+    return len(first & second) / max(len(first | second), 1)
+
+
+def peak_memory_mb(num: int, threads: int) -> tuple[float, float]:
+    """Of a process of its own that matches one pair: before it, and the most it ever had."""
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        return pool.apply(_match_once, (num, threads))
+
+
+def _match_once(num: int, threads: int) -> tuple[float, float]:
+    torch.set_num_threads(threads)
+    with tempfile.TemporaryDirectory() as folder:
+        matcher = _plugins(Path(folder), "cpu", half=False)[1]
+        a, b = random_pair(num)
+        matcher.match(*random_pair(8))
+        before = _peak_mb()
+        matcher.match(a, b)
+        return before, _peak_mb()
+
+
+def _peak_mb() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def _plugins(folder: Path, device: Device, *, half: bool) -> tuple[SuperPoint, SuperGlue]:
+    points, glue = folder / "superpoint_v1.pth", folder / "superglue_outdoor.pth"
+    if not points.exists():
+        torch.save(superpoint_weights(), points)
+        torch.save(superglue_weights(), glue)
+    return (
+        SuperPoint(SuperPointOptions(weights=str(points), device=device, half_precision=half)),
+        SuperGlue(SuperGlueOptions(weights=str(glue), device=device, half_precision=half)),
+    )
+
+
+def on_gpu(num: int, repeat: int) -> None:
+    """Results of the GPU against the processor's, and both machines' speed, through the plugins."""
+    noise = (random_image()[0, 0].numpy() * 255).astype(np.uint8)
+    image = np.ascontiguousarray(np.repeat(noise[:, :, None], 3, axis=2))
+    a, b = random_pair(num)
+    others = [b, *(random_pair(num, seed)[1] for seed in range(1, 16))]
+    rows = [("", "images/s", "pairs/s", "keypoints", "matches", "scores differ by")]
+    with tempfile.TemporaryDirectory() as folder:
+        points, glue = _plugins(Path(folder), "cpu", half=False)
+        xy = points.extract(image).keypoints_px[:, :2].tolist()
+        matches, scores = glue.match(a, b)
+        confidence = dict(zip(map(tuple, matches.tolist()), scores.tolist(), strict=True))
+        kinds: tuple[tuple[str, Device, bool], ...] = (
+            ("processor", "cpu", False),
+            ("GPU", "cuda", False),
+            ("GPU, half precision", "cuda", True),
+        )
+        for label, device, half in kinds:
+            points, glue = _plugins(Path(folder), device, half=half)
+            many = others if device == "cuda" else others[:1]
+            seconds = in_turns(
+                {
+                    "image": partial(points.extract, image),
+                    "pairs": partial(glue.match_many, a, many),
+                },
+                repeat,
+            )
+            same_xy = _jaccard(points.extract(image).keypoints_px[:, :2].tolist(), xy)
+            found, values = glue.match(a, b)
+            pairs = zip(map(tuple, found.tolist()), values.tolist(), strict=True)
+            differ = [abs(value - confidence[key]) for key, value in pairs if key in confidence]
+            same = _jaccard(found.tolist(), matches.tolist())
+            rows.append(
+                (
+                    label,
+                    f"{1 / seconds['image'].wall:.1f}",
+                    f"{len(many) / seconds['pairs'].wall:.1f}",
+                    f"{same_xy:.4f}",
+                    f"{same:.4f}",
+                    f"{max(differ):.0e}",
+                )
+            )
+    print(
+        f"{WIDTH}x{HEIGHT}, {num} keypoints; keypoints and matches: Jaccard index to the processor"
+    )
+    print(table(rows))
+    print(f"peak memory on the GPU {torch.cuda.max_memory_allocated() / 2**20:.0f} MB")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    parser.add_argument("--keypoints", type=int, default=1500)
+    parser.add_argument("--repeat", type=int, default=5)
+    parser.add_argument("--threads", type=int, default=2)
+    options = parser.parse_args()
+    os.environ["HF_HUB_OFFLINE"] = "1"
+    torch.set_num_threads(options.threads)
+    if options.device == "cuda":
+        on_gpu(options.keypoints, options.repeat)
+        return
+    load = os.getloadavg()[0]
+    # first: a new process starts from what this one has
+    before, peak = peak_memory_mb(options.keypoints, options.threads)
+    rows: list[tuple[str, ...]] = [
+        ("seconds", "transformers", "ours", "ratio", "cpu", "ours", "ratio", "agreement")
+    ]
+    rows += superpoint_rows(options.keypoints, options.repeat)
+    rows.append(superglue_row(options.keypoints, options.repeat))
+    print(f"{WIDTH}x{HEIGHT}, {options.threads} threads, {options.repeat} turns")
+    print(table(rows))
+    print(f"peak memory of a SuperGlue pair {peak:.0f} MB, of these {before:.0f} before the pair")
+    print(f"load average {load:.1f} before, {os.getloadavg()[0]:.1f} after")
+
+
+if __name__ == "__main__":
+    main()

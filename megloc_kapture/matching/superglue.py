@@ -1,0 +1,127 @@
+"""SuperGlue (Sarlin et al., CVPR 2020) as a matcher of keypoints that carry a score."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import Field
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.weights import WeightsFile, find_weights, read_weights, sha256_of
+from megloc_kapture.nets.runtime import NetworkOptions, inference, pick_device
+from megloc_kapture.nets.superglue import (
+    ImageKeypoints,
+    SuperGlueNet,
+    mutual_matches,
+    normalise_keypoints,
+    superglue,
+)
+from megloc_kapture.values import ImageFeatures
+
+Matches = tuple[NDArray[np.int64], NDArray[np.float32]]
+
+# one after the other is fastest on a processor, where a pair fills all cores
+_PAIRS_AT_ONCE = {"cpu": 1, "cuda": 8}
+
+
+class SuperGlueOptions(NetworkOptions):
+    """Options of SuperGlue; threshold and iterations are the authors' own."""
+
+    weights: str = Field(
+        default="superglue_outdoor",
+        description="name or file: superglue_outdoor, superglue_indoor or one of the same layout",
+    )
+    match_threshold: float = Field(default=0.2, ge=0, lt=1, description="scores kept are larger")
+    sinkhorn_iterations: int = Field(default=100, gt=0)
+
+
+class SuperGlue:
+    """The matcher plugin ``superglue``.
+
+    Takes keypoints whose third column is the detector's score, and descriptors of the size that
+    the weights were trained with: 256, SuperPoint's, for the official ones.
+    """
+
+    Options = SuperGlueOptions
+
+    def __init__(self, options: SuperGlueOptions | None = None) -> None:
+        self.options = options or SuperGlueOptions()
+        self._weights = find_weights(self.options.weights)
+
+    def weights(self) -> dict[str, str]:
+        """sha256 of the checkpoint by its file's name."""
+        return {self._weights.path.name: sha256_of(self._weights)}
+
+    def match(self, a: ImageFeatures, b: ImageFeatures) -> Matches:
+        """Match two images.
+
+        Returns
+        -------
+        matches : int64 (K, 2), rows of a and b, sorted by a; each row at most once.
+        scores : float32 (K,), in (0, 1].
+
+        Raises
+        ------
+        DataError : keypoints without scores in (0, 1], or descriptors of another size.
+        """
+        return self.match_many(a, [b])[0]
+
+    def match_many(self, a: ImageFeatures, others: Sequence[ImageFeatures]) -> list[Matches]:
+        """Match one image with each of several; see :meth:`match`."""
+        options = self.options
+        device = pick_device(options.device)
+        net = _network(self._weights, device)
+        found: list[Matches] = [
+            (np.zeros((0, 2), np.int64), np.zeros(0, np.float32)) for _ in others
+        ]
+        with inference(device, options.half_precision):
+            side = self._keypoints(a, net, device)
+            sides = [self._keypoints(b, net, device) for b in others]
+            usable = [k for k, b in enumerate(sides) if len(side.scores) and len(b.scores)]
+            at_once = _PAIRS_AT_ONCE[device.type]
+            for start in range(0, len(usable), at_once):
+                chunk = usable[start : start + at_once]
+                assignments = net([(side, sides[k]) for k in chunk], options.sinkhorn_iterations)
+                for k, assignment in zip(chunk, assignments, strict=True):
+                    matches, scores = mutual_matches(assignment, options.match_threshold)
+                    found[k] = matches.cpu().numpy(), scores.cpu().numpy()
+        return found
+
+    def _keypoints(
+        self, image: ImageFeatures, net: SuperGlueNet, device: torch.device
+    ) -> ImageKeypoints:
+        table = np.asarray(image.keypoints_px, dtype=np.float32)
+        descriptors = np.asarray(image.descriptors, dtype=np.float32)
+        if table.ndim != 2 or table.shape[1] < 3:
+            raise DataError(
+                f"SuperGlue takes keypoints of x, y, score; these have the shape {table.shape}"
+            )
+        scores = table[:, 2]
+        if not ((scores > 0) & (scores <= 1)).all():
+            worst = scores[~((scores > 0) & (scores <= 1))][0]
+            raise DataError(
+                "SuperGlue takes the detector's score as third column of the keypoints, above 0 "
+                f"and up to 1; this one has {worst:g}"
+            )
+        if len(table) and descriptors.shape != (len(table), net.descriptor_size):
+            raise DataError(
+                f"{self._weights.name} takes descriptors of {net.descriptor_size} dimensions, one "
+                f"for each of {len(table)} keypoints; these have the shape {descriptors.shape}"
+            )
+        xy = torch.from_numpy(table[:, :2] - np.float32(0.5)).to(
+            device
+        )  # its first pixel is (0, 0)
+        return ImageKeypoints(
+            normalise_keypoints(xy, image.width, image.height),
+            torch.from_numpy(scores.copy()).to(device),
+            torch.from_numpy(np.array(descriptors, order="C")).to(device),
+        )
+
+
+@lru_cache(maxsize=2)
+def _network(weights: WeightsFile, device: torch.device) -> SuperGlueNet:
+    return superglue(read_weights(weights), str(weights.path)).eval().to(device)

@@ -1,0 +1,168 @@
+"""The SuperGlue plugin with random weights: what it feeds the network, and what it refuses."""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from megloc_kapture.errors import DataError, MeglocError
+from megloc_kapture.matching import superglue as module
+from megloc_kapture.matching.superglue import SuperGlue, SuperGlueOptions
+from megloc_kapture.nets.superglue import (
+    ImageKeypoints,
+    SuperGlueNet,
+    mutual_matches,
+    normalise_keypoints,
+    superglue,
+)
+from megloc_kapture.values import ImageFeatures
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Small and peaky: descriptors that correspond are found."""
+    torch.manual_seed(0)
+    net = SuperGlueNet(encoder_sizes=(16, 32, 64), num_layers=4)
+    with torch.no_grad():
+        for layer in net.gnn.layers:
+            layer.get_submodule("mlp.3").get_parameter("weight").mul_(0.5)
+        net.final_proj.weight.copy_(10 * torch.eye(64)[:, :, None])
+        net.bin_score.fill_(6.0)
+    path = tmp_path_factory.mktemp("weights") / "small.pth"
+    torch.save(net.state_dict(), path)
+    return path
+
+
+def matcher(weights: Path, **options: object) -> SuperGlue:
+    return SuperGlue(
+        SuperGlueOptions.model_validate({"weights": str(weights), "device": "cpu", **options})
+    )
+
+
+def unit(values: NDArray[np.float64]) -> NDArray[np.float32]:
+    return (values / np.linalg.norm(values, axis=1, keepdims=True)).astype(np.float32)
+
+
+def image(num: int, seed: int) -> ImageFeatures:
+    rng = np.random.default_rng(seed)
+    xy = rng.integers(0, [640, 480], (num, 2)) + 0.5
+    table = np.column_stack([xy, rng.uniform(0.01, 1, num)]).astype(np.float32)
+    return ImageFeatures(table, unit(rng.standard_normal((num, 64))), 640, 480)
+
+
+def seen_again(first: ImageFeatures, num: int, seed: int) -> ImageFeatures:
+    """Half of it is new, in another order, in an image of another size."""
+    rng = np.random.default_rng(seed)
+    other = image(num, seed + 100)
+    half = num // 2
+    table, descriptors = other.keypoints_px.copy(), other.descriptors.copy()
+    table[:half] = first.keypoints_px[:half]
+    noise = rng.standard_normal((half, 64)) / 8
+    descriptors[:half] = unit(first.descriptors[:half] + 0.3 * noise)
+    order = rng.permutation(num)
+    return ImageFeatures(table[order], descriptors[order], 800, 500)
+
+
+def test_it_is_the_network_on_normalised_integer_pixels(weights: Path) -> None:
+    a = image(80, 0)
+    b = seen_again(a, 60, 1)
+    matches, scores = matcher(weights).match(a, b)
+    net = superglue(torch.load(weights, weights_only=True), "w").eval()
+    sides = [
+        ImageKeypoints(
+            normalise_keypoints(
+                torch.from_numpy(side.keypoints_px[:, :2]) - 0.5, side.width, side.height
+            ),
+            torch.from_numpy(side.keypoints_px[:, 2]),
+            torch.from_numpy(side.descriptors),
+        )
+        for side in (a, b)
+    ]
+    with torch.inference_mode():
+        expected, expected_scores = mutual_matches(net([(sides[0], sides[1])], 100)[0], 0.2)
+    np.testing.assert_array_equal(matches, expected.numpy())
+    np.testing.assert_array_equal(scores, expected_scores.numpy())
+    assert matches.dtype == np.int64 and scores.dtype == np.float32
+    right = (a.keypoints_px[matches[:, 0]] == b.keypoints_px[matches[:, 1]]).all(axis=1)
+    assert right.sum() == 30  # all that are seen twice
+    assert len(matches) < 50
+    assert (np.diff(matches[:, 0]) > 0).all()
+    assert len(set(matches[:, 1].tolist())) == len(matches)
+    assert scores.min() > 0.2
+    strict, _ = matcher(weights, match_threshold=float(np.median(scores))).match(a, b)
+    assert 0 < len(strict) < len(matches)
+
+
+def test_many_are_each_alone(weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    a = image(80, 0)
+    others = [seen_again(a, 60, 1), image(0, 2), seen_again(a, 90, 3), image(1, 4)]
+    plugin = matcher(weights)
+    alone = [plugin.match(a, other) for other in others]
+    # as on a GPU
+    monkeypatch.setitem(module._PAIRS_AT_ONCE, "cpu", 3)
+    for (matches, scores), found in zip(alone, plugin.match_many(a, others), strict=True):
+        np.testing.assert_array_equal(found[0], matches)
+        np.testing.assert_allclose(found[1], scores, atol=1e-5)
+    assert len(alone[0][0]) > 15 and len(alone[2][0]) > 15
+    assert plugin.match_many(a, []) == []
+
+
+def test_no_keypoints_no_matches(weights: Path) -> None:
+    for a, b in ((image(0, 0), image(9, 1)), (image(9, 1), image(0, 0))):
+        matches, scores = matcher(weights).match(a, b)
+        assert matches.shape == (0, 2) and matches.dtype == np.int64
+        assert scores.shape == (0,) and scores.dtype == np.float32
+    nothing = ImageFeatures(np.zeros((0, 3), np.float32), np.zeros((0, 0)), 640, 480)
+    assert len(matcher(weights).match(nothing, image(9, 1))[0]) == 0
+
+
+def test_half_precision_keeps_the_matches(weights: Path) -> None:
+    a = image(80, 0)
+    b = seen_again(a, 60, 1)
+    whole, _ = matcher(weights).match(a, b)
+    half, scores = matcher(weights, half_precision=True).match(a, b)
+    assert scores.dtype == np.float32
+    both = set(map(tuple, whole.tolist())) & set(map(tuple, half.tolist()))
+    either = set(map(tuple, whole.tolist())) | set(map(tuple, half.tolist()))
+    assert len(both) / len(either) > 0.9
+
+
+def test_what_it_cannot_use_is_named(weights: Path) -> None:
+    good = image(9, 0)
+    plugin = matcher(weights)
+    bare = ImageFeatures(good.keypoints_px[:, :2], good.descriptors, 640, 480)
+    with pytest.raises(DataError, match=r"x, y, score.*\(9, 2\)"):
+        plugin.match(good, bare)
+    for value in (0.0, 1.5, -0.2, np.nan):
+        table = good.keypoints_px.copy()
+        table[4, 2] = value
+        with pytest.raises(DataError, match=f"score as third column.*has {value:g}"):
+            plugin.match(ImageFeatures(table, good.descriptors, 640, 480), good)
+    short = ImageFeatures(good.keypoints_px, good.descriptors[:, :32], 640, 480)
+    with pytest.raises(DataError, match=r"small\.pth.*64 dimensions.*\(9, 32\)"):
+        plugin.match(good, short)
+
+
+def test_the_same_from_a_worker_and_which_file(weights: Path) -> None:
+    a = image(30, 0)
+    b = seen_again(a, 30, 1)
+    plugin = matcher(weights)
+    sent = pickle.dumps(plugin)
+    assert len(sent) < 5000  # no network
+    assert pickle.loads(sent).match(a, b)[1].tobytes() == plugin.match(a, b)[1].tobytes()
+    assert plugin.weights() == {"small.pth": hashlib.sha256(weights.read_bytes()).hexdigest()}
+
+
+def test_weights_that_are_missing_or_do_not_fit(tmp_path: Path) -> None:
+    with pytest.raises(MeglocError, match="nowhere"):
+        matcher(tmp_path / "nowhere.pth")
+    path = tmp_path / "wrong.pth"
+    torch.save({"bin_score": torch.tensor(1.0)}, path)
+    with pytest.raises(DataError, match=r"wrong\.pth: .*338 missing keys"):
+        matcher(path).match(image(3, 0), image(3, 1))

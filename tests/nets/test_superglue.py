@@ -1,0 +1,282 @@
+"""SuperGlue against transformers' on the same random weights, and its symmetries.
+
+The weights are peaky: attention looks at few keypoints, and descriptors that correspond are found,
+so that a wrong head, a wrong mask or a lost message changes the matches.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch.nn import functional
+from transformers import SuperGlueConfig, SuperGlueForKeypointMatching
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.nets.superglue import (
+    ImageKeypoints,
+    SuperGlueNet,
+    mutual_matches,
+    normalise_keypoints,
+    superglue,
+)
+
+KEYS = Path(__file__).parent / "keys" / "superglue.txt"
+WIDTH, HEIGHT = 640, 480
+THRESHOLD = 0.2
+
+
+def peaky_weights(seed: int = 0) -> dict[str, torch.Tensor]:
+    """Under the official keys and shapes."""
+    generator = torch.Generator().manual_seed(seed)
+    found = {}
+    for row in KEYS.read_text().splitlines():
+        key, shape = row.split()
+        sizes = [] if shape == "scalar" else [int(size) for size in shape.split("x")]
+        value = torch.randn(sizes, generator=generator)
+        if len(sizes) == 3:
+            value *= sizes[1] ** -0.5
+        elif ".1.weight" in key or key.endswith("running_var"):
+            value = 0.5 + torch.rand(sizes, generator=generator)
+        else:
+            value *= 0.1
+        if ".proj.0." in key or ".proj.1." in key:
+            value *= 12.0  # queries and keys
+        elif ".mlp.3." in key:
+            value *= 0.2
+        found[key] = value
+    found["bin_score"] = torch.tensor(2.0)
+    found["final_proj.weight"] = found["final_proj.weight"] + 7.0 * torch.eye(256)[:, :, None]
+    return found
+
+
+def random_image(num: int, seed: int, size: int = 256) -> ImageKeypoints:
+    generator = torch.Generator().manual_seed(seed)
+    descriptors = functional.normalize(torch.randn((num, size), generator=generator), dim=1)
+    pixels = torch.rand((num, 2), generator=generator) * torch.tensor([WIDTH - 1.0, HEIGHT - 1.0])
+    scores = 0.05 + 0.9 * torch.rand(num, generator=generator)
+    return ImageKeypoints(normalise_keypoints(pixels, WIDTH, HEIGHT), scores, descriptors)
+
+
+def seen_again(image: ImageKeypoints, num: int, num_new: int, seed: int) -> ImageKeypoints:
+    """Another view of the first keypoints, moved and noisy, with others among them."""
+    generator = torch.Generator().manual_seed(seed)
+    new = random_image(num_new, seed + 1000)
+    noise = torch.randn((num, 256), generator=generator) / 16
+    order = torch.randperm(num + num_new, generator=generator)
+    moved = image.xy[:num] + 0.02 * torch.randn((num, 2), generator=generator)
+    noisy = functional.normalize(image.descriptors[:num] + 0.7 * noise, dim=1)
+    return ImageKeypoints(
+        torch.cat([moved, new.xy])[order],
+        torch.cat([image.scores[:num], new.scores])[order],
+        torch.cat([noisy, new.descriptors])[order],
+    )
+
+
+def transformers_model(
+    weights: dict[str, torch.Tensor], *, by_head: bool = True
+) -> SuperGlueForKeypointMatching:
+    """With the weights under its own names, and its heads one after the other."""
+    # row h * 64 + d of its projections is row d * 4 + h of the official ones
+    order = torch.arange(256).view(64, 4).T.flatten() if by_head else torch.arange(256)
+    renamed = {}
+    for key, value in weights.items():
+        name, value = key, value.squeeze(-1) if value.ndim == 3 else value
+        if ".attn.proj." in key:
+            value = value[order]
+        elif key.endswith(".attn.merge.weight"):
+            value = value[:, order]
+        if key.startswith("kenc.encoder."):
+            index, kind = key.removeprefix("kenc.encoder.").split(".")
+            layer, part = divmod(int(index), 3)
+            part_name = "" if layer == 4 else (".linear", ".batch_norm")[part]
+            name = f"keypoint_encoder.encoder.{layer}{part_name}.{kind}"
+        for ours, theirs in (
+            ("attn.proj.0", "attention.self.query"),
+            ("attn.proj.1", "attention.self.key"),
+            ("attn.proj.2", "attention.self.value"),
+            ("attn.merge", "attention.output.dense"),
+            ("mlp.0", "mlp.0.linear"),
+            ("mlp.1", "mlp.0.batch_norm"),
+            ("mlp.3", "mlp.1"),
+        ):
+            name = name.replace(f".{ours}.", f".{theirs}.")
+        if key.startswith("final_proj."):
+            name = f"final_projection.{key}"
+        renamed[name] = value
+    config = SuperGlueConfig(matching_threshold=THRESHOLD, attn_implementation="eager")
+    model = SuperGlueForKeypointMatching(config).eval()
+    own = {k for k in model.state_dict() if not k.startswith("keypoint_detector.")}
+    assert own == set(renamed)
+    model.load_state_dict(renamed, strict=False)
+    return model
+
+
+def transformers_matches(
+    model: SuperGlueForKeypointMatching, a: ImageKeypoints, b: ImageKeypoints
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Partner in b of each keypoint of a, -1 without; and scores."""
+    half = torch.tensor([WIDTH, HEIGHT]) / 2
+    matches, scores, _, _ = model._match_image_pair(
+        torch.stack([image.xy * 0.7 * WIDTH + half for image in (a, b)])[None],
+        torch.stack([a.descriptors, b.descriptors])[None],
+        torch.stack([a.scores, b.scores])[None],
+        HEIGHT,
+        WIDTH,
+    )
+    return matches[0, 0], scores[0, 0]
+
+
+def partners(assignment: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """As :func:`transformers_matches` has it."""
+    matches, scores = mutual_matches(assignment, THRESHOLD)
+    partner = torch.full((len(assignment) - 1,), -1)
+    values = torch.zeros(len(assignment) - 1)
+    partner[matches[:, 0]], values[matches[:, 0]] = matches[:, 1], scores
+    return partner, values
+
+
+def network(seed: int = 0) -> SuperGlueNet:
+    return superglue(peaky_weights(seed), "w.pth").eval()
+
+
+def test_keys_and_shapes_are_the_official_ones() -> None:
+    rows = [row.split() for row in KEYS.read_text().splitlines()]
+    net = SuperGlueNet()
+    shapes = {
+        key: "x".join(map(str, value.shape)) if value.ndim else "scalar"
+        for key, value in net.state_dict().items()
+    }
+    assert shapes == dict(rows)
+    assert len(rows) == 339
+    assert sum(parameter.numel() for parameter in net.parameters()) == 12_023_297
+
+
+@torch.inference_mode()
+@pytest.mark.parametrize("seed", [0, 1])
+def test_matches_are_transformers(seed: int) -> None:
+    a = random_image(150, seed)
+    b = seen_again(a, 110, 40, seed)
+    weights = peaky_weights(seed)
+    partner, scores = partners(network(seed)([(a, b)], 100)[0])
+    expected, expected_scores = transformers_matches(transformers_model(weights), a, b)
+    found = partner >= 0
+    assert 40 < found.sum() < 150  # some match and some do not
+    assert partner.tolist() == expected.tolist()
+    torch.testing.assert_close(scores, expected_scores * found, rtol=0, atol=1e-5)
+    # heads in the wrong order are another network
+    interleaved = transformers_model(weights, by_head=False)
+    _, other_scores = transformers_matches(interleaved, a, b)
+    assert (other_scores - scores).abs().max() > 0.05
+
+
+@torch.inference_mode()
+def test_pairs_of_any_sizes_together_are_each_alone() -> None:
+    net = network()
+    a = random_image(150, 0)
+    pairs = [
+        (a, seen_again(a, 110, 40, 0)),
+        (a, random_image(1, 2)),
+        (random_image(3, 3), a),
+        (a, seen_again(a, 60, 30, 4)),
+    ]
+    together = net(pairs, 100)
+    for pair, found in zip(pairs, together, strict=True):
+        alone = net([pair], 100)[0]
+        assert found.shape == alone.shape == (len(pair[0].scores) + 1, len(pair[1].scores) + 1)
+        torch.testing.assert_close(found.exp(), alone.exp(), rtol=1e-4, atol=1e-5)
+        matches, _ = mutual_matches(found, THRESHOLD)
+        assert torch.equal(matches, mutual_matches(alone, THRESHOLD)[0])
+    assert len(mutual_matches(together[0], THRESHOLD)[0]) > 30
+
+
+@torch.inference_mode()
+def test_order_of_keypoints_and_of_images_does_not_matter() -> None:
+    net = network()
+    a = random_image(90, 5)
+    b = seen_again(a, 70, 20, 6)
+    whole = net([(a, b)], 100)[0]
+    order = torch.randperm(90, generator=torch.Generator().manual_seed(0))
+    shuffled = ImageKeypoints(b.xy[order], b.scores[order], b.descriptors[order])
+    found = net([(a, shuffled)], 100)[0]
+    torch.testing.assert_close(
+        found[:-1, :-1].exp(), whole[:-1, :-1][:, order].exp(), atol=1e-5, rtol=0
+    )
+    swapped = net([(b, a)], 500)[0]
+    whole = net([(a, b)], 500)[0]  # the columns are normalised last, which fades
+    torch.testing.assert_close(swapped.T[:-1, :-1].exp(), whole[:-1, :-1].exp(), atol=5e-3, rtol=0)
+    matches, _ = mutual_matches(swapped, THRESHOLD)
+    expected, _ = mutual_matches(whole, THRESHOLD)
+    assert len(expected) > 20
+    assert sorted(matches.flip(1).tolist()) == expected.tolist()
+
+
+@torch.inference_mode()
+def test_float32_is_float64() -> None:
+    a = random_image(90, 7)
+    b = seen_again(a, 70, 20, 8)
+    single = network()([(a, b)], 100)[0]
+    doubled = [
+        ImageKeypoints(image.xy.double(), image.scores.double(), image.descriptors.double())
+        for image in (a, b)
+    ]
+    net = network().double()
+    sides = net([(doubled[0], doubled[1])], 100)[0]
+    torch.testing.assert_close(single.double().exp(), sides.exp(), rtol=1e-4, atol=1e-4)
+
+
+@torch.inference_mode()
+def test_half_precision_ends_before_the_transport() -> None:
+    net = network()
+    a = random_image(150, 9)
+    b = seen_again(a, 110, 40, 10)
+    whole = net([(a, b)], 100)[0]
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        half = net([(a, b)], 100)[0]
+    assert half.dtype == torch.float32
+    assert not torch.equal(half, whole)
+    # the columns come last, so they are normalised to float32's precision
+    torch.testing.assert_close(half.exp().sum(0)[:-1], torch.ones(150), rtol=0, atol=1e-4)
+    agreeing = (partners(half)[0] == partners(whole)[0]).float().mean()
+    assert agreeing > 0.95
+
+
+def test_sizes_come_from_the_checkpoint() -> None:
+    small = SuperGlueNet(encoder_sizes=(16, 32, 128), num_layers=4)
+    net = superglue(small.state_dict(), "w.pth").eval()
+    assert net.descriptor_size == 128
+    a, b = random_image(20, 0, 128), random_image(30, 1, 128)
+    with torch.inference_mode():
+        expected = small.eval()([(a, b)], 20)[0]
+        torch.testing.assert_close(net([(a, b)], 20)[0], expected, rtol=0, atol=0)
+
+
+def test_a_checkpoint_that_does_not_fit_is_named() -> None:
+    weights = peaky_weights()
+    del weights["gnn.layers.7.mlp.1.running_mean"]
+    with pytest.raises(DataError, match=r"w\.pth: .*missing keys: gnn\.layers\.7\.mlp\.1\.running"):
+        superglue(weights, "w.pth")
+    with pytest.raises(DataError, match=r"w\.pth: .*unexpected keys: conv1a"):
+        superglue({"conv1a.weight": torch.zeros(3)}, "w.pth")
+
+
+def test_keypoints_are_normalised_by_centre_and_larger_side() -> None:
+    corners = torch.tensor([[0.0, 0.0], [640.0, 480.0], [320.0, 240.0]])
+    found = normalise_keypoints(corners, 640, 480)
+    expected = torch.tensor([[-320.0, -240.0], [320.0, 240.0], [0.0, 0.0]]) / 448
+    torch.testing.assert_close(found, expected)
+
+
+def test_matches_are_mutual_and_above_the_threshold() -> None:
+    confidences = torch.tensor(
+        [
+            [0.90, 0.30, 0.00, 0.00],
+            [0.85, 0.20, 0.00, 0.00],  # its best column prefers the first row
+            [0.00, 0.00, 0.10, 0.90],  # its own best, but too weak
+            [0.00, 0.00, 0.05, 0.00],
+        ]
+    )
+    matches, scores = mutual_matches((confidences + 1e-9).log(), 0.2)
+    assert matches.tolist() == [[0, 0]]
+    assert scores.tolist() == pytest.approx([0.9])

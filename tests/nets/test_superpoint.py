@@ -1,0 +1,229 @@
+"""SuperPoint against transformers' on the same random weights, and against answers by hand."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+import torch
+from torch.nn import functional
+from transformers import SuperPointConfig, SuperPointForKeypointDetection
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.nets.score_maps import select_pixels, suppress_non_maxima
+from megloc_kapture.nets.superpoint import (
+    DescriptorSampling,
+    SplitSuperPoint,
+    SuperPointNet,
+    pixel_scores,
+    sample_descriptors,
+    superpoint,
+    superpoint_with_descriptor,
+)
+
+KEYS = Path(__file__).parent / "keys" / "superpoint.txt"
+BACKBONE = ("conv1", "conv2", "conv3", "conv4")
+
+
+def random_weights(seed: int) -> dict[str, torch.Tensor]:
+    """Under the official keys and shapes; activations neither vanish nor grow with the depth."""
+    generator = torch.Generator().manual_seed(seed)
+    found = {}
+    for row in KEYS.read_text().splitlines():
+        key, shape = row.split()
+        sizes = [int(size) for size in shape.split("x")]
+        fan_in = sizes[1] * sizes[2] * sizes[3] if len(sizes) == 4 else 100
+        found[key] = torch.randn(sizes, generator=generator) * (2 / fan_in) ** 0.5
+    return found
+
+
+def random_gray(height: int, width: int, seed: int = 0) -> torch.Tensor:
+    return torch.rand((1, 1, height, width), generator=torch.Generator().manual_seed(seed))
+
+
+def transformers_model(
+    weights: dict[str, torch.Tensor], **options: float
+) -> SuperPointForKeypointDetection:
+    """With the weights under its own names."""
+    names = {
+        "convPa": "keypoint_decoder.conv_score_a",
+        "convPb": "keypoint_decoder.conv_score_b",
+        "convDa": "descriptor_decoder.conv_descriptor_a",
+        "convDb": "descriptor_decoder.conv_descriptor_b",
+    }
+    for block in range(4):
+        for letter in "ab":
+            names[f"conv{block + 1}{letter}"] = f"encoder.conv_blocks.{block}.conv_{letter}"
+    model = SuperPointForKeypointDetection(SuperPointConfig(**options)).eval()
+    renamed = {}
+    for key, value in weights.items():
+        layer, kind = key.split(".")
+        renamed[f"{names[layer]}.{kind}"] = value
+    model.load_state_dict(renamed)
+    return model
+
+
+def test_keys_and_shapes_are_the_official_ones() -> None:
+    rows = [row.split() for row in KEYS.read_text().splitlines()]
+    state = SuperPointNet().state_dict()
+    shapes = {key: "x".join(map(str, value.shape)) for key, value in state.items()}
+    assert shapes == dict(rows)
+    assert len(rows) == 24
+    assert sum(value.numel() for value in state.values()) == 1_300_865
+
+
+@torch.inference_mode()
+def test_dense_outputs_are_transformers() -> None:
+    weights = random_weights(0)
+    model = transformers_model(weights, nms_radius=0)
+    gray = random_gray(88, 136)
+    scores, descriptors = superpoint(weights, "w.pth").eval()(gray)
+    features = model.encoder(gray)[0]
+    expected = model.keypoint_decoder._get_pixel_scores(features)
+    assert scores.std() > 0.1 * scores.mean()  # not the same everywhere
+    torch.testing.assert_close(scores, expected, rtol=0, atol=1e-6)
+    decoder = model.descriptor_decoder
+    expected = decoder.conv_descriptor_b(decoder.relu(decoder.conv_descriptor_a(features)))
+    expected = functional.normalize(expected, dim=1)
+    torch.testing.assert_close(descriptors, expected, rtol=0, atol=1e-6)
+
+
+@torch.inference_mode()
+def test_keypoints_and_descriptors_are_transformers() -> None:
+    weights = random_weights(1)
+    # transformers finds the right and lower border eight times too far away: without borders
+    settings = {"nms_radius": 3, "keypoint_threshold": 0.02, "max_keypoints": 150}
+    model = transformers_model(weights, border_removal_distance=0, **settings)
+    gray = random_gray(120, 168)
+    expected = model(gray.expand(1, 3, -1, -1))
+    scores, descriptors = superpoint(weights, "w.pth").eval()(gray)
+    found = select_pixels(
+        suppress_non_maxima(scores[0], 3), threshold=0.02, border=0, max_keypoints=150
+    )
+    xy = (expected.keypoints[0] * torch.tensor([168, 120])).round().long()
+    assert len(found.xy) == 150
+    assert found.xy.tolist() == xy.tolist()
+    torch.testing.assert_close(found.scores, expected.scores[0], rtol=0, atol=1e-6)
+    sampled = sample_descriptors(descriptors[0], found.xy, "official")
+    torch.testing.assert_close(sampled, expected.descriptors[0], rtol=0, atol=1e-5)
+
+
+@torch.inference_mode()
+@pytest.mark.parametrize("size", [(63, 70), (64, 65), (66, 64), (130, 67), (131, 64), (197, 80)])
+def test_any_size_and_strips_make_no_difference(size: tuple[int, int]) -> None:
+    weights = random_weights(2)
+    gray = random_gray(*size)
+    scores, descriptors = superpoint(weights, "w.pth").eval()(gray)
+    assert scores.shape == (1, size[0] // 8 * 8, size[1] // 8 * 8)
+    assert descriptors.shape == (1, 256, size[0] // 8, size[1] // 8)
+    model = transformers_model(weights, nms_radius=0)
+    expected = model.keypoint_decoder._get_pixel_scores(model.encoder(gray)[0])
+    torch.testing.assert_close(scores, expected, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("channel", range(0, 65, 7))
+def test_a_hot_channel_is_its_pixel_of_the_cell(channel: int) -> None:
+    logits = torch.zeros(1, 65, 3, 4)
+    logits[0, channel, 1, 2] = 50.0
+    scores = pixel_scores(logits)[0]
+    hot = torch.nonzero(scores > 0.9).tolist()
+    assert hot == ([[8 + channel // 8, 16 + channel % 8]] if channel < 64 else [])
+    assert scores[8:16, 16:24].sum() == pytest.approx(float(channel < 64), abs=1e-6)
+    assert scores[0, 0] == pytest.approx(1 / 65)
+
+
+def cells_at(
+    xy: torch.Tensor, height: int, width: int, sampling: DescriptorSampling
+) -> torch.Tensor:
+    """Where in cells descriptors are read: a map that is linear in the cell gives it away."""
+    v, u = torch.meshgrid(torch.arange(height) + 1.0, torch.arange(width) + 1.0, indexing="ij")
+    sampled = sample_descriptors(torch.stack([u, v, torch.ones_like(u)]), xy, sampling)
+    torch.testing.assert_close(sampled.norm(dim=1), torch.ones(len(xy)))
+    return sampled[:, :2] / sampled[:, 2:] - 1
+
+
+def test_exact_sampling_reads_a_linear_map() -> None:
+    x = torch.arange(4, 80 - 4)
+    xy = torch.stack([x, torch.full_like(x, 20)], dim=1)
+    found = cells_at(xy, 6, 10, "exact")
+    torch.testing.assert_close(found, (xy - 3.5) / 8, rtol=0, atol=1e-5)
+
+
+def test_official_sampling_drifts_by_its_formula() -> None:
+    height, width = 75, 100
+    x = torch.tensor([4, 100, 400, 799])
+    y = torch.tensor([4, 75, 300, 599])
+    found = cells_at(torch.stack([x, y], dim=1), height, width, "official")
+    expected = torch.stack(
+        [
+            (x - 3.5) * (width - 1) / (8 * width - 4.5),
+            (y - 3.5) * (height - 1) / (8 * height - 4.5),
+        ],
+        dim=1,
+    )
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-4)
+    drift_px = 8 * (found[-1, 0] - (799 - 3.5) / 8)
+    assert drift_px == pytest.approx(-3.5, abs=0.05)
+
+
+def test_no_keypoints_no_descriptors() -> None:
+    empty = torch.zeros((0, 2), dtype=torch.int64)
+    assert sample_descriptors(torch.ones(256, 3, 4), empty, "official").shape == (0, 256)
+
+
+def parts(weights: dict[str, torch.Tensor], *prefixes: str) -> dict[str, torch.Tensor]:
+    return {key: value for key, value in weights.items() if key.startswith(prefixes)}
+
+
+@torch.inference_mode()
+@pytest.mark.parametrize("kept", [(*BACKBONE, "convD"), ("conv",)])
+def test_a_descriptor_network_of_its_own(kept: tuple[str, ...]) -> None:
+    frozen, tuned = random_weights(3), random_weights(4)
+    net = superpoint_with_descriptor(
+        frozen, parts(tuned, *kept), detector_where="a.pth", descriptor_where="b.pth"
+    )
+    assert isinstance(net, SplitSuperPoint)
+    gray = random_gray(40, 48)
+    scores, descriptors = net.eval()(gray)
+    assert torch.equal(scores, superpoint(frozen, "a.pth").eval()(gray)[0])
+    assert torch.equal(descriptors, superpoint(tuned, "b.pth").eval()(gray)[1])
+
+
+@torch.inference_mode()
+def test_a_descriptor_head_on_the_detectors_features() -> None:
+    frozen, tuned = random_weights(3), random_weights(4)
+    net = superpoint_with_descriptor(
+        parts(frozen, *BACKBONE, "convP"),
+        parts(tuned, "convD"),
+        detector_where="a.pth",
+        descriptor_where="b.pth",
+    )
+    gray = random_gray(40, 48)
+    scores, descriptors = net.eval()(gray)
+    whole = superpoint(frozen, "a.pth").eval()
+    assert torch.equal(scores, whole(gray)[0])
+    head = SuperPointNet(detector=False).eval()
+    head.load_state_dict({**parts(frozen, *BACKBONE), **parts(tuned, "convD")})
+    assert torch.equal(descriptors, head.describe(whole.encode(gray)))
+    assert not torch.allclose(descriptors, whole(gray)[1], atol=0.1)
+
+
+def test_a_checkpoint_that_does_not_fit_is_named() -> None:
+    weights = random_weights(5)
+    lacking = {key: value for key, value in weights.items() if key != "convDb.bias"}
+    with pytest.raises(DataError, match=r"w\.pth: .*1 missing keys: convDb\.bias$"):
+        superpoint(lacking, "w.pth")
+    with pytest.raises(DataError, match=r"a\.pth: .*convPa\.bias"):
+        superpoint_with_descriptor(
+            parts(weights, *BACKBONE), weights, detector_where="a.pth", descriptor_where="b.pth"
+        )
+    for wrong in (
+        parts(weights, "conv4", "convD"),  # half a backbone
+        parts(weights, *BACKBONE),
+        {**parts(weights, "convD"), "scale": torch.ones(1)},
+    ):
+        with pytest.raises(DataError, match=re.escape("b.pth: ")):
+            superpoint_with_descriptor(
+                weights, wrong, detector_where="a.pth", descriptor_where="b.pth"
+            )
