@@ -1,4 +1,4 @@
-"""Images inside a page: small JPEGs as data addresses, and two side by side with their matches."""
+"""Images inside a page: small ones as data addresses, points on them, matches between them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Picture:
     ----------
     width, height : of the small image, pixels.
     scale : small pixels per pixel of the original.
-    address : ``data:image/jpeg;base64,...``.
+    address : ``data:image/jpeg;base64,...`` or the same of a PNG.
     """
 
     width: int
@@ -41,16 +41,30 @@ def small_picture(path: Path, *, width: int, height: int) -> Picture:
     ------
     DataError : the image is missing or broken.
     """
+    return data_picture(*shrunk(read_image_rgb(path), width=width, height=height))
+
+
+def shrunk(
+    pixels: NDArray[np.uint8], *, width: int, height: int
+) -> tuple[NDArray[np.uint8], float]:
+    """Pixels (H, W, 3) made to fit into ``width`` x ``height``, never larger; and the scale."""
     import cv2  # only a report with images waits for it
 
-    pixels = read_image_rgb(path)
     scale = min(width / pixels.shape[1], height / pixels.shape[0], 1.0)
     size = (max(round(pixels.shape[1] * scale), 1), max(round(pixels.shape[0] * scale), 1))
-    small = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
-    bgr = np.ascontiguousarray(small[:, :, ::-1])
-    encoded = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
+    return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8), scale
+
+
+def data_picture(pixels: NDArray[np.uint8], scale: float, *, lossless: bool = False) -> Picture:
+    """Pixels (H, W, 3) RGB as a JPEG, or as a PNG where they are to stay as they are."""
+    import cv2
+
+    bgr = np.ascontiguousarray(pixels[:, :, ::-1])
+    options = [] if lossless else [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
+    kind = "png" if lossless else "jpeg"
+    encoded = cv2.imencode(f".{kind}", bgr, options)[1]
     text = base64.b64encode(encoded.tobytes()).decode("ascii")
-    return Picture(size[0], size[1], scale, f"data:image/jpeg;base64,{text}")
+    return Picture(pixels.shape[1], pixels.shape[0], scale, f"data:image/{kind};base64,{text}")
 
 
 def image_tag(picture: Picture, name: str) -> Markup:
@@ -95,6 +109,18 @@ def side_by_side(
             'fill="none"/>'
         )
     return Markup("".join([*parts, "</svg>"]))
+
+
+def dotted(picture: Picture, points_px: NDArray[np.float64], color: str, name: str) -> Markup:
+    """A picture in an ``<svg>`` with a dot for each point (N, 2), pixels of the original image."""
+    # a line of no length with round ends is a dot; as one path it is half as long as circles
+    dots = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in (points_px * picture.scale).tolist())
+    return Markup(
+        f'<svg viewBox="0 0 {picture.width} {picture.height}" width="{picture.width}" '
+        f'height="{picture.height}" role="img" aria-label="{escape(name)}">'
+        f'{_placed(picture, 0)}<path d="{dots}" stroke="{color}" '
+        'stroke-width="2" stroke-linecap="round" fill="none"/></svg>'
+    )
 
 
 def _placed(picture: Picture, x: int) -> str:

@@ -14,6 +14,7 @@ from megloc_kapture.evaluation import figures, tables
 from megloc_kapture.evaluation.evaluate import Evaluation, QueryResult
 from megloc_kapture.evaluation.figure_above import views_of_evaluation
 from megloc_kapture.evaluation.gallery import exhibits
+from megloc_kapture.evaluation.mask_pictures import mask_pictures
 from megloc_kapture.evaluation.page import render_page
 from megloc_kapture.evaluation.recall import within
 from megloc_kapture.evaluation.surroundings import Surroundings
@@ -48,7 +49,7 @@ def render_report(
     ----------
     map_poses : ``cam_from_world`` of the map's images, for the view from above.
     provenance : options, preset, inputs: plain JSON data, shown at the end with the versions.
-    around : where the images and matches of the worst queries are.
+    around : where the images, masks and matches of queries are.
     """
     inliers = figures.errors_against_inliers(evaluation)
     rows = worst_first(evaluation)
@@ -65,6 +66,7 @@ def render_report(
         inliers=None if inliers is None else Markup(inliers),
         views=views_of_evaluation(evaluation, map_poses, frames),
         exhibits=exhibits(worst_queries(evaluation), around, map_poses or {}),
+        masks=mask_pictures([] if around is None else around.masked),
         rows=rows[:_MAX_ROWS],
         num_hidden=max(len(rows) - _MAX_ROWS, 0),
         has_conditions=any(query.condition for query in evaluation.queries),

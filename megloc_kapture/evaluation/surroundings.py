@@ -13,8 +13,12 @@ from megloc_kapture.values import RigidTransform
 
 # parts of a workspace; datasets and the pipeline write them
 # the map's own keypoints are what queries were matched with; before there is one, its images do
-_MAPS, _QUERY, _QUERY_MATCHES = ("map", "mapping"), "query", "matches/query"
+_MAPS = ("map", "preprocessed/mapping", "mapping")
+_QUERY, _QUERY_MATCHES = "query", "matches/query"
+_QUERY_PYRAMID, _MAPPING_PYRAMID = "pyramid/query", "pyramid/mapping"
 _SENSORS = "sensors/sensors.txt"
+# images that were prepared for features, with masks; keypoints stand in their pixels
+_PREPARED, _ROLES, _MASKS = "preprocessed", ("mapping", "query"), "sensors/masks"
 
 
 @dataclass(frozen=True)
@@ -27,12 +31,14 @@ class Surroundings:
     mapping : images, cameras and poses of the map.
     frames : map image or query -> its coordinate frame, where a dataset has several.
     clusters : query -> the clusters of candidates it was tried in.
+    masked : folders whose images have masks, with the keypoints that were found in them.
     """
 
     queries: KaptureFolder | None = None
     mapping: KaptureFolder | None = None
     frames: Mapping[str, str] = field(default_factory=dict)
     clusters: Mapping[str, Sequence[ClusterRow]] = field(default_factory=dict)
+    masked: Sequence[KaptureFolder] = ()
 
     def map_poses(self) -> dict[str, RigidTransform]:
         """``cam_from_world`` of the map's images; empty without a map.
@@ -82,8 +88,16 @@ def surroundings_of(result: Path | str, *, mapping: Path | str | None = None) ->
     """
     clusters = Path(result) / CLUSTERS_FILE
     workspace = workspace_of(result)
-    features = [] if workspace is None else [workspace, workspace / _QUERY_MATCHES]
-    candidates = [Path(result)] if workspace is None else [workspace / _QUERY, Path(result)]
+    features = []
+    if workspace is not None:
+        # where pairs with few matches were tried again, those matches hold
+        pyramids = sorted((workspace / _QUERY_PYRAMID).glob("*"))
+        maps = sorted((workspace / _MAPPING_PYRAMID).glob("*"))
+        features = [workspace, *pyramids, *maps, workspace / _QUERY_MATCHES]
+    candidates = [Path(result)]
+    if workspace is not None:
+        # the keypoints stand in the images that features were extracted from
+        candidates = [workspace / _PREPARED / _QUERY, workspace / _QUERY, Path(result)]
     queries = next((place for place in candidates if (place / _SENSORS).is_file()), None)
     map_place = None if mapping is None else Path(mapping)
     if map_place is None and workspace is not None:
@@ -95,4 +109,15 @@ def surroundings_of(result: Path | str, *, mapping: Path | str | None = None) ->
         mapping=None if map_place is None else KaptureFolder(map_place, features_dirs=features),
         frames={image: group.frame for image, group in groups.items() if group.frame},
         clusters=read_clusters(clusters) if clusters.is_file() else {},
+        masked=[] if workspace is None else _masked(workspace),
     )
+
+
+def _masked(workspace: Path) -> list[KaptureFolder]:
+    found = []
+    for role in _ROLES:
+        prepared = workspace / _PREPARED / role
+        folder = prepared if (prepared / _SENSORS).is_file() else workspace / role
+        if (folder / _MASKS).is_dir() and (folder / _SENSORS).is_file():
+            found.append(KaptureFolder(folder, features_dirs=[workspace]))
+    return found

@@ -8,6 +8,7 @@ from typing import Any
 from megloc_kapture.evaluation.figure_above import views_without_truth
 from megloc_kapture.evaluation.figure_style import colors_of
 from megloc_kapture.evaluation.gallery import exhibits
+from megloc_kapture.evaluation.mask_pictures import mask_pictures
 from megloc_kapture.evaluation.page import render_page
 from megloc_kapture.evaluation.surroundings import Surroundings
 from megloc_kapture.evaluation.without_truth import WithoutTruth
@@ -44,4 +45,5 @@ def render_without_truth(
             exhibits(doubtful_queries(result), place, map_poses or {})
             for result, place in zip(found.results, places, strict=True)
         ],
+        masks=[mask_pictures(place.masked) for place in places],
     )

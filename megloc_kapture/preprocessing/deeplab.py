@@ -1,0 +1,101 @@
+"""DeepLabV3+ trained on Cityscapes as a segmenter: people and vehicles are what moves."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import Field
+
+from megloc_kapture.io.weights import WeightsFile, find_weights, read_weights, sha256_of
+from megloc_kapture.nets.deeplabv3plus import DeepLabV3Plus, backbone_of, most_likely
+from megloc_kapture.nets.loading import load_strictly
+from megloc_kapture.nets.runtime import NetworkOptions, image_tensor, inference, pick_device
+
+# by train id, as cityscapesScripts numbers them
+CITYSCAPES_CLASSES = (
+    "road",
+    "sidewalk",
+    "building",
+    "wall",
+    "fence",
+    "pole",
+    "traffic light",
+    "traffic sign",
+    "vegetation",
+    "terrain",
+    "sky",
+    "person",
+    "rider",
+    "car",
+    "truck",
+    "bus",
+    "train",
+    "motorcycle",
+    "bicycle",
+)
+# Cityscapes' categories human and vehicle
+CITYSCAPES_DYNAMIC = frozenset(CITYSCAPES_CLASSES[11:])
+
+
+class DeepLabOptions(NetworkOptions):
+    """Options of DeepLabV3+."""
+
+    weights: str = Field(
+        default="deeplabv3plus-resnet101",
+        description="deeplabv3plus-resnet101, deeplabv3plus-mobilenet, or a file; the backbone "
+        "is read from its keys",
+    )
+    max_size_px: int = Field(
+        default=2048,
+        ge=64,
+        description="longer side that the network sees (a Cityscapes image's); it bounds memory",
+    )
+
+
+class DeepLab:
+    """Cityscapes' 19 classes of an image, at the image's own size."""
+
+    name = "deeplabv3plus"
+    classes = CITYSCAPES_CLASSES
+    dynamic = CITYSCAPES_DYNAMIC
+    Options = DeepLabOptions
+
+    def __init__(self, options: DeepLabOptions | None = None) -> None:
+        self.options = options or DeepLabOptions()
+        self._weights = find_weights(self.options.weights)
+
+    def weights(self) -> dict[str, str]:
+        """The checkpoint's name and sha256."""
+        return {self._weights.name: sha256_of(self._weights)}
+
+    def segment(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Labels uint8 (H, W), indices into ``classes``, of an RGB image, uint8 (H, W, 3).
+
+        Raises
+        ------
+        DataError : the checkpoint does not fit.
+        OptionError : the device that is asked for is not there.
+        """
+        height, width = image.shape[:2]
+        scale = self.options.max_size_px / max(height, width)
+        if scale < 1:
+            size = (max(round(width * scale), 1), max(round(height * scale), 1))
+            image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+        device = pick_device(self.options.device)
+        network = _network(self._weights, device)
+        with inference(device, self.options.half_precision):
+            logits = network(image_tensor(image, device))[0].float()
+            return most_likely(logits, height, width).cpu().numpy()
+
+
+@lru_cache(maxsize=2)
+def _network(weights: WeightsFile, device: torch.device) -> DeepLabV3Plus:
+    tensors = read_weights(weights)
+    where = str(weights.path)
+    network = DeepLabV3Plus(backbone_of(tensors, where), num_classes=len(CITYSCAPES_CLASSES))
+    load_strictly(network, tensors, where)
+    return network.eval().to(device)

@@ -1,0 +1,1 @@
+"""ESPNetv2, trained on Cityscapes, for who segments without a large network."""

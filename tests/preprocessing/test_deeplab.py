@@ -1,0 +1,112 @@
+"""DeepLabV3+ as a segmenter: its checkpoint, its labels, and sizes beyond the network's."""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.nets.deeplabv3plus import Backbone, DeepLabV3Plus
+from megloc_kapture.preprocessing.deeplab import DeepLab, DeepLabOptions
+
+
+def smooth_noise() -> np.ndarray:
+    noise = np.random.default_rng(0).integers(0, 256, (12, 17, 3), dtype=np.uint8)
+    return cv2.resize(noise, (171, 123), interpolation=cv2.INTER_CUBIC)
+
+
+def checkpoint(path: Path, backbone: Backbone = "mobilenet") -> Path:
+    """Random weights in the container they are published in."""
+    torch.manual_seed(0)
+    network = DeepLabV3Plus(backbone, num_classes=19)
+    # statistics of what it sees, without which one class would win everywhere
+    for part in network.modules():
+        if isinstance(part, torch.nn.BatchNorm2d):
+            part.momentum = 1.0
+    with torch.no_grad():
+        image = torch.from_numpy(smooth_noise()).permute(2, 0, 1)[None].float() / 255
+        network.train()(torch.cat([image, 1 - image]))
+    torch.save({"cur_itrs": 30000, "model_state": network.state_dict(), "best_score": 0.7}, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return checkpoint(tmp_path_factory.mktemp("weights") / "mobilenet.pth")
+
+
+@pytest.fixture(scope="module")
+def photograph() -> np.ndarray:
+    return smooth_noise()
+
+
+def deeplab(weights: Path, **options: object) -> DeepLab:
+    return DeepLab(DeepLabOptions(weights=str(weights), device="cpu", **options))
+
+
+def test_labels_are_the_networks_at_the_images_size(weights: Path, photograph: np.ndarray) -> None:
+    labels = deeplab(weights).segment(photograph)
+    assert labels.shape == (123, 171) and labels.dtype == np.uint8
+    assert len(np.unique(labels)) > 3
+    # the same by the steps that the publication describes
+    network = DeepLabV3Plus("mobilenet", num_classes=19).eval()
+    network.load_state_dict(torch.load(weights, weights_only=True)["model_state"])
+    with torch.inference_mode():
+        small = network(torch.from_numpy(photograph).permute(2, 0, 1)[None].float() / 255)
+        large = torch.nn.functional.interpolate(
+            small, size=(123, 171), mode="bilinear", align_corners=False
+        )
+    assert np.array_equal(labels, large[0].argmax(0).numpy())
+
+
+def test_the_backbone_is_read_from_the_checkpoint(tmp_path: Path, photograph: np.ndarray) -> None:
+    resnet = checkpoint(tmp_path / "any-name.pth", "resnet101")
+    labels = deeplab(resnet).segment(photograph[:64, :80])
+    assert labels.shape == (64, 80) and labels.max() < 19
+
+
+def test_a_larger_image_is_made_smaller_and_its_labels_are_not(
+    weights: Path, photograph: np.ndarray
+) -> None:
+    large = cv2.resize(photograph, (342, 246), interpolation=cv2.INTER_NEAREST)
+    labels = deeplab(weights, max_size_px=171).segment(large)
+    assert labels.shape == (246, 342)
+    # each pixel of the small image is four equal ones of the large
+    small = deeplab(weights).segment(photograph)
+    doubled = cv2.resize(small, (342, 246), interpolation=cv2.INTER_NEAREST)
+    assert (labels == doubled).mean() > 0.9
+    # with all its pixels the network would see other things
+    assert (deeplab(weights).segment(large) == doubled).mean() < 0.7
+
+
+def test_people_and_vehicles_move() -> None:
+    assert len(DeepLab.classes) == len(set(DeepLab.classes)) == 19
+    # train ids of cityscapesScripts
+    assert [DeepLab.classes.index(c) for c in ("road", "sky", "person", "car")] == [0, 10, 11, 13]
+    assert DeepLab.dynamic == {
+        *("person", "rider", "car", "truck", "bus", "train", "motorcycle", "bicycle")
+    }
+
+
+def test_it_travels_light_and_names_its_weights(weights: Path, photograph: np.ndarray) -> None:
+    segmenter = deeplab(weights)
+    expected = segmenter.segment(photograph)
+    packed = pickle.dumps(segmenter)
+    assert len(packed) < 10_000
+    assert np.array_equal(pickle.loads(packed).segment(photograph), expected)
+    assert segmenter.weights() == {
+        "mobilenet.pth": hashlib.sha256(weights.read_bytes()).hexdigest()
+    }
+
+
+def test_a_checkpoint_of_something_else_is_refused(tmp_path: Path, photograph: np.ndarray) -> None:
+    path = tmp_path / "other.pth"
+    torch.save({"model_state": {"conv1a.weight": torch.zeros(64, 1, 3, 3)}}, path)
+    with pytest.raises(DataError, match=r"other\.pth: no DeepLabV3\+"):
+        deeplab(path).segment(photograph)
