@@ -362,7 +362,7 @@ DEPTH_SETTINGS: tuple[tuple[str, dict[str, Any]], ...] = (
 def depth(root: Path, workspace: Path, seeds: Sequence[int], assignments: Sequence[str]) -> str:
     """The table of a finished workspace; medians and recalls are means over the seeds."""
     options = options_of_preset(assignments=assignments)
-    local_type = options.make_extractor().name
+    local_type = options.main_type()
     query = KaptureFolder(
         workspace / "query", features_dirs=[workspace, workspace / "matches" / "query"]
     )

@@ -19,6 +19,7 @@ from megloc_kapture.io.kapture_store import KaptureFolder
 from megloc_kapture.io.point_covariances import read_point_covariances
 from megloc_kapture.mapping.uncertainty import point_deviations
 from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
+from megloc_kapture.plugins import LOCAL_FEATURES, PluginChoice, load_plugin
 
 _COLUMN = 18
 _QUANTILES = (0.1, 0.5, 0.9)
@@ -67,16 +68,14 @@ class Info(Common):
         errors = ", ".join(f"{name} {value:.3f} px" for name, value in origin.error_px.items())
         line(console, "pixel origin", f"{origin.intrinsics}: {origin.reason}")
         line(console, "", f"median reprojection error by origin: {errors}")
-        extractor = opened.extractor_name()
+        found = opened.extractor()
         line(console, "localizing with", opened.local_type)
-        line(console, "map descriptors", describe_descriptors(opened, extractor))
         line(
             console,
-            "query features",
-            f"extracted by plugin {extractor}, or given in kapture"
-            if extractor
-            else f"must be given in kapture: no extractor for {opened.local_type} is installed",
+            "map descriptors",
+            describe_descriptors(opened, None if found is None else found.name),
         )
+        line(console, "query features", describe_extraction(opened.local_type, found))
         own = "VLAD over the map's descriptors"
         types = opened.global_types()
         line(
@@ -130,6 +129,17 @@ def describe_refinement(console: Console, folder: KaptureFolder) -> None:
         at = np.quantile(known, _QUANTILES)
         text = ", ".join(f"{100 * q:g} %: {d:.3g}" for q, d in zip(_QUANTILES, at, strict=True))
         line(console, "", f"largest deviation for 1 px in the images, {text}")
+
+
+def describe_extraction(local_type: str, extractor: PluginChoice | None) -> str:
+    """Where features of queries can come from, in words."""
+    if extractor is None:
+        return f"must be given in kapture: no extractor for {local_type} is installed"
+    try:
+        load_plugin(LOCAL_FEATURES, extractor.name, extractor.options)
+    except MeglocError as error:
+        return f"must be given in kapture; plugin {extractor.name} could extract them, but {error}"
+    return f"extracted by plugin {extractor.name}, or given in kapture"
 
 
 def describe_descriptors(opened: KaptureMap, extractor: str | None) -> str:

@@ -25,8 +25,9 @@ from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder, read_pairs, write_pairs
 from megloc_kapture.io.outputs import staged_output
 from megloc_kapture.pipeline.executors import available_cores, open_executor, single_threaded
-from megloc_kapture.pipeline.presets import DEFAULT_PRESET, PipelineOptions, options_of_preset
-from megloc_kapture.plugins import LOCAL_FEATURES, load_plugin
+from megloc_kapture.pipeline.options import PipelineOptions
+from megloc_kapture.pipeline.presets import DEFAULT_PRESET, options_of_preset
+from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS, load_plugin
 from megloc_kapture.stages.global_vlad import extract_vlad, vlad_type
 from megloc_kapture.stages.image_pairs import PairingMethod, pair_map_images, pair_queries
 from megloc_kapture.stages.local_features import extract_local_features
@@ -69,8 +70,8 @@ class ExtractLocal(_StageCommand):
     """Kapture folder; may be repeated (map and queries)."""
     output: Output
     """Features folder: local_features/T/{keypoints,descriptors}."""
-    features: tuple[str, ...] = ("rootsift",)
-    """Extractor plugins."""
+    features: tuple[str, ...] = ()
+    """Extractor plugins; those of the preset unless given."""
     force: Force = False
     """Write into a folder that has other things in it."""
 
@@ -78,18 +79,28 @@ class ExtractLocal(_StageCommand):
         """Run it."""
         console = self.console()
         folders = _folders(self.input)
-        chosen = self.options().local_features
-        extractors = [
-            load_plugin(LOCAL_FEATURES, name, chosen.options if name == chosen.name else {})
-            for name in self.features
-        ]
+        options = self.options()
+        chosen = {one.name: one.options for one in options.local_features}
+        names = self.features or tuple(chosen)
+        extractors = [load_plugin(LOCAL_FEATURES, name, chosen.get(name, {})) for name in names]
         with self.features_folder(self.output, force=self.force) as (out, executor):
             for extractor in extractors:
                 counts = extract_local_features(
-                    folders, extractor, out, executor=executor, track=console.track
+                    folders,
+                    extractor,
+                    out,
+                    mask_margin_px=options.mask_margin_px,
+                    executor=executor,
+                    track=console.track,
                 )
                 console.say(
                     f"{extractor.name}: {counts['keypoints']} keypoints, {counts['images']} images"
+                    + (
+                        f"; masks of {counts['images_with_mask']} images removed "
+                        f"{counts['keypoints_masked']}"
+                        if "images_with_mask" in counts
+                        else ""
+                    )
                 )
         return 0
 
@@ -256,6 +267,10 @@ class Match(_StageCommand):
         local_type = _only_type(mapping, "descriptors", self.features)
         changes: dict[str, object] = {"matching": {"name": self.matcher}} if self.matcher else {}
         options = self.options(changes)
+        if self.matcher:  # also where the preset has another one for this type
+            matcher = load_plugin(MATCHERS, self.matcher, options.matching.options)
+        else:
+            matcher = options.make_matcher(local_type)
         first, verification = mapping, options.verify_mapping()
         if self.query is not None:
             first = KaptureFolder(self.query, features_dirs=existing(self.features_dir))
@@ -268,7 +283,7 @@ class Match(_StageCommand):
                 mapping,
                 pairs,
                 local_type,
-                options.make_matcher(),
+                matcher,
                 verification,
                 out,
                 executor=executor,

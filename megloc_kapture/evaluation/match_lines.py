@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from megloc_kapture.evaluation.surroundings import Surroundings
 from megloc_kapture.geometry.cameras import bearing_rays, focal_px
 from megloc_kapture.io.kapture_store import FeatureReader, MatchesReader
+from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.values import Camera, RigidTransform
 
 # how far a match may lie beside its epipolar line and still fit
@@ -47,7 +48,10 @@ class StoredMatches:
         if queries is None or mapping is None:
             return
         drawn = set(queries.types("keypoints")) & set(mapping.types("keypoints"))
-        for name in queries.types("matches"):
+        # those of a guided pyramid hold the others
+        for name in sorted(
+            queries.types("matches"), key=lambda name: (base_type(name) == name, name)
+        ):
             if name in drawn:
                 self._matches = queries.matches(name)
                 self._keypoints = (queries.keypoints(name), mapping.keypoints(name))

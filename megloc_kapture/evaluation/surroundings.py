@@ -91,9 +91,9 @@ def surroundings_of(result: Path | str, *, mapping: Path | str | None = None) ->
     features = []
     if workspace is not None:
         # where pairs with few matches were tried again, those matches hold
-        pyramids = sorted((workspace / _QUERY_PYRAMID).glob("*"))
-        maps = sorted((workspace / _MAPPING_PYRAMID).glob("*"))
-        features = [workspace, *pyramids, *maps, workspace / _QUERY_MATCHES]
+        pyramids = [workspace / name for name in (_QUERY_PYRAMID, _MAPPING_PYRAMID)]
+        there = [folder for folder in pyramids if folder.is_dir()]
+        features = [workspace, *there, workspace / _QUERY_MATCHES]
     candidates = [Path(result)]
     if workspace is not None:
         # the keypoints stand in the images that features were extracted from

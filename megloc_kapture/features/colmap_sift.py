@@ -66,12 +66,16 @@ class ColmapSift:
         )
         # several orientations at one place keep their order
         order = np.argsort(-keypoints[:, 2], kind="stable")
+        num_masked = 0
         if mask is not None and masked:
             last = np.array(mask.shape[::-1]) - 1
             column, row = np.clip(keypoints[order, :2].astype(np.int64), 0, last).T
-            order = order[mask[row, column]][: options.max_keypoints]
+            allowed = mask[row, column]
+            num_masked = int((~allowed).sum())
+            order = order[allowed][: options.max_keypoints]
         return LocalFeatures(
             np.ascontiguousarray(keypoints[order, :2]),
             np.ascontiguousarray(keypoints[order, 2]),
             descriptors[order],
+            num_masked,
         )

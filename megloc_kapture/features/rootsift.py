@@ -74,13 +74,15 @@ class RootSift:
                 np.zeros((0, 2), np.float32),
                 np.zeros(0, np.float32),
                 np.zeros((0, self.descriptor_size), np.float32),
+                num_masked=len(keypoints) - len(order),
             )
+        num_masked = len(keypoints) - len(order)
         order = order[: options.max_keypoints]
         xy = np.array([keypoints[k].pt for k in order], dtype=np.float32)
         scores = np.array([keypoints[k].response for k in order], dtype=np.float32)
         # OpenCV puts the centre of the first pixel at (0, 0), COLMAP at (0.5, 0.5)
         values = np.asarray(descriptors[order], dtype=np.float32)
-        return LocalFeatures(xy + np.float32(0.5), scores, root_sift(values))
+        return LocalFeatures(xy + np.float32(0.5), scores, root_sift(values), num_masked)
 
 
 def _is_on(mask: NDArray[np.bool_], keypoint: cv2.KeyPoint) -> bool:

@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.folders import evaluate_folders, results_without_truth
 from megloc_kapture.evaluation.outputs import write_evaluation
 from megloc_kapture.evaluation.provenance import package_versions
 from megloc_kapture.evaluation.rules import read_rules
 from megloc_kapture.evaluation.surroundings import surroundings_of
 from megloc_kapture.evaluation.without_truth_outputs import write_without_truth
-from megloc_kapture.io.atomic import write_bytes
 from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder, read_pairs, write_pairs
-from megloc_kapture.io.side_tables import SIDE_TABLES, Protocol
-from megloc_kapture.pipeline.datasets import ProtocolChange, with_model
-from megloc_kapture.pipeline.manifests import FileHashes
-from megloc_kapture.pipeline.map_plan import check_given, map_images, matched_images, plan_map
+from megloc_kapture.io.side_tables import SIDE_TABLES
+from megloc_kapture.pipeline.datasets import with_model
+from megloc_kapture.pipeline.image_plan import plan_images
+from megloc_kapture.pipeline.map_plan import (
+    map_images,
+    matched_images,
+    matching_used,
+    plan_map,
+)
 from megloc_kapture.pipeline.plan import Stage
 from megloc_kapture.pipeline.run import (
     EVALUATION,
@@ -32,18 +35,15 @@ from megloc_kapture.pipeline.run import (
     QUERY_GT,
     QUERY_MATCHES,
     QUERY_PAIRS,
-    REFERENCE,
+    QUERY_PYRAMID,
     SUBMISSIONS,
     TIMING,
     Run,
 )
 from megloc_kapture.pipeline.submission import write_submission
-from megloc_kapture.pipeline.workspace import HASHES
-from megloc_kapture.plugins import LocalFeatureExtractor
-from megloc_kapture.stages.given_map import has_descriptors
 from megloc_kapture.stages.global_vlad import extract_vlad, vlad_type
+from megloc_kapture.stages.guided_pyramid import pyramid_queries
 from megloc_kapture.stages.image_pairs import pair_queries
-from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.localized_folder import write_localized
 from megloc_kapture.stages.matches import iterate_candidates, match_pairs
 from megloc_kapture.stages.query_poses import localize_from_matches
@@ -58,22 +58,24 @@ def plan_evaluation(run: Run) -> list[Stage]:
     MeglocError : the dataset or the options cannot be used; nothing has been written by then.
     """
     options = run.options
-    options.make_matcher()
+    for local_type in options.local_types():
+        options.make_matcher(local_type)
     options.localization.make_ranker()
     given = options.uses_given_map()
+    if given and options.changes_frames():
+        raise OptionError(
+            f"map = {options.map}: the given map's keypoints are in the original images; "
+            "pre-processing may mask them, but not resize or undistort"
+        )
+    if options.matches_again() and options.verification == "none":
+        raise OptionError(
+            "guided pyramid matching counts verified matches; verification = none has none"
+        )
     if given:
         run = replace(run, source=with_model(run.source))
     dump = options.model_dump(mode="json")
     stages = [
-        *_dataset_stages(run),
-        Stage(
-            "local_features",
-            1,
-            _features_used(run, dump),
-            ("import",),
-            ("local_features",),
-            lambda out: _local_features(run, out),
-        ),
+        *plan_images(run, dump),
         Stage(
             "global_features",
             1,
@@ -87,7 +89,7 @@ def plan_evaluation(run: Run) -> list[Stage]:
             "query_pairs",
             2,
             {"query_pairs": dump["query_pairs"]},
-            ("import", "global_features"),
+            ("import", run.images_stage, "global_features"),
             (QUERY_PAIRS,),
             lambda out: _query_pairs(run, out),
         ),
@@ -96,19 +98,28 @@ def plan_evaluation(run: Run) -> list[Stage]:
             2,
             {
                 "local_types": options.local_types(),
-                "matching": dump["matching"],
+                "matching": matching_used(run, options.local_types()),
                 "verification": dump["verification"],
                 "two_view": dump["query_verification"],
             },
-            ("import", "local_features", "query_pairs", *(["map"] if given else [])),
+            (run.images_stage, "local_features", "query_pairs", *(["map"] if given else [])),
             (QUERY_MATCHES,),
             lambda out: _query_matches(run, out),
         ),
+        *(_pyramid_stages(run, dump) if options.matches_again() else ()),
         Stage(
             "localization",
             3,
             {"localization": dump["localization"]},
-            ("import", "local_features", "map", "query_pairs", "query_matches"),
+            (
+                "import",
+                run.images_stage,
+                "local_features",
+                "map",
+                "query_pairs",
+                "query_matches",
+                *(["query_pyramid"] if options.matches_again() else []),
+            ),
             (LOCALIZED, TIMING),
             lambda out: _localization(run, out),
         ),
@@ -132,94 +143,12 @@ def plan_evaluation(run: Run) -> list[Stage]:
     return stages
 
 
-def _features_used(run: Run, dump: Mapping[str, Any]) -> dict[str, Any]:
-    """Options of the features that are extracted at all."""
-    used = {"local_features": dump["local_features"]} if run.options.makes_points() else {}
-    if run.options.uses_given_map():
-        used["given_features"] = dump["given_features"]
-    return used
-
-
-def _dataset_stages(run: Run) -> list[Stage]:
-    """Import, behind rendering where the dataset is made rather than given."""
-
-    def change(given: Protocol) -> Protocol:
-        if given.dataset == Protocol().dataset:
-            given = given.model_copy(update={"dataset": run.dataset})
-        return given if run.benchmark is None else run.benchmark.change(given)
-
-    source = run.source
-    outputs = (MAPPING, QUERY, QUERY_GT, SIDE_TABLES, REFERENCE)
-    wanted = None if run.benchmark is None else run.benchmark.change(Protocol())
-    settings = {**source.settings(), "protocol": wanted and wanted.model_dump(mode="json")}
-    render = source.renderer(run.executor, run.track)
-    if render is not None:
-        world = run.workspace.path("world")
-        return [
-            Stage("render", 1, source.render_options(), (), ("world",), render),
-            Stage(
-                "import",
-                2,
-                settings,
-                ("render",),
-                outputs,
-                lambda out: _import(run, world, out, change),
-            ),
-        ]
-    if source.root is None:
-        raise ValueError("a run needs a root or something that renders one")
-    source.check()
-    root = source.root.resolve()
-    remembered = run.workspace.path(HASHES)
-    hashes = FileHashes(remembered)
-    content = hashes.of_files(root, source.input_files(root))
-    write_bytes(remembered, (json.dumps(hashes.content()) + "\n").encode())
-    external = {"dataset files": content, "dataset root": str(root)}
-    return [
-        Stage(
-            "import",
-            2,
-            settings,
-            (),
-            outputs,
-            lambda out: _import(run, root, out, change),
-            external,
-        )
-    ]
-
-
-def _import(run: Run, root: Path, out: Path, change: ProtocolChange) -> dict[str, float]:
-    counts = run.source.import_to(root, out, change)
-    if not counts["queries"]:
-        raise DataError("no query image is left to localize", path=root)
-    return counts
-
-
-def _local_features(run: Run, out: Path) -> dict[str, int]:
-    mapping, query = run.workspace.folder(MAPPING), run.workspace.folder(QUERY)
-    work: list[tuple[LocalFeatureExtractor, list[KaptureFolder]]] = []
-    if run.options.makes_points():
-        work.append((run.options.make_extractor(), [mapping, query]))
-    if run.options.uses_given_map():
-        check_given(run)
-        described = has_descriptors(run.workspace.folder(REFERENCE))
-        folders = [query] if described else [mapping, query]
-        work.append((run.options.make_given_extractor(), folders))
-    counts: Counter[str] = Counter()
-    for extractor, folders in work:
-        found = extract_local_features(
-            folders, extractor, out, executor=run.executor, track=run.track
-        )
-        counts.update(found)
-    return counts
-
-
 def _global_features(run: Run, out: Path) -> dict[str, int]:
     local_type = run.options.main_type()
     mapping = map_images(run, local_type)
     return extract_vlad(
         mapping,
-        [mapping, run.workspace.folder(QUERY, "")],
+        [mapping, run.workspace.folder(run.query, "")],
         local_type,
         out,
         run.options.vlad,
@@ -232,7 +161,7 @@ def _query_pairs(run: Run, out: Path) -> dict[str, int]:
     local_type = run.options.main_type()
     pairs = pair_queries(
         map_images(run, local_type),
-        run.workspace.folder(QUERY, ""),
+        run.workspace.folder(run.query, ""),
         run.options.query_pairs,
         global_type=vlad_type(local_type),
         restrictions=run.restrictions(),
@@ -248,11 +177,11 @@ def _query_matches(run: Run, out: Path) -> dict[str, int]:
         mapping = matched_images(run, local_type)
         described = mapping.descriptors(local_type)
         found = match_pairs(
-            run.workspace.folder(QUERY, ""),
+            run.workspace.folder(run.query, ""),
             mapping,
             [pair for pair in pairs if pair.map in described],
             local_type,
-            run.options.make_matcher(),
+            run.options.make_matcher(local_type),
             run.options.verify_queries(),
             out / QUERY_MATCHES,
             executor=run.executor,
@@ -262,16 +191,61 @@ def _query_matches(run: Run, out: Path) -> dict[str, int]:
     return counts
 
 
+def _pyramid_stages(run: Run, dump: Mapping[str, Any]) -> list[Stage]:
+    return [
+        Stage(
+            "query_pyramid",
+            1,
+            {
+                "guided_pyramid": dump["guided_pyramid"],
+                "two_view": dump["query_verification"],
+                "mask_margin_px": dump["mask_margin_px"],
+            },
+            (run.images_stage, "local_features", "map", "query_pairs", "query_matches"),
+            (QUERY_PYRAMID,),
+            lambda out: _query_pyramid(run, out),
+        )
+    ]
+
+
+def _query_pyramid(run: Run, out: Path) -> dict[str, float]:
+    counts: dict[str, float] = {}
+    options = run.options
+    extractors = options.make_extractors() if options.makes_points() else []
+    if options.uses_given_map():
+        extractors.append(options.make_given_extractor())
+    pairs = read_pairs(run.workspace.path(QUERY_PAIRS))
+    for extractor in extractors:
+        mapping = matched_images(run, extractor.name)
+        described = mapping.descriptors(extractor.name)
+        found = pyramid_queries(
+            run.workspace.folder(run.query, "", QUERY_MATCHES),
+            mapping,
+            [pair for pair in pairs if pair.map in described],
+            extractor.name,
+            extractor,
+            options.make_matcher(extractor.name),
+            options.query_verification,
+            options.guided_pyramid,
+            out / QUERY_PYRAMID,
+            mask_margin_px=options.mask_margin_px,
+            executor=run.executor,
+            track=run.track,
+        )
+        counts |= {f"{extractor.name} {name}": count for name, count in found.items()}
+    return counts
+
+
 def _localization(run: Run, out: Path) -> dict[str, int]:
-    query = run.workspace.folder(QUERY, "")
+    query = run.workspace.folder(run.query, *run.query_features())
     pairs = read_pairs(run.workspace.path(QUERY_PAIRS))
     options = run.options.localization
     results = localize_from_matches(
         run.workspace.folder(MAP),
         query,
-        run.workspace.folder(QUERY, QUERY_MATCHES),
+        query,
         pairs,
-        run.options.local_types(),
+        run.options.query_types(),
         options,
         restrictions=run.restrictions(),
         executor=run.executor,
@@ -279,7 +253,7 @@ def _localization(run: Run, out: Path) -> dict[str, int]:
     )
     return write_localized(
         out / LOCALIZED,
-        query,
+        run.workspace.folder(QUERY),  # as imported: the poses are theirs as well
         results,
         fallback=options.fallback,
         first_candidates=first_candidates(pairs, run.workspace.folder(MAPPING)),

@@ -5,14 +5,15 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import forkserver
 from multiprocessing.connection import wait
-from typing import Any, Literal
+from typing import Literal
 
 from megloc_kapture.errors import MeglocError, OptionError
 
@@ -24,30 +25,62 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-class _SingleThreadedBlas:
-    """Counts who needs one thread per matrix product; the first sets it, the last restores it."""
+class _SharedLimit:
+    """Counts who needs a limit of the process; the first sets it, the last takes it back."""
 
-    def __init__(self) -> None:
+    def __init__(self, limit: Callable[[], Callable[[], object]]) -> None:
+        """``limit`` sets it and returns what takes it back."""
+        self._limit = limit
         self._lock = threading.Lock()
         self._users = 0
-        self._limits: Any = None
+        self._restore: Callable[[], object] | None = None
 
-    def enter(self) -> None:
-        from threadpoolctl import threadpool_limits
-
+    @contextmanager
+    def __call__(self) -> Iterator[None]:
         with self._lock:
             if self._users == 0:
-                self._limits = threadpool_limits(limits=1, user_api="blas")
+                self._restore = self._limit()
             self._users += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._users -= 1
+                if self._users == 0 and self._restore is not None:
+                    self._restore()
 
-    def leave(self) -> None:
-        with self._lock:
-            self._users -= 1
-            if self._users == 0:
-                self._limits.restore_original_limits()
+
+def _limit_blas() -> Callable[[], object]:
+    from threadpoolctl import threadpool_limits
+
+    restore: Callable[[], object] = threadpool_limits(
+        limits=1, user_api="blas"
+    ).restore_original_limits
+    return restore
 
 
-_single_threaded_blas = _SingleThreadedBlas()
+def _limit_torch() -> Callable[[], object]:
+    """One thread for torch, now, or from its import on: it sets its own, past BLAS's limits."""
+    wanted = os.environ.get("OMP_NUM_THREADS")
+    os.environ["OMP_NUM_THREADS"] = "1"
+    imported = sys.modules.get("torch")
+    before: int = int(wanted or available_cores())
+    if imported is not None:
+        before = imported.get_num_threads()
+        imported.set_num_threads(1)
+
+    def restore() -> None:
+        os.environ.pop("OMP_NUM_THREADS")
+        if wanted is not None:
+            os.environ["OMP_NUM_THREADS"] = wanted
+        torch = sys.modules.get("torch")
+        if torch is not None:
+            torch.set_num_threads(before)
+
+    return restore
+
+
+_blas_limit, _torch_limit = _SharedLimit(_limit_blas), _SharedLimit(_limit_torch)
 
 
 @contextmanager
@@ -59,13 +92,10 @@ def single_threaded() -> Iterator[None]:
     """
     from threadpoolctl import threadpool_limits
 
-    _single_threaded_blas.enter()
-    try:
-        # unlike BLAS's, OpenMP's limit is of the calling thread alone
-        with threadpool_limits(limits=1, user_api="openmp"):
-            yield
-    finally:
-        _single_threaded_blas.leave()
+    # OpenMP's limit is of the calling thread alone, and taking it back sets every library to what
+    # it had before: so BLAS is limited around it, and torch, which sets OpenMP's threads, in it
+    with _blas_limit(), threadpool_limits(limits=1, user_api="openmp"), _torch_limit():
+        yield
 
 
 def _start_worker() -> None:
@@ -75,6 +105,7 @@ def _start_worker() -> None:
 
     threading.Thread(target=_end_with_parent, daemon=True).start()
     threadpool_limits(limits=1)
+    _limit_torch()
     cv2.setNumThreads(1)
 
 

@@ -15,6 +15,7 @@ from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.geometry.cameras import shift_principal_point
 from megloc_kapture.io.kapture_store import FeatureReader, KaptureFolder
 from megloc_kapture.io.side_tables import PROTOCOL_FILE, SIDE_TABLES
+from megloc_kapture.io.weights_registry import registry
 from megloc_kapture.localization.map_index import MapIndex
 from megloc_kapture.mapping.pixel_origin import (
     ObservedImage,
@@ -22,7 +23,9 @@ from megloc_kapture.mapping.pixel_origin import (
     PixelOrigin,
     find_pixel_origin,
 )
-from megloc_kapture.plugins import LOCAL_FEATURES, plugin_names
+from megloc_kapture.matching.guided_pyramid import base_type
+from megloc_kapture.plugins import LOCAL_FEATURES, PluginChoice, plugin_names
+from megloc_kapture.stages.map_refinement import REPORT_FILE
 from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.shared_index import index_map
 from megloc_kapture.values import Camera, RigidTransform
@@ -30,6 +33,7 @@ from megloc_kapture.values import Camera, RigidTransform
 PixelOriginChoice = Literal["auto", "corner", "centre"]
 
 _SAMPLED_IMAGES = 50
+_NETWORKS = ("aliked", "aslfeat", "r2d2", "superpoint", "xfeat")
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +140,7 @@ class KaptureMap:
         return shift_principal_point(camera, shift) if shift else camera
 
     def keypoints_px(self, image: str) -> NDArray[np.float32]:
-        """Keypoints (N, 2) float32 of a map image, in COLMAP's convention."""
+        """Keypoints float32 (N, 2 or more) of a map image; x, y in COLMAP's convention."""
         return self.keypoints_to_colmap(self._keypoints.read(image))
 
     def descriptors(self, image: str) -> NDArray[Any]:
@@ -144,11 +148,12 @@ class KaptureMap:
         return np.asarray(self._descriptors.read(image))
 
     def keypoints_to_colmap(self, keypoints: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Keypoints stored as the map stores its own, in COLMAP's convention; (N, 2)."""
-        shift = np.float32(self.pixel_origin.keypoints_shift_px)
-        return np.asarray(keypoints[:, :2], dtype=np.float32) + shift
+        """Keypoints stored as the map stores its own, x and y in COLMAP's convention."""
+        moved = np.array(keypoints, dtype=np.float32)
+        moved[:, :2] += np.float32(self.pixel_origin.keypoints_shift_px)
+        return moved
 
-    def extractor_name(self) -> str | None:
+    def extractor(self) -> PluginChoice | None:
         """The extractor plugin that makes this type of features; None where there is none."""
         return extractor_of(self.folder, self.local_type)
 
@@ -214,16 +219,33 @@ def check_lengths(keypoints: FeatureReader, descriptors: FeatureReader, image: s
         )
 
 
-def extractor_of(folder: KaptureFolder, local_type: str) -> str | None:
+def extractor_of(folder: KaptureFolder, local_type: str) -> PluginChoice | None:
     """The extractor plugin of a keypoints type: by the folder's name, or the name in its file."""
-    known = plugin_names(LOCAL_FEATURES)
-    if local_type in known:
-        return local_type
+    names = [local_type, base_type(local_type)]
     if local_type in folder.types("keypoints"):
-        name = folder.keypoints(local_type).config.name
-        if name in known:
-            return name
-    return None
+        names.append(folder.keypoints(local_type).config.name)
+    return next((found for name in names if (found := _extractor_named(name))), None)
+
+
+def _extractor_named(name: str) -> PluginChoice | None:
+    known = plugin_names(LOCAL_FEATURES)
+    if name in known:
+        return PluginChoice(name=name)
+    # a network's types are called as its weights are: aliked-n16, r2d2_WASF_N16
+    plugin = next((plugin for plugin in known if name.startswith(plugin)), None)
+    if plugin is None or name not in registry():
+        return None
+    return PluginChoice(name=plugin, options={"weights": name})
+
+
+def _is_ours(folder: KaptureFolder, local_type: str) -> bool:
+    """Whether the keypoints are surely in our convention.
+
+    Other toolkits write types named after the same networks, in the networks' own convention.
+    """
+    refined = (folder.root / "reconstruction" / REPORT_FILE).is_file()
+    found = _extractor_named(base_type(local_type))
+    return found is not None and (refined or found.name not in _NETWORKS)
 
 
 def _find_origin(folder: KaptureFolder, local_type: str, index: MapIndex) -> PixelOrigin:
@@ -245,7 +267,7 @@ def _find_origin(folder: KaptureFolder, local_type: str, index: MapIndex) -> Pix
         sample.append(
             ObservedImage(data.camera_of(image), poses[image], stored[rows, :2], index.xyz[points])
         )
-    known: Origin | None = "corner" if extractor_of(folder, local_type) else None
+    known: Origin | None = "corner" if _is_ours(folder, local_type) else None
     return find_pixel_origin(
         sample, cameras=[data.camera_of(image) for image in images], keypoints_at=known
     )

@@ -19,7 +19,6 @@ from megloc_kapture.features.vlad import (
     sample_rows,
     train_vocabulary,
 )
-from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.io.kapture_store import KaptureFolder
 from megloc_kapture.localization.cluster_poses import (
     ClusterLocalization,
@@ -27,23 +26,28 @@ from megloc_kapture.localization.cluster_poses import (
     TypedMatches,
     in_turn,
 )
+from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.map_descriptors import extract_again
-from megloc_kapture.pipeline.presets import PipelineOptions, options_of_preset
+from megloc_kapture.pipeline.options import PipelineOptions
+from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.queries import KaptureQueries, Query
+from megloc_kapture.pipeline.query_features import QueryFeatures
 from megloc_kapture.plugins import LOCAL_FEATURES, LocalFeatureExtractor, load_plugin
 from megloc_kapture.retrieval.search import rank_by_similarity
 from megloc_kapture.stages.global_vlad import VladSettings, read_vocabulary
 from megloc_kapture.stages.image_pairs import read_global_features, unit_rows
-from megloc_kapture.stages.local_features import checked_features
 from megloc_kapture.stages.matches import (
+    BATCH,
     FeatureCache,
     Features,
+    batched,
     match_and_verify,
     two_view_verification,
 )
 from megloc_kapture.stages.parallel import ordered_map
+from megloc_kapture.stages.pyramid_query import retry_query
 from megloc_kapture.stages.query_poses import localize_views
 from megloc_kapture.stages.ranking_scene import KaptureScene
 from megloc_kapture.values import Camera, Failure, LocalFeatures, Pose, RigidTransform
@@ -87,8 +91,9 @@ class Localizer:
     ) -> None:
         self.map = kapture_map
         self.options = options or options_of_preset(preset)
-        self._matcher = self.options.make_matcher()
+        self._matcher = self.options.make_matcher(kapture_map.local_type)
         self._ranker = self.options.localization.make_ranker()
+        self._query_features = QueryFeatures(self.options)
         self._descriptors: dict[str, NDArray[Any]] | None = None
         if not kapture_map.has_descriptors():
             self._descriptors = extract_again(kapture_map, self._extractor)
@@ -174,8 +179,8 @@ class Localizer:
     def _localize(self, views: Sequence[tuple[Query, RigidTransform]]) -> ClusterLocalization:
         matched = []
         for query, cam_from_rig in views:
-            features, matches = self._match(query)
-            typed = TypedMatches(self.map.index, features.keypoints_px, matches)
+            keypoints_px, matches = self._match(query)
+            typed = TypedMatches(self.map.index, keypoints_px[:, :2], matches)
             matched.append(QueryView(query.name, query.camera, (typed,), cam_from_rig))
         candidates = in_turn(
             [[image for image, _, _ in typed.matches] for view in matched for typed in view.matches]
@@ -250,40 +255,54 @@ class Localizer:
         shared = [name for name in self.map.global_types() if name in global_types]
         return f"global features {shared[0]}" if shared else "VLAD over the map's descriptors"
 
-    def _match(self, query: Query) -> tuple[Features, _Matches]:
+    def _match(self, query: Query) -> tuple[NDArray[np.float32], _Matches]:
+        """The query's keypoints, and their matches with each candidate."""
         local = query.features or self._extract(query)
-        rays = bearing_rays(query.camera, local.keypoints_px[:, :2])
-        features = Features(query.camera, local.keypoints_px[:, :2], rays, local.descriptors)
+        features = Features.of(query.camera, local.keypoints_px, local.descriptors)
         verification = two_view_verification(self.options.query_verification)
         if self.options.verification == "none":
             verification = _keep_all
-        matches = []
-        for image in self.candidates(query, local):
-            pairs, scores = match_and_verify(
-                features, self._map_features(image), self._matcher, verification
+        matches: _Matches = []
+        for images in batched(self.candidates(query, local), BATCH):
+            found = match_and_verify(
+                features,
+                [self._map_features(image) for image in images],
+                self._matcher,
+                [verification] * len(images),
             )
-            matches.append((image, pairs, scores))
-        return features, matches
+            matches += [(image, *matched) for image, matched in zip(images, found, strict=True)]
+        if not self.options.matches_again():
+            return features.keypoints_px, matches
+        return retry_query(
+            features,
+            matches,
+            self._map_features,
+            self._extractor,
+            self._matcher,
+            image=query.read_image,
+            mask=lambda: self._query_features.mask(query),
+            verification=self.options.query_verification,
+            options=self.options.guided_pyramid,
+            name=query.name,
+        )
 
     def _extract(self, query: Query) -> LocalFeatures:
-        extractor = self._extractor
-        features = extractor.extract(query.read_image(), query.read_mask())
-        return checked_features(extractor, features, query.name)
+        return self._query_features.extract(query, self._extractor)
 
     @cached_property
     def _extractor(self) -> LocalFeatureExtractor:
-        name = self.map.extractor_name()
-        if name is None:
+        found = self.map.extractor()
+        if found is None:
             raise DataError(
                 f"features of type {self.map.local_type!r} are missing and no extractor for them "
                 "is installed; give them with --features-dir, or in the kapture folder",
                 path=self.map.folder.root,
             )
-        chosen = self.options.local_features
-        options = chosen.options if chosen.name == name else {}
-        extractor: LocalFeatureExtractor = load_plugin(LOCAL_FEATURES, name, options)
+        chosen = {one.name: one.options for one in self.options.local_features}
+        options = {**chosen.get(found.name, {}), **found.options}
+        extractor: LocalFeatureExtractor = load_plugin(LOCAL_FEATURES, found.name, options)
         if not isinstance(extractor, LocalFeatureExtractor):
-            raise PluginError(f"plugin {name!r} is no extractor of local features")
+            raise PluginError(f"plugin {found.name!r} is no extractor of local features")
         return extractor
 
     def _map_features(self, image: str) -> Features:
@@ -300,7 +319,7 @@ class Localizer:
         camera = self.map.camera(image)
         # only keypoints that observe a point can help a pose, but all take part in the mutual
         # check: without its rivals a wrong match would look unrivalled
-        return Features(camera, keypoints, bearing_rays(camera, keypoints), descriptors)
+        return Features.of(camera, keypoints, descriptors)
 
     def _map_descriptors(self, image: str) -> NDArray[Any]:
         if self._descriptors is not None:
@@ -319,7 +338,7 @@ class Localizer:
         folder = self.map.folder
         for name in self.map.global_types():
             stored = read_vocabulary(folder.root / "reconstruction" / "global_features" / name)
-            if stored is not None and stored[1].local_type == self.map.local_type:
+            if stored is not None and stored[1].local_type == base_type(self.map.local_type):
                 return *stored, self._global_vectors(name)
         options = self.options.vlad
         images = self.map.images

@@ -40,7 +40,7 @@ def extract_again(
         mask = read_mask(folder.root / "sensors" / "masks" / f"{image}.png", pixels.shape[:2])
         features = checked_features(extractor, extractor.extract(pixels, mask), image)
         stored = kapture_map.keypoints_px(image)
-        rows = rows_found_again(stored, features.keypoints_px[:, :2])
+        rows = rows_found_again(stored[:, :2], features.keypoints_px[:, :2])
         descriptors = np.zeros((len(stored), features.descriptors.shape[1]), np.float32)
         hit = rows >= 0
         descriptors[hit] = features.descriptors[rows[hit]]

@@ -6,7 +6,8 @@ without the points that refinement rejects; the stage that writes it is always t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,15 +17,17 @@ from megloc_kapture.io.kapture_store import KaptureFolder, read_pairs, write_pai
 from megloc_kapture.pipeline.plan import Stage
 from megloc_kapture.pipeline.run import (
     MAP,
-    MAPPING,
     MAPPING_MATCHES,
     MAPPING_PAIRS,
+    MAPPING_PYRAMID,
     REFERENCE,
     UNREFINED,
     Run,
 )
+from megloc_kapture.plugins import weights_of
 from megloc_kapture.stages.given_map import given_map, given_type, has_descriptors, join_maps
 from megloc_kapture.stages.global_vlad import vlad_type
+from megloc_kapture.stages.guided_pyramid import pyramid_mapping
 from megloc_kapture.stages.image_pairs import pair_map_images
 from megloc_kapture.stages.lifting import lift_map
 from megloc_kapture.stages.map_refinement import refine_map
@@ -43,9 +46,9 @@ def plan_map(run: Run, dump: Mapping[str, Any]) -> list[Stage]:
     """
     by = run.options.map
     stages: list[Stage] = []
-    if by in ("triangulate", "given+triangulate"):
+    if run.options.triangulates():
         stages += _matching_stages(run, dump)
-    after = ["import", "local_features", "global_features"]
+    after = ["import", run.images_stage, "local_features", "global_features"]
     options: dict[str, Any] = {"by": by}
     write: Callable[[Run, Path], Mapping[str, float]] = _triangulate
     if by == "lift":
@@ -54,6 +57,8 @@ def plan_map(run: Run, dump: Mapping[str, Any]) -> list[Stage]:
         write = _given
     else:
         after.append("mapping_matches")
+        if run.options.matches_again():
+            after.append("mapping_pyramid")
         options["triangulation"] = dump["triangulation"]
     stages.append(Stage("points", 1, options, tuple(after), (UNREFINED,), partial(write, run)))
     stages.append(
@@ -97,7 +102,7 @@ def map_images(run: Run, local_type: str) -> KaptureFolder:
     # descriptors of its own: those that were extracted for it lie in the workspace
     if _is_given(run, local_type) and has_descriptors(run.workspace.folder(REFERENCE)):
         return run.workspace.folder(REFERENCE, "")
-    return run.workspace.folder(MAPPING, "")
+    return run.workspace.folder(run.mapping, "")
 
 
 def matched_images(run: Run, local_type: str) -> KaptureFolder:
@@ -108,7 +113,7 @@ def matched_images(run: Run, local_type: str) -> KaptureFolder:
     return (
         run.workspace.folder(MAP)
         if _is_given(run, local_type)
-        else run.workspace.folder(MAPPING, "")
+        else run.workspace.folder(run.mapping, *run.mapping_features())
     )
 
 
@@ -128,7 +133,7 @@ def _matching_stages(run: Run, dump: Mapping[str, Any]) -> list[Stage]:
             "mapping_pairs",
             3,
             {"mapping_pairs": dump["mapping_pairs"]},
-            ("import", "global_features"),
+            (run.images_stage, "global_features"),
             (MAPPING_PAIRS,),
             lambda out: _mapping_pairs(run, out),
         ),
@@ -136,21 +141,55 @@ def _matching_stages(run: Run, dump: Mapping[str, Any]) -> list[Stage]:
             "mapping_matches",
             2,
             {
-                "matching": dump["matching"],
+                "matching": matching_used(run, run.options.own_types()),
                 "verification": dump["verification"],
                 "known_poses": dump["mapping_verification"],
             },
-            ("import", "local_features", "mapping_pairs"),
+            (run.images_stage, "local_features", "mapping_pairs"),
             (MAPPING_MATCHES,),
             lambda out: _mapping_matches(run, out),
         ),
+        *(_pyramid_stages(run, dump) if run.options.matches_again() else ()),
     ]
+
+
+def _pyramid_stages(run: Run, dump: Mapping[str, Any]) -> list[Stage]:
+    return [
+        Stage(
+            "mapping_pyramid",
+            1,
+            {"guided_pyramid": dump["guided_pyramid"]},
+            (run.images_stage, "local_features", "mapping_pairs", "mapping_matches"),
+            (MAPPING_PYRAMID,),
+            lambda out: _mapping_pyramid(run, out),
+        )
+    ]
+
+
+def _mapping_pyramid(run: Run, out: Path) -> dict[str, float]:
+    counts: dict[str, float] = {}
+    for extractor in run.options.make_extractors():
+        found = pyramid_mapping(
+            run.workspace.folder(run.mapping, "", MAPPING_MATCHES),
+            read_pairs(run.workspace.path(MAPPING_PAIRS)),
+            extractor.name,
+            extractor,
+            run.options.make_matcher(extractor.name),
+            run.options.mapping_verification,
+            run.options.guided_pyramid,
+            out / MAPPING_PYRAMID,
+            mask_margin_px=run.options.mask_margin_px,
+            executor=run.executor,
+            track=run.track,
+        )
+        counts |= {f"{extractor.name} {name}": count for name, count in found.items()}
+    return counts
 
 
 def _mapping_pairs(run: Run, out: Path) -> dict[str, int]:
     options = run.options.mapping_pairs
     pairs = pair_map_images(
-        run.workspace.folder(MAPPING, ""),
+        run.workspace.folder(run.mapping, ""),
         options,
         global_type=vlad_type(run.options.main_type()),
         restrictions=run.restrictions(),
@@ -160,25 +199,41 @@ def _mapping_pairs(run: Run, out: Path) -> dict[str, int]:
     return {"pairs": len(pairs)}
 
 
+def matching_used(run: Run, local_types: Sequence[str]) -> dict[str, Any]:
+    """How each type is matched: part of what a stage's matches depend on."""
+    return {
+        local_type: {
+            **run.options.matching_of(local_type).model_dump(mode="json"),
+            "weights": weights_of(run.options.make_matcher(local_type)),
+        }
+        for local_type in local_types
+    }
+
+
 def _mapping_matches(run: Run, out: Path) -> dict[str, int]:
-    mapping = run.workspace.folder(MAPPING, "")
-    return match_pairs(
-        mapping,
-        mapping,
-        read_pairs(run.workspace.path(MAPPING_PAIRS)),
-        run.options.main_type(),
-        run.options.make_matcher(),
-        run.options.verify_mapping(),
-        out / MAPPING_MATCHES,
-        executor=run.executor,
-        track=run.track,
-    )
+    mapping = run.workspace.folder(run.mapping, "")
+    pairs = read_pairs(run.workspace.path(MAPPING_PAIRS))
+    counts: Counter[str] = Counter()
+    for local_type in run.options.own_types():
+        found = match_pairs(
+            mapping,
+            mapping,
+            pairs,
+            local_type,
+            run.options.make_matcher(local_type),
+            run.options.verify_mapping(),
+            out / MAPPING_MATCHES,
+            executor=run.executor,
+            track=run.track,
+        )
+        counts.update(found)
+    return counts
 
 
 def _lift(run: Run, out: Path) -> dict[str, float]:
     return lift_map(
-        run.workspace.folder(MAPPING, ""),
-        run.options.main_type(),
+        run.workspace.folder(run.mapping, ""),
+        run.options.own_types(),
         out / UNREFINED,
         run.options.lifting,
         executor=run.executor,
@@ -188,7 +243,7 @@ def _lift(run: Run, out: Path) -> dict[str, float]:
 
 def _given(run: Run, out: Path, name: str = UNREFINED) -> dict[str, float]:
     check_given(run)
-    mapping = run.workspace.folder(MAPPING, "")
+    mapping = run.workspace.folder(run.mapping, "")
     return given_map(run.workspace.folder(REFERENCE), mapping, out / name)
 
 
@@ -196,9 +251,9 @@ def _triangulate(run: Run, out: Path) -> dict[str, float]:
     joined = run.options.uses_given_map()
     own = out / (_OWN if joined else UNREFINED)
     counts = triangulate_map(
-        run.workspace.folder(MAPPING, ""),
-        run.workspace.folder(MAPPING, MAPPING_MATCHES),
-        run.options.main_type(),
+        run.workspace.folder(run.mapping, *run.mapping_features()),
+        run.workspace.folder(run.mapping, *run.mapping_features()),
+        run.options.point_types(),
         own,
         run.options.triangulation,
         num_threads=run.num_threads,

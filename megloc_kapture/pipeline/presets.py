@@ -1,113 +1,46 @@
-"""Presets: every option of the pipeline in one frozen model, with defaults and units."""
+"""Presets: options by name, and changes to them from files and the command line."""
 
 from __future__ import annotations
 
 import tomllib
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
-from pydantic import Field, ValidationError
+from pydantic import ValidationError
 
 from megloc_kapture.errors import OptionError
-from megloc_kapture.features.vlad import VladOptions
-from megloc_kapture.io.colmap import TriangulationOptions
-from megloc_kapture.mapping.lifting import LiftingOptions
-from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
-from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS, Matcher, PluginChoice, load_plugin
-from megloc_kapture.plugins import LocalFeatureExtractor as Extractor
-from megloc_kapture.stages.image_pairs import MappingPairsOptions, QueryPairsOptions
-from megloc_kapture.stages.map_refinement import MapRefinementOptions
-from megloc_kapture.stages.matches import NoVerification, Verification
-from megloc_kapture.stages.query_poses import LocalizationOptions
+from megloc_kapture.matching.guided_pyramid import GuidedPyramidOptions
+from megloc_kapture.pipeline.options import LocalFeaturesChoice, PipelineOptions
+from megloc_kapture.plugins import PluginChoice
+from megloc_kapture.stages.preprocessing import PreprocessingOptions
 from megloc_kapture.values import Options
 
+# the paper's local features and matching; retrieval is VLAD until its global features are there
+_MEGLOC = PipelineOptions(
+    preprocessing=PreprocessingOptions(max_size_px=1600),
+    local_features=(
+        LocalFeaturesChoice(name="superpoint", matching=PluginChoice(name="superglue")),
+        LocalFeaturesChoice(
+            name="aslfeat",
+            # as its authors match it; which matcher MegLoc gave it, the paper does not say
+            matching=PluginChoice(name="nn", options={"max_ratio": 0.8}),
+        ),
+    ),
+    guided_pyramid=GuidedPyramidOptions(mode="all"),
+)
+# chosen by benchmarks/features.py among weights that are free for any use: docs/choices.md
+_MODERN = PipelineOptions(
+    preprocessing=PreprocessingOptions(max_size_px=1600),
+    local_features=(
+        LocalFeaturesChoice(name="aliked", options={"max_keypoints": 2048, "threshold": 0.05}),
+    ),
+)
 
-class PipelineOptions(Options):
-    """All options of a run. ``--set matching.options.max_ratio=0.9`` sets one of them."""
-
-    local_features: PluginChoice = PluginChoice(name="rootsift")
-    vlad: VladOptions = VladOptions()
-    mapping_pairs: MappingPairsOptions = MappingPairsOptions()
-    query_pairs: QueryPairsOptions = QueryPairsOptions()
-    matching: PluginChoice = PluginChoice(name="nn")
-    verification: Literal["geometric", "none"] = Field(
-        default="geometric", description="of matches, by known poses or a two-view model"
-    )
-    mapping_verification: KnownPoseOptions = KnownPoseOptions()
-    query_verification: TwoViewOptions = TwoViewOptions()
-    map: Literal["triangulate", "lift", "given", "given+triangulate"] = Field(
-        default="triangulate",
-        description="points of the map: triangulated from matches; keypoints lifted through the "
-        "map images' depth maps; those of the model the dataset comes with; or the model's and "
-        "triangulated ones, of two keypoints types",
-    )
-    given_features: PluginChoice = Field(
-        default=PluginChoice(name="sift"), description="what a given model was made of"
-    )
-    triangulation: TriangulationOptions = TriangulationOptions()
-    lifting: LiftingOptions = LiftingOptions()
-    refinement: MapRefinementOptions = MapRefinementOptions()
-    localization: LocalizationOptions = LocalizationOptions()
-
-    def make_extractor(self) -> Extractor:
-        """The local-feature extractor; raises PluginError."""
-        extractor: Extractor = load_plugin(
-            LOCAL_FEATURES, self.local_features.name, self.local_features.options
-        )
-        return extractor
-
-    def make_given_extractor(self) -> Extractor:
-        """The extractor of a given map's features; raises PluginError."""
-        extractor: Extractor = load_plugin(
-            LOCAL_FEATURES, self.given_features.name, self.given_features.options
-        )
-        return extractor
-
-    def uses_given_map(self) -> bool:
-        """Whether the model that the dataset comes with is localized in."""
-        return self.map.startswith("given")
-
-    def makes_points(self) -> bool:
-        """Whether the map has points of features that are extracted here."""
-        return self.map != "given"
-
-    def local_types(self) -> list[str]:
-        """Keypoints types that queries are localized with, the one retrieval uses first.
-
-        Raises
-        ------
-        PluginError : an extractor cannot be made.
-        OptionError : two types of one name.
-        """
-        types = [self.make_extractor().name] if self.makes_points() else []
-        if self.uses_given_map():
-            types.append(self.make_given_extractor().name)
-        if len(set(types)) < len(types):
-            raise OptionError(
-                f"map = {self.map} needs local_features of another type than the given map's "
-                f"{types[0]!r}"
-            )
-        return types
-
-    def main_type(self) -> str:
-        """The keypoints type that retrieval uses; see :meth:`local_types`."""
-        return self.local_types()[0]
-
-    def make_matcher(self) -> Matcher:
-        """The matcher; raises PluginError."""
-        matcher: Matcher = load_plugin(MATCHERS, self.matching.name, self.matching.options)
-        return matcher
-
-    def verify_mapping(self) -> Verification:
-        """How mapping pairs are verified."""
-        return NoVerification() if self.verification == "none" else self.mapping_verification
-
-    def verify_queries(self) -> Verification:
-        """How query pairs are verified."""
-        return NoVerification() if self.verification == "none" else self.query_verification
-
-
-PRESETS: dict[str, PipelineOptions] = {"classic": PipelineOptions()}
+PRESETS: dict[str, PipelineOptions] = {
+    "classic": PipelineOptions(),
+    "megloc": _MEGLOC,
+    "modern": _MODERN,
+}
 DEFAULT_PRESET = "classic"
 
 
@@ -168,10 +101,43 @@ def _known(path: str) -> str:
 
 def _merge(tree: dict[str, Any], changes: dict[str, Any]) -> None:
     for key, value in changes.items():
-        if isinstance(value, dict) and isinstance(tree.get(key), dict):
-            _merge(tree[key], value)
+        present = tree.get(key)
+        if isinstance(value, dict) and isinstance(present, dict):
+            _merge(present, value)
+        elif isinstance(value, dict) and isinstance(present, list | tuple | str):
+            several = [present] if isinstance(present, str) else present
+            tree[key] = _merged_choices(key, several, value)
         else:
             tree[key] = value
+
+
+def _merged_choices(
+    key: str, choices: Sequence[Any], changes: dict[str, Any]
+) -> list[dict[str, Any]]:
+    """Plugins of a list with changes: of the only one, or of those that are named.
+
+    ``local_features.options.max_keypoints`` is the option of the only type,
+    ``local_features.aliked.options.max_keypoints`` that of one of several.
+    """
+    merged = [
+        {"name": one} if isinstance(one, str) else dict(one)
+        for one in choices
+        if isinstance(one, str | dict)
+    ]
+    named = {one.get("name"): one for one in merged}
+    if set(changes) <= set(named):
+        for name, change in changes.items():
+            if not isinstance(change, dict):
+                raise OptionError(f"option {key}.{name}: a table is expected, got {change!r}")
+            _merge(named[name], change)
+    elif len(merged) == 1:
+        _merge(merged[0], changes)
+    else:
+        raise OptionError(
+            f"option {key}.{min(changes)}: there are several, name one of them: "
+            f"{', '.join(f'{key}.{name}' for name in named)}"
+        )
+    return merged
 
 
 def _value(text: str) -> Any:

@@ -15,6 +15,7 @@ from megloc_kapture.datasets.kapture_folders import check_image
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.kapture_store import FeatureReader, KaptureFolder
 from megloc_kapture.pipeline.kapture_map import KaptureMap, check_lengths
+from megloc_kapture.plugins import LOCAL_FEATURES, load_plugin
 from megloc_kapture.stages.local_features import read_image_of, read_mask
 from megloc_kapture.values import Camera, LocalFeatures
 
@@ -114,12 +115,13 @@ class KaptureQueries:
         ------
         DataError : there are no images; an image is needed and absent, broken or not of its
             camera's size; features are truncated, of different length, or not as wide as the
-            map's; or they are absent and there is no extractor for their type.
+            map's; or they are absent and there is no extractor for their type, or not its weights.
+        PluginError : the extractor cannot be loaded.
         """
         if not self.names:
             raise DataError("there are no query images", path=self._folder.root)
         self._check_widths()
-        extractor = self._map.extractor_name()
+        extractor = self._map.extractor()
         for name in self.names:
             if self._has_features(name):
                 if self._keypoints is not None and self._descriptors is not None:
@@ -132,6 +134,7 @@ class KaptureQueries:
                     path=self._folder.root,
                 )
             else:
+                load_plugin(LOCAL_FEATURES, extractor.name, extractor.options)
                 check_image(self._folder, name)
             for vectors in self._globals.values():
                 if name in vectors:

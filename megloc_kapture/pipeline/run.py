@@ -11,7 +11,7 @@ from megloc_kapture.datasets.official import REFERENCE
 from megloc_kapture.io.side_tables import SIDE_TABLES, read_protocol
 from megloc_kapture.pipeline.benchmarks import BenchmarkFile
 from megloc_kapture.pipeline.datasets import DatasetChoice
-from megloc_kapture.pipeline.presets import PipelineOptions
+from megloc_kapture.pipeline.options import PipelineOptions
 from megloc_kapture.pipeline.submission import place_of
 from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.stages.parallel import Track, untracked
@@ -24,10 +24,13 @@ __all__ = [
     "MAPPING",
     "MAPPING_MATCHES",
     "MAPPING_PAIRS",
+    "MAPPING_PYRAMID",
+    "PREPROCESSED",
     "QUERY",
     "QUERY_GT",
     "QUERY_MATCHES",
     "QUERY_PAIRS",
+    "QUERY_PYRAMID",
     "REFERENCE",
     "SUBMISSIONS",
     "TIMING",
@@ -38,6 +41,8 @@ __all__ = [
 MAPPING_PAIRS, QUERY_PAIRS = "pairs/mapping.txt", "pairs/query.txt"
 MAPPING_MATCHES, QUERY_MATCHES = "matches/mapping", "matches/query"
 UNREFINED, MAP = "map_unrefined", "map"
+MAPPING_PYRAMID, QUERY_PYRAMID = "pyramid/mapping", "pyramid/query"
+PREPROCESSED = "preprocessed"
 LOCALIZED, SUBMISSIONS, EVALUATION = "localized", "submissions", "evaluation"
 TIMING = "timing.csv"
 
@@ -59,6 +64,35 @@ class Run:
     executor: Executor | None = None
     track: Track = untracked
     num_threads: int = 1
+
+    @property
+    def images_stage(self) -> str:
+        """Name of the stage that writes :attr:`mapping` and :attr:`query`."""
+        return "preprocess" if self.options.preprocesses() else "import"
+
+    @property
+    def mapping(self) -> str:
+        """The kapture folder of the map's images, as everything after pre-processing sees them."""
+        return f"{PREPROCESSED}/{MAPPING}" if self.options.preprocesses() else MAPPING
+
+    @property
+    def query(self) -> str:
+        """The kapture folder of the queries' images; see :attr:`mapping`."""
+        return f"{PREPROCESSED}/{QUERY}" if self.options.preprocesses() else QUERY
+
+    def mapping_features(self) -> list[str]:
+        """Features folders of the map's images, once they are matched."""
+        places = ["", MAPPING_MATCHES]
+        if self.options.matches_again() and self.options.triangulates():
+            places.append(MAPPING_PYRAMID)
+        return places
+
+    def query_features(self) -> list[str]:
+        """Features folders of the queries, once they are matched."""
+        places = ["", QUERY_MATCHES]
+        if self.options.matches_again():
+            places.append(QUERY_PYRAMID)
+        return places
 
     @property
     def dataset(self) -> str:

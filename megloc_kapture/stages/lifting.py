@@ -95,7 +95,7 @@ def _between(
 
 def lift_map(
     mapping: KaptureFolder,
-    local_type: str,
+    local_types: Sequence[str],
     output: Path,
     options: LiftingOptions,
     *,
@@ -103,6 +103,10 @@ def lift_map(
     track: Track = untracked,
 ) -> dict[str, float]:
     """Lift the keypoints of the map's images through their depth maps, and write the map.
+
+    Parameters
+    ----------
+    local_types : keypoints types that get points, each its own.
 
     Returns
     -------
@@ -124,23 +128,28 @@ def lift_map(
             path=mapping.root,
         )
     spec = FolderSpec(mapping.root, mapping.features_dirs)
-    jobs = [_Job(spec, local_type, image, records[image], options) for image in with_depth]
     row_of = {image: row for row, image in enumerate(images)}
     points: list[NDArray[np.float64]] = []
-    image_ids: list[NDArray[np.int32]] = []
-    keypoint_ids: list[NDArray[np.int32]] = []
-    results = track(ordered_map(_lift, jobs, executor), len(jobs), "lifting")
-    for image, (lifted, ids) in zip(with_depth, results, strict=True):
-        points.append(poses[image].inverse().apply(lifted))
-        image_ids.append(np.full(len(ids), row_of[image], np.int32))
-        keypoint_ids.append(ids)
+    seen: dict[str, Observations] = {}
+    total = 0
+    for local_type in local_types:
+        jobs = [_Job(spec, local_type, image, records[image], options) for image in with_depth]
+        image_ids: list[NDArray[np.int32]] = []
+        keypoint_ids: list[NDArray[np.int32]] = []
+        results = track(ordered_map(_lift, jobs, executor), len(jobs), f"lifting {local_type}")
+        for image, (lifted, ids) in zip(with_depth, results, strict=True):
+            points.append(poses[image].inverse().apply(lifted))
+            image_ids.append(np.full(len(ids), row_of[image], np.int32))
+            keypoint_ids.append(ids)
+        seen[local_type] = _observations(local_type, images, image_ids, keypoint_ids, total)
+        total += len(seen[local_type])
     xyz = np.concatenate(points)
     write_sensors(output, data)
     link_images(mapping.root, output)
-    copy_features(mapping, output, local_type)
+    for local_type in local_types:
+        copy_features(mapping, output, local_type)
     write_points3d(output, np.concatenate([xyz, np.zeros_like(xyz)], axis=1))
-    seen = _observations(local_type, images, image_ids, keypoint_ids)
-    write_observations(output, {local_type: seen})
+    write_observations(output, seen)
     return {
         "images": len(images),
         "images_with_depth": len(with_depth),
@@ -153,12 +162,13 @@ def _observations(
     images: Sequence[str],
     image_ids: Sequence[NDArray[np.int32]],
     keypoint_ids: Sequence[NDArray[np.int32]],
+    first_point: int,
 ) -> Observations:
     keypoints = np.concatenate(keypoint_ids)
     return Observations(
         keypoints_type=local_type,
         image_names=tuple(images),
-        point_ids=np.arange(len(keypoints)),
+        point_ids=first_point + np.arange(len(keypoints)),
         image_ids=np.concatenate(image_ids),
         keypoint_ids=keypoints,
     )

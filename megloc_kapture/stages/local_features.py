@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError, PluginError
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture_store import FeatureConfig, FeatureWriter, KaptureFolder
+from megloc_kapture.io.mask_counts import write_mask_counts
 from megloc_kapture.plugins import LocalFeatureExtractor
+from megloc_kapture.preprocessing.mask_margin import with_margin
 from megloc_kapture.stages.parallel import Track, ordered_map, untracked
 from megloc_kapture.values import Camera, LocalFeatures
 
@@ -25,6 +27,7 @@ class _Job:
     image: str
     image_path: Path
     mask_path: Path
+    mask_margin_px: float
     camera: Camera
 
 
@@ -33,6 +36,7 @@ def extract_local_features(
     extractor: LocalFeatureExtractor,
     output: Path,
     *,
+    mask_margin_px: float = 0.0,
     executor: Executor | None = None,
     track: Track = untracked,
 ) -> dict[str, int]:
@@ -40,16 +44,21 @@ def extract_local_features(
 
     Masks are read from ``sensors/masks/<image>.png`` where there are any (0 = ignore).
 
+    Parameters
+    ----------
+    mask_margin_px : keypoints nearer than this to a masked pixel go too.
+
     Returns
     -------
-    Counts for the log: images and keypoints.
+    Counts for the log: images, keypoints, and where there are masks the images that have one and
+    the keypoints that they removed.
 
     Raises
     ------
     DataError : an image is absent, unreadable, or not of its camera's size; or two folders have
         an image of the same name.
     """
-    jobs = list(_jobs(folders, extractor))
+    jobs = list(_jobs(folders, extractor, mask_margin_px))
     duplicates = sorted(
         {a.image for a, b in zip(jobs, jobs[1:], strict=False) if a.image == b.image}
     )
@@ -58,6 +67,7 @@ def extract_local_features(
     if not jobs:
         raise DataError("there are no images to extract features from")
     total = 0
+    masked: dict[str, int] = {}
     keypoint_writer: FeatureWriter | None = None
     descriptor_writer: FeatureWriter | None = None
     results = ordered_map(_extract, jobs, executor)
@@ -68,10 +78,18 @@ def extract_local_features(
         keypoint_writer.write(job.image, features.keypoints_px)
         descriptor_writer.write(job.image, features.descriptors)
         total += len(features.keypoints_px)
-    return {"images": len(jobs), "keypoints": total}
+        if job.mask_path.is_file():
+            masked[job.image] = features.num_masked
+    counts = {"images": len(jobs), "keypoints": total}
+    if masked:
+        write_mask_counts(output, extractor.name, masked)
+        counts |= {"images_with_mask": len(masked), "keypoints_masked": sum(masked.values())}
+    return counts
 
 
-def _jobs(folders: Sequence[KaptureFolder], extractor: LocalFeatureExtractor) -> Iterator[_Job]:
+def _jobs(
+    folders: Sequence[KaptureFolder], extractor: LocalFeatureExtractor, mask_margin_px: float
+) -> Iterator[_Job]:
     named = sorted(
         ((image, k) for k, folder in enumerate(folders) for image in folder.read().image_names())
     )
@@ -82,6 +100,7 @@ def _jobs(folders: Sequence[KaptureFolder], extractor: LocalFeatureExtractor) ->
             image=image,
             image_path=folder.image_path(image),
             mask_path=folder.root / "sensors" / "masks" / f"{image}.png",
+            mask_margin_px=mask_margin_px,
             camera=folder.read().camera_of(image),
         )
 
@@ -108,7 +127,7 @@ def _writers(
 
 def _extract(job: _Job) -> LocalFeatures:
     image = read_image_of(job.image_path, job.camera)
-    mask = read_mask(job.mask_path, image.shape[:2])
+    mask = read_mask(job.mask_path, image.shape[:2], margin_px=job.mask_margin_px)
     return checked_features(job.extractor, job.extractor.extract(image, mask), job.image)
 
 
@@ -129,8 +148,20 @@ def check_size(image: NDArray[np.uint8], camera: Camera, name: Path | str) -> No
         )
 
 
-def read_mask(path: Path, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
-    """The mask beside an image, True = use; None where there is no such file."""
+def read_mask(
+    path: Path, shape: tuple[int, ...], *, margin_px: float = 0.0
+) -> NDArray[np.bool_] | None:
+    """The mask beside an image, True = use; None where there is no such file.
+
+    Parameters
+    ----------
+    shape : (H, W) of the image.
+    margin_px : pixels nearer than this to an ignored one are ignored as well.
+
+    Raises
+    ------
+    DataError : not an image, or not of that size.
+    """
     if not path.is_file():
         return None
     mask = read_image_rgb(path)[:, :, 0] > 0
@@ -139,7 +170,7 @@ def read_mask(path: Path, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
             f"the mask is {mask.shape[1]}x{mask.shape[0]}, its image {shape[1]}x{shape[0]}",
             path=path,
         )
-    return np.asarray(mask)
+    return with_margin(np.asarray(mask), margin_px)
 
 
 def checked_features(extractor: LocalFeatureExtractor, features: Any, image: str) -> LocalFeatures:

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import groupby
+from itertools import groupby, islice
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,9 +34,12 @@ from megloc_kapture.matching.verification import (
 )
 from megloc_kapture.plugins import Matcher
 from megloc_kapture.stages.parallel import FolderSpec, Track, ordered_map, untracked
-from megloc_kapture.values import Camera, Options
+from megloc_kapture.values import Camera, ImageFeatures, Options
+
+Item = TypeVar("Item")
 
 _CACHE_BYTES = 256 << 20  # descriptors kept per process: about a hundred images
+BATCH = 8  # pairs that a matcher gets at once, where it can use them
 
 
 class NoVerification(Options):
@@ -50,12 +53,25 @@ Verification = KnownPoseOptions | TwoViewOptions | NoVerification
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """What matching needs of one image: keypoints (N, 2) in pixels, rays (N, 3), descriptors."""
+    """What matching needs of one image: keypoints (N, 2 or more), rays (N, 3), descriptors."""
 
     camera: Camera
     keypoints_px: NDArray[np.float32]
     rays: NDArray[np.float64]
     descriptors: NDArray[Any]
+
+    @classmethod
+    def of(
+        cls, camera: Camera, keypoints_px: NDArray[np.float32], descriptors: NDArray[Any]
+    ) -> Features:
+        """With the rays of the keypoints."""
+        return cls(camera, keypoints_px, bearing_rays(camera, keypoints_px[:, :2]), descriptors)
+
+    def for_matcher(self) -> ImageFeatures:
+        """What a matcher gets of them."""
+        return ImageFeatures(
+            self.keypoints_px, self.descriptors, self.camera.width, self.camera.height
+        )
 
     @cached_property
     def slopes(self) -> NDArray[np.float64]:
@@ -126,24 +142,58 @@ def match_pairs(
 def _match(job: _Job) -> list[_PairMatches]:
     first, second = job.first.open(), job.second.open()
     features = _cached(job.first, first, job.local_type, job.image)
-    return [
-        match_and_verify(
+    found: list[_PairMatches] = []
+    for others in batched(job.others, BATCH):  # not all at once: their features are in memory
+        found += match_and_verify(
             features,
-            _cached(job.second, second, job.local_type, other),
+            [_cached(job.second, second, job.local_type, other) for other in others],
             job.matcher,
-            _relative_verification(job.verification, first, second, job.image, other),
+            [
+                _relative_verification(job.verification, first, second, job.image, other)
+                for other in others
+            ],
         )
-        for other in job.others
-    ]
+    return found
 
 
-def match_and_verify(a: Features, b: Features, matcher: Matcher, verification: Any) -> _PairMatches:
-    """Match two images; ``verification`` maps (a, b, matches) to a mask of those to keep."""
-    matches, scores = matcher.match(a.descriptors, b.descriptors)
-    if len(matches) == 0:
-        return matches, scores
-    good = verification(a, b, matches)
-    return matches[good], scores[good]
+def match_and_verify(
+    a: Features, others: Sequence[Features], matcher: Matcher, verifications: Sequence[Any]
+) -> list[_PairMatches]:
+    """Match one image with several, and keep the matches that are verified.
+
+    Parameters
+    ----------
+    verifications : for each pair a function of (a, other, matches) that is the mask of those to
+        keep.
+    """
+    matched = match_all(matcher, a.for_matcher(), [other.for_matcher() for other in others])
+    found = []
+    for other, verify, (matches, scores) in zip(others, verifications, matched, strict=True):
+        if len(matches):
+            good = verify(a, other, matches)
+            matches, scores = matches[good], scores[good]
+        found.append((matches, scores))
+    return found
+
+
+def match_all(
+    matcher: Matcher, a: ImageFeatures, others: Sequence[ImageFeatures]
+) -> list[_PairMatches]:
+    """Matches of one image with each of several, at once where the matcher can."""
+    at_once = getattr(matcher, "match_many", None)
+    if at_once is None:
+        return [matcher.match(a, other) for other in others]
+    found: list[_PairMatches] = []
+    for batch in batched(others, BATCH):
+        found += at_once(a, batch)
+    return found
+
+
+def batched(items: Iterable[Item], size: int) -> Iterator[list[Item]]:
+    """The items in lists of at most ``size``."""
+    waiting = iter(items)
+    while batch := list(islice(waiting, size)):
+        yield batch
 
 
 def two_view_verification(options: TwoViewOptions) -> Any:
@@ -191,10 +241,7 @@ def read_features(
     keypoints: FeatureReader, descriptors: FeatureReader, camera: Camera, image: str
 ) -> Features:
     """Read what matching needs of one image."""
-    keypoints_px = keypoints.read(image)
-    return Features(
-        camera, keypoints_px, bearing_rays(camera, keypoints_px[:, :2]), descriptors.read(image)
-    )
+    return Features.of(camera, keypoints.read(image), descriptors.read(image))
 
 
 class FeatureCache:

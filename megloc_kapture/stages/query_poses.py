@@ -29,6 +29,7 @@ from megloc_kapture.localization.cluster_poses import (
 from megloc_kapture.localization.clusters import ClusterOptions, cluster_candidates
 from megloc_kapture.localization.map_index import MapIndex
 from megloc_kapture.localization.rig_cameras import poses_of_cameras
+from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.plugins import (
     POSE_RANKERS,
     PluginChoice,
@@ -214,7 +215,8 @@ def localize_from_matches(
 
     Parameters
     ----------
-    local_types : keypoints types whose matches are used, together.
+    local_types : keypoints types whose matches are used, together. The map may know a guided
+        pyramid's type by the type it was made of, whose keypoints come first in it.
     restrictions : the coordinate frames of the map's images, which are never mixed.
 
     Raises
@@ -228,7 +230,11 @@ def localize_from_matches(
     )
     candidates = {name: tuple(images) for name, images in iterate_candidates(pairs)}
     units = query_units(query.read(), rigs=options.rigs)
-    with shared_index({name: index_map(map_folder, name) for name in local_types}) as indices:
+    observed = map_folder.observations()
+    of_map = {name: name if name in observed else base_type(name) for name in local_types}
+    with shared_index(
+        {name: index_map(map_folder, of_map[name]) for name in local_types}
+    ) as indices:
         jobs = []
         for unit in units:
             own = tuple(candidates.get(image, ()) for image in unit.images)

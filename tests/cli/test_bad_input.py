@@ -148,7 +148,7 @@ QUERIES: dict[str, tuple[Spoil, str]] = {
     ),
     "no features of one": (
         remove(f"{KEYPOINTS}/{QUERY}.kpt"),
-        r"query: image '.*rgb_00267\.jpg' has no features of type 'r2d2_500'.*no extractor",
+        r"the weights r2d2_WASF_N16 are missing.*megloc weights fetch r2d2_WASF_N16",
     ),
     "other descriptors": (
         line(f"{DESCRIPTORS}/descriptors.txt", 3, lambda text: text.replace("128", "64")),
@@ -174,9 +174,33 @@ def without_descriptors(root: Path) -> None:
             path.unlink()
 
 
+def of_unknown_type(root: Path) -> None:
+    """The type of the keypoints becomes one that no extractor makes."""
+    for kind in (KEYPOINTS, DESCRIPTORS):
+        folder = root / kind
+        for table in folder.glob("*.txt"):
+            table.write_text(table.read_text().replace("r2d2", "orb"))
+        folder.rename(folder.with_name("orb_500"))
+    seen = root / "reconstruction" / "observations.txt"
+    if seen.is_file():
+        seen.write_text(seen.read_text().replace("r2d2_500", "orb_500"))
+
+
+def test_features_that_nobody_can_extract(megloc: Any, gallery: Path) -> None:
+    for part in ("map", "query"):
+        of_unknown_type(gallery / part)
+    megloc("info", gallery / "map").out.index("must be given in kapture: no extractor for orb_500")
+    (gallery / "query" / "reconstruction" / "keypoints" / "orb_500" / f"{QUERY}.kpt").unlink()
+    message = r"query: image '.*rgb_00267\.jpg' has no features of type 'orb_500'.*no extractor"
+    megloc(*localize(gallery)).refused(message)
+    assert not (gallery.parent / "new").exists()
+
+
 def test_descriptors_that_nobody_can_extract_again(megloc: Any, gallery: Path) -> None:
     without_descriptors(gallery / "map")
-    megloc(*localize(gallery)).refused(r"/map: .*'r2d2_500'", "no extractor")
+    for part in ("map", "query"):
+        of_unknown_type(gallery / part)
+    megloc(*localize(gallery)).refused(r"/map: .*'orb_500'", "no extractor")
     assert not (gallery.parent / "new").exists()
     told = megloc("info", gallery / "map").out
     assert re.search("map descriptors .*no extractor .*not possible", told)

@@ -119,10 +119,9 @@ def test_all_queries_are_localized_well(finished: Path) -> None:
 
 def test_a_manifest_says_what_was_done(finished: Path) -> None:
     manifest = json.loads((finished / "stages" / "local_features.json").read_text())
-    assert manifest["options"]["local_features"] == {
-        "name": "rootsift",
-        "options": {"max_keypoints": 800},
-    }
+    assert manifest["options"]["local_features"] == [
+        {"name": "rootsift", "options": {"max_keypoints": 800}, "weights": {}}
+    ]
     assert manifest["counts"]["images"] == 11
     assert set(manifest["inputs"]) == {"import"}
     assert manifest["seconds"] > 0 and manifest["versions"]["pycolmap"]

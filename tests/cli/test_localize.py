@@ -194,7 +194,9 @@ def test_info_says_what_the_foreign_map_allows(megloc: Any, shared_data: Path) -
     assert told["points"] == "630"
     assert told["pixel origin"].startswith("centre: ")
     assert told["map descriptors"] == "there"
-    assert told["query features"].startswith("must be given in kapture: no extractor for r2d2_500")
+    # R2D2 has an extractor, whose weights are not there
+    assert told["query features"].startswith("must be given in kapture; plugin r2d2 could extract")
+    assert "megloc weights fetch r2d2_WASF_N16" in told["query features"]
     assert told["retrieval"].startswith("AP-GeM-LM18 where queries bring it, else VLAD")
     errors = re.search(r"origin: corner ([\d.]+) px, centre ([\d.]+) px", done.out)
     assert errors is not None
@@ -218,7 +220,4 @@ def test_info_of_a_folder_that_is_no_map(megloc: Any, scene: Path) -> None:
 def test_info_of_a_map_whose_descriptors_are_missing(megloc: Any, gallery: Path) -> None:
     shutil.rmtree(gallery / "map" / "reconstruction" / "descriptors")
     told = described(megloc("info", gallery / "map").out)
-    assert (
-        "no extractor for the type is installed: localizing is not possible"
-        in (told["map descriptors"])
-    )
+    assert told["map descriptors"] == "missing; will be extracted again by plugin r2d2"

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 
 import pytest
@@ -36,6 +38,41 @@ def test_workers_are_other_processes_with_one_thread_each() -> None:
         assert executor.submit(os.getpid).result() != os.getpid()
         counts = {pool["num_threads"] for pool in executor.submit(threadpool_info).result()}
         assert counts == {1}
+
+
+def _torch_threads() -> int:
+    import torch
+
+    return torch.get_num_threads()
+
+
+def test_torch_has_one_thread_in_workers_and_within_a_block() -> None:
+    with open_executor("processes", 2) as executor:
+        assert executor is not None
+        assert executor.submit(_torch_threads).result() == 1
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        with single_threaded():
+            assert torch.get_num_threads() == 1
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_torch_imported_within_a_block_has_one_thread_there_and_all_afterwards() -> None:
+    script = """if True:
+        from megloc_kapture.pipeline.executors import available_cores, single_threaded
+        with single_threaded():
+            import torch
+            torch.zeros(1000, 1000).exp()  # something that starts its threads
+            assert torch.get_num_threads() == 1, torch.get_num_threads()
+        assert torch.get_num_threads() == available_cores(), torch.get_num_threads()
+    """
+    environment = {key: value for key, value in os.environ.items() if key != "OMP_NUM_THREADS"}
+    subprocess.run([sys.executable, "-c", script], check=True, env=environment)
 
 
 def test_a_worker_that_dies_is_told_in_one_line() -> None:

@@ -105,7 +105,7 @@ def test_both_need_features_of_two_types(tmp_path: Path) -> None:
         options,
         Workspace(tmp_path / "workspace"),
     )
-    with pytest.raises(OptionError, match="another type than the given map's 'sift'"):
+    with pytest.raises(OptionError, match="'sift' is asked for twice"):
         plan_evaluation(run)
 
 

@@ -13,15 +13,16 @@ import pytest
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.evaluation.folders import load_poses
 from megloc_kapture.evaluation.pose_errors import pose_errors
-from megloc_kapture.geometry.cameras import bearing_rays, project, shift_principal_point
+from megloc_kapture.geometry.cameras import project, shift_principal_point
 from megloc_kapture.io.kapture_store import FeatureWriter, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.localization.correspondences import observed_matches
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.queries import KaptureQueries
+from megloc_kapture.plugins import PluginChoice
 from megloc_kapture.stages.matches import Features, match_and_verify, two_view_verification
-from megloc_kapture.values import Camera, Pose
+from megloc_kapture.values import Pose
 
 
 def shift_keypoints(root: Path, shift_px: float) -> None:
@@ -50,7 +51,7 @@ def test_our_own_map_is_as_colmap_has_it(workspace: Path) -> None:
     assert opened.pixel_origin.error_px["corner"] < opened.pixel_origin.error_px["centre"]
     assert len(opened.images) == 7
     assert opened.has_descriptors() and opened.has_images()
-    assert opened.extractor_name() == "rootsift"
+    assert opened.extractor() == PluginChoice(name="rootsift")
     assert opened.global_types() == ["vlad_rootsift"]
 
 
@@ -86,21 +87,21 @@ def test_a_half_pixel_between_keypoints_and_intrinsics_is_found_and_undone(
 def residuals_px(opened: KaptureMap, queries: KaptureFolder, truth: Path) -> list[float]:
     """Of each query, the median distance of its matches from where its true pose puts them."""
     poses, options, found = load_poses(truth), options_of_preset(), []
-    matcher, verify = options.make_matcher(), two_view_verification(options.query_verification)
-
-    def features(camera: Camera, keypoints: np.ndarray, descriptors: np.ndarray) -> Features:
-        return Features(camera, keypoints, bearing_rays(camera, keypoints), descriptors)
+    matcher, verify = (
+        options.make_matcher(opened.local_type),
+        two_view_verification(options.query_verification),
+    )
 
     for query in KaptureQueries(queries, opened):
         assert query.features is not None
-        keypoints = query.features.keypoints_px
-        ours = features(query.camera, keypoints, query.features.descriptors)
+        keypoints = query.features.keypoints_px[:, :2]
+        ours = Features.of(query.camera, keypoints, query.features.descriptors)
         matches = []
         for image in opened.images:
-            theirs = features(
+            theirs = Features.of(
                 opened.camera(image), opened.keypoints_px(image), opened.descriptors(image)
             )
-            matches.append((image, *match_and_verify(ours, theirs, matcher, verify)))
+            matches.append((image, *match_and_verify(ours, [theirs], matcher, [verify])[0]))
         pairs = observed_matches(opened.index, matches).resolve()
         seen = project(query.camera, poses[query.name], opened.index.xyz[pairs.point_ids])
         distances = np.linalg.norm(seen - keypoints[pairs.keypoint_ids], axis=1)
@@ -179,7 +180,7 @@ def test_of_several_types_one_is_chosen(map_copy: Path) -> None:
     opened = KaptureMap.open(map_copy, keypoints_type="other")
     assert opened.local_type == "other"
     # the name inside its configuration tells who extracted it
-    assert opened.extractor_name() == "rootsift"
+    assert opened.extractor() == PluginChoice(name="rootsift")
     with pytest.raises(OptionError, match="'third'; there are: other, rootsift"):
         KaptureMap.open(map_copy, keypoints_type="third")
 

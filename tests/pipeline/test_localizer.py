@@ -17,7 +17,8 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.pose_errors import pose_errors
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder
-from megloc_kapture.pipeline.presets import PipelineOptions, options_of_preset
+from megloc_kapture.pipeline.options import PipelineOptions
+from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.values import LocalFeatures, RigidTransform
 
 FEW = options_of_preset(assignments=["local_features.options.max_keypoints=800"])
@@ -328,10 +329,12 @@ def test_the_foreign_map_from_python(virtual_gallery: Path) -> None:
     assert metres <= 0.010 and degrees <= 0.16
 
 
-def test_its_queries_cannot_be_extracted(virtual_gallery: Path) -> None:
+def test_its_queries_cannot_be_extracted_without_the_networks_weights(
+    virtual_gallery: Path,
+) -> None:
     localizer = Localizer(KaptureMap.open(virtual_gallery / "map"))
     camera = Camera("SIMPLE_PINHOLE", 1536, 1024, (1000.0, 768.0, 512.0))
-    with pytest.raises(DataError, match="'r2d2_500' are missing and no extractor for them"):
+    with pytest.raises(DataError, match="the weights r2d2_WASF_N16 are missing.*megloc weights"):
         localizer.localize(np.zeros((1024, 1536, 3), np.uint8), camera)
 
 

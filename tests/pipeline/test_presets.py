@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from megloc_kapture.errors import OptionError, PluginError
+from megloc_kapture.errors import DataError, OptionError, PluginError
 from megloc_kapture.pipeline.presets import (
     PRESETS,
     PipelineOptions,
@@ -77,18 +77,81 @@ def test_what_is_no_option_is_refused_by_name(assignment: str, message: str) -> 
 
 
 def test_an_unknown_preset_lists_the_known() -> None:
-    with pytest.raises(OptionError, match="unknown preset 'best'; known: classic"):
+    with pytest.raises(OptionError, match="unknown preset 'best'; known: classic, megloc, modern"):
         options_of_preset("best")
+
+
+@pytest.mark.parametrize(
+    ("assignments", "expected"),
+    [
+        (["local_features=sift"], {"sift": {}}),
+        (["local_features.name=sift"], {"sift": {}}),
+        (
+            ["local_features=sift", "local_features.sift.options.max_keypoints=7"],
+            {"sift": {"max_keypoints": 7}},
+        ),
+        (['local_features=["sift", "rootsift"]'], {"sift": {}, "rootsift": {}}),
+        (
+            [
+                'local_features=["sift", "rootsift"]',
+                "local_features.sift.options.max_keypoints=7",
+                "local_features.rootsift.options.max_keypoints=8",
+            ],
+            {"sift": {"max_keypoints": 7}, "rootsift": {"max_keypoints": 8}},
+        ),
+        (
+            ["local_features.rootsift.options.max_keypoints=9"],
+            {"rootsift": {"max_keypoints": 9}},
+        ),
+    ],
+)
+def test_local_features_are_named_alone_or_in_a_list(
+    assignments: list[str], expected: dict[str, dict[str, int]]
+) -> None:
+    options = options_of_preset(assignments=assignments)
+    assert {one.name: one.options for one in options.local_features} == expected
+    assert options.local_types() == list(expected)
+    assert options.main_type() == next(iter(expected))
+
+
+def test_one_of_several_types_is_named_to_change_it() -> None:
+    several = 'local_features=["sift", "rootsift"]'
+    with pytest.raises(OptionError, match=r"name one of them: local_features\.sift, local_f"):
+        options_of_preset(assignments=[several, "local_features.options.max_keypoints=7"])
+    with pytest.raises(OptionError, match="'sift' is asked for twice"):
+        options_of_preset(assignments=['local_features=["sift", "sift"]']).local_types()
+    with pytest.raises(OptionError, match="local_features: .*at least 1 item"):
+        options_of_preset(assignments=["local_features=[]"])
+
+
+@pytest.mark.parametrize("name", ["megloc", "modern"])
+def test_a_preset_without_its_weights_names_file_place_and_command(name: str) -> None:
+    options = options_of_preset(name)
+    file = {"megloc": "superpoint_v1.pth", "modern": "aliked-n16.pth"}[name]
+    with pytest.raises(DataError, match=rf"{file} .*https://github.com/.*megloc weights fetch"):
+        options.make_extractors()
+
+
+def test_a_type_may_have_a_matcher_of_its_own() -> None:
+    options = options_of_preset(
+        assignments=[
+            'local_features=["sift", "rootsift"]',
+            "local_features.sift.matching.name=nn",
+            "local_features.sift.matching.options.max_ratio=0.8",
+        ]
+    )
+    assert options.make_matcher("sift").options.max_ratio == 0.8  # type: ignore[attr-defined]
+    assert options.make_matcher("rootsift").options.max_ratio is None  # type: ignore[attr-defined]
 
 
 def test_plugins_are_made_with_their_options() -> None:
     options = options_of_preset(
         assignments=["local_features.options.max_keypoints=7", "verification=none"]
     )
-    extractor = options.make_extractor()
+    (extractor,) = options.make_extractors()
     assert extractor.name == "rootsift"
     assert extractor.options.max_keypoints == 7  # type: ignore[attr-defined]
     assert options.verify_queries() == options.verify_mapping()
     assert options_of_preset().verify_queries() != options_of_preset().verify_mapping()
-    with pytest.raises(PluginError, match="no plugin 'surf' .*; registered: nn"):
-        options_of_preset(assignments=["matching.name=surf"]).make_matcher()
+    with pytest.raises(PluginError, match="no plugin 'surf' .*; registered: .*nn"):
+        options_of_preset(assignments=["matching.name=surf"]).make_matcher("rootsift")

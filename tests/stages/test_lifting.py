@@ -39,7 +39,7 @@ def lifted(tmp_path_factory: pytest.TempPathFactory) -> tuple[KaptureFolder, Pat
     write_synthetic_kapture(root, OPTIONS)
     mapping = KaptureFolder(root / "mapping", features_dirs=[root])
     extract_local_features([mapping], RootSift(RootSiftOptions(max_keypoints=300)), root)
-    counts = lift_map(mapping, "rootsift", root / "map", LiftingOptions())
+    counts = lift_map(mapping, ["rootsift"], root / "map", LiftingOptions())
     assert counts["images_with_depth"] == counts["images"] == 9
     return mapping, root / "map"
 
@@ -128,4 +128,4 @@ def test_a_map_without_depth_is_refused(lifted: tuple[KaptureFolder, Path], tmp_
     write_sensors(tmp_path, data)
     data.records_depth = records
     with pytest.raises(DataError, match="no mapping image has a pose and a depth map"):
-        lift_map(KaptureFolder(tmp_path), "rootsift", tmp_path / "map", LiftingOptions())
+        lift_map(KaptureFolder(tmp_path), ["rootsift"], tmp_path / "map", LiftingOptions())

@@ -16,6 +16,7 @@ from megloc_kapture.errors import DataError, PluginError
 from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
 from megloc_kapture.io.images import read_image_rgb, write_image
 from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.mask_counts import read_mask_counts
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.values import Camera, LocalFeatures
 
@@ -87,11 +88,23 @@ def test_masks_beside_the_images_are_obeyed(
     mask[:, 80:] = 255
     (folder.root / "sensors" / "masks").mkdir()
     write_image(folder.root / "sensors" / "masks" / "a.png.png", mask)
-    extract_local_features([folder], EXTRACTOR, tmp_path / "features")
-    masked = folder.keypoints("rootsift").read("a.png")
-    free = folder.keypoints("rootsift").read("b.png")
-    assert len(masked) > 10 and masked[:, 0].min() >= 79.5
+    output = tmp_path / "features"
+    counts = extract_local_features([folder], EXTRACTOR, output)
+    found = KaptureFolder(folder.root, features_dirs=[output]).keypoints("rootsift")
+    masked, free = found.read("a.png"), found.read("b.png")
+    assert len(masked) > 10 and masked[:, 0].min() >= 80
     assert free[:, 0].min() < 40
+    unmasked = EXTRACTOR.extract(read_image_rgb(folder.image_path("a.png"))).keypoints_px
+    removed = int((unmasked[:, 0] < 80).sum())
+    assert removed > 10
+    assert read_mask_counts(output, "rootsift") == {"a.png": removed}
+    assert (counts["images_with_mask"], counts["keypoints_masked"]) == (1, removed)
+    # a margin takes the strip beside the masked half as well
+    extract_local_features([folder], EXTRACTOR, tmp_path / "margin", mask_margin_px=10)
+    strict = KaptureFolder(folder.root, features_dirs=[tmp_path / "margin"]).keypoints("rootsift")
+    near = masked[:, 0] < 90
+    assert near.any()
+    np.testing.assert_array_equal(strict.read("a.png"), masked[~near])
 
 
 def test_a_mask_of_another_size_is_refused(

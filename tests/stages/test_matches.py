@@ -200,7 +200,7 @@ def test_the_matchers_rows_are_those_that_verification_judges() -> None:
         seen.append(matches.tolist())
         return np.array([True, False, True])
 
-    matches, scores = match_and_verify(features(4), features(3), Fixed(), verify)
+    matches, scores = match_and_verify(features(4), [features(3)], Fixed(), [verify])[0]
     assert seen == [[[0, 2], [1, 1], [3, 0]]]
     assert matches.tolist() == [[0, 2], [3, 0]]
     np.testing.assert_allclose(scores, [0.9, 0.7])

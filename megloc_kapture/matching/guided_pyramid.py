@@ -1,0 +1,268 @@
+"""Guided pyramid matching: a pair with few matches is tried again at other scales and turns.
+
+MegLoc, section "Guided pyramid matching". Where a pair has fewer than 100 verified matches,
+features are extracted from the image scaled and turned, and matched with the other image as it is.
+What is verified is either all put together (``all``) or the richest is kept (``max``).
+
+Each variant is verified by itself: most of them are turned the wrong way and have matches by chance
+only, in which a two-view model over all variants together would drown. But without poses a few
+matches fit some model by chance, a different one for each variant, so all must then agree with that
+of the richest. Only keypoints that take part in a verified match are added to an image, for a
+variant has as many keypoints as the image itself.
+
+The array functions here know of no file; extraction, matching and verification are given to them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, field_validator
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.geometry.image_variants import ImageVariant
+from megloc_kapture.values import ImageFeatures, LocalFeatures, Options
+
+_SUFFIX = "-pyramid"
+# an enlargement that the bound cuts down to less than this beyond the next smaller one is left out
+_MIN_STEP = 1.2
+
+Extract = Callable[[NDArray[np.uint8], NDArray[np.bool_] | None], LocalFeatures]
+PairMatches = tuple[NDArray[np.int64], NDArray[np.floating[Any]]]
+Match = Callable[[ImageFeatures, Sequence[ImageFeatures]], Sequence[PairMatches]]
+
+
+class GuidedPyramidOptions(Options):
+    """Options of guided pyramid matching; benchmarks/guided_pyramid.py measures the scales."""
+
+    mode: Literal["off", "all", "max"] = Field(
+        default="off", description="matches of all variants together, or of the richest"
+    )
+    min_matches: int = Field(
+        default=100, gt=0, description="a pair with fewer verified matches is tried again"
+    )
+    scales: tuple[float, ...] = Field(default=(1 / 3, 0.5, 1.0, 2.0, 3.0), min_length=1)
+    rotations_deg: tuple[int, ...] = Field(
+        default=(0, 90, 180, 270), min_length=1, description="multiples of 90"
+    )
+    max_side_px: int = Field(
+        default=1600,
+        gt=0,
+        description="an image is not enlarged beyond this; memory grows with the pixels",
+    )
+
+    @field_validator("scales")
+    @classmethod
+    def _positive(cls, scales: tuple[float, ...]) -> tuple[float, ...]:
+        if not all(0 < scale <= 16 for scale in scales):
+            raise ValueError("a scale is greater than 0 and at most 16")
+        return tuple(sorted(set(scales)))
+
+    @field_validator("rotations_deg")
+    @classmethod
+    def _quarters(cls, rotations: tuple[int, ...]) -> tuple[int, ...]:
+        if any(rotation % 90 for rotation in rotations):
+            raise ValueError("rotations are multiples of 90 degrees")
+        return tuple(sorted({rotation % 360 for rotation in rotations}))
+
+    def variants(self, width: int, height: int) -> list[ImageVariant]:
+        """The variants of an image of this size, sorted; the image as it is is none of them.
+
+        A scale that would enlarge it beyond ``max_side_px`` is reduced to it, and left out where
+        that is hardly more than the next smaller scale.
+        """
+        limit = max(1.0, self.max_side_px / max(width, height))
+        scales = [scale for scale in self.scales if scale <= limit]
+        if len(scales) < len(self.scales) and limit >= _MIN_STEP * max([1.0, *scales[-1:]]):
+            scales.append(limit)
+        every = (ImageVariant(*each) for each in product(scales, self.rotations_deg))
+        return [variant for variant in every if not variant.is_identity]
+
+
+def pyramid_type(local_type: str) -> str:
+    """Name of the keypoints type that has a type's keypoints first, then those that were added."""
+    return local_type + _SUFFIX
+
+
+def base_type(local_type: str) -> str:
+    """The type a pyramid's keypoints begin with; the type itself where it is none of a pyramid."""
+    return local_type.removesuffix(_SUFFIX)
+
+
+@dataclass(frozen=True, eq=False)
+class VariantFeatures:
+    """Features of an image's variant.
+
+    Attributes
+    ----------
+    features : as the matcher gets them, in the variant's own pixels.
+    keypoints_px : float32 (N, C), x and y in pixels of the original; the other columns as found.
+    """
+
+    variant: ImageVariant
+    features: ImageFeatures
+    keypoints_px: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class SkippedVariant:
+    """A variant that gave nothing, and why."""
+
+    variant: ImageVariant
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class VariantMatches:
+    """Verified matches of a variant with another image.
+
+    Attributes
+    ----------
+    keypoints_px : float32 (K, C), in pixels of the original.
+    descriptors : (K, D).
+    other_rows : int64 (K,), keypoints of the other image.
+    scores : float32 (K,).
+    """
+
+    variant: ImageVariant
+    keypoints_px: NDArray[np.float32]
+    descriptors: NDArray[Any]
+    other_rows: NDArray[np.int64]
+    scores: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.other_rows)
+
+    def only(self, good: NDArray[np.bool_]) -> VariantMatches:
+        """Those of a mask (K,)."""
+        return VariantMatches(
+            self.variant,
+            self.keypoints_px[good],
+            self.descriptors[good],
+            self.other_rows[good],
+            self.scores[good],
+        )
+
+
+def as_they_are(found: list[VariantMatches]) -> list[VariantMatches]:
+    """What every variant found."""
+    return found
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What is right of an image's matches with another one.
+
+    Attributes
+    ----------
+    verify : which matches (K, 2) of a variant, rows of it and of the other image, are right.
+    agree : what remains of several variants' verified matches that need not agree.
+    """
+
+    verify: Callable[[VariantFeatures, NDArray[np.int64]], NDArray[np.bool_]]
+    agree: Callable[[list[VariantMatches]], list[VariantMatches]] = as_they_are
+
+
+def extract_variants(
+    image: NDArray[np.uint8],
+    mask: NDArray[np.bool_] | None,
+    variants: Sequence[ImageVariant],
+    extract: Extract,
+    *,
+    like: ImageFeatures,
+) -> tuple[list[VariantFeatures], list[SkippedVariant]]:
+    """Features of an image's variants.
+
+    Parameters
+    ----------
+    image : uint8 (H, W, 3), RGB.
+    mask : bool (H, W), True = use; changed along with the image.
+    extract : image and mask to features; whatever it raises skips the variant, for networks refuse
+        images that are too small for them in ways of their own.
+    like : features of the image as it is: what is added has as many columns.
+
+    Raises
+    ------
+    DataError : the extractor's features have another size than ``like``.
+    """
+    height, width = image.shape[:2]
+    found, skipped = [], []
+    for variant in variants:
+        try:
+            features = extract(
+                variant.of_image(image), None if mask is None else variant.of_mask(mask)
+            )
+        except Exception as error:
+            first_line = (str(error).splitlines() or [""])[0]
+            skipped.append(SkippedVariant(variant, f"{type(error).__name__}: {first_line}"))
+            continue
+        if len(features.keypoints_px) == 0:
+            skipped.append(SkippedVariant(variant, "no keypoints"))
+            continue
+        found.append(_checked(variant, features, width, height, like))
+    return found, skipped
+
+
+def _checked(
+    variant: ImageVariant,
+    features: LocalFeatures,
+    width: int,
+    height: int,
+    like: ImageFeatures,
+) -> VariantFeatures:
+    columns, values = like.keypoints_px.shape[1], like.descriptors.shape[1]
+    sizes = features.keypoints_px.shape[1], features.descriptors.shape[1]
+    if sizes[0] < columns or sizes[1] != values:
+        raise DataError(
+            f"the image's features have {columns} numbers per keypoint and {values} per "
+            f"descriptor, the extractor's {sizes[0]} and {sizes[1]}"
+        )
+    keypoints = features.keypoints_px[:, :columns].copy()
+    keypoints[:, :2] = variant.px_in_original(features.keypoints_px[:, :2], width, height)
+    own = ImageFeatures(
+        features.keypoints_px[:, :columns], features.descriptors, *variant.size(width, height)
+    )
+    return VariantFeatures(variant, own, keypoints)
+
+
+def match_variants(
+    variants: Sequence[VariantFeatures],
+    others: Sequence[ImageFeatures],
+    match: Match,
+    judgements: Sequence[Judgement],
+) -> list[list[VariantMatches]]:
+    """Verified matches of an image's variants with each of several other images.
+
+    Parameters
+    ----------
+    match : matches of one image with each of several, see ``plugins.Matcher``.
+    judgements : for each of ``others``.
+
+    Returns
+    -------
+    For each of ``others`` the variants that match it, in their order.
+    """
+    found: list[list[VariantMatches]] = [[] for _ in others]
+    for variant in variants:
+        matched = match(variant.features, others)
+        for into, judgement, (matches, scores) in zip(found, judgements, matched, strict=True):
+            if len(matches) == 0:
+                continue
+            good = judgement.verify(variant, matches)
+            if good.any():
+                rows = matches[good]
+                into.append(
+                    VariantMatches(
+                        variant.variant,
+                        variant.keypoints_px[rows[:, 0]],
+                        variant.features.descriptors[rows[:, 0]],
+                        rows[:, 1],
+                        np.asarray(scores[good], dtype=np.float32),
+                    )
+                )
+    return [judgement.agree(matches) for judgement, matches in zip(judgements, found, strict=True)]

@@ -1,0 +1,186 @@
+"""Every option of the pipeline in one frozen model, with defaults and units."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import Field, field_validator
+
+from megloc_kapture.errors import OptionError
+from megloc_kapture.features.vlad import VladOptions
+from megloc_kapture.io.colmap import TriangulationOptions
+from megloc_kapture.mapping.lifting import LiftingOptions
+from megloc_kapture.matching.guided_pyramid import GuidedPyramidOptions, base_type, pyramid_type
+from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
+from megloc_kapture.plugins import (
+    LOCAL_FEATURES,
+    MATCHERS,
+    LocalFeatureExtractor,
+    Matcher,
+    PluginChoice,
+    load_plugin,
+)
+from megloc_kapture.stages.image_pairs import MappingPairsOptions, QueryPairsOptions
+from megloc_kapture.stages.map_refinement import MapRefinementOptions
+from megloc_kapture.stages.matches import NoVerification, Verification
+from megloc_kapture.stages.preprocessing import PreprocessingOptions
+from megloc_kapture.stages.query_poses import LocalizationOptions
+from megloc_kapture.values import Options
+
+
+class LocalFeaturesChoice(PluginChoice):
+    """An extractor of local features, its options, and how its features are matched."""
+
+    matching: PluginChoice | None = Field(
+        default=None, description="matcher of this type; none: that of the run"
+    )
+
+
+class PipelineOptions(Options):
+    """All options of a run. ``--set matching.options.max_ratio=0.9`` sets one of them."""
+
+    preprocessing: PreprocessingOptions = PreprocessingOptions()
+    local_features: tuple[LocalFeaturesChoice, ...] = Field(
+        default=(LocalFeaturesChoice(name="rootsift"),),
+        min_length=1,
+        description="types of local features, all in one map; retrieval uses the first",
+    )
+    mask_margin_px: float = Field(
+        default=0.0, ge=0, description="features nearer than this to a masked pixel go too"
+    )
+    vlad: VladOptions = VladOptions()
+    mapping_pairs: MappingPairsOptions = MappingPairsOptions()
+    query_pairs: QueryPairsOptions = QueryPairsOptions()
+    matching: PluginChoice = Field(
+        default=PluginChoice(name="nn"), description="of types that name no matcher of their own"
+    )
+    verification: Literal["geometric", "none"] = Field(
+        default="geometric", description="of matches, by known poses or a two-view model"
+    )
+    mapping_verification: KnownPoseOptions = KnownPoseOptions()
+    query_verification: TwoViewOptions = TwoViewOptions()
+    guided_pyramid: GuidedPyramidOptions = GuidedPyramidOptions()
+    map: Literal["triangulate", "lift", "given", "given+triangulate"] = Field(
+        default="triangulate",
+        description="points of the map: triangulated from matches; keypoints lifted through the "
+        "map images' depth maps; those of the model the dataset comes with; or the model's and "
+        "triangulated ones, of two keypoints types",
+    )
+    given_features: PluginChoice = Field(
+        default=PluginChoice(name="sift"), description="what a given model was made of"
+    )
+    triangulation: TriangulationOptions = TriangulationOptions()
+    lifting: LiftingOptions = LiftingOptions()
+    refinement: MapRefinementOptions = MapRefinementOptions()
+    localization: LocalizationOptions = LocalizationOptions()
+
+    @field_validator("local_features", mode="before")
+    @classmethod
+    def _named(cls, value: Any) -> Any:
+        """A name alone stands for its choice, and one choice for a list of one."""
+        several = [value] if isinstance(value, str | dict) else value
+        if not isinstance(several, list | tuple):
+            return value
+        return tuple({"name": one} if isinstance(one, str) else one for one in several)
+
+    def make_extractors(self) -> list[LocalFeatureExtractor]:
+        """The extractors of local features, in order; raises PluginError, MissingWeightsError."""
+        return [
+            load_plugin(LOCAL_FEATURES, chosen.name, chosen.options)
+            for chosen in self.local_features
+        ]
+
+    def make_given_extractor(self) -> LocalFeatureExtractor:
+        """The extractor of a given map's features; raises PluginError."""
+        extractor: LocalFeatureExtractor = load_plugin(
+            LOCAL_FEATURES, self.given_features.name, self.given_features.options
+        )
+        return extractor
+
+    def preprocesses(self) -> bool:
+        """Whether anything is done to the images before features are extracted."""
+        return self.preprocessing != PreprocessingOptions()
+
+    def changes_frames(self) -> bool:
+        """Whether the images become others in size or projection."""
+        masked = PreprocessingOptions(masks=self.preprocessing.masks)
+        return self.preprocessing != masked
+
+    def uses_given_map(self) -> bool:
+        """Whether the model that the dataset comes with is localized in."""
+        return self.map.startswith("given")
+
+    def makes_points(self) -> bool:
+        """Whether the map has points of features that are extracted here."""
+        return self.map != "given"
+
+    def matches_again(self) -> bool:
+        """Whether pairs with few matches are tried again by guided pyramid matching."""
+        return self.guided_pyramid.mode != "off"
+
+    def triangulates(self) -> bool:
+        """Whether map images are matched with each other."""
+        return self.map in ("triangulate", "given+triangulate")
+
+    def point_types(self) -> list[str]:
+        """Keypoints types of our own in the map: the pyramids' where map images were retried."""
+        types = self.own_types()
+        if self.matches_again() and self.triangulates():
+            return [pyramid_type(local_type) for local_type in types]
+        return types
+
+    def query_types(self) -> list[str]:
+        """Keypoints types of the queries' matches; in the order of :meth:`local_types`."""
+        types = self.local_types()
+        return [pyramid_type(name) for name in types] if self.matches_again() else types
+
+    def own_types(self) -> list[str]:
+        """Keypoints types that are extracted here and get points; none for a given map alone."""
+        return (
+            [extractor.name for extractor in self.make_extractors()] if self.makes_points() else []
+        )
+
+    def local_types(self) -> list[str]:
+        """Keypoints types that queries are localized with, the one retrieval uses first.
+
+        Raises
+        ------
+        PluginError : an extractor cannot be made.
+        OptionError : two types of one name.
+        """
+        types = self.own_types()
+        if self.uses_given_map():
+            types.append(self.make_given_extractor().name)
+        twice = sorted({name for name in types if types.count(name) > 1})
+        if twice:
+            raise OptionError(
+                f"keypoints type {twice[0]!r} is asked for twice, in local_features or of the "
+                f"given map (map = {self.map})"
+            )
+        return types
+
+    def main_type(self) -> str:
+        """The keypoints type that retrieval uses; see :meth:`local_types`."""
+        return self.local_types()[0]
+
+    def matching_of(self, local_type: str) -> PluginChoice:
+        """How features of a type are matched."""
+        if self.makes_points():
+            for chosen, extractor in zip(self.local_features, self.make_extractors(), strict=True):
+                if extractor.name == base_type(local_type) and chosen.matching is not None:
+                    return chosen.matching
+        return self.matching
+
+    def make_matcher(self, local_type: str) -> Matcher:
+        """The matcher of a type; raises PluginError."""
+        chosen = self.matching_of(local_type)
+        matcher: Matcher = load_plugin(MATCHERS, chosen.name, chosen.options)
+        return matcher
+
+    def verify_mapping(self) -> Verification:
+        """How mapping pairs are verified."""
+        return NoVerification() if self.verification == "none" else self.mapping_verification
+
+    def verify_queries(self) -> Verification:
+        """How query pairs are verified."""
+        return NoVerification() if self.verification == "none" else self.query_verification

@@ -1,0 +1,136 @@
+"""Stage: guided pyramid matching of pairs with few matches, as a keypoints type of its own.
+
+MegLoc, section "Guided pyramid matching": when mapping, both images of a pair are extracted again
+at other scales and turns, when localizing the query alone. ``T-pyramid`` has of every image the
+keypoints of T first, unchanged, then those that were added, and the matches of all pairs: so every
+index into T is one into T-pyramid, and what reads kapture reads it.
+
+An image is extracted again once, however many pairs it is in: the work goes by images, not by
+pairs.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from itertools import groupby
+from pathlib import Path
+
+from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder
+from megloc_kapture.matching.guided_pyramid import GuidedPyramidOptions, pyramid_type
+from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
+from megloc_kapture.plugins import LocalFeatureExtractor, Matcher
+from megloc_kapture.stages.parallel import FolderSpec, Track, untracked
+from megloc_kapture.stages.pyramid_jobs import HowToRetry, Retry
+from megloc_kapture.stages.pyramid_pairs import PyramidPairs
+
+
+def pyramid_mapping(
+    mapping: KaptureFolder,
+    pairs: Sequence[ImagePair],
+    local_type: str,
+    extractor: LocalFeatureExtractor,
+    matcher: Matcher,
+    verification: KnownPoseOptions,
+    options: GuidedPyramidOptions,
+    output: Path,
+    *,
+    mask_margin_px: float = 0.0,
+    executor: Executor | None = None,
+    track: Track = untracked,
+) -> dict[str, float]:
+    """Try mapping pairs with few matches again, each image's variants with the other as it is.
+
+    Parameters
+    ----------
+    mapping : images with poses, with the features and verified matches of ``local_type``.
+    pairs : those that were matched.
+    output : gets ``local_features/T-pyramid``: keypoints, descriptors, matches of all pairs, and
+        ``guided_pyramid.csv``, a row per pair that was tried.
+
+    Returns
+    -------
+    Counts for the log, and ``seconds_per_tried_pair``, of one worker.
+
+    Raises
+    ------
+    DataError : features or matches are missing, or an image; or the extractor's features are not
+        like those of ``local_type``.
+    """
+    spec = FolderSpec(mapping.root, mapping.features_dirs)
+    how = HowToRetry(
+        spec, spec, local_type, local_type, extractor, matcher, verification, options,
+        mask_margin_px,
+    )  # fmt: skip
+    poses = mapping.read().poses()
+    # kept in one file, so (a, b) and (b, a) are one pair
+    named = sorted({(min(p.query, p.map), max(p.query, p.map)) for p in pairs})
+    run = PyramidPairs(mapping, mapping, how, mapping.matches(local_type), named)
+    run.find_hard(posed=set(poses))
+    jobs = []
+    others: dict[str, tuple[list[str], list[str]]] = defaultdict(lambda: ([], []))
+    for a, b in run.hard:
+        others[a][0].append(b)
+        # turning one image is turning the other: b is turned only where it is scaled
+        others[b][1].append(a)
+    for image in sorted(others):
+        jobs.append(Retry(how, image, *map(tuple, others[image])))
+    return run.write(jobs, output, executor, track)
+
+
+def pyramid_queries(
+    query: KaptureFolder,
+    mapping: KaptureFolder,
+    pairs: Sequence[ImagePair],
+    local_type: str,
+    extractor: LocalFeatureExtractor,
+    matcher: Matcher,
+    verification: TwoViewOptions,
+    options: GuidedPyramidOptions,
+    output: Path,
+    *,
+    mask_margin_px: float = 0.0,
+    executor: Executor | None = None,
+    track: Track = untracked,
+) -> dict[str, float]:
+    """Try query pairs with few matches again: the query's variants with the map's keypoints.
+
+    The map is neither extracted again nor changed. Where it has keypoints of ``T-pyramid`` the
+    variants are matched with those, which begin with those of T.
+
+    Parameters
+    ----------
+    query : images, with the features and the matches of ``local_type``.
+    mapping : images of the map with features of ``local_type``.
+    pairs : those that were matched, and ``output``: see :func:`pyramid_mapping`.
+
+    Returns
+    -------
+    Counts, see :func:`pyramid_mapping`.
+
+    Raises
+    ------
+    DataError : see :func:`pyramid_mapping`.
+    """
+    larger = pyramid_type(local_type)
+    there = all(larger in mapping.types(kind) for kind in ("keypoints", "descriptors"))
+    how = HowToRetry(
+        FolderSpec(query.root, query.features_dirs),
+        FolderSpec(mapping.root, mapping.features_dirs),
+        local_type,
+        larger if there else local_type,
+        extractor,
+        matcher,
+        verification,
+        options,
+        mask_margin_px,
+    )
+    named = sorted({(pair.query, pair.map) for pair in pairs})
+    run = PyramidPairs(query, mapping, how, query.matches(local_type), named)
+    run.find_hard()
+    jobs = [
+        Retry(how, image, tuple(other for _, other in group))
+        for image, group in groupby(run.hard, key=lambda pair: pair[0])
+    ]
+    return run.write(jobs, output, executor, track)

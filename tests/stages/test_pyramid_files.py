@@ -1,0 +1,100 @@
+"""The spool of variants' matches, and the files of the type ``T-pyramid``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from megloc_kapture.errors import OutputError
+from megloc_kapture.geometry.image_variants import ImageVariant
+from megloc_kapture.io.kapture_features import FeatureReader, feature_folder
+from megloc_kapture.io.kapture_store import FeatureConfig, FeatureWriter
+from megloc_kapture.matching.guided_pyramid import VariantMatches
+from megloc_kapture.stages.pyramid_files import MatchSpool, PyramidFeatures
+
+KEYPOINTS = FeatureConfig("toy", np.dtype("float32"), 3)
+DESCRIPTORS = FeatureConfig("toy", np.dtype("uint8"), 5, "toy", "L2")
+
+
+def readers(root: Path, *, tar: bool = False) -> tuple[FeatureReader, FeatureReader]:
+    rng = np.random.default_rng(0)
+    keypoints = rng.random((4, 3)).astype(np.float32)
+    descriptors = rng.integers(0, 255, (4, 5)).astype(np.uint8)
+    for kind, config, array in (
+        ("keypoints", KEYPOINTS, keypoints),
+        ("descriptors", DESCRIPTORS, descriptors),
+    ):
+        with FeatureWriter(root, kind, "toy", config, orphan=True, tar=tar) as writer:
+            writer.write("a/1.png", array)
+    return _opened(root, "toy")
+
+
+def _opened(root: Path, name: str) -> tuple[FeatureReader, FeatureReader]:
+    places = {
+        kind: [(root, feature_folder(root, kind, name, orphan=True))]
+        for kind in ("keypoints", "descriptors")
+    }
+    return (
+        FeatureReader("keypoints", name, places["keypoints"]),
+        FeatureReader("descriptors", name, places["descriptors"]),
+    )
+
+
+def test_what_is_spooled_comes_back(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    many = [
+        VariantMatches(
+            ImageVariant(0.5, 90),
+            rng.random((count, 3)).astype(np.float32),
+            rng.integers(0, 255, (count, 5)).astype(np.uint8),
+            rng.integers(0, 2**40, count),
+            rng.random(count).astype(np.float32),
+        )
+        for count in (3, 0, 5)
+    ]
+    with MatchSpool(tmp_path / "new", *readers(tmp_path / "toy")) as spool:
+        places = [spool.put(matches) for matches in many]
+        for matches, place in reversed(list(zip(many, places, strict=True))):
+            found = spool.get(place)
+            assert found.variant == matches.variant and len(found) == len(matches)
+            np.testing.assert_array_equal(found.keypoints_px, matches.keypoints_px)
+            np.testing.assert_array_equal(found.other_rows, matches.other_rows)
+            np.testing.assert_array_equal(found.scores, matches.scores)
+        asked = [(2, 4), (0, 1), (2, 0)]
+        found = spool.descriptors(
+            [places[number].descriptor_at(match, spool.row_bytes) for number, match in asked]
+        )
+        expected = [many[number].descriptors[match] for number, match in asked]
+        np.testing.assert_array_equal(found, expected)
+    assert list((tmp_path / "new").iterdir()) == []  # nothing of it stays
+
+
+@pytest.mark.parametrize("tar", [False, True])
+def test_an_image_that_nothing_was_added_to_has_what_it_had(tmp_path: Path, tar: bool) -> None:
+    sources = readers(tmp_path / "toy", tar=tar)
+    features = PyramidFeatures(tmp_path / "out", *sources)
+    features.write("a/1.png", np.zeros((0, 3), np.float32), np.zeros((0, 5), np.uint8))
+    for source, written in zip(sources, _opened(tmp_path / "out", "toy-pyramid"), strict=True):
+        np.testing.assert_array_equal(written.read("a/1.png"), source.read("a/1.png"))
+        if not tar:  # no space twice
+            assert Path(written.where("a/1.png")).samefile(source.where("a/1.png"))
+
+
+def test_what_was_added_comes_behind_and_the_source_stays_as_it_is(tmp_path: Path) -> None:
+    sources = readers(tmp_path / "toy")
+    before = [source.read("a/1.png") for source in sources]
+    more = np.full((2, 3), 7.5, np.float32), np.full((2, 5), 9, np.uint8)
+    PyramidFeatures(tmp_path / "out", *sources).write("a/1.png", *more)
+    opened = _opened(tmp_path / "out", "toy-pyramid")
+    for source, written, own, added in zip(sources, opened, before, more, strict=True):
+        np.testing.assert_array_equal(written.read("a/1.png"), np.concatenate([own, added]))
+        np.testing.assert_array_equal(source.read("a/1.png"), own)
+    assert opened[1].config.keypoints_type == "toy-pyramid"
+
+
+def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="file"):
+        MatchSpool(tmp_path / "file", *readers(tmp_path / "toy"))
