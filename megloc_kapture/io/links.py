@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -61,5 +63,23 @@ def link_file(source: Path, place: Path) -> None:
         place.parent.mkdir(parents=True, exist_ok=True)
         place.unlink(missing_ok=True)
         place.symlink_to(Path(source).resolve())
+    except OSError as error:
+        raise output_error(place, error) from error
+
+
+def hard_link(source: Path, place: Path) -> None:
+    """Make ``place`` another name of a file, or a copy of it where the file system has no such.
+
+    Raises
+    ------
+    OutputError : cannot be written.
+    """
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.unlink(missing_ok=True)
+        try:
+            os.link(source, place)
+        except OSError:  # another file system, or one without hard links
+            shutil.copyfile(source, place)
     except OSError as error:
         raise output_error(place, error) from error

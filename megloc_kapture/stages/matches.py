@@ -141,12 +141,12 @@ def match_pairs(
 
 def _match(job: _Job) -> list[_PairMatches]:
     first, second = job.first.open(), job.second.open()
-    features = _cached(job.first, first, job.local_type, job.image)
+    features = cached_features(job.first, first, job.local_type, job.image)
     found: list[_PairMatches] = []
     for others in batched(job.others, BATCH):  # not all at once: their features are in memory
         found += match_and_verify(
             features,
-            [_cached(job.second, second, job.local_type, other) for other in others],
+            [cached_features(job.second, second, job.local_type, other) for other in others],
             job.matcher,
             [
                 _relative_verification(job.verification, first, second, job.image, other)
@@ -279,7 +279,10 @@ def _size(features: Features) -> int:
 _cache = FeatureCache()
 
 
-def _cached(spec: FolderSpec, folder: KaptureFolder, local_type: str, image: str) -> Features:
+def cached_features(
+    spec: FolderSpec, folder: KaptureFolder, local_type: str, image: str
+) -> Features:
+    """The features of an image of a folder that a work item opened; kept in this process."""
     return _cache.get(
         (*spec.key, local_type, image),
         lambda: read_features(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +14,7 @@ from megloc_kapture.geometry.image_variants import ImageVariant
 from megloc_kapture.io.atomic import output_error
 from megloc_kapture.io.kapture_features import SUFFIX, feature_folder
 from megloc_kapture.io.kapture_store import FeatureReader, FeatureWriter
+from megloc_kapture.io.links import hard_link
 from megloc_kapture.matching.guided_pyramid import VariantMatches, pyramid_type
 
 
@@ -135,27 +134,8 @@ class PyramidFeatures:
             self._sources, self._writers, self._folders, added, strict=True
         ):
             place = folder / f"{image}{SUFFIX[source.kind]}"
-            if len(more) == 0 and link_file(Path(source.where(image)), place):
+            stored = Path(source.where(image))
+            if len(more) == 0 and stored.is_file():  # else it is a member of a tar
+                hard_link(stored, place)
                 continue
             writer.write(image, np.concatenate([source.read(image), more]))
-
-
-def link_file(source: Path, place: Path) -> bool:
-    """Make ``place`` a hard link to a file, or a copy of it; False where it is no file.
-
-    Raises
-    ------
-    OutputError : cannot be written.
-    """
-    if not source.is_file():  # a member of a tar
-        return False
-    try:
-        place.parent.mkdir(parents=True, exist_ok=True)
-        place.unlink(missing_ok=True)
-        try:
-            os.link(source, place)
-        except OSError:  # another file system, or one without hard links
-            shutil.copyfile(source, place)
-    except OSError as error:
-        raise output_error(place, error) from error
-    return True

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.image_variants import ImageVariant
-from megloc_kapture.io.kapture_store import KaptureFolder
 from megloc_kapture.matching.guided_pyramid import (
     Extract,
     GuidedPyramidOptions,
@@ -32,11 +31,10 @@ from megloc_kapture.plugins import LocalFeatureExtractor, Matcher
 from megloc_kapture.stages.local_features import checked_features, read_image_of, read_mask
 from megloc_kapture.stages.matches import (
     BATCH,
-    FeatureCache,
     Features,
     batched,
+    cached_features,
     match_all,
-    read_features,
 )
 from megloc_kapture.stages.parallel import FolderSpec
 from megloc_kapture.values import LocalFeatures
@@ -108,7 +106,7 @@ def retry(job: Retry) -> Retried:
         image.shape[:2],
         margin_px=how.mask_margin_px,
     )
-    itself = _cached(how.first, first, how.first_type, job.image)
+    itself = cached_features(how.first, first, how.first_type, job.image)
     every = how.options.variants(camera.width, camera.height)
     scaled = [variant for variant in every if variant.scale != 1.0]
     variants, skipped = extract_variants(
@@ -125,7 +123,7 @@ def retry(job: Retry) -> Retried:
         for matches in match_in_batches(
             used,
             names,
-            lambda name: _cached(how.second, second, how.second_type, name),
+            lambda name: cached_features(how.second, second, how.second_type, name),
             how.matcher,
             lambda name, other: _judgement(job, itself, name, other),
         )
@@ -184,21 +182,6 @@ def _judgement(job: Retry, itself: Features, name: str, other: Features) -> Judg
         other.slopes,
         other_from_world @ image_from_world.inverse(),
         how.verification,
-    )
-
-
-_cache = FeatureCache()
-
-
-def _cached(spec: FolderSpec, folder: KaptureFolder, local_type: str, image: str) -> Features:
-    return _cache.get(
-        (*spec.key, local_type, image),
-        lambda: read_features(
-            folder.keypoints(local_type),
-            folder.descriptors(local_type),
-            folder.read().camera_of(image),
-            image,
-        ),
     )
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
@@ -12,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.atomic import output_error
 from megloc_kapture.io.colmap import MapImage, TriangulationOptions, triangulate
 from megloc_kapture.io.kapture_features import SUFFIX, ArrayKind
 from megloc_kapture.io.kapture_store import (
@@ -25,7 +22,7 @@ from megloc_kapture.io.kapture_store import (
     write_points3d,
     write_sensors,
 )
-from megloc_kapture.io.links import link_images
+from megloc_kapture.io.links import hard_link, link_images
 
 
 def triangulate_map(
@@ -167,18 +164,18 @@ def _copy_type(
     for image in sorted(kept) if link_own else ():
         file = beside[0] / f"{image}{SUFFIX[kind]}"
         if file.is_file():
-            _link(file, place / f"{image}{SUFFIX[kind]}")
+            hard_link(file, place / f"{image}{SUFFIX[kind]}")
     for features_dir in source.features_dirs:
         found = features_dir / parent / type_name / kind
         beside.append(found.parent)
         for image in images:
-            file = found / f"{image}{SUFFIX[kind]}"
-            if image not in kept and file.is_file():
-                _link(file, place / f"{image}{SUFFIX[kind]}")
+            file, copy = (folder / f"{image}{SUFFIX[kind]}" for folder in (found, place))
+            if image not in kept and file.is_file() and not copy.exists():  # the first has it
+                hard_link(file, copy)
     if kind == "global_features":
         for folder, name in product(beside, _VOCABULARY_FILES):
-            if (folder / name).is_file():
-                _link(folder / name, place / name)
+            if (folder / name).is_file() and not (place / name).exists():
+                hard_link(folder / name, place / name)
     reader = _reader(source, kind, type_name)
     with FeatureWriter(output, kind, type_name, reader.config) as writer:
         for image in images:
@@ -194,16 +191,3 @@ def _reader(folder: KaptureFolder, kind: ArrayKind, type_name: str) -> FeatureRe
         if kind == "descriptors"
         else folder.global_features(type_name)
     )
-
-
-def _link(source: Path, place: Path) -> None:
-    try:
-        place.parent.mkdir(parents=True, exist_ok=True)
-        if place.exists():
-            return
-        try:
-            os.link(source, place)
-        except OSError:  # another file system, or one without hard links
-            shutil.copyfile(source, place)
-    except OSError as error:
-        raise output_error(place, error) from error

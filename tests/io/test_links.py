@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from megloc_kapture.errors import OutputError
-from megloc_kapture.io.links import link_file, link_images
+from megloc_kapture.io.links import hard_link, link_file, link_images
 
 
 @pytest.fixture
@@ -76,3 +76,13 @@ def test_one_file_is_linked_in_the_place_of_an_older_one(source: Path, tmp_path:
     place.parent.joinpath("file").touch()
     with pytest.raises(OutputError, match="file/a.jpg"):
         link_file(image, place.parent / "file" / "a.jpg")
+
+
+def test_a_hard_link_is_the_same_file_and_replaces_what_was_there(tmp_path: Path) -> None:
+    source, place = tmp_path / "source", tmp_path / "deep" / "place"
+    source.write_bytes(b"new")
+    for _ in range(2):
+        hard_link(source, place)
+        assert place.samefile(source)
+    with pytest.raises(OutputError, match="below"):
+        hard_link(source, source / "below")
