@@ -118,8 +118,9 @@ def dotted(picture: Picture, points_px: NDArray[np.float64], color: str, name: s
     return Markup(
         f'<svg viewBox="0 0 {picture.width} {picture.height}" width="{picture.width}" '
         f'height="{picture.height}" role="img" aria-label="{escape(name)}">'
-        f'{_placed(picture, 0)}<path d="{dots}" stroke="{color}" '
-        'stroke-width="2" stroke-linecap="round" fill="none"/></svg>'
+        # as style: the figures of the same page say for every element that ends are cut
+        f'{_placed(picture, 0)}<path d="{dots}" stroke="{color}" stroke-width="2" '
+        'style="stroke-linecap:round" fill="none"/></svg>'
     )
 
 

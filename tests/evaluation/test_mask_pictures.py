@@ -210,6 +210,9 @@ def test_the_report_shows_them(
     page = page_of(html)
     assert "What masks hide" in page.text
     assert "50 keypoints of x kept, 17 removed" in page.text
+    # dots are nothing but round ends, and the figures' style is for every element of the page
+    assert "stroke-linecap: butt" in html
+    assert 'style="stroke-linecap:round"' in html
     assert html == render_report(evaluation, around=around)
     assert len(html) < len(render_report(evaluation)) + 200_000
     assert "What masks hide" not in page_of(render_report(evaluation)).text
