@@ -46,7 +46,7 @@ class PipelineOptions(Options):
         description="types of local features, all in one map; retrieval uses the first",
     )
     mask_margin_px: float = Field(
-        default=0.0, ge=0, description="features nearer than this to a masked pixel go too"
+        default=4.0, ge=0, description="features nearer than this to a masked pixel go too"
     )
     vlad: VladOptions = VladOptions()
     mapping_pairs: MappingPairsOptions = MappingPairsOptions()
