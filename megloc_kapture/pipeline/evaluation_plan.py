@@ -211,11 +211,8 @@ def _pyramid_stages(run: Run, dump: Mapping[str, Any]) -> list[Stage]:
 def _query_pyramid(run: Run, out: Path) -> dict[str, float]:
     counts: dict[str, float] = {}
     options = run.options
-    extractors = options.make_extractors() if options.makes_points() else []
-    if options.uses_given_map():
-        extractors.append(options.make_given_extractor())
     pairs = read_pairs(run.workspace.path(QUERY_PAIRS))
-    for extractor in extractors:
+    for extractor in options.query_extractors():
         mapping = matched_images(run, extractor.name)
         described = mapping.descriptors(extractor.name)
         found = pyramid_queries(

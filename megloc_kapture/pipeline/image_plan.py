@@ -32,9 +32,13 @@ def plan_images(run: Run, dump: Mapping[str, Any]) -> list[Stage]:
     ----------
     dump : the options as plain JSON values.
     """
+    remembered = run.workspace.path(HASHES)
+    hashes = FileHashes(remembered)
+    stages = [*_dataset_stages(run, hashes), *_preprocessing_stages(run, dump, hashes)]
+    if hashes.content():
+        write_bytes(remembered, (json.dumps(hashes.content()) + "\n").encode())
     return [
-        *_dataset_stages(run),
-        *_preprocessing_stages(run, dump),
+        *stages,
         Stage(
             "local_features",
             1,
@@ -46,7 +50,7 @@ def plan_images(run: Run, dump: Mapping[str, Any]) -> list[Stage]:
     ]
 
 
-def _dataset_stages(run: Run) -> list[Stage]:
+def _dataset_stages(run: Run, hashes: FileHashes) -> list[Stage]:
     """Import, behind rendering where the dataset is made rather than given."""
 
     def change(given: Protocol) -> Protocol:
@@ -76,10 +80,7 @@ def _dataset_stages(run: Run) -> list[Stage]:
         raise ValueError("a run needs a root or something that renders one")
     source.check()
     root = source.root.resolve()
-    remembered = run.workspace.path(HASHES)
-    hashes = FileHashes(remembered)
     content = hashes.of_files(root, source.input_files(root))
-    write_bytes(remembered, (json.dumps(hashes.content()) + "\n").encode())
     external = {"dataset files": content, "dataset root": str(root)}
     return [
         Stage(
@@ -101,7 +102,7 @@ def _import(run: Run, root: Path, out: Path, change: ProtocolChange) -> dict[str
     return counts
 
 
-def _preprocessing_stages(run: Run, dump: Mapping[str, Any]) -> list[Stage]:
+def _preprocessing_stages(run: Run, dump: Mapping[str, Any], hashes: FileHashes) -> list[Stage]:
     options = run.options.preprocessing
     if not run.options.preprocesses():
         return []
@@ -117,19 +118,18 @@ def _preprocessing_stages(run: Run, dump: Mapping[str, Any]) -> list[Stage]:
             ("import",),
             (PREPROCESSED,),
             lambda out: _preprocess(run, out),
-            _given_masks(options.masks),
+            _given_masks(options.masks, hashes),
         )
     ]
 
 
-def _given_masks(options: MaskOptions) -> dict[str, str]:
+def _given_masks(options: MaskOptions, hashes: FileHashes) -> dict[str, str]:
     """Fingerprints of the masks that lie outside the workspace."""
-    hashes = FileHashes()
     drawn = [fixed.file for fixed in options.fixed if fixed.file is not None]
-    found = {f"mask {path}": hashes.of_file(path) for path in drawn}
+    found = {f"mask {path}": hashes.of_file(path.resolve()) for path in drawn}
     if options.user_masks is not None:
-        files = options.user_masks.rglob("*.png")
-        found["user masks"] = hashes.of_files(options.user_masks, files)
+        root = options.user_masks.resolve()
+        found["user masks"] = hashes.of_files(root, root.rglob("*.png"))
     return found
 
 
@@ -168,9 +168,9 @@ def _features_used(run: Run, dump: Mapping[str, Any]) -> dict[str, Any]:
 
 def _local_features(run: Run, out: Path) -> dict[str, int]:
     mapping, query = run.workspace.folder(run.mapping), run.workspace.folder(run.query)
-    work: list[tuple[LocalFeatureExtractor, list[KaptureFolder]]] = []
-    if run.options.makes_points():
-        work += [(extractor, [mapping, query]) for extractor in run.options.make_extractors()]
+    work: list[tuple[LocalFeatureExtractor, list[KaptureFolder]]] = [
+        (extractor, [mapping, query]) for extractor in run.options.own_extractors()
+    ]
     if run.options.uses_given_map():
         check_given(run)
         described = has_descriptors(run.workspace.folder(REFERENCE))

@@ -69,11 +69,11 @@ class FileHashes:
     those of last time has last time's hash.
     """
 
-    def __init__(self, path: Path | None = None) -> None:
-        """``path`` is where they are remembered, if anywhere."""
+    def __init__(self, path: Path) -> None:
+        """``path`` is where they are remembered."""
         self._known: dict[str, list[Any]] = {}
         self._seen: dict[str, list[Any]] = {}
-        if path is not None and path.is_file():
+        if path.is_file():
             try:
                 content = json.loads(path.read_text(encoding="utf-8"))
                 self._known = content if isinstance(content, dict) else {}

@@ -134,11 +134,18 @@ class PipelineOptions(Options):
         types = self.local_types()
         return [pyramid_type(name) for name in types] if self.matches_again() else types
 
+    def own_extractors(self) -> list[LocalFeatureExtractor]:
+        """Extractors of the types that get points of our own; none for a given map alone."""
+        return self.make_extractors() if self.makes_points() else []
+
+    def query_extractors(self) -> list[LocalFeatureExtractor]:
+        """Extractors of all types that queries are localized with, ours first."""
+        given = [self.make_given_extractor()] if self.uses_given_map() else []
+        return [*self.own_extractors(), *given]
+
     def own_types(self) -> list[str]:
-        """Keypoints types that are extracted here and get points; none for a given map alone."""
-        return (
-            [extractor.name for extractor in self.make_extractors()] if self.makes_points() else []
-        )
+        """Keypoints types that are extracted here and get points."""
+        return [extractor.name for extractor in self.own_extractors()]
 
     def local_types(self) -> list[str]:
         """Keypoints types that queries are localized with, the one retrieval uses first.
@@ -148,9 +155,7 @@ class PipelineOptions(Options):
         PluginError : an extractor cannot be made.
         OptionError : two types of one name.
         """
-        types = self.own_types()
-        if self.uses_given_map():
-            types.append(self.make_given_extractor().name)
+        types = [extractor.name for extractor in self.query_extractors()]
         twice = sorted({name for name in types if types.count(name) > 1})
         if twice:
             raise OptionError(

@@ -122,6 +122,7 @@ class KaptureQueries:
             raise DataError("there are no query images", path=self._folder.root)
         self._check_widths()
         extractor = self._map.extractor()
+        loads = False
         for name in self.names:
             if self._has_features(name):
                 if self._keypoints is not None and self._descriptors is not None:
@@ -134,7 +135,9 @@ class KaptureQueries:
                     path=self._folder.root,
                 )
             else:
-                load_plugin(LOCAL_FEATURES, extractor.name, extractor.options)
+                if not loads:  # looking a plugin up is too slow to do it for every query
+                    load_plugin(LOCAL_FEATURES, extractor.name, extractor.options)
+                    loads = True
                 check_image(self._folder, name)
             for vectors in self._globals.values():
                 if name in vectors:
