@@ -37,7 +37,8 @@ def read_checkpoint(
     Parameters
     ----------
     content : the file's bytes: of torch (also with ``state_dict`` or ``model_state`` in it),
-        safetensors, npz, ONNX (initialisers), TensorFlow's ``.index``, or a tar of the latter.
+        safetensors, npz, ONNX (initialisers), MATLAB's ``.mat`` of NetVLAD, TensorFlow's
+        ``.index``, or a tar of the latter.
     where : the file; its ending says what it is, save for tars and torch's files.
     read_beside : content of the file beside it whose name has another ending instead of
         ``.index``.
@@ -59,6 +60,10 @@ def read_checkpoint(
         from megloc_kapture.io.onnx_initialisers import read_initialisers
 
         return _of_arrays(read_initialisers(content, where), where)
+    if ending == ".mat":
+        from megloc_kapture.io.matlab_weights import read_matlab_netvlad
+
+        return read_matlab_netvlad(content, where)
     if ending == _INDEX:
         from megloc_kapture.io.tensor_bundle import read_tensor_bundle
 
@@ -73,8 +78,11 @@ def _of_torch(content: bytes, where: str) -> dict[str, torch.Tensor]:
 
     import torch
 
+    from megloc_kapture.io.apgem_checkpoint import holds_pca, stand_ins, tensors_beside
+
+    is_apgem = holds_pca(content)
     try:
-        with torch.serialization.safe_globals(_dropped()):
+        with torch.serialization.safe_globals(stand_ins() if is_apgem else _dropped()):
             found = torch.load(io.BytesIO(content), weights_only=True, map_location="cpu")
     except Exception as error:  # torch's reader raises what it likes for broken bytes
         foreign = sorted(set(re.findall(r"GLOBAL ([\w.]+)", str(error))))
@@ -89,7 +97,10 @@ def _of_torch(content: bytes, where: str) -> dict[str, torch.Tensor]:
             "or it is damaged",
             path=where,
         ) from error
-    return _state_dict(found, where)
+    tensors = _state_dict(found, where)
+    if is_apgem and isinstance(found, Mapping):
+        tensors |= tensors_beside(found, where)
+    return tensors
 
 
 class _Dropped:

@@ -18,13 +18,13 @@ _BLOCKS: dict[Depth, tuple[int, int, int, int]] = {50: (3, 4, 6, 3), 101: (3, 4,
 _WIDTHS = (64, 128, 256, 512)
 _EXPANSION = 4
 # of the images of ImageNet, RGB in [0, 1]
-_MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+IMAGENET_MEAN, IMAGENET_DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 def imagenet_normalised(image: torch.Tensor) -> torch.Tensor:
     """An RGB image (B, 3, H, W) in [0, 1], shifted and scaled as networks from ImageNet take it."""
-    mean = image.new_tensor(_MEAN)[:, None, None]
-    return (image - mean) / image.new_tensor(_DEVIATION)[:, None, None]
+    mean = image.new_tensor(IMAGENET_MEAN)[:, None, None]
+    return (image - mean) / image.new_tensor(IMAGENET_DEVIATION)[:, None, None]
 
 
 class Bottleneck(nn.Module):

@@ -1,0 +1,197 @@
+"""Variables of MATLAB's MAT files of level 5, plain data only; written by MATLAB's ``save -v7``.
+
+SciPy's reader says of itself that it is not made for files from strangers: a wrong type code lets
+it follow a wild pointer. This one takes numbers, text, cells and structs, and skips everything
+else (objects, functions, sparse and complex arrays), whose size every element tells.
+
+Format: MathWorks, MAT-File Format, chapter 1, level 5.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.errors import DataError
+
+MatValue: TypeAlias = "NDArray[Any] | str | list[MatValue] | dict[str, MatValue] | None"
+"""Numbers (MATLAB's shape), text, a cell or an array of structs, one struct; None: not read."""
+
+_HEADER = 128
+_ENDIAN = {b"IM": "<", b"MI": ">"}
+_LEVEL_5, _LEVEL_7_3 = 0x0100, 0x0200
+_STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8"} | {
+    12: "i8",
+    13: "u8",
+}
+_TEXT = {1: "latin-1", 2: "latin-1", 4: "utf-16", 16: "utf-8", 17: "utf-16", 18: "utf-32"}
+_MATRIX, _COMPRESSED = 14, 15
+_CELL, _STRUCT, _CHAR, _NUMBERS = 1, 2, 4, range(6, 16)
+_COMPLEX = 0x0800
+_DEEPEST = 32  # cells in structs in cells: a file that goes on is refused
+_LARGEST = 1 << 31  # bytes of one variable unpacked; NetVLAD's has 0.6e9
+_CHUNK = 1 << 20
+
+
+class _BrokenError(ValueError):
+    """The bytes are no MAT file; becomes a DataError that names the file."""
+
+
+def read_mat(content: bytes, where: str) -> dict[str, MatValue]:
+    """All variables of a MAT file by name; nothing of the file is run.
+
+    Parameters
+    ----------
+    content : the file's bytes. Arrays of a file that is not compressed are views of them.
+    where : the file, for messages.
+
+    Raises
+    ------
+    DataError : no MAT file of level 5, damaged, or larger unpacked than 2 GiB.
+    """
+    try:
+        order = _byte_order(content)
+        found: dict[str, MatValue] = {}
+        at = _HEADER
+        while at < len(content):
+            kind, body, at = _element(memoryview(content), at, order)
+            if kind == _COMPRESSED:
+                kind, body, _ = _element(_unpacked(body, order), 0, order)
+            if kind == _MATRIX:
+                name, value = _matrix(body, order, 0)
+                found[name] = value
+        return found
+    except (_BrokenError, struct.error, UnicodeDecodeError, zlib.error) as error:
+        raise DataError(f"not a MAT file that can be read: {error}", path=where) from error
+
+
+def _byte_order(content: bytes) -> str:
+    order = _ENDIAN.get(content[_HEADER - 2 : _HEADER])
+    if order is None:
+        raise _BrokenError("it is none of level 5, as MATLAB's save -v7 writes them")
+    version = struct.unpack_from(order + "H", content, _HEADER - 4)[0]
+    if version == _LEVEL_7_3:
+        raise _BrokenError("it is of level 7.3 (HDF5); save it with -v7")
+    if version != _LEVEL_5:
+        raise _BrokenError(f"its level is {version:#x}, not {_LEVEL_5:#x}")
+    return order
+
+
+def _element(data: memoryview, at: int, order: str) -> tuple[int, memoryview, int]:
+    """Type and bytes of the element at a place, and the place of the next one."""
+    kind, size = struct.unpack_from(order + "II", data, at)
+    if kind >> 16:  # up to four bytes stand in the tag itself
+        kind, size, start, after = kind & 0xFFFF, kind >> 16, at + 4, at + 8
+        if size > 4:
+            raise _BrokenError(f"{size} bytes where 4 fit")
+    else:
+        start = at + 8
+        # all but packed elements fill up to whole eights; the last one of a file need not
+        after = start + size + (0 if kind == _COMPRESSED else -size % 8)
+    if start + size > len(data):
+        raise _BrokenError("it ends too early")
+    return kind, data[start : start + size], after
+
+
+def _unpacked(packed: memoryview, order: str) -> memoryview:
+    """The one element in a packed element, in memory that may be written to."""
+    tag = zlib.decompressobj().decompress(packed[:_CHUNK], 8)
+    size = struct.unpack(order + "II", tag)[1] + 8
+    if size > _LARGEST:
+        raise _BrokenError(f"a variable of {size} bytes, more than {_LARGEST}")
+    # memory is asked for in one piece, as joining pieces would need it twice, and taken as it fills
+    unpacked, filled, stream = np.empty(size, np.uint8), 0, zlib.decompressobj()
+    for start in range(0, len(packed), _CHUNK):
+        part = stream.decompress(packed[start : start + _CHUNK], size - filled + 1)
+        if filled + len(part) > size:
+            raise _BrokenError("more is packed in an element than it says")
+        unpacked[filled : filled + len(part)] = np.frombuffer(part, np.uint8)
+        filled += len(part)
+    if filled < size:
+        raise _BrokenError("it ends too early")
+    return unpacked.data
+
+
+def _matrix(data: memoryview, order: str, depth: int) -> tuple[str, MatValue]:
+    """Name and value of an array."""
+    if len(data) == 0:
+        return "", np.zeros((0, 0))
+    if depth > _DEEPEST:
+        raise _BrokenError(f"more than {_DEEPEST} arrays in one another")
+    _, flags, at = _element(data, 0, order)
+    word = struct.unpack_from(order + "I", flags)[0]
+    _, sizes, at = _element(data, at, order)
+    shape = struct.unpack(f"{order}{len(sizes) // 4}i", sizes)
+    if len(shape) < 2 or len(shape) > 32 or min(shape) < 0:
+        raise _BrokenError(f"an array of shape {shape[:4]}")
+    _, letters, at = _element(data, at, order)
+    name, kind, count = bytes(letters).decode("latin-1"), word & 0xFF, math.prod(shape)
+    if kind == _CELL:
+        return name, _items(data, at, order, depth, count)
+    if kind == _STRUCT:
+        return name, _structs(data, at, order, depth, count)
+    if kind == _CHAR:
+        return name, _text(data, at, order)
+    if kind in _NUMBERS and not word & _COMPLEX:
+        return name, _numbers(data, at, order, shape)
+    return name, None
+
+
+def _items(data: memoryview, at: int, order: str, depth: int, count: int) -> list[MatValue]:
+    """``count`` arrays one after another."""
+    if count * 8 > len(data) - at:
+        raise _BrokenError(f"{count} arrays in {len(data) - at} bytes")
+    items = []
+    for _ in range(count):
+        kind, body, at = _element(data, at, order)
+        if kind != _MATRIX:
+            raise _BrokenError(f"type {kind} where an array should be")
+        items.append(_matrix(body, order, depth + 1)[1])
+    return items
+
+
+def _structs(data: memoryview, at: int, order: str, depth: int, count: int) -> MatValue:
+    """One struct, or the list of several."""
+    _, length, at = _element(data, at, order)
+    width = struct.unpack(order + "i", length)[0]
+    _, letters, at = _element(data, at, order)
+    if width < 1 or len(letters) % width:
+        raise _BrokenError(f"names of fields of {width} letters in {len(letters)}")
+    names = [
+        bytes(letters[start : start + width]).split(b"\0")[0].decode("latin-1")
+        for start in range(0, len(letters), width)
+    ]
+    if not names:
+        return {}
+    items = _items(data, at, order, depth, count * len(names))
+    rows = [
+        dict(zip(names, items[start : start + len(names)], strict=True))
+        for start in range(0, len(items), len(names))
+    ]
+    return rows[0] if count == 1 else list(rows)
+
+
+def _text(data: memoryview, at: int, order: str) -> str:
+    kind, letters, _ = _element(data, at, order)
+    encoding = _TEXT.get(kind)
+    if encoding is None:
+        raise _BrokenError(f"text of type {kind}")
+    if encoding in ("utf-16", "utf-32"):
+        encoding += "-le" if order == "<" else "-be"
+    return bytes(letters).decode(encoding)
+
+
+def _numbers(data: memoryview, at: int, order: str, shape: tuple[int, ...]) -> NDArray[Any]:
+    kind, values, _ = _element(data, at, order)
+    stored = _STORED.get(kind)
+    if stored is None:
+        raise _BrokenError(f"numbers of type {kind}")
+    dtype = np.dtype(order + stored)
+    if math.prod(shape) * dtype.itemsize != len(values):
+        raise _BrokenError(f"{len(values)} bytes for an array {shape} of {dtype.name}")
+    return np.frombuffer(values, dtype).reshape(shape, order="F")
