@@ -11,13 +11,18 @@ import contextlib
 import io
 import os
 import tarfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.atomic import output_error, write_bytes
 from megloc_kapture.io.paths import check_no_escape, check_relative, safe_join
+from megloc_kapture.io.row_reading import read_file_row, read_fully, read_rows_at
+from megloc_kapture.io.tar_runs import names_of_run, stride_of
 
 _TAR_BLOCK = 512
 _TAR_RECORD = 20 * _TAR_BLOCK
@@ -31,6 +36,14 @@ class BlobSource(Protocol):
     def size(self, name: str) -> int: ...
     def read(self, name: str) -> bytearray: ...
     def where(self, name: str) -> str: ...
+
+    def read_rows(self, names: Sequence[str], rows: NDArray[np.uint8]) -> NDArray[np.int64]:
+        """Read blobs of one size into the rows (N, B) of an array, C-contiguous.
+
+        Returns their sizes, int64 (N,), -1 where there is no such blob: only the rows of those of
+        size B are filled.
+        """
+        ...
 
 
 class FolderBlobs:
@@ -71,8 +84,44 @@ class FolderBlobs:
         except OSError as error:
             raise _unreadable(path, error) from error
 
+    def read_rows(self, names: Sequence[str], rows: NDArray[np.uint8]) -> NDArray[np.int64]:
+        sizes = np.full(len(names), -1, dtype=np.int64)
+        width = rows.shape[1]
+        flat = rows.reshape(-1).data
+        parent, descriptor = "", None
+        try:
+            for k, name in enumerate(names):
+                above, slash, last = check_relative(name).rpartition("/")
+                if descriptor is None or above + slash != parent:
+                    if descriptor is not None:
+                        os.close(descriptor)
+                    parent, descriptor = above + slash, self._open_folder(above)
+                if descriptor is None:
+                    continue
+                row = flat[k * width : (k + 1) * width]
+                size = read_file_row(descriptor, last, row)
+                if size is None:  # a link: where it leads to is checked
+                    size = -1 if name not in self else self.size(name)
+                    if size == width:
+                        row[:] = self.read(name)
+                sizes[k] = size
+        except OSError as error:
+            raise _unreadable(self._folder / name, error) from error
+        finally:
+            if descriptor is not None:
+                os.close(descriptor)
+        return sizes
+
     def where(self, name: str) -> str:
         return str(self._folder / name)
+
+    def _open_folder(self, relative: str) -> int | None:
+        """A descriptor of a folder below, None where there is none."""
+        path = check_no_escape(self._root, self._folder / relative)
+        try:
+            return os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        except (FileNotFoundError, NotADirectoryError):
+            return None
 
     def _checked(self, name: str) -> Path:
         return check_no_escape(self._root, safe_join(self._folder, name))
@@ -112,17 +161,25 @@ class TarBlobs:
     def read(self, name: str) -> bytearray:
         offset, size = self._place(name)
         content = bytearray(size)
-        done = 0
         try:
             with memoryview(content) as view:
-                while done < size:  # one call gives 2 GiB at most
-                    read = os.preadv(self._file.fileno(), [view[done:]], offset + done)
-                    if read == 0:
-                        raise DataError(f"truncated at member {name!r}", path=self._path)
-                    done += read
+                if not read_fully(self._file.fileno(), view, offset):
+                    raise DataError(f"truncated at member {name!r}", path=self._path)
         except OSError as error:
             raise _unreadable(self._path, error) from error
         return content
+
+    def read_rows(self, names: Sequence[str], rows: NDArray[np.uint8]) -> NDArray[np.int64]:
+        absent = (0, -1)
+        places = [self._index.get(name, absent) for name in names]
+        offsets, sizes = np.array(places, dtype=np.int64).reshape(-1, 2).T
+        wanted = np.flatnonzero(sizes == rows.shape[1])
+        try:
+            if not read_rows_at(self._file.fileno(), offsets[wanted], wanted, rows):
+                raise DataError("truncated while it was read", path=self._path)
+        except OSError as error:
+            raise _unreadable(self._path, error) from error
+        return sizes
 
     def where(self, name: str) -> str:
         return f"{self._path}[{name}]"
@@ -153,6 +210,7 @@ def index_tar(path: Path, *, repair: bool = False) -> tuple[dict[str, tuple[int,
     """
     index: dict[str, tuple[int, int]] = {}
     end = 0
+    layout = (0, 0)
     try:
         total = path.stat().st_size
         if total == 0:
@@ -177,6 +235,20 @@ def index_tar(path: Path, *, repair: bool = False) -> tuple[dict[str, tuple[int,
                     if not member.isreg() or member.issparse():
                         raise DataError(f"member {member.name!r} is not a plain file", path=path)
                     index[_member_name(member.name, path)] = (member.offset_data, member.size)
+                    before, layout = layout, (member.offset_data - member.offset, member.size)
+                    if layout != before or tar.pax_headers:
+                        continue
+                    # two alike: more of them will follow
+                    header_bytes, size = layout
+                    run = names_of_run(
+                        file.fileno(), end, total, header_bytes=header_bytes, size=size
+                    )
+                    stride = stride_of(header_bytes, size)
+                    begins = range(end + header_bytes, total, stride)
+                    for name, begin in zip(_member_names(run, path), begins, strict=False):
+                        index[name] = (begin, size)
+                    end += len(run) * stride
+                    tar.offset = end  # where it goes on
             _check_end(path, file, end, repair)
     except FileNotFoundError as error:
         raise DataError("file is missing", path=path) from error
@@ -192,6 +264,16 @@ def _check_end(path: Path, file: BinaryIO, end: int, repair: bool) -> None:
     file.seek(end)
     if not repair and any(file.read(_TAR_BLOCK)):
         raise DataError(f"broken or truncated after byte {end}", path=path)
+
+
+def _member_names(names: list[str], path: Path) -> list[str]:
+    """:func:`_member_name` of each; names that are plain need one look at all of them."""
+    if names:
+        try:
+            check_relative("/".join(names))  # an empty component where one begins or ends with "/"
+        except DataError:
+            return [_member_name(name, path) for name in names]
+    return names
 
 
 def _member_name(name: str, path: Path) -> str:

@@ -255,6 +255,44 @@ class FeatureReader:
             return array
         return array.reshape(rows, self.config.dsize)
 
+    def read_rows(self, images: Sequence[str], rows: NDArray[Any]) -> None:
+        """Read the global features of several images into the rows of an array.
+
+        Parameters
+        ----------
+        rows : (N, dsize), C-contiguous, of the configuration's dtype.
+
+        Raises
+        ------
+        ValueError : features of another kind, or rows of another shape or layout.
+        DataError : an image has none, or a truncated file.
+        """
+        if self.kind != "global_features":
+            raise ValueError(f"{self.kind} have no fixed number of rows")
+        config, shape = self.config, (len(images), self.config.dsize)
+        if rows.shape != shape or rows.dtype != config.dtype or not rows.flags.c_contiguous:
+            raise ValueError(f"expected contiguous {config.dtype.name} {shape}, got {rows.shape}")
+        todo = np.arange(len(images))
+        content = rows.view(np.uint8)
+        for source in self._sources:
+            if len(todo) == 0:
+                return
+            names = [images[k] + SUFFIX[self.kind] for k in todo.tolist()]
+            whole = len(todo) == len(images)
+            here = content if whole else np.empty((len(todo), content.shape[1]), dtype=np.uint8)
+            sizes = source.read_rows(names, here)
+            for k in np.flatnonzero((sizes >= 0) & (sizes != config.row_bytes)).tolist():
+                self._rows(source, names[k], int(sizes[k]))  # says what is wrong
+            found = sizes >= 0
+            if not whole:
+                content[todo[found]] = here[found]
+            todo = todo[~found]
+        if len(todo):
+            raise DataError(
+                f"{len(todo)} images have no global feature of type {self.type_name}, "
+                f"the first is {images[int(todo[0])]}"
+            )
+
     def where(self, image: str) -> str:
         """The file (or member of a tar) that holds an image's array, for messages."""
         source, name = self._source(image)

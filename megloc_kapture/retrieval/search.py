@@ -1,31 +1,61 @@
-"""Exact nearest neighbours among global descriptors, as blocked matrix products."""
+"""Exact nearest neighbours among global descriptors, as blocked matrix products.
+
+Databases are read block by block, and no more than one block of similarities per feature is kept:
+what the search needs does not grow with the database.
+"""
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
+from megloc_kapture.retrieval.best_rows import BestRows
+from megloc_kapture.retrieval.blocks import (
+    ConcatenatedBlocks,
+    VectorBlocks,
+    VectorSource,
+    as_blocks,
+    common_length,
+)
+from megloc_kapture.retrieval.early_fusion import concatenate
+from megloc_kapture.retrieval.fusion import FusionOptions, check_features, fuse
+from megloc_kapture.retrieval.rank_fusion import borda, reciprocal_rank, round_robin
+from megloc_kapture.retrieval.weights import normalized_weights
 
-_BLOCK_ELEMENTS = 1 << 22  # scores held at once: 16 MiB of float32
+_BLOCK_ELEMENTS = 1 << 22  # similarities held at once, per feature: 16 MiB of float32
+_VECTOR_ELEMENTS = 1 << 24  # of a block of database rows: 64 MiB of float32
+_MOST_ROWS = 1 << 14  # of a block, however short they are
+_CACHED_ELEMENTS = 1 << 18  # of similarities ranked at once: 1 MiB
+_THREADS = 4  # that fuse and rank; products have the matrix library's own
+
+Permitted = NDArray[np.bool_] | Callable[[int, int], NDArray[np.bool_]] | None
+Found = tuple[NDArray[np.int64], NDArray[np.float32]]
 
 
 def rank_by_similarity(
     queries: NDArray[np.floating[Any]],
-    database: NDArray[np.floating[Any]],
+    database: VectorSource,
     top_k: int,
     *,
-    permitted: NDArray[np.bool_] | None = None,
-) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    permitted: Permitted = None,
+) -> Found:
     """The ``top_k`` most similar database rows of each query row, by inner product.
 
     Parameters
     ----------
-    queries, database : float (Q, D) and (M, D), rows of unit length for cosine similarity.
+    queries : float (Q, D), rows of unit length for cosine similarity. A zero row, of an image
+        without features, has similarity 0 with everything.
+    database : float (M, D), or a source of blocks of them.
     top_k : at most this many per query.
-    permitted : bool (Q, M) or None; rows that a query must not get.
+    permitted : bool (Q, M), False for rows that a query must not get; or a function that gives
+        (Q, stop - start) of the database rows ``start`` to ``stop``; or None.
 
     Returns
     -------
@@ -37,54 +67,154 @@ def rank_by_similarity(
     ------
     DataError : different dimensions, or values that are not finite.
     """
-    q = np.ascontiguousarray(queries, dtype=np.float32)
-    m = np.ascontiguousarray(database, dtype=np.float32)
-    if q.ndim != 2 or m.ndim != 2 or q.shape[1] != m.shape[1]:
-        raise DataError(
-            f"global descriptors of queries {q.shape} and map {m.shape} have different dimensions"
+    (found,) = _search([queries], [database], [top_k], lambda matrices: matrices, permitted)
+    return found
+
+
+def rank_fused(
+    queries: Sequence[NDArray[np.floating[Any]]],
+    database: Sequence[VectorSource],
+    top_k: int,
+    *,
+    fusion: FusionOptions,
+    weights: Sequence[float] | None = None,
+    permitted: Permitted = None,
+) -> Found:
+    """The ``top_k`` best database rows of each query row by several features together.
+
+    Parameters
+    ----------
+    queries : per feature float (Q, D_i), rows of unit length or zero.
+    database : per feature float (M, D_i), or a source of blocks of them.
+    top_k, permitted : as of :func:`rank_by_similarity`.
+    fusion : the method, of similarities or of ranks. One feature alone is not fused.
+    weights : one per feature, positive; all equal by default.
+
+    Returns
+    -------
+    indices, scores : as of :func:`rank_by_similarity`; scores as the fusion makes them.
+
+    Raises
+    ------
+    DataError : different dimensions or numbers of rows, or values that are not finite.
+    OptionError : weights that cannot be used, or other features than those of the queries.
+    """
+    check_features(len(queries), len(database))
+    normalized_weights(weights, len(queries))  # refused before anything is read
+    if len(queries) == 1:
+        return rank_by_similarity(queries[0], database[0], top_k, permitted=permitted)
+    if fusion.method == "early":
+        together = concatenate([np.asarray(rows, np.float32) for rows in queries], weights)
+        joined = ConcatenatedBlocks(database, weights)
+        return rank_by_similarity(together, joined, top_k, permitted=permitted)
+    if not fusion.fuses_ranks():
+        (found,) = _search(
+            queries, database, [top_k], lambda ms: [fuse(ms, fusion, weights)], permitted
         )
-    if not (np.isfinite(q).all() and np.isfinite(m).all()):
-        raise DataError("global descriptors have values that are not finite")
-    k = min(top_k, len(m))
-    indices = np.full((len(q), k), -1, dtype=np.int64)
-    scores = np.full((len(q), k), -np.inf, dtype=np.float32)
-    if k == 0:
-        return indices, scores
-    rows = max(1, min(256, len(q)))
-    columns = max(k, _BLOCK_ELEMENTS // rows)
-    for start in range(0, len(q), rows):
-        stop = min(start + rows, len(q))
-        best_index = np.zeros((stop - start, 0), dtype=np.int64)
-        best_score = np.zeros((stop - start, 0), dtype=np.float32)
-        for left in range(0, len(m), columns):
-            right = min(left + columns, len(m))
-            block = q[start:stop] @ m[left:right].T
-            if permitted is not None:
-                block[~permitted[start:stop, left:right]] = -np.inf
-            new_index, new_score = _top(block, k)
-            # earlier blocks come first, so that stable sorting keeps the database's order
-            best_index = np.concatenate([best_index, new_index + left], axis=1)
-            best_score = np.concatenate([best_score, new_score], axis=1)
-            order = np.argsort(-best_score, axis=1, kind="stable")[:, :k]
-            best_index = np.take_along_axis(best_index, order, axis=1)
-            best_score = np.take_along_axis(best_score, order, axis=1)
-        valid = best_score > -np.inf
-        indices[start:stop] = np.where(valid, best_index, -1)
-        scores[start:stop] = best_score
-    return indices, scores
+        return found
+    # a turn of the round gives one image at most, so longer lists would change nothing
+    length = top_k if fusion.method == "round_robin" else max(top_k, fusion.list_length)
+    lists = _search(queries, database, [length] * len(queries), lambda ms: ms, permitted)
+    rankings = [indices for indices, _ in lists]
+    top_k = min(top_k, rankings[0].shape[1])
+    if fusion.method == "round_robin":
+        return round_robin(rankings, top_k)
+    if fusion.method == "borda":
+        return borda(rankings, top_k, weights)
+    return reciprocal_rank(rankings, top_k, weights, constant=fusion.rank_constant)
 
 
-def _top(block: NDArray[np.float32], k: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Top k of each row, ties by column, exactly as a full stable sort would give."""
-    width = block.shape[1]
-    if k < width:
-        # everything at or above the k-th value, then a stable sort of those few
-        threshold = -np.partition(-block, k - 1, axis=1)[:, k - 1]
-        index = np.empty((len(block), k), dtype=np.int64)
-        for row, bound in enumerate(threshold):
-            candidates = np.flatnonzero(block[row] >= bound)
-            order = np.argsort(-block[row, candidates], kind="stable")[:k]
-            index[row] = candidates[order]
-    else:
-        index = np.argsort(-block, axis=1, kind="stable")[:, :k]
-    return index, np.take_along_axis(block, index, axis=1)
+Matrices = Sequence[NDArray[np.floating[Any]]]
+
+
+def _search(
+    queries: Sequence[NDArray[np.floating[Any]]],
+    database: Sequence[VectorSource],
+    lengths: Sequence[int],
+    combine: Callable[[Matrices], Matrices],
+    permitted: Permitted,
+) -> list[Found]:
+    """One ranking, of the length that is asked for, per matrix of scores that ``combine`` makes."""
+    sources = [as_blocks(source) for source in database]
+    vectors = [_checked(rows, source) for rows, source in zip(queries, sources, strict=True)]
+    num_queries, num_rows = len(vectors[0]), common_length(sources)
+    if any(len(rows) != num_queries for rows in vectors):
+        raise DataError(f"features of {', '.join(str(len(rows)) for rows in vectors)} queries")
+    best = [BestRows(num_queries, min(length, num_rows)) for length in lengths]
+    step = _VECTOR_ELEMENTS // max(1, *(source.dimension for source in sources))
+    step = max(1, min(step, _MOST_ROWS, _BLOCK_ELEMENTS))
+    height = min(step, num_rows)
+    buffers = [np.empty((height, source.dimension), dtype=np.float32) for source in sources]
+    at_once = max(1, _BLOCK_ELEMENTS // step)
+    with ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool:
+        for left in range(0, num_rows, step) if num_queries else ():
+            right = min(left + step, num_rows)
+            blocks = [
+                source.read(left, right, out=buffer[: right - left])
+                for source, buffer in zip(sources, buffers, strict=True)
+            ]
+            allowed = permitted(left, right) if callable(permitted) else permitted
+            if allowed is not None and not callable(permitted):
+                allowed = allowed[:, left:right]
+            for first in range(0, num_queries, at_once):
+                matrices = [
+                    _similarities(rows[first : first + at_once], block, left)
+                    for rows, block in zip(vectors, blocks, strict=True)
+                ]
+                mask = None if allowed is None else allowed[first : first + at_once]
+                rank = partial(_rank, matrices, mask, combine, best, first, left)
+                for _ in pool.map(rank, _parts(*matrices[0].shape)):
+                    pass
+    return [ranking.result() for ranking in best]
+
+
+def _parts(num_queries: int, width: int) -> list[slice]:
+    """Queries whose scores a processor's cache holds."""
+    step = max(1, _CACHED_ELEMENTS // width)
+    return [slice(start, start + step) for start in range(0, num_queries, step)]
+
+
+def _rank(
+    matrices: Matrices,
+    allowed: NDArray[np.bool_] | None,
+    combine: Callable[[Matrices], Matrices],
+    best: Sequence[BestRows],
+    first_query: int,
+    first_row: int,
+    part: slice,
+) -> None:
+    """Fuse and rank the similarities of some of a block's queries."""
+    fused = combine([matrix[part] for matrix in matrices])
+    for scores, ranking in zip(fused, best, strict=True):
+        if allowed is not None:
+            scores = np.where(allowed[part], scores, -np.inf)
+        ranking.add(first_query + part.start, first_row, scores)
+
+
+def _checked(queries: NDArray[np.floating[Any]], source: VectorBlocks) -> NDArray[np.float32]:
+    rows = np.ascontiguousarray(queries, dtype=np.float32)
+    if rows.ndim != 2 or rows.shape[1] != source.dimension:
+        of_map = (len(source), source.dimension)
+        raise DataError(
+            f"global descriptors of queries {rows.shape} and map {of_map} have different dimensions"
+        )
+    if not np.isfinite(rows).all():
+        raise DataError("global descriptors of queries have values that are not finite")
+    return rows
+
+
+def _similarities(
+    queries: NDArray[np.float32], rows: NDArray[np.float32], first_row: int
+) -> NDArray[np.float32]:
+    with np.errstate(over="ignore", invalid="ignore"):
+        products = queries @ rows.T
+        # a value that is not finite makes its whole column so, and thereby the column's sum: less
+        # to look at than all values
+        sums = np.ones(len(products), dtype=np.float32) @ products
+    for column in np.flatnonzero(~np.isfinite(sums)).tolist():
+        if not np.isfinite(rows[column]).all():
+            raise DataError(
+                "global descriptors have values that are not finite, the first in row "
+                f"{first_row + column} of the map"
+            )
+    return products

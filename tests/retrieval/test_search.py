@@ -8,9 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.retrieval import search
-from megloc_kapture.retrieval.search import rank_by_similarity
+from megloc_kapture.retrieval.fusion import FusionOptions, fuse
+from megloc_kapture.retrieval.search import rank_by_similarity, rank_fused
 
 
 def full_sort(
@@ -98,6 +99,125 @@ def test_nothing_to_search() -> None:
     assert indices.shape == (2, 0) and scores.shape == (2, 0)
     indices, scores = rank_by_similarity(np.zeros((0, 4)), np.zeros((3, 4)), 5)
     assert indices.shape == (0, 3) and scores.shape == (0, 3)
+
+
+class Blocks:
+    """A source that gives rows only as they are read, and remembers what was."""
+
+    def __init__(self, rows: NDArray[np.float64]) -> None:
+        self.rows, self.reads = rows, list[tuple[int, int]]()
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    @property
+    def dimension(self) -> int:
+        return int(self.rows.shape[1])
+
+    def read(
+        self, start: int, stop: int, out: NDArray[np.float32] | None = None
+    ) -> NDArray[np.float32]:
+        self.reads.append((start, stop))
+        rows = np.empty((stop - start, self.dimension), np.float32) if out is None else out
+        rows[:] = self.rows[start:stop]
+        return rows
+
+
+def test_a_source_is_read_once_in_blocks_and_gives_what_the_array_gives() -> None:
+    rng = np.random.default_rng(2)
+    queries, database = rng.integers(-3, 4, (9, 4)) * 1.0, rng.integers(-3, 4, (50, 4)) * 1.0
+    source = Blocks(database)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(search, "_MOST_ROWS", 16)
+        found = rank_by_similarity(queries, source, 7)
+    assert source.reads == [(0, 16), (16, 32), (32, 48), (48, 50)]
+    for ours, expected in zip(found, full_sort(queries, database, 7), strict=True):
+        np.testing.assert_array_equal(ours, expected)
+
+
+def test_permission_may_come_block_by_block() -> None:
+    rng = np.random.default_rng(3)
+    queries, database = rng.normal(size=(5, 4)), rng.normal(size=(40, 4))
+    permitted = rng.uniform(size=(5, 40)) < 0.3
+    expected = rank_by_similarity(queries, database, 20, permitted=permitted)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(search, "_MOST_ROWS", 16)
+        found = rank_by_similarity(
+            queries, database, 20, permitted=lambda start, stop: permitted[:, start:stop]
+        )
+    np.testing.assert_array_equal(found[0], expected[0])
+    np.testing.assert_allclose(found[1], expected[1], rtol=1e-6)
+
+
+def test_a_zero_row_is_similar_to_nothing() -> None:
+    database = np.array([[-1.0, 0.0], [0.0, 0.0], [1.0, 0.0]])
+    indices, scores = rank_by_similarity(np.array([[1.0, 0.0], [0.0, 0.0]]), database, 3)
+    assert indices.tolist() == [[2, 1, 0], [0, 1, 2]]
+    assert scores.tolist() == [[1, 0, -1], [0, 0, 0]]
+
+
+METHODS = [
+    *("mean", "power", "maximum", "minimum", "mean_and_power", "mean_and_min", "min_and_max"),
+    *("villena_roman", "harmonic_mean", "ghm", "round_robin", "reciprocal_rank", "borda"),
+]
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("masked", [False, True])
+def test_fused_ranking_is_that_of_the_whole_matrices(method: str, masked: bool) -> None:
+    rng = np.random.default_rng(4)
+    queries = [rng.normal(size=(7, d)) / 4 for d in (5, 9, 3)]
+    database = [rng.normal(size=(60, d)) / 4 for d in (5, 9, 3)]
+    permitted = rng.uniform(size=(7, 60)) < 0.5 if masked else None
+    options = FusionOptions.model_validate({"method": method})
+    weights = [1.0, 2.0, 0.5]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(search, "_BLOCK_ELEMENTS", 48)
+        patch.setattr(search, "_MOST_ROWS", 13)
+        indices, scores = rank_fused(
+            queries, database, 10, fusion=options, weights=weights, permitted=permitted
+        )
+    assert indices.shape == scores.shape == (7, 10)
+    for row in range(7):
+        # ranks count among what is permitted
+        allowed = np.arange(60) if permitted is None else np.flatnonzero(permitted[row])
+        matrices = [q[row : row + 1] @ m[allowed].T for q, m in zip(queries, database, strict=True)]
+        fused = fuse(matrices, options, weights)[0]
+        expected = allowed[np.argsort(-fused, kind="stable")[:10]]
+        if method in ("power", "harmonic_mean", "villena_roman", "borda", "reciprocal_rank"):
+            # of equal scores, which these have, rounding may turn the order
+            place = {int(image): k for k, image in enumerate(allowed)}
+            np.testing.assert_allclose(
+                [fused[place[i]] for i in indices[row].tolist()],
+                np.sort(fused)[::-1][:10],
+                atol=1e-6,
+            )
+        else:
+            assert indices[row].tolist() == expected.tolist()
+
+
+def test_one_feature_is_not_fused() -> None:
+    rng = np.random.default_rng(5)
+    queries, database = rng.normal(size=(5, 4)), rng.normal(size=(40, 4))
+    expected = rank_by_similarity(queries, database, 6)
+    for found, same in zip(
+        rank_fused([queries], [database], 6, fusion=FusionOptions()), expected, strict=True
+    ):
+        np.testing.assert_array_equal(found, same)
+
+
+def test_features_that_do_not_fit_are_refused() -> None:
+    one, more = np.zeros((2, 4)), np.zeros((3, 4))
+    for queries, database, match in [
+        ([one, more], [one, one], "2, 3 queries"),
+        ([one, one], [one, more], r"\[2, 3\] rows"),
+    ]:
+        with pytest.raises(DataError, match=match):
+            rank_fused(queries, database, 1, fusion=FusionOptions())
+    with pytest.raises(OptionError, match="2 global features of the queries, 1 of the map"):
+        rank_fused([one, one], [one], 1, fusion=FusionOptions())
+    with pytest.raises(OptionError, match="weights"):
+        rank_fused([one, one], [one, one], 1, fusion=FusionOptions(), weights=[1.0, 0.0])
 
 
 def test_different_dimensions_are_refused() -> None:

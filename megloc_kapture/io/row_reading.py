@@ -1,0 +1,116 @@
+"""Many pieces of files of one known size, read straight into the rows of an array."""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+
+import numpy as np
+from numpy.typing import NDArray
+
+# what lies between two rows is read over where it is less: a call costs more
+_LARGEST_GAP = 1 << 16
+_ROWS_PER_CALL = 512  # each with what lies before it: the system takes 1024 buffers at once
+
+
+def read_rows_at(
+    descriptor: int, offsets: NDArray[np.int64], into: NDArray[np.int64], rows: NDArray[np.uint8]
+) -> bool:
+    """Read pieces of a file, piece k from ``offsets[k]`` into the row ``into[k]``.
+
+    Parameters
+    ----------
+    descriptor : of the open file; its position is neither used nor changed.
+    offsets, into : int64 (K,), in any order.
+    rows : uint8 (N, B), C-contiguous; B bytes are a piece.
+
+    Returns
+    -------
+    Whether the file had all of them.
+
+    Raises
+    ------
+    OSError : as the system says it.
+    """
+    width = rows.shape[1]
+    flat = rows.reshape(-1).data
+    between = memoryview(bytearray(_LARGEST_GAP))
+    order = np.argsort(offsets, kind="stable")
+    starts, places = offsets[order], into[order] * width
+    gaps = np.diff(starts) - width
+    # a new call where pieces are far apart, or overlap: one image asked for twice
+    breaks = np.flatnonzero((gaps < 0) | (gaps >= _LARGEST_GAP)) + 1
+    first = 0
+    for stop in [*breaks.tolist(), len(starts)]:
+        while first < stop:
+            last = min(first + _ROWS_PER_CALL, stop)
+            buffers = [flat[place : place + width] for place in places[first:last].tolist()]
+            skipped = [between[:gap] for gap in gaps[first : last - 1].tolist()]
+            woven = [view for pair in zip(buffers, skipped, strict=False) for view in pair]
+            woven.append(buffers[-1])
+            expected = int(starts[last - 1] - starts[first]) + width
+            if os.preadv(descriptor, woven, int(starts[first])) != expected:
+                one_by_one = zip(buffers, starts[first:last].tolist(), strict=True)
+                if not all(read_fully(descriptor, view, start) for view, start in one_by_one):
+                    return False
+            first = last
+    return True
+
+
+def read_fully(descriptor: int, view: memoryview, offset: int) -> bool:
+    """Fill ``view`` with what a file has from ``offset`` on; whether there was enough."""
+    done = 0
+    while done < len(view):  # one call gives 2 GiB at most
+        read = os.preadv(descriptor, [view[done:]], offset + done)
+        if read == 0:
+            return False
+        done += read
+    return True
+
+
+def read_file_row(folder: int, name: str, row: memoryview) -> int | None:
+    """Read a whole file into ``row``, in three calls to the system where the size is as expected.
+
+    Parameters
+    ----------
+    folder : descriptor of the open folder.
+    name : of the file in it, one component.
+
+    Returns
+    -------
+    Its size, -1 where there is no such plain file, or None where it is a link, which is not
+    followed. The row is filled only where the size is that of the row.
+
+    Raises
+    ------
+    OSError : as the system says it.
+    """
+    try:
+        # not blocking: a pipe would wait for somebody to write
+        flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+        descriptor = os.open(name, flags, dir_fd=folder)
+    except FileNotFoundError:
+        return -1
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            return None
+        raise
+    try:
+        # one byte more than expected: tells a longer file
+        try:
+            read = os.preadv(descriptor, [row, bytearray(1)], 0)
+        except OSError as error:
+            if error.errno in (errno.EISDIR, errno.ESPIPE):  # a folder, a pipe
+                return -1
+            raise
+        if read == len(row):
+            return read
+        found = os.fstat(descriptor)
+        if not stat.S_ISREG(found.st_mode):
+            return -1
+        if found.st_size == len(row) and not read_fully(descriptor, row, 0):
+            return read  # being cut while we read
+        return found.st_size
+    finally:
+        os.close(descriptor)

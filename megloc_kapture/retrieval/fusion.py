@@ -1,0 +1,219 @@
+"""Late fusion: the similarities of several global features become one.
+
+The operators are those of Csurka and Clinchant, "An empirical study of fusion operators for
+multimodal image retrieval", CBMI 2012, as kapture-localization has them, which MegLoc uses. With
+similarities ``s_i`` of n features and weights ``w_i`` that sum to one:
+
+==============  ===================================================================================
+mean            ``sum(w_i s_i)``
+power           ``prod(s_i ** w_i)``
+maximum         ``max(s_i)``
+minimum         ``min(s_i)``
+mean_and_power  ``gamma mean + (1 - gamma) power``
+mean_and_min    ``gamma mean + (1 - gamma) min``
+min_and_max     ``alpha min + (1 - alpha) max``
+villena_roman   ``(1 - alpha) max + alpha min ** 2 / (max + min)``
+harmonic_mean   ``1 / sum((1 / n) / (w_i s_i))``
+ghm             ``1 / sum((1 / n) / (gamma + w_i s_i)) - gamma``, the generalized harmonic mean
+early           as ``mean``, in one search: the vectors are concatenated, see ``early_fusion``
+round_robin     first of each feature, second of each feature, ...; see ``rank_fusion``
+==============  ===================================================================================
+
+They are written for similarities that are not negative, as those of text are. A cosine may be
+negative, where a root is not a number and a mean of reciprocals jumps from one infinity to the
+other. So powers, reciprocals and ``villena_roman`` take what is below their domain as its border:
+such an image is as bad as can be, and no image gains by being less similar.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.retrieval.weights import normalized_weights
+from megloc_kapture.values import Options
+
+RankMethod = Literal["round_robin", "reciprocal_rank", "borda"]
+FusionMethod = (
+    Literal[
+        "mean",
+        "power",
+        "maximum",
+        "minimum",
+        "mean_and_power",
+        "mean_and_min",
+        "min_and_max",
+        "villena_roman",
+        "harmonic_mean",
+        "ghm",
+        "early",
+    ]
+    | RankMethod
+)
+RANK_METHODS: frozenset[str] = frozenset({"round_robin", "reciprocal_rank", "borda"})
+
+Similarities = NDArray[np.floating[Any]]
+
+
+class FusionOptions(Options):
+    """How the similarities, or the rankings, of several global features become one."""
+
+    method: FusionMethod = Field(
+        default="ghm",
+        description="ghm: generalized harmonic mean; early: of vectors, each whitened by its own "
+        "method; the last three fuse ranks",
+    )
+    gamma: float = Field(
+        default=0.5,
+        ge=0,
+        description="ghm: what is added to each similarity; mean_and_power, mean_and_min: share "
+        "of the mean, at most 1",
+    )
+    alpha: float = Field(
+        default=0.5,
+        ge=0,
+        le=1,
+        description="min_and_max: share of the minimum; villena_roman: share of its second term",
+    )
+    rank_constant: float = Field(
+        default=60.0, gt=0, description="reciprocal_rank: added to each rank"
+    )
+    list_length: int = Field(
+        default=200,
+        gt=0,
+        description="reciprocal_rank, borda: images of each feature's ranking that count, at "
+        "least as many as are asked for",
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.method in ("mean_and_power", "mean_and_min") and self.gamma > 1:
+            raise ValueError(f"gamma is a share in {self.method}, {self.gamma} is more than 1")
+        return self
+
+    def fuses_ranks(self) -> bool:
+        """Whether only the order of each feature's similarities counts."""
+        return self.method in RANK_METHODS
+
+
+def fuse(
+    similarities: Sequence[Similarities],
+    options: FusionOptions,
+    weights: Sequence[float] | None = None,
+) -> Similarities:
+    """Fuse the similarities of several features, element by element.
+
+    Methods that fuse ranks look at whole rows: each row must hold all images there are. Their
+    result has no meaning but its order, in which ties are left to the order of the images.
+
+    Parameters
+    ----------
+    similarities : per feature float (Q, M), finite; all of one shape and dtype.
+    weights : one per feature, positive; all equal by default. Maximum, minimum, ``min_and_max``,
+        ``villena_roman`` and ``round_robin`` have no use for them.
+
+    Returns
+    -------
+    float (Q, M), of the similarities' dtype; of ranks float64.
+
+    Raises
+    ------
+    OptionError : weights that cannot be used, or no feature.
+    DataError : different shapes.
+    """
+    shares = normalized_weights(weights, len(similarities)).tolist()
+    if len({matrix.shape for matrix in similarities}) != 1:
+        shapes = ", ".join(str(matrix.shape) for matrix in similarities)
+        raise DataError(f"similarities of different shapes: {shapes}")
+    method, gamma, alpha = options.method, options.gamma, options.alpha
+    if options.fuses_ranks():
+        return _by_ranks(similarities, options, shares)
+    if method in ("mean", "early"):
+        return _mean(similarities, shares)
+    if method == "power":
+        return _power(similarities, shares)
+    if method == "mean_and_power":
+        return gamma * _mean(similarities, shares) + (1 - gamma) * _power(similarities, shares)
+    if method == "harmonic_mean":
+        return _harmonic_mean(similarities, shares, 0.0)
+    if method == "ghm":
+        return _harmonic_mean(similarities, shares, gamma)
+    least = np.minimum.reduce(similarities)
+    if method == "minimum":
+        return least
+    if method == "mean_and_min":
+        return gamma * _mean(similarities, shares) + (1 - gamma) * least
+    largest = np.maximum.reduce(similarities)
+    if method == "maximum":
+        return largest
+    if method == "min_and_max":
+        return alpha * least + (1 - alpha) * largest
+    return _villena_roman(least, largest, alpha)
+
+
+def _mean(similarities: Sequence[Similarities], shares: Sequence[float]) -> Similarities:
+    total = shares[0] * similarities[0]
+    for matrix, share in zip(similarities[1:], shares[1:], strict=True):
+        total += share * matrix
+    return total
+
+
+def _power(similarities: Sequence[Similarities], shares: Sequence[float]) -> Similarities:
+    product = np.ones_like(similarities[0])
+    for matrix, share in zip(similarities, shares, strict=True):
+        product *= np.maximum(matrix, 0) ** share
+    return product
+
+
+def _harmonic_mean(
+    similarities: Sequence[Similarities], shares: Sequence[float], gamma: float
+) -> Similarities:
+    """The limit towards the pole, ``-gamma``, is the value at the pole and beyond."""
+    count = len(similarities)
+    total = np.zeros_like(similarities[0])
+    with np.errstate(divide="ignore", over="ignore"):
+        for matrix, share in zip(similarities, shares, strict=True):
+            # 1 / 0 is infinite, and makes the mean zero
+            total += (1 / count) / np.maximum(gamma + share * matrix, 0)
+        fused: Similarities = 1 / total
+    fused -= gamma
+    return fused
+
+
+def _villena_roman(least: Similarities, largest: Similarities, alpha: float) -> Similarities:
+    """As kapture-localization computes it; its help has the minimum in the maximum's place."""
+    least, largest = np.maximum(least, 0), np.maximum(largest, 0)
+    total = least + largest
+    joint = np.divide(least * least, total, out=np.zeros_like(total), where=total > 0)
+    return (1 - alpha) * largest + alpha * joint
+
+
+def _by_ranks(
+    similarities: Sequence[Similarities], options: FusionOptions, shares: Sequence[float]
+) -> NDArray[np.float64]:
+    features = len(similarities)
+    length = similarities[0].shape[1]
+    fused = np.zeros(similarities[0].shape)
+    fused[:] = -np.inf if options.method == "round_robin" else 0.0
+    for feature, (matrix, share) in enumerate(zip(similarities, shares, strict=True)):
+        order = np.argsort(-matrix, axis=1, kind="stable")
+        ranks = np.empty_like(order)
+        np.put_along_axis(ranks, order, np.arange(length)[None], axis=1)
+        if options.method == "round_robin":
+            np.maximum(fused, -(ranks * features + feature), out=fused)
+        elif options.method == "reciprocal_rank":
+            fused += share / (options.rank_constant + 1 + ranks)
+        else:
+            fused += share * (length - ranks)
+    return fused
+
+
+def check_features(count: int, databases: int) -> None:
+    """Raise OptionError unless queries and database have the same number of features, any."""
+    if count == 0 or count != databases:
+        raise OptionError(f"{count} global features of the queries, {databases} of the map")

@@ -1,0 +1,42 @@
+"""The same pairs of the same global features, by kapture-localization's tool and by ours."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from kloc import kloc, needs_kapture_localization
+
+from megloc_kapture.io.global_vectors import KaptureVectors
+from megloc_kapture.io.kapture_store import KaptureFolder, read_pairs
+from megloc_kapture.retrieval.search import rank_by_similarity
+from megloc_kapture.stages.candidates import QueryPairsOptions, Retrieval
+from megloc_kapture.stages.image_pairs import pair_queries
+
+TYPE = "AP-GeM-LM18"
+
+
+@needs_kapture_localization
+@pytest.mark.parametrize("top_k", [3, 50])
+def test_ap_gem_gives_the_pairs_and_scores_of_kapture_localization(
+    shared_data: Path, tmp_path: Path, top_k: int
+) -> None:
+    scene = shared_data / "foreign_maps" / "virtual_gallery"
+    both = ["--mapping", scene / "map", "--query", scene / "query"]
+    path = tmp_path / "pairs.txt"
+    kloc("kapture_compute_image_pairs", *both, "-gfeat", TYPE, "--topk", str(top_k), "-o", path)
+    theirs = read_pairs(path)
+    mapping, query = KaptureFolder(scene / "map"), KaptureFolder(scene / "query")
+    options = QueryPairsOptions(top_k=top_k)
+    ours = pair_queries(mapping, query, options, retrieval=Retrieval((TYPE,)))
+    assert len(theirs) >= 12
+    assert [(p.query, p.map) for p in ours] == [(p.query, p.map) for p in theirs]
+    assert [p.score for p in ours] == pytest.approx([p.score for p in theirs], rel=0, abs=1e-6)
+
+    images, queries = sorted(mapping.read().poses()), query.read().image_names()
+    vectors = KaptureVectors(query.global_features(TYPE), queries).read(0, len(queries))
+    database = KaptureVectors(mapping.global_features(TYPE), images)
+    indices, scores = rank_by_similarity(vectors, database, top_k)
+    assert [images[k] for k in indices.ravel()] == [p.map for p in theirs]
+    expected = pytest.approx([p.score for p in theirs], rel=0, abs=1e-6)
+    assert scores.ravel().tolist() == expected
