@@ -29,7 +29,7 @@ sys.path.append(str(Path(__file__).resolve().parent / "speed"))
 from timing import table  # noqa: E402
 
 SEEDED = (
-    "vlad.seed",
+    "global_features.options.seed",
     "query_verification.seed",
     "triangulation.seed",
     "localization.pose.seed",

@@ -9,8 +9,8 @@ must be picklable.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -30,8 +30,11 @@ from megloc_kapture.values import (
 
 LOCAL_FEATURES = "megloc_kapture.local_features"
 MATCHERS = "megloc_kapture.matchers"
+GLOBAL_FEATURES = "megloc_kapture.global_features"
 SEGMENTERS = "megloc_kapture.segmenters"
 POSE_RANKERS = "megloc_kapture.pose_rankers"
+IMAGE_DISTANCES = "megloc_kapture.image_distances"
+POSE_REFINERS = "megloc_kapture.pose_refiners"
 DATASETS = "megloc_kapture.datasets"
 
 
@@ -53,6 +56,22 @@ class LocalFeatureExtractor(Protocol):
         self, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
     ) -> LocalFeatures:
         """Features of an RGB image, uint8 (H, W, 3); none on False pixels of the mask (H, W)."""
+        ...
+
+
+@runtime_checkable
+class GlobalFeatureExtractor(Protocol):
+    """Group ``megloc_kapture.global_features``: image to one vector that is compared by cosine.
+
+    An extractor that is faster on several images at once may have ``describe_many(images)``, the
+    vectors float32 (B, D) of B images of one size, in their order.
+    """
+
+    name: str
+    """The kapture type name its vectors are stored under; it tells the model as well."""
+
+    def describe(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """The vector of an RGB image, uint8 (H, W, 3): float32 (D,), unit length."""
         ...
 
 
@@ -124,15 +143,51 @@ class PoseHypothesis:
     max_error_px: float
 
 
+@dataclass(frozen=True, eq=False)
+class DepthView:
+    """A depth map that was taken with an image.
+
+    Attributes
+    ----------
+    camera : of the depth sensor.
+    depth_m : float32 (H, W), along the optical axis; 0, less or NaN where nothing is known.
+    image_from_depth : from the depth camera's frame to that of the image.
+    """
+
+    camera: Camera
+    depth_m: NDArray[np.float32]
+    image_from_depth: RigidTransform
+
+
 class RankingScene(Protocol):
-    """What a ranker may look at beside the matches; images are read only when asked for."""
+    """What rankers and refiners may look at beside the matches; read only when asked for."""
 
     def query_image(self, name: str) -> NDArray[np.uint8]:
         """RGB pixels (H, W, 3) of a query image; raises DataError where there are none."""
         ...
 
+    def query_mask(self, name: str) -> NDArray[np.bool_] | None:
+        """Mask (H, W) of a query image, True = use; None without one."""
+        ...
+
+    def query_depth(self, name: str) -> DepthView | None:
+        """Depth that was taken with a query image; None without."""
+        ...
+
     def map_image(self, name: str) -> NDArray[np.uint8]:
         """RGB pixels (H, W, 3) of a map image; raises DataError where there are none."""
+        ...
+
+    def map_mask(self, name: str) -> NDArray[np.bool_] | None:
+        """Mask (H, W) of a map image, True = use; None without one."""
+        ...
+
+    def map_depth(self, name: str) -> DepthView | None:
+        """Depth that was taken with a map image; None without."""
+        ...
+
+    def map_points(self, name: str) -> NDArray[np.float64]:
+        """Points of the map that an image observes, in the world, (N, 3)."""
         ...
 
     def map_camera(self, name: str) -> Camera:
@@ -152,6 +207,70 @@ class PoseRanker(Protocol):
         self, hypotheses: Sequence[PoseHypothesis], scene: RankingScene
     ) -> NDArray[np.float64]:
         """One score (H,) per hypothesis, higher is better; of equals the first wins."""
+        ...
+
+
+@runtime_checkable
+class ImageDistance(Protocol):
+    """Group ``megloc_kapture.image_distances``: how different two aligned images look."""
+
+    name: str
+    """The measure, for reports."""
+
+    def distance(
+        self, a: NDArray[np.uint8], b: NDArray[np.uint8], valid: NDArray[np.bool_]
+    ) -> float:
+        """Distance of two RGB images of one size, uint8 (H, W, 3), over valid pixels (H, W).
+
+        Lower is more alike; infinite where too little is valid to tell.
+        """
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class PoseRefinement:
+    """What refining a pose came to.
+
+    Attributes
+    ----------
+    cam_from_world : the better pose, or the old one where ``reason`` says why it stays.
+    reason : empty where the new pose is accepted.
+    measures : numbers by name, e.g. residuals and overlap before and after; for tables.
+    covariance : as of :class:`~megloc_kapture.values.Pose`, or None.
+    """
+
+    cam_from_world: RigidTransform
+    reason: str = ""
+    measures: Mapping[str, float] = field(default_factory=dict)
+    covariance: NDArray[np.float64] | None = None
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the pose is a new one."""
+        return not self.reason
+
+
+@runtime_checkable
+class PoseRefiner(Protocol):
+    """Group ``megloc_kapture.pose_refiners``: a pose to a better one, or a reason to keep it."""
+
+    name: str
+    """The method, for tables."""
+
+    def refine(
+        self,
+        query: str,
+        camera: Camera,
+        cam_from_world: RigidTransform,
+        references: Sequence[str],
+        scene: RankingScene,
+    ) -> PoseRefinement:
+        """Refine the pose of one query image.
+
+        Parameters
+        ----------
+        references : map images that may show the same, best first.
+        """
         ...
 
 
@@ -183,9 +302,12 @@ class DatasetAdapter(Protocol):
 
 _PROTOCOLS: dict[str, type] = {
     LOCAL_FEATURES: LocalFeatureExtractor,
+    GLOBAL_FEATURES: GlobalFeatureExtractor,
     MATCHERS: Matcher,
     SEGMENTERS: Segmenter,
     POSE_RANKERS: PoseRanker,
+    IMAGE_DISTANCES: ImageDistance,
+    POSE_REFINERS: PoseRefiner,
     DATASETS: DatasetAdapter,
 }
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -16,11 +17,18 @@ from megloc_kapture.evaluation.outputs import RECALL_JSON, RECALL_TEXT, REPORT_H
 from megloc_kapture.evaluation.thresholds import Threshold
 from megloc_kapture.evaluation.without_truth_outputs import AGREEMENT_TEXT
 from megloc_kapture.io.status_table import STATUS_FILE, read_status
+from megloc_kapture.pipeline.ablation import (
+    fresh_copy,
+    outcome,
+    outcomes_text,
+    variants,
+    write_outcomes,
+)
 from megloc_kapture.pipeline.benchmarks import BenchmarkFile, find_benchmark, read_benchmark
 from megloc_kapture.pipeline.datasets import TWIN_PREFIX, DatasetChoice, choose_dataset
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
 from megloc_kapture.pipeline.executors import available_cores, open_executor, single_threaded
-from megloc_kapture.pipeline.plan import StageReport, all_kept, run_plan
+from megloc_kapture.pipeline.plan import Stage, StageReport, all_kept, run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.run import EVALUATION, LOCALIZED, Run
 from megloc_kapture.pipeline.workspace import Workspace
@@ -53,6 +61,8 @@ class Eval(Choosing, Working, Common):
     """Stop behind this stage."""
     dry_run: bool = False
     """Say which stages would run, and why."""
+    ablate: bool = False
+    """Run again without each of the steps in turn, in ablation/, and print what each adds."""
     fail_below: float | None = None
     """Exit with 3 when the share of queries at the last threshold is lower (0 to 1)."""
     force: Force = False
@@ -86,6 +96,7 @@ class Eval(Choosing, Working, Common):
             benchmark = benchmark.model_copy(update={"thresholds": pairs})
         choice.check()
         self._check_judging(choice)
+        self._check_ablation(choice)
         place = self.workspace or Path("runs") / f"{self.dataset}-{preset}"
         workspace = Workspace(place, force=self.force)
         with (
@@ -103,8 +114,9 @@ class Eval(Choosing, Working, Common):
                 track=console.track,
                 num_threads=self.workers or available_cores(),
             )
+            stages = plan_evaluation(run)
             reports = run_plan(
-                plan_evaluation(run),
+                stages,
                 workspace,
                 first=self.from_stage,
                 last=self.until,
@@ -112,6 +124,8 @@ class Eval(Choosing, Working, Common):
                 on_start=lambda name, why: console.say(f"{name}: {why}"),
                 on_report=lambda report: console.say(describe(report)),
             )
+            if self.ablate and not self.dry_run:
+                self._ablate(console, run, stages)
         if self.dry_run:
             return 0
         if all_kept(reports):
@@ -119,6 +133,33 @@ class Eval(Choosing, Working, Common):
         if not any(report.name == "evaluation" for report in reports):
             return 0
         return self._conclude(console, workspace, run.submission_below(workspace.root), benchmark)
+
+    def _ablate(self, console: Console, run: Run, stages: Sequence[Stage]) -> None:
+        outcomes = [outcome("all steps", run.workspace, stages)]
+        for variant in variants(run.options):
+            console.say(f"ablation: without {variant.name}")
+            workspace = fresh_copy(run.workspace, variant.slug)
+            changed = replace(run, options=variant.options, workspace=workspace)
+            with workspace.lock():
+                planned = plan_evaluation(changed)
+                run_plan(
+                    planned,
+                    workspace,
+                    on_start=lambda name, why: console.say(f"{name}: {why}"),
+                    on_report=lambda report: console.say(describe(report)),
+                )
+            outcomes.append(outcome(f"without {variant.name}", workspace, planned))
+        path = write_outcomes(run.workspace, outcomes)
+        console.result(outcomes_text(outcomes))
+        console.result(f"ablation   {shown(path)}")
+
+    def _check_ablation(self, choice: DatasetChoice) -> None:
+        if not self.ablate:
+            return
+        if self.until not in (None, "evaluation"):
+            raise OptionError(f"--ablate needs stage evaluation; --until {self.until} skips it")
+        if not choice.has_truth():
+            raise OptionError(f"--ablate needs true poses: {choice.root}/query_gt is missing")
 
     def _check_judging(self, choice: DatasetChoice) -> None:
         if self.fail_below is None:

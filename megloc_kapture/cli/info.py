@@ -13,7 +13,7 @@ import tyro
 from megloc_kapture.cli.common import Common, existing
 from megloc_kapture.cli.console import Console
 from megloc_kapture.cli.refine_map import report_lines
-from megloc_kapture.cli.stages import FeaturesDirs
+from megloc_kapture.cli.stage_command import FeaturesDirs
 from megloc_kapture.errors import MeglocError
 from megloc_kapture.io.kapture_store import KaptureFolder
 from megloc_kapture.io.point_covariances import read_point_covariances

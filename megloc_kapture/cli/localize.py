@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from megloc_kapture.cli.common import Choosing, Common, Force, Input, Output, existing
-from megloc_kapture.cli.stages import FeaturesDirs
+from megloc_kapture.cli.stage_command import FeaturesDirs
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.kapture_store import KaptureFolder, read_pairs
 from megloc_kapture.io.outputs import staged_output

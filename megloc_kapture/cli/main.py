@@ -22,14 +22,9 @@ from megloc_kapture.cli.info import Info
 from megloc_kapture.cli.localize import Localize
 from megloc_kapture.cli.preprocess import Preprocess
 from megloc_kapture.cli.refine_map import RefineMap
-from megloc_kapture.cli.stages import (
-    ExtractGlobal,
-    ExtractLocal,
-    Match,
-    PairsMapping,
-    PairsQuery,
-    Triangulate,
-)
+from megloc_kapture.cli.refine_poses import RefinePoses
+from megloc_kapture.cli.retrieval import ExtractGlobal, PairsMapping, PairsQuery
+from megloc_kapture.cli.stages import ExtractLocal, Match, Triangulate
 from megloc_kapture.cli.submit import Submit
 from megloc_kapture.cli.weights import WeightsCommand
 from megloc_kapture.errors import MeglocError
@@ -59,6 +54,7 @@ COMMANDS: dict[str, type[Any]] = {
     "match": Match,
     "triangulate": Triangulate,
     "refine-map": RefineMap,
+    "refine-poses": RefinePoses,
     "localize": Localize,
     "submit": Submit,
     "check": Check,

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from megloc_kapture.cli.common import Choosing, Common, Force, Input, Output, Working, existing
-from megloc_kapture.cli.stages import MAP, FeaturesDirs
+from megloc_kapture.cli.stage_command import FeaturesDirs
+from megloc_kapture.cli.stages import MAP
 from megloc_kapture.io.json_model import read_json_model
 from megloc_kapture.io.kapture_store import KaptureFolder
 from megloc_kapture.io.outputs import staged_output

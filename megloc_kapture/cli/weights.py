@@ -88,7 +88,7 @@ class Fetch(Common):
         console.say(f"  licence: {weights.licence}: {weights.terms}")
         found = fetch(url, place, size=file.size, sha256=file.sha256, watch=watch)
         told = "sha256 right" if file.sha256 else f"sha256 {found}, which the registry cannot check"
-        if file.sha256 is None and place.suffix != ".mat":
+        if file.sha256 is None:
             read_weights(describe(weights.name, place))
         console.result(f"{weights.name}: {place} ({place.stat().st_size} bytes, {told})")
 
@@ -101,12 +101,14 @@ class Add(Common):
     """File; of a TensorFlow checkpoint its .index or the published tar."""
     name: str | None = None
     """Network that it is for; told by its sha256 or its name unless given."""
+    unverified: bool = False
+    """Take a file that is not the published one, such as one you trained."""
     force: Force = False
     """Replace a different file that stands in its place."""
 
     def run(self) -> int:
         """Run it."""
-        added = add_weights(self.file, name=self.name, force=self.force)
+        added = add_weights(self.file, name=self.name, force=self.force, unverified=self.unverified)
         self.console().result(f"{added.name}: {added.path} ({_trust(added)})")
         return 0
 

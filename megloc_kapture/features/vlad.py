@@ -6,29 +6,53 @@ CVPR 2016, equations 1 and 2, as MegLoc uses it::
     V(j, k) = sum_i a_k(x_i) (x_i(j) - c_k(j)),   a_k(x) = exp(-alpha |x - c_k|^2) / sum_k'(...)
 
 Intra-normalisation: Arandjelovic and Zisserman, All about VLAD, CVPR 2013. Power law: Perronnin
-et al., ECCV 2010.
+et al., ECCV 2010. Several vocabularies, whitened together: Jegou and Chum, ECCV 2012.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from functools import partial
+from typing import Any, Literal, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.errors import DataError
+from megloc_kapture.features.pca_whitening import PcaWhitening, learn_whitening
 from megloc_kapture.values import Options
 
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
 _CHUNK = 16384  # descriptors assigned at once: bounds memory at 16384 x clusters floats
+# whitening is learnt from at most this many images, and numbers in all: 1 GiB of float32
+_WHITENING_IMAGES = 4096
+_WHITENING_NUMBERS = 1 << 28
 
 
 class VladOptions(Options):
     """Options of the vocabulary and the aggregation."""
 
-    num_clusters: int = Field(default=128, gt=0)
+    num_clusters: int = Field(default=128, gt=0, description="of each vocabulary")
+    vocabularies: int = Field(
+        default=1, gt=0, description="trained with different seeds, their vectors side by side"
+    )
+    dimensions: int | None = Field(
+        default=None,
+        gt=0,
+        description="PCA whitening learnt on the map, to at most this many and fewer than it has "
+        "images; none without",
+    )
+    whitening_power: float = Field(
+        default=0.5,
+        ge=0,
+        le=1,
+        description="of the deviations that whitening divides by; 1 as in Jegou and Chum, 0.5 as "
+        "in AP-GeM",
+    )
     assignment: Literal["hard", "soft"] = "hard"
     alpha: float = Field(
         default=30.0,
@@ -46,15 +70,88 @@ class VladOptions(Options):
 
 @dataclass(frozen=True, eq=False)
 class Vocabulary:
-    """Cluster centres, float32 (K, D)."""
+    """What describes an image.
+
+    Attributes
+    ----------
+    centres : float32 (V, K, D), the clusters of each vocabulary.
+    whitening : of the vectors of all vocabularies, or None.
+    """
 
     centres: NDArray[np.float32]
+    whitening: PcaWhitening | None = None
+
+    @property
+    def size(self) -> int:
+        """Length of an image's vector."""
+        return self.centres.size if self.whitening is None else len(self.whitening.projection)
+
+
+class Each(Protocol):
+    """Applies a function to items, results in their order; ``map``, or something parallel."""
+
+    def __call__(
+        self, function: Callable[[Item], Result], items: Iterable[Item], /
+    ) -> Iterable[Result]: ...
+
+
+def train_vlad(
+    images: Sequence[str],
+    length: Callable[[str], int],
+    read: Callable[[str], NDArray[Any]],
+    options: VladOptions | None = None,
+    *,
+    each: Each = map,
+) -> Vocabulary:
+    """Train vocabularies, and their whitening where it is wanted, on the images of a map.
+
+    Parameters
+    ----------
+    length : how many descriptors an image has.
+    read : an image's descriptors (N, D).
+    each : what shares the description of the images, which whitening is learnt from.
+
+    Raises
+    ------
+    DataError : no descriptors, fewer distinct ones than clusters, values that are not finite, or
+        too few images for whitening.
+    """
+    options = options or VladOptions()
+    rows = sample_rows(map(length, images), options.training_descriptors, options.seed)
+    sampled = [
+        np.asarray(read(image)[chosen], dtype=np.float32)
+        for image, chosen in zip(images, rows, strict=True)
+        if len(chosen)
+    ]
+    if not sampled:
+        raise DataError("the map has no descriptors")
+    vocabulary = train_vocabulary(np.concatenate(sampled), options)
+    if options.dimensions is None:
+        return vocabulary
+    del sampled
+    most = min(_WHITENING_IMAGES, max(2, _WHITENING_NUMBERS // vocabulary.size))
+    described = [image for image, chosen in zip(images, rows, strict=True) if len(chosen)]
+    if len(described) > most:  # spread over the names, and so over places and sequences
+        picks = np.linspace(0, len(described) - 1, most).round().astype(np.int64)
+        described = [described[pick] for pick in picks]
+    vectors = np.empty((len(described), vocabulary.size), dtype=np.float32)
+    describe = partial(_read_and_aggregate, read, vocabulary, options)
+    for row, vector in zip(vectors, each(describe, described), strict=True):
+        row[:] = vector
+    whitening = learn_whitening(vectors, options.dimensions, options.whitening_power)
+    return Vocabulary(vocabulary.centres, whitening)
+
+
+def _read_and_aggregate(
+    read: Callable[[str], NDArray[Any]], vocabulary: Vocabulary, options: VladOptions, image: str
+) -> NDArray[np.float32]:
+    return aggregate(read(image), vocabulary, options)
 
 
 def train_vocabulary(
     descriptors: NDArray[np.floating[Any]], options: VladOptions | None = None
 ) -> Vocabulary:
-    """k-means (k-means++ start, Lloyd) over descriptors (N, D).
+    """k-means (k-means++ start, Lloyd) over descriptors (N, D), once per vocabulary; no whitening.
 
     Raises
     ------
@@ -69,7 +166,14 @@ def train_vocabulary(
         )
     if not np.isfinite(data).all():
         raise DataError("the map's descriptors have values that are not finite")
-    rng = np.random.default_rng(options.seed)
+    return Vocabulary(
+        np.stack([_cluster(data, options, number) for number in range(options.vocabularies)])
+    )
+
+
+def _cluster(data: NDArray[np.float32], options: VladOptions, number: int) -> NDArray[np.float32]:
+    """The centres of one vocabulary; each draws numbers of its own."""
+    rng = np.random.default_rng([options.seed, number])
     centres = _plus_plus(data, options.num_clusters, rng)
     previous = np.full(len(data), -1, dtype=np.int64)
     for _ in range(options.iterations):
@@ -83,7 +187,7 @@ def train_vocabulary(
         centres[filled] = (sums[filled] / counts[filled, None]).astype(np.float32)
         for k in np.flatnonzero(~filled):  # a cluster that lost all starts anew somewhere else
             centres[k] = data[rng.integers(len(data))]
-    return Vocabulary(centres)
+    return centres
 
 
 def _plus_plus(
@@ -141,23 +245,33 @@ def sample_rows(counts: Iterable[int], total: int, seed: int) -> list[NDArray[np
 
 
 def aggregate(
-    descriptors: NDArray[np.floating[Any]],
+    descriptors: NDArray[Any],
     vocabulary: Vocabulary,
     options: VladOptions | None = None,
 ) -> NDArray[np.float32]:
-    """VLAD of descriptors (N, D): float32 (K * D,), cluster after cluster, unit length.
+    """VLAD of descriptors (N, D): float32 (``vocabulary.size``,), unit length.
 
-    An image without descriptors gets the zero vector: it is similar to nothing.
+    Without whitening vocabulary after vocabulary, in each cluster after cluster. An image without
+    descriptors gets the zero vector: it is similar to nothing.
     """
     options = options or VladOptions()
-    centres = vocabulary.centres
     data = np.ascontiguousarray(descriptors, dtype=np.float32)
-    if len(data) and data.shape[1] != centres.shape[1]:
+    if len(data) and data.shape[1] != vocabulary.centres.shape[2]:
         raise DataError(
-            f"descriptors have {data.shape[1]} dimensions, the vocabulary {centres.shape[1]}"
+            f"descriptors have {data.shape[1]} dimensions, "
+            f"the vocabulary {vocabulary.centres.shape[2]}"
         )
     if len(data) == 0:
-        return np.zeros(centres.size, dtype=np.float32)
+        return np.zeros(vocabulary.size, dtype=np.float32)
+    blocks = [_aggregate_one(data, centres, options) for centres in vocabulary.centres]
+    vector = _unit(np.concatenate(blocks)).astype(np.float32)
+    return vector if vocabulary.whitening is None else vocabulary.whitening.apply(vector)
+
+
+def _aggregate_one(
+    data: NDArray[np.float32], centres: NDArray[np.float32], options: VladOptions
+) -> NDArray[np.float64]:
+    """VLAD by one vocabulary: float64 (K * D,), unit length."""
     if options.assignment == "hard":
         labels = _nearest(data, centres)
         sums = _sum_by_label(data, labels, len(centres))
@@ -174,7 +288,7 @@ def aggregate(
     vector = residuals.ravel()
     if options.power != 1.0:
         vector = np.sign(vector) * np.abs(vector) ** options.power
-    return _unit(vector).astype(np.float32)
+    return _unit(vector)
 
 
 def soft_assignment(

@@ -24,6 +24,7 @@ STATUS_COLUMNS = (
     "cluster",
     "fallback",
     "candidates",
+    "refinement",
 )
 
 Fallback = Literal["none", "retrieval", "rig"]
@@ -47,6 +48,8 @@ class QueryStatus(Options):
         guess; ``rig``: it was given its pose through the rig, by another camera of its moment.
         Everything that counts poses says how many of them are fallbacks.
     candidates : the map images the pose comes from, best first.
+    refinement : by method, whether a refined pose was accepted or why the one before it stays;
+        empty where nothing was refined.
     """
 
     image: str
@@ -57,6 +60,7 @@ class QueryStatus(Options):
     cluster: int | None = Field(default=None, ge=0)
     fallback: Fallback = "none"
     candidates: tuple[str, ...] = ()
+    refinement: str = ""
 
     @model_validator(mode="after")
     def _consistent(self) -> QueryStatus:
@@ -120,5 +124,6 @@ def write_status(path: Path | str, statuses: Iterable[QueryStatus]) -> None:
             "" if s.cluster is None else str(s.cluster),
             s.fallback,
             _CANDIDATE_SEPARATOR.join(s.candidates),
+            s.refinement,
         )
     write_csv_table(path, STATUS_COLUMNS, (rows[image] for image in sorted(rows)))

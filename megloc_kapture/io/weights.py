@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     import torch
 
 FOLDER_VARIABLE = "MEGLOC_WEIGHTS"
+UNVERIFIED = "unverified"  # folder of files that a user has instead of the published ones
 
 
 class MissingWeightsError(DataError):
@@ -49,7 +50,7 @@ class WeightsFile:
     def published(self) -> PublishedFile | None:
         """The registry's file that it should be; None for a user's own and for converted ones."""
         known = registry().get(self.name)
-        if known is None:
+        if known is None or self.path.is_relative_to(weights_folder() / UNVERIFIED):
             return None
         path = self.path.as_posix()
         files = (file for file in known.files if any(path.endswith("/" + n) for n in file.names))

@@ -8,6 +8,7 @@ from pathlib import Path
 from megloc_kapture.errors import DataError, OptionError, OutputError
 from megloc_kapture.io.atomic import atomic_write
 from megloc_kapture.io.weights import (
+    UNVERIFIED,
     WeightsFile,
     describe,
     read_weights,
@@ -23,11 +24,10 @@ from megloc_kapture.io.weights_registry import (
     registry,
 )
 
-# read where they are used (a network's own layout); here only their checksum can be proven
-_READ_ELSEWHERE = (".mat",)
 
-
-def add_weights(source: Path, *, name: str | None = None, force: bool = False) -> WeightsFile:
+def add_weights(
+    source: Path, *, name: str | None = None, force: bool = False, unverified: bool = False
+) -> WeightsFile:
     """Copy a file into the folder of weights under the name it is looked for by.
 
     Parameters
@@ -35,6 +35,8 @@ def add_weights(source: Path, *, name: str | None = None, force: bool = False) -
     source : the file; never changed. Of a TensorFlow checkpoint its ``.index``.
     name : the network it is for; found out by the sha256 or the file's name unless given.
     force : replace a different file that stands there.
+    unverified : take it though it is not the published file, e.g. one trained anew. It is kept in
+        a folder of its own, ``unverified``, and is found where the published one is not there.
 
     Raises
     ------
@@ -47,8 +49,9 @@ def add_weights(source: Path, *, name: str | None = None, force: bool = False) -
     found = describe(source.name, source)
     sha256 = sha256_of(found)
     weights, target = _recognised(source, sha256, name)
-    prove(found, sha256, next((f for f in weights.files if f.name == target), None), weights)
-    place = weights_folder() / target
+    expected = next((f for f in weights.files if f.name == target), None)
+    prove(found, sha256, None if unverified else expected, weights)
+    place = weights_folder() / (f"{UNVERIFIED}/{target}" if unverified else target)
     if place.exists() and not force:
         if sha256_of(describe(weights.name, place)) == sha256:
             return describe(weights.name, place)
@@ -79,14 +82,7 @@ def prove(
             f"sha256 {sha256} instead of {known}",
             path=file.path,
         )
-    if file.path.suffix not in _READ_ELSEWHERE:
-        read_weights(file)
-    elif not known:
-        raise DataError(
-            "cannot be proven: its sha256 is not known, and its container is read only where it "
-            "is used; copy it to the folder of weights by hand if you trust it",
-            path=file.path,
-        )
+    read_weights(file)
 
 
 def _recognised(source: Path, sha256: str, name: str | None) -> tuple[Weights, str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,17 +14,14 @@ from megloc_kapture.evaluation.provenance import package_versions
 from megloc_kapture.evaluation.rules import read_rules
 from megloc_kapture.evaluation.surroundings import surroundings_of
 from megloc_kapture.evaluation.without_truth_outputs import write_without_truth
-from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder, read_pairs, write_pairs
+from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder, read_pairs
 from megloc_kapture.io.side_tables import SIDE_TABLES
 from megloc_kapture.pipeline.datasets import with_model
 from megloc_kapture.pipeline.image_plan import plan_images
-from megloc_kapture.pipeline.map_plan import (
-    map_images,
-    matched_images,
-    matching_used,
-    plan_map,
-)
+from megloc_kapture.pipeline.map_plan import matched_images, plan_map
+from megloc_kapture.pipeline.missing_weights import check_weights
 from megloc_kapture.pipeline.plan import Stage
+from megloc_kapture.pipeline.retrieval_plan import plan_global_features, plan_query_pairs
 from megloc_kapture.pipeline.run import (
     EVALUATION,
     LOCALIZED,
@@ -36,16 +32,18 @@ from megloc_kapture.pipeline.run import (
     QUERY_MATCHES,
     QUERY_PAIRS,
     QUERY_PYRAMID,
+    REFINEMENT_TIMING,
     SUBMISSIONS,
     TIMING,
+    UNREFINED_POSES,
     Run,
 )
 from megloc_kapture.pipeline.submission import write_submission
-from megloc_kapture.stages.global_vlad import extract_vlad, vlad_type
+from megloc_kapture.plugins import weights_of
 from megloc_kapture.stages.guided_pyramid import pyramid_queries
-from megloc_kapture.stages.image_pairs import pair_queries
 from megloc_kapture.stages.localized_folder import write_localized
-from megloc_kapture.stages.matches import iterate_candidates, match_pairs
+from megloc_kapture.stages.matches import iterate_candidates
+from megloc_kapture.stages.pose_refinement import refine_poses
 from megloc_kapture.stages.query_poses import localize_from_matches
 from megloc_kapture.values import RigidTransform
 
@@ -58,9 +56,9 @@ def plan_evaluation(run: Run) -> list[Stage]:
     MeglocError : the dataset or the options cannot be used; nothing has been written by then.
     """
     options = run.options
-    for local_type in options.local_types():
-        options.make_matcher(local_type)
-    options.localization.make_ranker()
+    check_weights(options)
+    options.local_types()
+    options.retrieval()
     given = options.uses_given_map()
     if given and options.changes_frames():
         raise OptionError(
@@ -74,38 +72,12 @@ def plan_evaluation(run: Run) -> list[Stage]:
     if given:
         run = replace(run, source=with_model(run.source))
     dump = options.model_dump(mode="json")
+    last = "refine_poses" if options.pose_refinement.refines() else "localization"
     stages = [
         *plan_images(run, dump),
-        Stage(
-            "global_features",
-            1,
-            {"vlad": dump["vlad"], "local_type": options.main_type()},
-            ("local_features",),
-            ("global_features",),
-            lambda out: _global_features(run, out),
-        ),
+        plan_global_features(run, dump),
         *plan_map(run, dump),
-        Stage(
-            "query_pairs",
-            2,
-            {"query_pairs": dump["query_pairs"]},
-            ("import", run.images_stage, "global_features"),
-            (QUERY_PAIRS,),
-            lambda out: _query_pairs(run, out),
-        ),
-        Stage(
-            "query_matches",
-            2,
-            {
-                "local_types": options.local_types(),
-                "matching": matching_used(run, options.local_types()),
-                "verification": dump["verification"],
-                "two_view": dump["query_verification"],
-            },
-            (run.images_stage, "local_features", "query_pairs", *(["map"] if given else [])),
-            (QUERY_MATCHES,),
-            lambda out: _query_matches(run, out),
-        ),
+        *plan_query_pairs(run, dump),
         *(_pyramid_stages(run, dump) if options.matches_again() else ()),
         Stage(
             "localization",
@@ -120,14 +92,15 @@ def plan_evaluation(run: Run) -> list[Stage]:
                 "query_matches",
                 *(["query_pyramid"] if options.matches_again() else []),
             ),
-            (LOCALIZED, TIMING),
+            (run.first_poses, TIMING),
             lambda out: _localization(run, out),
         ),
+        *(_refinement_stages(run, dump) if options.pose_refinement.refines() else ()),
         Stage(
             "submission",
             2,
             {"dataset": run.dataset, "preset": run.preset, "options": dump},
-            ("import", "localization"),
+            ("import", last),
             (SUBMISSIONS,),
             lambda out: _submission(run, out),
         ),
@@ -135,60 +108,12 @@ def plan_evaluation(run: Run) -> list[Stage]:
             "evaluation",
             2,
             {"dataset": run.dataset, "preset": run.preset, "options": dump},
-            ("import", "localization"),
+            ("import", last),
             (EVALUATION,),
             lambda out: _evaluation(run, out),
         ),
     ]
     return stages
-
-
-def _global_features(run: Run, out: Path) -> dict[str, int]:
-    local_type = run.options.main_type()
-    mapping = map_images(run, local_type)
-    return extract_vlad(
-        mapping,
-        [mapping, run.workspace.folder(run.query, "")],
-        local_type,
-        out,
-        run.options.vlad,
-        executor=run.executor,
-        track=run.track,
-    )
-
-
-def _query_pairs(run: Run, out: Path) -> dict[str, int]:
-    local_type = run.options.main_type()
-    pairs = pair_queries(
-        map_images(run, local_type),
-        run.workspace.folder(run.query, ""),
-        run.options.query_pairs,
-        global_type=vlad_type(local_type),
-        restrictions=run.restrictions(),
-    )
-    write_pairs(out / QUERY_PAIRS, pairs)
-    return {"pairs": len(pairs)}
-
-
-def _query_matches(run: Run, out: Path) -> dict[str, int]:
-    counts: Counter[str] = Counter()
-    pairs = read_pairs(run.workspace.path(QUERY_PAIRS))
-    for local_type in run.options.local_types():
-        mapping = matched_images(run, local_type)
-        described = mapping.descriptors(local_type)
-        found = match_pairs(
-            run.workspace.folder(run.query, ""),
-            mapping,
-            [pair for pair in pairs if pair.map in described],
-            local_type,
-            run.options.make_matcher(local_type),
-            run.options.verify_queries(),
-            out / QUERY_MATCHES,
-            executor=run.executor,
-            track=run.track,
-        )
-        counts.update(found)
-    return counts
 
 
 def _pyramid_stages(run: Run, dump: Mapping[str, Any]) -> list[Stage]:
@@ -249,12 +174,41 @@ def _localization(run: Run, out: Path) -> dict[str, int]:
         track=run.track,
     )
     return write_localized(
-        out / LOCALIZED,
+        out / run.first_poses,
         run.workspace.folder(QUERY),  # as imported: the poses are theirs as well
         results,
         fallback=options.fallback,
         first_candidates=first_candidates(pairs, run.workspace.folder(MAPPING)),
         timing=out / TIMING,
+    )
+
+
+def _refinement_stages(run: Run, dump: Mapping[str, Any]) -> list[Stage]:
+    chosen = run.options.pose_refinement
+    weights = [weights_of(refiner) for refiner in chosen.make_refiners()]
+    return [
+        Stage(
+            "refine_poses",
+            1,
+            {"pose_refinement": dump["pose_refinement"], "weights": weights},
+            ("import", run.images_stage, "map", "localization"),
+            (LOCALIZED, REFINEMENT_TIMING),
+            lambda out: _refine_poses(run, out),
+        )
+    ]
+
+
+def _refine_poses(run: Run, out: Path) -> dict[str, float]:
+    return refine_poses(
+        run.workspace.folder(MAP),
+        run.workspace.folder(run.query),
+        run.workspace.folder(UNREFINED_POSES),
+        out / LOCALIZED,
+        run.options.pose_refinement,
+        restrictions=run.restrictions(),
+        executor=run.executor,
+        track=run.track,
+        timing=out / REFINEMENT_TIMING,
     )
 
 

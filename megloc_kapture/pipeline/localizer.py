@@ -13,12 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, PluginError
-from megloc_kapture.features.vlad import (
-    Vocabulary,
-    aggregate,
-    sample_rows,
-    train_vocabulary,
-)
 from megloc_kapture.io.kapture_store import KaptureFolder
 from megloc_kapture.localization.cluster_poses import (
     ClusterLocalization,
@@ -26,22 +20,21 @@ from megloc_kapture.localization.cluster_poses import (
     TypedMatches,
     in_turn,
 )
-from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.map_descriptors import extract_again
+from megloc_kapture.pipeline.map_retrieval import MapRetrieval
 from megloc_kapture.pipeline.options import PipelineOptions
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.queries import KaptureQueries, Query
 from megloc_kapture.pipeline.query_features import QueryFeatures
 from megloc_kapture.plugins import LOCAL_FEATURES, LocalFeatureExtractor, load_plugin
-from megloc_kapture.retrieval.search import rank_by_similarity
-from megloc_kapture.stages.global_vlad import VladSettings, read_vocabulary
-from megloc_kapture.stages.image_pairs import read_global_features, unit_rows
+from megloc_kapture.retrieval.coverage import most_covering
 from megloc_kapture.stages.matches import (
     BATCH,
     FeatureCache,
     Features,
+    VerifiedMatches,
     batched,
     match_and_verify,
     two_view_verification,
@@ -55,7 +48,7 @@ from megloc_kapture.values import Camera, Failure, LocalFeatures, Pose, RigidTra
 # a map this small is matched whole where nothing can rank its images
 MAX_EXHAUSTIVE_IMAGES = 50
 
-_Matches = list[tuple[str, NDArray[np.int64], NDArray[np.floating]]]
+_Matches = list[tuple[str, NDArray[np.int64], NDArray[np.floating[Any]]]]
 
 
 class Localizer:
@@ -98,7 +91,9 @@ class Localizer:
         if not kapture_map.has_descriptors():
             self._descriptors = extract_again(kapture_map, self._extractor)
         self._cache = FeatureCache()
-        self._vectors: dict[str, NDArray[np.float32]] = {}
+        self._retrieval = MapRetrieval(
+            kapture_map, self.options, self._query_features, self._map_descriptors
+        )
 
     # ------------------------------------------------------------------ the public calls
 
@@ -193,7 +188,7 @@ class Localizer:
             self.options.localization,
             centers={image: self.map.poses[image].center() for image in candidates},
             ranker=self._ranker,
-            scene=KaptureScene(self.map.folder, lambda name: named[name].read_image()),
+            scene=KaptureScene(self.map.folder, read_query=lambda name: named[name].read_image()),
         )
 
     # ------------------------------------------------------------------ the steps
@@ -234,26 +229,14 @@ class Localizer:
         return frozenset(self.map.folder.read().image_names())
 
     def _rank(self, query: Query, local: LocalFeatures, permitted: Sequence[str]) -> list[str]:
-        mask = np.isin(self.map.images, list(permitted))[None]
-        shared = [name for name in self.map.global_types() if name in query.global_features]
-        if shared:
-            vector = np.asarray(query.global_features[shared[0]], np.float32).reshape(1, -1)
-            database = self._global_vectors(shared[0])
-        else:
-            vocabulary, settings, database = self._vlad
-            vector = aggregate(local.descriptors, vocabulary, settings.options)[None]
-        index, _ = rank_by_similarity(
-            unit_rows(vector), database, self.options.query_pairs.top_k, permitted=mask
-        )
-        return [self.map.images[i] for i in index[0] if i >= 0]
+        return self._retrieval.rank(query, local, permitted)
 
     def describe_retrieval(self, global_types: Collection[str]) -> str:
         """How the candidates of queries that bring these global features are found, for people."""
         options = self.options.query_pairs
         if options.by == "exhaustive" or len(self.map.images) <= options.top_k:
             return f"all {len(self.map.images)} map images"
-        shared = [name for name in self.map.global_types() if name in global_types]
-        return f"global features {shared[0]}" if shared else "VLAD over the map's descriptors"
+        return self._retrieval.describe(global_types)
 
     def _match(self, query: Query) -> tuple[NDArray[np.float32], _Matches]:
         """The query's keypoints, and their matches with each candidate."""
@@ -262,15 +245,16 @@ class Localizer:
         verification = two_view_verification(self.options.query_verification)
         if self.options.verification == "none":
             verification = _keep_all
-        matches: _Matches = []
+        found: list[tuple[str, VerifiedMatches]] = []
         for images in batched(self.candidates(query, local), BATCH):
-            found = match_and_verify(
+            pairs = match_and_verify(
                 features,
                 [self._map_features(image) for image in images],
                 self._matcher,
                 [verification] * len(images),
             )
-            matches += [(image, *matched) for image, matched in zip(images, found, strict=True)]
+            found += zip(images, pairs, strict=True)
+        matches = [(image, pair.matches, pair.scores) for image, pair in self._reranked(found)]
         if not self.options.matches_again():
             return features.keypoints_px, matches
         return retry_query(
@@ -285,6 +269,25 @@ class Localizer:
             options=self.options.guided_pyramid,
             name=query.name,
         )
+
+    def _reranked(
+        self, found: list[tuple[str, VerifiedMatches]]
+    ) -> list[tuple[str, VerifiedMatches]]:
+        """Those of the candidates that are kept, best first; all without reranking."""
+        options = self.options.reranking
+        if not options.reranks():
+            return found
+        if options.by == "coverage":
+            keypoints = [np.unique(pair.matches[:, 0]) for _, pair in found]
+            order, _ = most_covering(keypoints, options.keep)
+            return [found[rank] for rank in order]
+
+        def count(rank: int) -> int:
+            pair = found[rank][1]
+            return pair.num_found if options.by == "matches" else len(pair.matches)
+
+        best = sorted(range(len(found)), key=lambda rank: (-count(rank), rank))
+        return [found[rank] for rank in best[: options.keep]]
 
     def _extract(self, query: Query) -> LocalFeatures:
         return self._query_features.extract(query, self._extractor)
@@ -325,39 +328,6 @@ class Localizer:
         if self._descriptors is not None:
             return self._descriptors[image]
         return self.map.descriptors(image)
-
-    def _global_vectors(self, global_type: str) -> NDArray[np.float32]:
-        if global_type not in self._vectors:
-            reader = self.map.folder.global_features(global_type)
-            self._vectors[global_type] = read_global_features(reader, self.map.images)
-        return self._vectors[global_type]
-
-    @cached_property
-    def _vlad(self) -> tuple[Vocabulary, VladSettings, NDArray[np.float32]]:
-        """Vocabulary, how it was made, and the map's vectors: the map's own where it has them."""
-        folder = self.map.folder
-        for name in self.map.global_types():
-            stored = read_vocabulary(folder.root / "reconstruction" / "global_features" / name)
-            if stored is not None and stored[1].local_type == base_type(self.map.local_type):
-                return *stored, self._global_vectors(name)
-        options = self.options.vlad
-        images = self.map.images
-        rows = sample_rows(
-            [len(self._map_descriptors(image)) for image in images],
-            options.training_descriptors,
-            options.seed,
-        )
-        sampled = [
-            np.asarray(self._map_descriptors(image)[chosen], np.float32)
-            for image, chosen in zip(images, rows, strict=True)
-            if len(chosen)
-        ]
-        if not sampled:
-            raise DataError("the map has no descriptors", path=folder.root)
-        vocabulary = train_vocabulary(np.concatenate(sampled), options)
-        vectors = [aggregate(self._map_descriptors(image), vocabulary, options) for image in images]
-        settings = VladSettings(local_type=self.map.local_type, options=options)
-        return vocabulary, settings, np.stack(vectors)
 
 
 def _query_of(image: Path | str | NDArray[np.uint8], camera: Camera) -> Query:

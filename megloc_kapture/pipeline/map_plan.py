@@ -26,7 +26,6 @@ from megloc_kapture.pipeline.run import (
 )
 from megloc_kapture.plugins import weights_of
 from megloc_kapture.stages.given_map import given_map, given_type, has_descriptors, join_maps
-from megloc_kapture.stages.global_vlad import vlad_type
 from megloc_kapture.stages.guided_pyramid import pyramid_mapping
 from megloc_kapture.stages.image_pairs import pair_map_images
 from megloc_kapture.stages.lifting import lift_map
@@ -131,8 +130,12 @@ def _matching_stages(run: Run, dump: Mapping[str, Any]) -> list[Stage]:
     return [
         Stage(
             "mapping_pairs",
-            3,
-            {"mapping_pairs": dump["mapping_pairs"]},
+            4,
+            {
+                "mapping_pairs": dump["mapping_pairs"],
+                "fusion": dump["fusion"],
+                "weights": [chosen.weight for chosen in run.options.global_features],
+            },
             (run.images_stage, "global_features"),
             (MAPPING_PAIRS,),
             lambda out: _mapping_pairs(run, out),
@@ -191,7 +194,7 @@ def _mapping_pairs(run: Run, out: Path) -> dict[str, int]:
     pairs = pair_map_images(
         run.workspace.folder(run.mapping, ""),
         options,
-        global_type=vlad_type(run.options.main_type()),
+        retrieval=run.options.retrieval(),
         restrictions=run.restrictions(),
         covisible=run.workspace.folder(REFERENCE) if run.options.uses_given_map() else None,
     )

@@ -7,11 +7,11 @@ from typing import Any, Literal
 from pydantic import Field, field_validator
 
 from megloc_kapture.errors import OptionError
-from megloc_kapture.features.vlad import VladOptions
 from megloc_kapture.io.colmap import TriangulationOptions
 from megloc_kapture.mapping.lifting import LiftingOptions
 from megloc_kapture.matching.guided_pyramid import GuidedPyramidOptions, base_type, pyramid_type
 from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
+from megloc_kapture.pipeline.global_choice import GlobalFeaturesChoice
 from megloc_kapture.plugins import (
     LOCAL_FEATURES,
     MATCHERS,
@@ -20,11 +20,15 @@ from megloc_kapture.plugins import (
     PluginChoice,
     load_plugin,
 )
-from megloc_kapture.stages.image_pairs import MappingPairsOptions, QueryPairsOptions
+from megloc_kapture.retrieval.fusion import FusionOptions
+from megloc_kapture.stages.candidates import QueryPairsOptions, Retrieval
+from megloc_kapture.stages.image_pairs import MappingPairsOptions
 from megloc_kapture.stages.map_refinement import MapRefinementOptions
 from megloc_kapture.stages.matches import NoVerification, Verification
+from megloc_kapture.stages.pose_refinement import PoseRefinementOptions
 from megloc_kapture.stages.preprocessing import PreprocessingOptions
 from megloc_kapture.stages.query_poses import LocalizationOptions
+from megloc_kapture.stages.reranking import RerankingOptions
 from megloc_kapture.values import Options
 
 
@@ -43,14 +47,20 @@ class PipelineOptions(Options):
     local_features: tuple[LocalFeaturesChoice, ...] = Field(
         default=(LocalFeaturesChoice(name="rootsift"),),
         min_length=1,
-        description="types of local features, all in one map; retrieval uses the first",
+        description="types of local features, all in one map; VLAD uses the first",
     )
     mask_margin_px: float = Field(
         default=4.0, ge=0, description="features nearer than this to a masked pixel go too"
     )
-    vlad: VladOptions = VladOptions()
+    global_features: tuple[GlobalFeaturesChoice, ...] = Field(
+        default=(GlobalFeaturesChoice(),),
+        min_length=1,
+        description="what retrieval compares: vlad, or image networks; several are fused",
+    )
+    fusion: FusionOptions = FusionOptions()
     mapping_pairs: MappingPairsOptions = MappingPairsOptions()
     query_pairs: QueryPairsOptions = QueryPairsOptions()
+    reranking: RerankingOptions = RerankingOptions()
     matching: PluginChoice = Field(
         default=PluginChoice(name="nn"), description="of types that name no matcher of their own"
     )
@@ -73,8 +83,9 @@ class PipelineOptions(Options):
     lifting: LiftingOptions = LiftingOptions()
     refinement: MapRefinementOptions = MapRefinementOptions()
     localization: LocalizationOptions = LocalizationOptions()
+    pose_refinement: PoseRefinementOptions = PoseRefinementOptions()
 
-    @field_validator("local_features", mode="before")
+    @field_validator("local_features", "global_features", mode="before")
     @classmethod
     def _named(cls, value: Any) -> Any:
         """A name alone stands for its choice, and one choice for a list of one."""
@@ -148,7 +159,7 @@ class PipelineOptions(Options):
         return [extractor.name for extractor in self.own_extractors()]
 
     def local_types(self) -> list[str]:
-        """Keypoints types that queries are localized with, the one retrieval uses first.
+        """Keypoints types that queries are localized with, the one VLAD uses first.
 
         Raises
         ------
@@ -165,8 +176,24 @@ class PipelineOptions(Options):
         return types
 
     def main_type(self) -> str:
-        """The keypoints type that retrieval uses; see :meth:`local_types`."""
+        """The keypoints type that VLAD uses; see :meth:`local_types`."""
         return self.local_types()[0]
+
+    def retrieval(self) -> Retrieval:
+        """The global features that are compared, and how they are fused.
+
+        Raises
+        ------
+        OptionError : two of one type, or options that VLAD cannot have.
+        PluginError, MissingWeightsError : an extractor cannot be made.
+        """
+        main_type = self.main_type()
+        types = [chosen.type_name(main_type) for chosen in self.global_features]
+        twice = sorted({name for name in types if types.count(name) > 1})
+        if twice:
+            raise OptionError(f"global features {twice[0]!r} are asked for twice")
+        weights = tuple(chosen.weight for chosen in self.global_features)
+        return Retrieval(tuple(types), weights, self.fusion)
 
     def matching_of(self, local_type: str) -> PluginChoice:
         """How features of a type are matched."""

@@ -10,12 +10,14 @@ from pydantic import ValidationError
 
 from megloc_kapture.errors import OptionError
 from megloc_kapture.matching.guided_pyramid import GuidedPyramidOptions
+from megloc_kapture.pipeline.global_choice import GlobalFeaturesChoice
 from megloc_kapture.pipeline.options import LocalFeaturesChoice, PipelineOptions
 from megloc_kapture.plugins import PluginChoice
 from megloc_kapture.stages.preprocessing import PreprocessingOptions
+from megloc_kapture.stages.reranking import RerankingOptions
 from megloc_kapture.values import Options
 
-# the paper's local features and matching; retrieval is VLAD until its global features are there
+# the paper's features, matching and retrieval
 _MEGLOC = PipelineOptions(
     preprocessing=PreprocessingOptions(max_size_px=1600),
     local_features=(
@@ -26,6 +28,10 @@ _MEGLOC = PipelineOptions(
             matching=PluginChoice(name="nn", options={"max_ratio": 0.8}),
         ),
     ),
+    global_features=tuple(
+        GlobalFeaturesChoice(name=name) for name in ("netvlad", "delg", "apgem", "openibl")
+    ),
+    reranking=RerankingOptions(by="coverage"),
     guided_pyramid=GuidedPyramidOptions(mode="all"),
 )
 # chosen by benchmarks/features.py among weights that are free for any use: docs/choices.md
@@ -35,11 +41,25 @@ _MODERN = PipelineOptions(
         LocalFeaturesChoice(name="aliked", options={"max_keypoints": 2048, "threshold": 0.05}),
     ),
 )
+# what only a download gives, all of it free for any use
+_MODERN_LARGE = PipelineOptions(
+    preprocessing=PreprocessingOptions(max_size_px=1600),
+    local_features=(
+        LocalFeaturesChoice(
+            name="aliked",
+            options={"max_keypoints": 2048, "threshold": 0.05},
+            matching=PluginChoice(name="lightglue", options={"weights": "aliked_lightglue"}),
+        ),
+    ),
+    global_features=(GlobalFeaturesChoice(name="megaloc"),),
+    reranking=RerankingOptions(by="coverage"),
+)
 
 PRESETS: dict[str, PipelineOptions] = {
     "classic": PipelineOptions(),
     "megloc": _MEGLOC,
     "modern": _MODERN,
+    "modern-large": _MODERN_LARGE,
 }
 DEFAULT_PRESET = "classic"
 

@@ -1,4 +1,4 @@
-"""Local features of one query image, pre-processed as a preset's maps are, in its own pixels."""
+"""Features of one query image, pre-processed as a preset's maps are, in its own pixels."""
 
 from __future__ import annotations
 
@@ -11,11 +11,17 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import OptionError
 from megloc_kapture.pipeline.options import PipelineOptions
 from megloc_kapture.pipeline.queries import Query
-from megloc_kapture.plugins import SEGMENTERS, LocalFeatureExtractor, load_plugin
+from megloc_kapture.plugins import (
+    SEGMENTERS,
+    GlobalFeatureExtractor,
+    LocalFeatureExtractor,
+    load_plugin,
+)
 from megloc_kapture.preprocessing.frame_plan import plan_frame
 from megloc_kapture.preprocessing.frames import processed_image, processed_mask, reached_region
 from megloc_kapture.preprocessing.mask_margin import with_margin
 from megloc_kapture.stages.class_masks import ClassMasks
+from megloc_kapture.stages.global_features import describe_images
 from megloc_kapture.stages.image_masks import MaskOptions
 from megloc_kapture.stages.local_features import checked_features
 from megloc_kapture.values import LocalFeatures
@@ -56,6 +62,19 @@ class QueryFeatures:
             used = classes.mask(classes.labels(query.read_image(), query.name))
             mask = used if mask is None else mask & used
         return None if mask is None else with_margin(mask, self._options.mask_margin_px)
+
+    def describe(self, query: Query, extractor: GlobalFeatureExtractor) -> NDArray[np.float32]:
+        """The vector of the resized or undistorted image: float32 (D,).
+
+        Raises
+        ------
+        DataError, OptionError, PluginError : as :meth:`extract`.
+        """
+        image = query.read_image()
+        plan = plan_frame(query.camera, self._options.preprocessing)
+        if plan.changes_pixels:
+            image = processed_image(image, plan)
+        return describe_images(extractor, [image], query.name)[0]
 
     def extract(self, query: Query, extractor: LocalFeatureExtractor) -> LocalFeatures:
         """Features of the resized or undistorted image, keypoints in pixels of the original.

@@ -27,22 +27,27 @@ __all__ = [
     "MAPPING_PYRAMID",
     "PREPROCESSED",
     "QUERY",
+    "QUERY_CANDIDATES",
     "QUERY_GT",
     "QUERY_MATCHES",
     "QUERY_PAIRS",
     "QUERY_PYRAMID",
     "REFERENCE",
+    "REFINEMENT_TIMING",
     "SUBMISSIONS",
     "TIMING",
     "UNREFINED",
+    "UNREFINED_POSES",
     "Run",
 ]
 
 MAPPING_PAIRS, QUERY_PAIRS = "pairs/mapping.txt", "pairs/query.txt"
+QUERY_CANDIDATES = "pairs/query_candidates.txt"  # before they are reranked
 MAPPING_MATCHES, QUERY_MATCHES = "matches/mapping", "matches/query"
 UNREFINED, MAP = "map_unrefined", "map"
 MAPPING_PYRAMID, QUERY_PYRAMID = "pyramid/mapping", "pyramid/query"
 PREPROCESSED = "preprocessed"
+UNREFINED_POSES, REFINEMENT_TIMING = "localized_unrefined", "timing_refinement.csv"
 LOCALIZED, SUBMISSIONS, EVALUATION = "localized", "submissions", "evaluation"
 TIMING = "timing.csv"
 
@@ -93,6 +98,11 @@ class Run:
         if self.options.matches_again():
             places.append(QUERY_PYRAMID)
         return places
+
+    @property
+    def first_poses(self) -> str:
+        """The localized queries as localization leaves them, before poses are refined."""
+        return UNREFINED_POSES if self.options.pose_refinement.refines() else LOCALIZED
 
     @property
     def dataset(self) -> str:

@@ -10,31 +10,24 @@ import io
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
+from functools import lru_cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.features.vlad import (
-    VladOptions,
-    Vocabulary,
-    aggregate,
-    sample_rows,
-    train_vocabulary,
-)
+from megloc_kapture.features.pca_whitening import PcaWhitening
+from megloc_kapture.features.vlad import VladOptions, Vocabulary, aggregate, train_vlad
 from megloc_kapture.io.atomic import write_bytes
 from megloc_kapture.io.json_model import read_json_model, write_json_model
-from megloc_kapture.io.kapture_store import (
-    FeatureConfig,
-    FeatureReader,
-    FeatureWriter,
-    KaptureFolder,
-)
+from megloc_kapture.io.kapture_store import FeatureConfig, FeatureWriter, KaptureFolder
 from megloc_kapture.stages.parallel import FolderSpec, Track, ordered_map, untracked
 from megloc_kapture.values import Options
 
 VOCABULARY_FILE = "vocabulary.npy"
+MEAN_FILE, PROJECTION_FILE = "whitening_mean.npy", "whitening_projection.npy"
 SETTINGS_FILE = "vlad.json"
 
 
@@ -46,12 +39,22 @@ class VladSettings(Options):
 
 
 @dataclass(frozen=True)
-class _Job:
+class _Descriptors:
+    """Reads descriptors, here or in a worker."""
+
     folder: FolderSpec
     local_type: str
+
+    def __call__(self, image: str) -> NDArray[Any]:
+        return self.folder.open().descriptors(self.local_type).read(image)
+
+
+@dataclass(frozen=True)
+class _Job:
+    read: _Descriptors
     image: str
-    vocabulary: Vocabulary
-    options: VladOptions
+    vocabulary: Path
+    run: tuple[object, ...]
 
 
 def vlad_type(local_type: str) -> str:
@@ -60,19 +63,25 @@ def vlad_type(local_type: str) -> str:
 
 
 def train_on_map(
-    descriptors: FeatureReader, images: Sequence[str], options: VladOptions
+    mapping: KaptureFolder,
+    local_type: str,
+    options: VladOptions,
+    *,
+    executor: Executor | None = None,
 ) -> Vocabulary:
-    """Train the vocabulary on the map images' descriptors, the same share of each image's."""
-    counts = [descriptors.length(image) for image in images]
-    rows = sample_rows(counts, options.training_descriptors, options.seed)
-    sampled = [
-        descriptors.read(image)[chosen]
-        for image, chosen in zip(images, rows, strict=True)
-        if len(chosen)
-    ]
-    if not sampled:
-        raise DataError(f"the map has no descriptors of type {descriptors.type_name}")
-    return train_vocabulary(np.concatenate(sampled), options)
+    """Train on the descriptors of the map's images.
+
+    Raises
+    ------
+    DataError : they are missing, or too few.
+    """
+    images = mapping.read().image_names()
+    descriptors = mapping.descriptors(local_type)
+    if not any(descriptors.length(image) for image in images):
+        raise DataError(f"the map has no descriptors of type {local_type}", path=mapping.root)
+    read = _Descriptors(FolderSpec(mapping.root, mapping.features_dirs), local_type)
+    each = partial(ordered_map, executor=executor)
+    return train_vlad(images, descriptors.length, read, options, each=each)
 
 
 def extract_vlad(
@@ -88,41 +97,58 @@ def extract_vlad(
     """Train on ``mapping``, aggregate for all images of the folders, write to ``output``.
 
     The descriptors are read from the folders and their features folders.
+
+    Returns
+    -------
+    Counts for the log: images, clusters, dimensions.
     """
-    images = mapping.read().image_names()
-    vocabulary = train_on_map(mapping.descriptors(local_type), images, options)
+    vocabulary = train_on_map(mapping, local_type, options, executor=executor)
     type_name = vlad_type(local_type)
-    write_vocabulary(output / "global_features" / type_name, vocabulary, local_type, options)
-    config = FeatureConfig(
-        type_name, np.dtype(np.float32), vocabulary.centres.size, metric_type="L2"
-    )
+    place = output / "global_features" / type_name
+    write_vocabulary(place, vocabulary, local_type, options)
+    config = FeatureConfig(type_name, np.dtype(np.float32), vocabulary.size, metric_type="L2")
+    run = FolderSpec(place).key
     jobs = []
     for folder in folders:
-        spec = FolderSpec(folder.root, folder.features_dirs)
-        jobs += [
-            _Job(spec, local_type, image, vocabulary, options)
-            for image in folder.read().image_names()
-        ]
+        read = _Descriptors(FolderSpec(folder.root, folder.features_dirs), local_type)
+        jobs += [_Job(read, image, place, run) for image in folder.read().image_names()]
     jobs.sort(key=lambda job: job.image)
     writer = FeatureWriter(output, "global_features", type_name, config, orphan=True)
     results = ordered_map(_aggregate, jobs, executor)
     for job, vector in zip(jobs, track(results, len(jobs), "VLAD"), strict=True):
         writer.write(job.image, vector)
-    return {"images": len(jobs), "clusters": len(vocabulary.centres)}
+    return {
+        "images": len(jobs),
+        "clusters": vocabulary.centres.shape[1],
+        "dimensions": vocabulary.size,
+    }
 
 
 def _aggregate(job: _Job) -> NDArray[np.float32]:
-    descriptors = job.folder.open().descriptors(job.local_type).read(job.image)
-    return aggregate(descriptors, job.vocabulary, job.options)
+    vocabulary, settings = _read_once(job.vocabulary, job.run)
+    return aggregate(job.read(job.image), vocabulary, settings.options)
+
+
+@lru_cache(maxsize=1)
+def _read_once(folder: Path, run: tuple[object, ...]) -> tuple[Vocabulary, VladSettings]:
+    """A vocabulary may be large: not sent with every image, but read once by every process."""
+    found = read_vocabulary(folder)
+    if found is None:
+        raise DataError("the vocabulary is gone", path=folder / VOCABULARY_FILE)
+    return found
 
 
 def write_vocabulary(
     folder: Path, vocabulary: Vocabulary, local_type: str, options: VladOptions
 ) -> None:
-    """Write ``vocabulary.npy`` and ``vlad.json`` into the folder of a global-features type."""
-    buffer = io.BytesIO()
-    np.save(buffer, vocabulary.centres, allow_pickle=False)
-    write_bytes(folder / VOCABULARY_FILE, buffer.getvalue())
+    """Write what describes images into the folder of a global-features type.
+
+    ``vocabulary.npy`` and ``vlad.json``, and with whitening its mean and projection.
+    """
+    _write_array(folder / VOCABULARY_FILE, vocabulary.centres)
+    if vocabulary.whitening is not None:
+        _write_array(folder / MEAN_FILE, vocabulary.whitening.mean)
+        _write_array(folder / PROJECTION_FILE, vocabulary.whitening.projection)
     write_json_model(folder / SETTINGS_FILE, VladSettings(local_type=local_type, options=options))
 
 
@@ -131,16 +157,41 @@ def read_vocabulary(folder: Path) -> tuple[Vocabulary, VladSettings] | None:
 
     Raises
     ------
-    DataError : the file is broken.
+    DataError : a file is broken, or they do not fit each other.
     """
     path = folder / VOCABULARY_FILE
     if not path.is_file():
         return None
     settings = read_json_model(folder / SETTINGS_FILE, VladSettings)
+    centres = _read_array(path, "vocabulary")
+    if centres.ndim == 2:  # as it was written when there was one vocabulary only
+        centres = centres[None]
+    if centres.ndim != 3:
+        raise DataError(f"not a vocabulary: {centres.shape}", path=path)
+    if settings.options.dimensions is None:
+        return Vocabulary(centres), settings
+    mean = _read_array(folder / MEAN_FILE, "whitening")
+    projection = _read_array(folder / PROJECTION_FILE, "whitening")
+    if mean.shape != (centres.size,) or projection.shape[1:] != mean.shape:
+        raise DataError(
+            f"mean {mean.shape} and projection {projection.shape} do not fit the vocabulary "
+            f"{centres.shape}",
+            path=folder / PROJECTION_FILE,
+        )
+    return Vocabulary(centres, PcaWhitening(mean, projection)), settings
+
+
+def _write_array(path: Path, array: NDArray[np.float32]) -> None:
+    buffer = io.BytesIO()
+    np.save(buffer, array, allow_pickle=False)
+    write_bytes(path, buffer.getvalue())
+
+
+def _read_array(path: Path, what: str) -> NDArray[np.float32]:
     try:
-        centres = np.load(path, allow_pickle=False)
+        array = np.load(path, allow_pickle=False)
     except (ValueError, OSError, EOFError) as error:
-        raise DataError(f"not a vocabulary: {error}", path=path) from error
-    if centres.ndim != 2 or centres.dtype != np.float32 or not np.isfinite(centres).all():
-        raise DataError(f"not a vocabulary: {centres.dtype} {centres.shape}", path=path)
-    return Vocabulary(centres), settings
+        raise DataError(f"not a {what}: {error}", path=path) from error
+    if array.dtype != np.float32 or not np.isfinite(array).all():
+        raise DataError(f"not a {what}: {array.dtype} {array.shape}", path=path)
+    return array

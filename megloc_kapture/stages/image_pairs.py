@@ -12,7 +12,6 @@ from pydantic import Field
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.kapture_store import (
-    FeatureReader,
     ImagePair,
     KaptureData,
     KaptureFolder,
@@ -25,7 +24,13 @@ from megloc_kapture.mapping.pairs_by_covisibility import (
 )
 from megloc_kapture.mapping.pairs_by_poses import PairsByPosesOptions, pairs_by_poses
 from megloc_kapture.mapping.pairs_by_sequence import PairsBySequenceOptions, pairs_by_sequence
-from megloc_kapture.retrieval.search import rank_by_similarity
+from megloc_kapture.retrieval.blocks import VectorSource
+from megloc_kapture.stages.candidates import (
+    Candidates,
+    QueryPairsOptions,
+    Retrieval,
+    vectors_of,
+)
 from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
 from megloc_kapture.values import Options, RigidTransform
 
@@ -45,38 +50,6 @@ class MappingPairsOptions(Options):
         """Whether a method looks at points that are there already."""
         overlap = "poses" in self.by and self.poses.min_overlap is not None
         return overlap or "covisibility" in self.by
-
-
-class QueryPairsOptions(Options):
-    """How a query's candidates among the map's images are chosen."""
-
-    by: Literal["retrieval", "exhaustive"] = "retrieval"
-    top_k: int = Field(default=50, gt=0, description="most similar map images per query")
-
-
-def read_global_features(reader: FeatureReader, images: Sequence[str]) -> NDArray[np.float32]:
-    """Global features of the images, unit rows: float32 (N, D).
-
-    Raises
-    ------
-    DataError : an image has none.
-    """
-    missing = [image for image in images if image not in reader]
-    if missing:
-        raise DataError(
-            f"{len(missing)} images have no global feature of type {reader.type_name}, "
-            f"the first is {missing[0]}"
-        )
-    rows = np.zeros((len(images), reader.config.dsize), dtype=np.float32)
-    for row, image in zip(rows, images, strict=True):
-        row[:] = reader.read(image).reshape(-1)
-    return unit_rows(rows)
-
-
-def unit_rows(rows: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Rows scaled to unit length; zero rows stay zero."""
-    norm = np.linalg.norm(rows, axis=1, keepdims=True)
-    return np.divide(rows, norm, out=np.zeros_like(rows), where=norm > 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +91,7 @@ def pair_map_images(
     mapping: KaptureFolder,
     options: MappingPairsOptions,
     *,
-    global_type: str | None,
+    retrieval: Retrieval | None,
     restrictions: Restrictions = UNRESTRICTED,
     covisible: KaptureFolder | None = None,
 ) -> list[ImagePair]:
@@ -150,10 +123,10 @@ def pair_map_images(
         for method in options.by:
             similarity = None
             if method == "retrieval":
-                if global_type is None:
+                if retrieval is None:
                     raise DataError("pairs by retrieval need global features of the map")
-                vectors = read_global_features(mapping.global_features(global_type), names)
-                pairs, similarity = _most_similar(vectors, options.top_k)
+                vectors = vectors_of(retrieval.readers(mapping), names)
+                pairs, similarity = _most_similar(vectors, retrieval, options.top_k)
             elif method == "poses":
                 pairs = _by_poses(data, [poses[name] for name in names], names, within, options)
             elif method == "sequence":
@@ -203,11 +176,11 @@ def _united(
 
 
 def _most_similar(
-    vectors: NDArray[np.float32], top_k: int
+    vectors: Sequence[VectorSource], retrieval: Retrieval, top_k: int
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Pairs (P, 2), i < j, of each row and its ``top_k`` most similar others, and similarities."""
-    index, similarity = rank_by_similarity(vectors, vectors, top_k + 1)
-    rows = np.repeat(np.arange(len(vectors)), index.shape[1])
+    index, similarity = retrieval.rank(vectors, vectors, top_k + 1)
+    rows = np.repeat(np.arange(len(index)), index.shape[1])
     both = np.stack([rows, index.ravel()], axis=1)
     # an image is its own nearest, or ties with its copies: it must not use up a place
     others = both[:, 0] != both[:, 1]
@@ -221,33 +194,40 @@ def pair_queries(
     query: KaptureFolder,
     options: QueryPairsOptions,
     *,
-    global_type: str | None,
+    retrieval: Retrieval | None,
     restrictions: Restrictions = UNRESTRICTED,
 ) -> list[ImagePair]:
     """Candidates of every query among the posed map images its prior permits, best first.
 
     Sorted by query. A query that nothing is permitted to has no candidate.
+
+    Raises
+    ------
+    DataError : global features are needed and not there.
     """
-    images = sorted(mapping.read().poses())
+    poses = mapping.read().poses()
+    images = sorted(poses)
     queries = query.read().image_names()
-    if options.by == "retrieval" and global_type is None:
-        raise DataError("retrieval needs global features of map and queries")
-    if options.by == "exhaustive" or global_type is None:
-        of_query: list[list[ImagePair]] = [[] for _ in queries]
+    of_query: list[list[ImagePair]] = [[] for _ in queries]
+    if options.by == "exhaustive":
         for positions, permitted in restrictions.pools(queries, images):
             for at in positions:
                 of_query[at] = [ImagePair(queries[at], images[i], 1.0) for i in permitted]
         return [pair for pairs in of_query for pair in pairs]
-    map_vectors = read_global_features(mapping.global_features(global_type), images)
-    query_vectors = read_global_features(query.global_features(global_type), queries)
-    of_query = [[] for _ in queries]
+    if retrieval is None:
+        raise DataError("retrieval needs global features of map and queries")
+    database, described = retrieval.readers(mapping), retrieval.readers(query)
+    candidates = Candidates(
+        lambda members: vectors_of(database, [images[member] for member in members.tolist()]),
+        [poses[image] for image in images],
+        retrieval,
+    )
     for positions, permitted in restrictions.pools(queries, images):
-        # the whole map is by far the most frequent pool: no copy of it
-        among = map_vectors if len(permitted) == len(images) else map_vectors[permitted]
-        index, scores = rank_by_similarity(query_vectors[positions], among, options.top_k)
+        asked = vectors_of(described, [queries[at] for at in positions])
+        index, scores = candidates.of(asked, permitted, options)
         for at, row, row_scores in zip(positions, index.tolist(), scores.tolist(), strict=True):
             of_query[at] = [
-                ImagePair(queries[at], images[int(permitted[i])], float(score))
+                ImagePair(queries[at], images[i], score)
                 for i, score in zip(row, row_scores, strict=True)
                 if i >= 0
             ]

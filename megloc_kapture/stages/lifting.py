@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.depth_maps import read_depth_map
 from megloc_kapture.io.kapture_store import (
-    KaptureData,
     KaptureFolder,
     Observations,
     write_observations,
@@ -27,25 +26,9 @@ from megloc_kapture.io.kapture_store import (
 )
 from megloc_kapture.io.links import link_images
 from megloc_kapture.mapping.lifting import LiftingOptions, lift_keypoints
+from megloc_kapture.stages.depth_records import DepthRecord, depth_records
 from megloc_kapture.stages.parallel import FolderSpec, Track, ordered_map, untracked
 from megloc_kapture.stages.triangulation import copy_features
-from megloc_kapture.values import Camera, RigidTransform
-
-
-@dataclass(frozen=True)
-class DepthRecord:
-    """A depth map that was taken with an image.
-
-    Parameters
-    ----------
-    path : below ``records_data``.
-    camera : of the depth sensor.
-    image_from_depth : from the depth camera's frame to the image's.
-    """
-
-    path: str
-    camera: Camera
-    image_from_depth: RigidTransform
 
 
 @dataclass(frozen=True)
@@ -55,42 +38,6 @@ class _Job:
     image: str
     depth: DepthRecord
     options: LiftingOptions
-
-
-def depth_records(data: KaptureData) -> dict[str, DepthRecord]:
-    """Image -> the depth map of its moment, of a depth sensor on one rig with its camera.
-
-    Where several depth sensors share the rig, the one nearest to the camera counts.
-    """
-    rigs_of: dict[str, list[str]] = {}
-    for rig, members in sorted(data.rigs.items()):
-        for sensor in members:
-            rigs_of.setdefault(sensor, []).append(rig)
-    at_time: dict[int, list[tuple[str, str]]] = {}
-    for (timestamp, sensor), path in sorted(data.records_depth.items()):
-        at_time.setdefault(timestamp, []).append((sensor, path))
-    found = {}
-    for (timestamp, camera), image in data.records_camera.items():
-        options = [
-            (image_from_depth, sensor, path)
-            for sensor, path in at_time.get(timestamp, ())
-            if (image_from_depth := _between(data, rigs_of, camera, sensor)) is not None
-        ]
-        if options:
-            image_from_depth, sensor, path = min(
-                options, key=lambda option: (np.linalg.norm(option[0].translation), option[1])
-            )
-            found[image] = DepthRecord(path, data.sensors[sensor].camera(), image_from_depth)
-    return found
-
-
-def _between(
-    data: KaptureData, rigs_of: dict[str, list[str]], camera: str, depth: str
-) -> RigidTransform | None:
-    for rig in rigs_of.get(camera, ()):
-        if depth in data.rigs[rig]:
-            return data.rigs[rig][camera] @ data.rigs[rig][depth].inverse()
-    return None
 
 
 def lift_map(

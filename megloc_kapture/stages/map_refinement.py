@@ -50,7 +50,7 @@ from megloc_kapture.mapping.rejection import (
     track_lengths,
 )
 from megloc_kapture.mapping.uncertainty import point_covariances, point_deviations
-from megloc_kapture.stages.lifting import DepthRecord, depth_records
+from megloc_kapture.stages.depth_records import DepthRecord, depth_records
 from megloc_kapture.stages.parallel import FolderSpec, Track, ordered_map, untracked
 from megloc_kapture.stages.triangulation import copy_features
 from megloc_kapture.values import Options

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby, islice
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ from megloc_kapture.io.kapture_store import (
     KaptureFolder,
     MatchesWriter,
 )
+from megloc_kapture.io.match_counts import PairCount, write_match_counts
 from megloc_kapture.matching.verification import (
     KnownPoseOptions,
     TwoViewOptions,
@@ -93,6 +94,14 @@ class _Job:
 _PairMatches = tuple[NDArray[np.int64], NDArray[np.float32]]
 
 
+class VerifiedMatches(NamedTuple):
+    """Matches of a pair that are verified, their scores, and how many there were before."""
+
+    matches: NDArray[np.int64]
+    scores: NDArray[np.float32]
+    num_found: int
+
+
 def match_pairs(
     first: KaptureFolder,
     second: KaptureFolder,
@@ -107,7 +116,8 @@ def match_pairs(
 ) -> dict[str, int]:
     """Match each pair (image of ``first``, image of ``second``) and write what is verified.
 
-    A pair without verified matches is written with none, so that it is known to be done.
+    A pair without verified matches is written with none, so that it is known to be done. How many
+    matches each pair had before and has after verification stands in ``match_counts.csv``.
 
     Returns
     -------
@@ -129,20 +139,24 @@ def match_pairs(
         others = tuple(other for _, other in group)
         jobs.append(_Job(specs[0], specs[1], local_type, matcher, verification, image, others))
     writer = MatchesWriter(output, local_type, orphan=True)
-    matched = total = 0
+    counts: list[PairCount] = []
     results = ordered_map(_match, jobs, executor)
     for job, found in zip(jobs, track(results, len(jobs), "matching"), strict=True):
-        for other, (matches, scores) in zip(job.others, found, strict=True):
-            writer.write(job.image, other, matches, scores)
-            matched += len(matches) > 0
-            total += len(matches)
-    return {"pairs": len(ordered), "pairs_with_matches": matched, "matches": total}
+        for other, pair in zip(job.others, found, strict=True):
+            writer.write(job.image, other, pair.matches, pair.scores)
+            counts.append(PairCount(job.image, other, pair.num_found, len(pair.matches)))
+    write_match_counts(output, local_type, counts)
+    return {
+        "pairs": len(ordered),
+        "pairs_with_matches": sum(count.verified > 0 for count in counts),
+        "matches": sum(count.verified for count in counts),
+    }
 
 
-def _match(job: _Job) -> list[_PairMatches]:
+def _match(job: _Job) -> list[VerifiedMatches]:
     first, second = job.first.open(), job.second.open()
     features = cached_features(job.first, first, job.local_type, job.image)
-    found: list[_PairMatches] = []
+    found: list[VerifiedMatches] = []
     for others in batched(job.others, BATCH):  # not all at once: their features are in memory
         found += match_and_verify(
             features,
@@ -158,7 +172,7 @@ def _match(job: _Job) -> list[_PairMatches]:
 
 def match_and_verify(
     a: Features, others: Sequence[Features], matcher: Matcher, verifications: Sequence[Any]
-) -> list[_PairMatches]:
+) -> list[VerifiedMatches]:
     """Match one image with several, and keep the matches that are verified.
 
     Parameters
@@ -169,10 +183,8 @@ def match_and_verify(
     matched = match_all(matcher, a.for_matcher(), [other.for_matcher() for other in others])
     found = []
     for other, verify, (matches, scores) in zip(others, verifications, matched, strict=True):
-        if len(matches):
-            good = verify(a, other, matches)
-            matches, scores = matches[good], scores[good]
-        found.append((matches, scores))
+        good = verify(a, other, matches) if len(matches) else np.zeros(0, bool)
+        found.append(VerifiedMatches(matches[good], scores[good], len(matches)))
     return found
 
 

@@ -40,7 +40,7 @@ from megloc_kapture.plugins import (
 from megloc_kapture.stages.matches import iterate_candidates
 from megloc_kapture.stages.parallel import FolderSpec, Track, ordered_map, untracked
 from megloc_kapture.stages.query_units import QueryUnit, query_units
-from megloc_kapture.stages.ranking_scene import KaptureScene, query_reader
+from megloc_kapture.stages.ranking_scene import KaptureScene
 from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.shared_index import index_map, open_index, shared_index
 from megloc_kapture.values import Failure, Options, Pose
@@ -138,7 +138,7 @@ def _localize(job: _Job) -> list[tuple[str, Pose | Failure]]:
     }
     posed = [pair for pair in zip(job.candidates, job.frames, strict=True) if pair[0] in centers]
     candidates, frames = [image for image, _ in posed], [frame for _, frame in posed]
-    scene = KaptureScene(mapping, query_reader(query))
+    scene = KaptureScene(mapping, query)
 
     def localize(together: Sequence[QueryView]) -> ClusterLocalization:
         return localize_views(

@@ -1,51 +1,120 @@
-"""What a pose ranker may look at, out of kapture folders; read only when asked for."""
+"""What pose rankers and refiners may look at, out of kapture folders; read only when asked for."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
+from megloc_kapture.io.depth_maps import read_depth_map
 from megloc_kapture.io.kapture_store import KaptureFolder
-from megloc_kapture.stages.local_features import read_image_of
+from megloc_kapture.plugins import DepthView
+from megloc_kapture.stages.depth_records import DepthRecord, depth_records
+from megloc_kapture.stages.local_features import read_image_of, read_mask
 from megloc_kapture.values import Camera, RigidTransform
 
 
+class _Images:
+    """Pixels, masks and depth of the images of one folder."""
+
+    def __init__(self, folder: KaptureFolder) -> None:
+        self.folder = folder
+
+    def camera(self, name: str) -> Camera:
+        return self.folder.read().camera_of(name)
+
+    def image(self, name: str) -> NDArray[np.uint8]:
+        return read_image_of(self.folder.image_path(name), self.camera(name))
+
+    def mask(self, name: str) -> NDArray[np.bool_] | None:
+        camera = self.camera(name)
+        path = self.folder.root / "sensors" / "masks" / f"{name}.png"
+        return read_mask(path, (camera.height, camera.width))
+
+    def depth(self, name: str) -> DepthView | None:
+        record = self._depth_records.get(name)
+        if record is None:
+            return None
+        depth_m = read_depth_map(
+            self.folder.depth_path(record.path),
+            width=record.camera.width,
+            height=record.camera.height,
+        )
+        return DepthView(record.camera, depth_m, record.image_from_depth)
+
+    @cached_property
+    def _depth_records(self) -> dict[str, DepthRecord]:
+        return depth_records(self.folder.read())
+
+
 class KaptureScene:
-    """A :class:`~megloc_kapture.plugins.RankingScene` of a map's folder.
+    """A :class:`~megloc_kapture.plugins.RankingScene` of a map's folder and its queries'.
 
     Parameters
     ----------
-    read_query : pixels of a query image by its name.
+    query : the folder of the queries; None where they are not in one.
+    read_query : pixels of a query image by its name, where they are not in the folder.
     """
 
     def __init__(
-        self, mapping: KaptureFolder, read_query: Callable[[str], NDArray[np.uint8]]
+        self,
+        mapping: KaptureFolder,
+        query: KaptureFolder | None = None,
+        *,
+        read_query: Callable[[str], NDArray[np.uint8]] | None = None,
     ) -> None:
-        self._mapping, self._read_query = mapping, read_query
+        self._map = _Images(mapping)
+        self._query = None if query is None else _Images(query)
+        self._read_query = read_query
 
     def query_image(self, name: str) -> NDArray[np.uint8]:
         """RGB pixels (H, W, 3) of a query image; raises DataError."""
-        return self._read_query(name)
+        if self._read_query is not None:
+            return self._read_query(name)
+        if self._query is None:
+            raise DataError(f"the pixels of query {name} are not known")
+        return self._query.image(name)
+
+    def query_mask(self, name: str) -> NDArray[np.bool_] | None:
+        """Mask (H, W) of a query image, True = use; None without one."""
+        return None if self._query is None else self._query.mask(name)
+
+    def query_depth(self, name: str) -> DepthView | None:
+        """Depth that was taken with a query image; None without; raises DataError."""
+        return None if self._query is None else self._query.depth(name)
 
     def map_image(self, name: str) -> NDArray[np.uint8]:
         """RGB pixels (H, W, 3) of a map image; raises DataError."""
-        return read_image_of(self._mapping.image_path(name), self.map_camera(name))
+        return self._map.image(name)
+
+    def map_mask(self, name: str) -> NDArray[np.bool_] | None:
+        """Mask (H, W) of a map image, True = use; None without one."""
+        return self._map.mask(name)
+
+    def map_depth(self, name: str) -> DepthView | None:
+        """Depth that was taken with a map image; None without; raises DataError."""
+        return self._map.depth(name)
+
+    def map_points(self, name: str) -> NDArray[np.float64]:
+        """Points of the map that an image observes, in the world, (N, 3); raises DataError."""
+        ids = [
+            observed.point_ids[observed.image_ids == observed.image_names.index(name)]
+            for observed in self._map.folder.observations().values()
+            if name in observed.image_names
+        ]
+        xyz = self._map.folder.points3d()[:, :3]
+        return xyz[np.unique(np.concatenate([np.zeros(0, np.int64), *ids]))]
 
     def map_camera(self, name: str) -> Camera:
         """Camera of a map image, as stored."""
-        return self._mapping.read().camera_of(name)
+        return self._map.camera(name)
 
     def map_pose(self, name: str) -> RigidTransform:
         """``cam_from_world`` of a map image; raises DataError when it has none."""
-        pose = self._mapping.read().cam_from_world(name)
+        pose = self._map.folder.read().cam_from_world(name)
         if pose is None:
-            raise DataError(f"map image {name} has no pose", path=self._mapping.root)
+            raise DataError(f"map image {name} has no pose", path=self._map.folder.root)
         return pose
-
-
-def query_reader(query: KaptureFolder) -> Callable[[str], NDArray[np.uint8]]:
-    """Reads the pixels of a query folder's images by name."""
-    return lambda name: read_image_of(query.image_path(name), query.read().camera_of(name))

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from megloc_kapture.io.kapture_store import KaptureFolder, read_pairs
+from megloc_kapture.io.match_counts import read_match_counts
 
 Contents = Callable[[Path], dict[str, bytes]]
 
@@ -106,6 +107,82 @@ def test_and_the_map_they_make_is_one_to_localize_in(
     assert "100.0 / 100.0 / 100.0 / 100.0" in again.out
     megloc("submit", "kapture", "-i", result, "-o", poses).refused(r"poses\.txt exists; -f")
     assert megloc("submit", "kapture", "-i", result, "-o", poses, "-f").status == 0
+
+
+def test_reranking_keeps_the_best_matched_and_their_matches(
+    megloc: Any, made: Made, scene: Path, tmp_path: Path
+) -> None:
+    pairs, matches = tmp_path / "reranked.txt", tmp_path / "reranking"
+    both = ["--features-dir", made.features, "--features-dir", made.vlad]
+    command = ["pairs-query", "-i", scene / "mapping", "--query", scene / "query", "-o", pairs]
+    by = ("--rerank", "2", "--rerank-by", "verified")
+    done = megloc(*command, *both, *by, "--matches-dir", matches, *INLINE, "-q")
+    assert (done.status, done.err) == (0, "")
+    counts = {
+        (count.image, count.other): count.verified
+        for count in read_match_counts(matches, "rootsift")
+    }
+    # all candidates were matched, and the matches are those that a later step makes
+    assert counts.keys() == {(pair.query, pair.map) for pair in read_pairs(made.query_pairs)}
+    kept = read_pairs(pairs)
+    for query in {pair.query for pair in kept}:
+        best = sorted((n for (q, _), n in counts.items() if q == query), reverse=True)[:2]
+        assert [counts[pair.query, pair.map] for pair in kept if pair.query == query] == best
+    for name in ("matches", "match_counts.csv"):
+        ours, later = (
+            f / "local_features" / "rootsift" / name for f in (matches, made.query_matches)
+        )
+        assert ours.exists() and later.exists()
+    found = KaptureFolder(scene / "query", features_dirs=[matches]).matches("rootsift")
+    again = KaptureFolder(scene / "query", features_dirs=[made.query_matches]).matches("rootsift")
+    for pair in kept:
+        assert (
+            found.read(pair.query, pair.map)[0].tolist()
+            == again.read(pair.query, pair.map)[0].tolist()
+        )
+    refused = megloc(*command, *both, "--rerank", "2", "-f")
+    refused.refused("--rerank N and --matches-dir DIR go together")
+    megloc(*command, *both).refused(r"reranked\.txt exists; -f")
+
+
+def test_several_global_features_are_fused(
+    megloc: Any, made: Made, scene: Path, tmp_path: Path
+) -> None:
+    soft = tmp_path / "soft"
+    features = ["--features-dir", made.features]
+    done = megloc(
+        *("extract-global", "-i", scene / "mapping", "--query", scene / "query", "-o", soft),
+        *(*features, *INLINE, "--set", "global_features.options.assignment=soft", "-q"),
+    )
+    assert (done.status, done.err) == (0, "")
+    # the same vectors under a second name
+    second = soft / "global_features" / "second"
+    (soft / "global_features" / "vlad_rootsift").rename(second)
+    folders = ["--features-dir", made.vlad, "--features-dir", soft]
+    command = ["pairs-query", "-i", scene / "mapping", "--query", scene / "query"]
+    megloc(*command, "-o", tmp_path / "none.txt", *folders).refused(
+        "several types of global_features, name one: second, vlad_rootsift"
+    )
+    found = {}
+    for name, arguments in {
+        "hard": ["--features", "vlad_rootsift"],
+        "both": ["--features", "vlad_rootsift", "second", "--fusion", "mean"],
+        "soft": ["--features", "second"],
+    }.items():
+        out = tmp_path / f"{name}.txt"
+        done = megloc(*command, "-o", out, *folders, *arguments, "-q")
+        assert (done.status, done.err) == (0, "")
+        found[name] = {(pair.query, pair.map): pair.score for pair in read_pairs(out)}
+    assert found["hard"] != found["soft"]
+    for pair, score in found["both"].items():
+        assert score == pytest.approx((found["hard"][pair] + found["soft"][pair]) / 2, abs=1e-6)
+
+
+def test_unknown_global_features_are_refused(megloc: Any, scene: Path, tmp_path: Path) -> None:
+    command = ["extract-global", "-i", scene / "mapping", "-o", tmp_path / "out"]
+    megloc(*command, "--features", "nothing").refused(
+        "no plugin 'nothing' in megloc_kapture.global_features; registered: "
+    )
 
 
 def test_output_of_another_kind_is_refused(megloc: Any, made: Made, scene: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,12 +11,14 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
+from megloc_kapture.features.pca_whitening import learn_whitening
 from megloc_kapture.features.vlad import (
     VladOptions,
     Vocabulary,
     aggregate,
     sample_rows,
     soft_assignment,
+    train_vlad,
     train_vocabulary,
 )
 
@@ -59,7 +63,7 @@ def test_the_vector_is_the_formulas(assignment: str, intra: bool, power: float) 
     options = VladOptions.model_validate(
         {"assignment": assignment, "alpha": 4.0, "intra_normalization": intra, "power": power}
     )
-    vector = aggregate(data, Vocabulary(centres), options)
+    vector = aggregate(data, Vocabulary(centres[None]), options)
     assert vector.dtype == np.float32 and vector.shape == (40,)
     np.testing.assert_allclose(vector, vlad_by_loops(data, centres, options), atol=2e-6)
     np.testing.assert_allclose(np.linalg.norm(vector), 1.0, atol=1e-6)
@@ -87,7 +91,7 @@ def test_soft_weights_do_not_overflow_far_from_every_centre() -> None:
 def test_sharp_soft_assignment_is_hard_assignment() -> None:
     rng = np.random.default_rng(2)
     data, centres = unit_rows(rng, 80, 8), unit_rows(rng, 4, 8)
-    vocabulary = Vocabulary(centres)
+    vocabulary = Vocabulary(centres[None])
     hard = aggregate(data, vocabulary, VladOptions(assignment="hard"))
     distances = [
         float(
@@ -109,9 +113,9 @@ def test_intra_normalisation_gives_every_met_cluster_the_same_weight() -> None:
     burst = np.repeat(centres[:1], 100, axis=0) + np.float32(0.05) * unit_rows(rng, 1, 6)
     single = centres[1:2] + np.float32(0.05) * unit_rows(rng, 1, 6)
     data = np.concatenate([burst, single])
-    blocks = aggregate(data, Vocabulary(centres), VladOptions()).reshape(3, 6)
+    blocks = aggregate(data, Vocabulary(centres[None]), VladOptions()).reshape(3, 6)
     np.testing.assert_allclose(np.linalg.norm(blocks, axis=1), [0.5**0.5, 0.5**0.5, 0], atol=1e-5)
-    raw = aggregate(data, Vocabulary(centres), VladOptions(intra_normalization=False))
+    raw = aggregate(data, Vocabulary(centres[None]), VladOptions(intra_normalization=False))
     lengths = np.linalg.norm(raw.reshape(3, 6), axis=1)
     assert lengths[0] > 50 * lengths[1] > 0
 
@@ -120,7 +124,7 @@ def test_uint8_descriptors_count_as_numbers() -> None:
     rng = np.random.default_rng(4)
     data = rng.integers(0, 256, (50, 8), dtype=np.uint8)
     centres = rng.uniform(0, 255, (4, 8)).astype(np.float32)
-    vector = aggregate(data, Vocabulary(centres), VladOptions())
+    vector = aggregate(data, Vocabulary(centres[None]), VladOptions())
     expected = vlad_by_loops(data.astype(np.float32), centres, VladOptions())
     np.testing.assert_allclose(vector, expected, atol=1e-5)
 
@@ -130,16 +134,16 @@ def test_more_descriptors_than_one_chunk(monkeypatch: pytest.MonkeyPatch) -> Non
     data, centres = unit_rows(rng, 50, 8), unit_rows(rng, 4, 8)
     for assignment in ("hard", "soft"):
         options = VladOptions.model_validate({"assignment": assignment})
-        whole = aggregate(data, Vocabulary(centres), options)
+        whole = aggregate(data, Vocabulary(centres[None]), options)
         with monkeypatch.context() as patch:
             patch.setattr("megloc_kapture.features.vlad._CHUNK", 7)
-            parts = aggregate(data, Vocabulary(centres), options)
+            parts = aggregate(data, Vocabulary(centres[None]), options)
         np.testing.assert_allclose(parts, whole, atol=1e-6)
 
 
 @pytest.mark.parametrize("assignment", ["hard", "soft"])
 def test_an_image_without_descriptors_is_similar_to_nothing(assignment: str) -> None:
-    vocabulary = Vocabulary(np.eye(3, 8, dtype=np.float32))
+    vocabulary = Vocabulary(np.eye(3, 8, dtype=np.float32)[None])
     options = VladOptions.model_validate({"assignment": assignment})
     vector = aggregate(np.zeros((0, 8), np.float32), vocabulary, options)
     assert vector.shape == (24,) and vector.dtype == np.float32 and not vector.any()
@@ -147,12 +151,12 @@ def test_an_image_without_descriptors_is_similar_to_nothing(assignment: str) -> 
 
 def test_descriptors_on_their_centres_leave_no_residual_and_no_nan() -> None:
     centres = np.eye(3, 8, dtype=np.float32)
-    assert not aggregate(centres, Vocabulary(centres), VladOptions()).any()
+    assert not aggregate(centres, Vocabulary(centres[None]), VladOptions()).any()
 
 
 def test_another_size_of_descriptors_is_refused() -> None:
     with pytest.raises(DataError, match="descriptors have 4 dimensions, the vocabulary 8"):
-        aggregate(np.zeros((5, 4), np.float32), Vocabulary(np.zeros((3, 8), np.float32)))
+        aggregate(np.zeros((5, 4), np.float32), Vocabulary(np.zeros((1, 3, 8), np.float32)))
 
 
 def clusters(rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
@@ -164,7 +168,7 @@ def clusters(rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.
 @pytest.mark.parametrize("seed", range(5))
 def test_the_vocabulary_finds_well_separated_clusters(seed: int) -> None:
     truth, data = clusters(np.random.default_rng(100 + seed))
-    centres = train_vocabulary(data, VladOptions(num_clusters=6, seed=seed)).centres
+    centres = train_vocabulary(data, VladOptions(num_clusters=6, seed=seed)).centres[0]
     assert centres.dtype == np.float32
     distance = np.linalg.norm(centres[:, None] - truth, axis=2)
     assert sorted(distance.argmin(axis=1).tolist()) == list(range(6))
@@ -174,7 +178,7 @@ def test_the_vocabulary_finds_well_separated_clusters(seed: int) -> None:
 
 def test_the_vocabulary_is_a_fixed_point_of_lloyd() -> None:
     _, data = clusters(np.random.default_rng(7))
-    centres = train_vocabulary(data, VladOptions(num_clusters=4, iterations=100)).centres
+    centres = train_vocabulary(data, VladOptions(num_clusters=4, iterations=100)).centres[0]
     labels = np.linalg.norm(data[:, None] - centres, axis=2).argmin(axis=1)
     means = np.array([data[labels == k].astype(np.float64).mean(axis=0) for k in range(4)])
     np.testing.assert_allclose(centres, means, atol=1e-4)
@@ -193,7 +197,7 @@ def test_a_large_training_set_starts_from_a_sample() -> None:
     rng = np.random.default_rng(9)
     truth = np.array([[0.0, 0.0], [50.0, 0.0], [0.0, 50.0]])
     data = (truth[rng.integers(0, 3, 30_000)] + rng.normal(size=(30_000, 2))).astype(np.float32)
-    centres = train_vocabulary(data, VladOptions(num_clusters=3)).centres
+    centres = train_vocabulary(data, VladOptions(num_clusters=3)).centres[0]
     distance = np.linalg.norm(centres[:, None] - truth, axis=2)
     assert sorted(distance.argmin(axis=1).tolist()) == [0, 1, 2]
     assert distance.min(axis=1).max() < 0.1
@@ -206,7 +210,7 @@ def test_too_few_descriptors_are_refused() -> None:
     copies = np.repeat(data[:3], 20, axis=0)
     with pytest.raises(DataError, match="fewer than 10 distinct"):
         train_vocabulary(copies, VladOptions(num_clusters=10))
-    assert len(train_vocabulary(copies, VladOptions(num_clusters=3)).centres) == 3
+    assert train_vocabulary(copies, VladOptions(num_clusters=3)).centres.shape == (1, 3, 8)
 
 
 def test_training_refuses_values_that_are_not_finite() -> None:
@@ -228,3 +232,112 @@ def test_sampled_rows_are_a_share_of_every_image(counts: list[int], total: int, 
     assert all(
         np.array_equal(a, b) for a, b in zip(rows, sample_rows(counts, total, seed), strict=True)
     )
+
+
+def test_vocabularies_stand_side_by_side_with_equal_weight() -> None:
+    rng = np.random.default_rng(11)
+    data = unit_rows(rng, 300, 8)
+    options = VladOptions(num_clusters=4, vocabularies=3)
+    vocabulary = train_vocabulary(data, options)
+    assert vocabulary.centres.shape == (3, 4, 8) and vocabulary.size == 96
+    assert len({centres.tobytes() for centres in vocabulary.centres}) == 3
+    image = unit_rows(rng, 40, 8)
+    alone = [vlad_by_loops(image, centres, options) for centres in vocabulary.centres]
+    np.testing.assert_allclose(
+        aggregate(image, vocabulary, options), np.concatenate(alone) / np.sqrt(3), atol=2e-6
+    )
+
+
+def test_the_first_of_several_vocabularies_is_the_one_trained_alone() -> None:
+    data = unit_rows(np.random.default_rng(12), 300, 8)
+    one = train_vocabulary(data, VladOptions(num_clusters=4, seed=7))
+    several = train_vocabulary(data, VladOptions(num_clusters=4, seed=7, vocabularies=2))
+    np.testing.assert_array_equal(one.centres[0], several.centres[0])
+
+
+def images_of(rng: np.random.Generator, count: int) -> dict[str, NDArray[np.float32]]:
+    """Images of a few kinds of descriptors each, and one without any."""
+    kinds = unit_rows(rng, 12, 8)
+    found = {}
+    for number in range(count):
+        some = kinds[rng.integers(0, 12, 30)] + 0.2 * rng.normal(size=(30, 8))
+        found[f"{number:03d}"] = some.astype(np.float32)
+    return {**found, "empty": np.zeros((0, 8), np.float32)}
+
+
+WHITENED = VladOptions(num_clusters=4, vocabularies=2, dimensions=10)
+
+
+def train(images: dict[str, NDArray[np.float32]], options: VladOptions) -> Vocabulary:
+    return train_vlad(sorted(images), lambda name: len(images[name]), images.__getitem__, options)
+
+
+def test_training_whole_is_training_vocabularies_and_then_whitening() -> None:
+    images = images_of(np.random.default_rng(13), 30)
+    vocabulary = train(images, WHITENED)
+    named = sorted(set(images) - {"empty"})
+    plain = train_vocabulary(np.concatenate([images[name] for name in named]), WHITENED)
+    np.testing.assert_array_equal(vocabulary.centres, plain.centres)
+    vectors = np.stack([aggregate(images[name], plain, WHITENED) for name in named])
+    expected = learn_whitening(vectors.copy(), 10, 0.5)
+    assert vocabulary.whitening is not None and vocabulary.size == 10
+    np.testing.assert_array_equal(vocabulary.whitening.projection, expected.projection)
+    np.testing.assert_array_equal(vocabulary.whitening.mean, expected.mean)
+    for name, vector in zip(named, vectors, strict=True):
+        np.testing.assert_array_equal(
+            aggregate(images[name], vocabulary, WHITENED), expected.apply(vector)
+        )
+    assert not aggregate(images["empty"], vocabulary, WHITENED).any()
+
+
+def test_the_power_of_whitening_is_an_option() -> None:
+    images = images_of(np.random.default_rng(18), 12)
+    half, whole = (
+        train(images, WHITENED.model_copy(update={"whitening_power": power})).whitening
+        for power in (0.5, 1.0)
+    )
+    assert half is not None and whole is not None
+    assert not np.allclose(half.projection, whole.projection)
+
+
+@pytest.mark.parametrize(("count", "size"), [(2, 1), (5, 4), (30, 10)])
+def test_whitening_has_fewer_dimensions_than_images_and_no_more_than_wanted(
+    count: int, size: int
+) -> None:
+    images = images_of(np.random.default_rng(14), count)
+    assert train(images, WHITENED).size == size
+
+
+def test_training_without_whitening_has_none() -> None:
+    images = images_of(np.random.default_rng(15), 5)
+    vocabulary = train(images, WHITENED.model_copy(update={"dimensions": None}))
+    assert vocabulary.whitening is None and vocabulary.size == 64
+
+
+def test_whitening_is_learnt_from_a_bounded_number_of_images(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    images = images_of(np.random.default_rng(16), 40)
+    monkeypatch.setattr("megloc_kapture.features.vlad._WHITENING_IMAGES", 6)
+    described: list[str] = []
+
+    def each(function: Any, items: Any) -> Any:
+        described.extend(items)
+        return map(function, items)
+
+    def length(name: str) -> int:
+        return len(images[name])
+
+    vocabulary = train_vlad(sorted(images), length, images.__getitem__, WHITENED, each=each)
+    assert vocabulary.size == 5
+    assert described == ["000", "008", "016", "023", "031", "039"]
+
+
+def test_a_map_without_any_descriptor_is_refused() -> None:
+    with pytest.raises(DataError, match="no descriptors"):
+        train({"empty": np.zeros((0, 8), np.float32)}, WHITENED)
+
+
+def test_whitening_of_one_image_is_refused() -> None:
+    with pytest.raises(DataError, match="cannot be learnt from 1 images"):
+        train(images_of(np.random.default_rng(17), 1), WHITENED)

@@ -244,11 +244,30 @@ def test_add_refuses(folder: Path, tmp_path: Path) -> None:
         add_weights(broken)
     unknown = tmp_path / "TokyoTM_struct.mat"
     unknown.write_bytes(b"MATLAB 5.0 MAT-file")
-    with pytest.raises(DataError, match="cannot be proven"):
+    with pytest.raises(DataError, match="TokyoTM_struct"):
         add_weights(unknown)
     with pytest.raises(DataError, match="no such file"):
         add_weights(tmp_path / "nowhere.pth")
     assert list(folder.iterdir()) == []
+
+
+def test_a_file_that_is_not_the_published_one_is_taken_when_asked(
+    folder: Path, tmp_path: Path
+) -> None:
+    own = write(tmp_path / "superpoint_v1.pth", 3.0)
+    added = add_weights(own, unverified=True)
+    assert added.path == folder / "unverified" / "superpoint_v1.pth"
+    found = find_weights("superpoint_v1")
+    assert found.path == added.path and found.published is None
+    assert read_weights(found).keys() == read_weights(describe("own", own)).keys()
+    # the published one comes first, and is checked
+    shutil.copyfile(own, folder / "superpoint_v1.pth")
+    with pytest.raises(DataError, match="is not the published file"):
+        read_weights(find_weights("superpoint_v1"))
+    broken = tmp_path / "vgg16_netvlad.pth"
+    broken.write_bytes(b"<html>sign in</html>")
+    with pytest.raises(DataError, match="no file of weights that can be read"):
+        add_weights(broken, unverified=True)
 
 
 def test_add_does_not_replace_without_being_asked(folder: Path, tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ SMALL = {
     "width": 400,
     "height": 300,
 }
-CHEAP = ["local_features.options.max_keypoints=800", "vlad.num_clusters=16"]
+CHEAP = ["local_features.options.max_keypoints=800", "global_features.options.num_clusters=16"]
 BOTH = ["map=given+triangulate", 'mapping_pairs.by=["covisibility"]']
 
 

@@ -40,7 +40,7 @@ def options(shared_data: Path) -> PipelineOptions:
             "local_features.xfeat.options.max_keypoints=800",
             "preprocessing.max_size_px=640",
             "guided_pyramid.scales=[1.0]",
-            "vlad.num_clusters=16",
+            "global_features.options.num_clusters=16",
         ]
     )
 

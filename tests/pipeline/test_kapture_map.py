@@ -101,7 +101,7 @@ def residuals_px(opened: KaptureMap, queries: KaptureFolder, truth: Path) -> lis
             theirs = Features.of(
                 opened.camera(image), opened.keypoints_px(image), opened.descriptors(image)
             )
-            matches.append((image, *match_and_verify(ours, [theirs], matcher, [verify])[0]))
+            matches.append((image, *match_and_verify(ours, [theirs], matcher, [verify])[0][:2]))
         pairs = observed_matches(opened.index, matches).resolve()
         seen = project(query.camera, poses[query.name], opened.index.xyz[pairs.point_ids])
         distances = np.linalg.norm(seen - keypoints[pairs.keypoint_ids], axis=1)

@@ -23,7 +23,7 @@ from megloc_kapture.pipeline.workspace import Workspace
 SMALL = [
     "local_features.aliked.options.max_keypoints=600",
     "preprocessing.max_size_px=640",
-    "vlad.num_clusters=16",
+    "global_features.options.num_clusters=16",
 ]
 
 

@@ -40,7 +40,7 @@ def localized(folder: Path, changes: Sequence[str]) -> Workspace:
     benchmark = find_benchmark(dataset, TWIN_PREFIX)
     source = choose_dataset(dataset, None, import_options=benchmark.import_options)
     source = replace(source, twin=twin_of("robotcar", **SMALL))
-    cheap = ["local_features.options.max_keypoints=1500", "vlad.num_clusters=32"]
+    cheap = ["local_features.options.max_keypoints=1500", "global_features.options.num_clusters=32"]
     options = options_of_preset(changes=benchmark.options, assignments=[*cheap, *changes])
     workspace = Workspace(folder)
     with workspace.lock(), single_threaded(), open_executor("processes", 2) as executor:

@@ -48,7 +48,10 @@ def finished(
     source = choose_dataset(dataset, None, import_options=benchmark.import_options)
     source = replace(source, twin=twin_of(name, **SMALL[name]))
     workspace = Workspace(tmp_path_factory.mktemp(name) / "workspace")
-    changes = ["local_features.options.max_keypoints=1500", "vlad.num_clusters=32"]
+    changes = [
+        "local_features.options.max_keypoints=1500",
+        "global_features.options.num_clusters=32",
+    ]
     options = options_of_preset(changes=benchmark.options, assignments=changes)
 
     def again() -> list[Any]:

@@ -21,10 +21,10 @@ from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, Sensor, 
 from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
 from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
+from megloc_kapture.stages.candidates import QueryPairsOptions, Retrieval
 from megloc_kapture.stages.global_vlad import extract_vlad
 from megloc_kapture.stages.image_pairs import (
     MappingPairsOptions,
-    QueryPairsOptions,
     pair_map_images,
     pair_queries,
 )
@@ -148,10 +148,10 @@ def world(images_only: World) -> World:
         extract_local_features([it.mapping(), it.query()], EXTRACTOR, it.features_dir)
         extract_vlad(it.mapping(), [it.mapping(), it.query()], "rootsift", it.features_dir, VLAD)
         map_pairs = pair_map_images(
-            it.mapping(), MappingPairsOptions(), global_type="vlad_rootsift"
+            it.mapping(), MappingPairsOptions(), retrieval=Retrieval(("vlad_rootsift",))
         )
         query_pairs = pair_queries(
-            it.mapping(), it.query(), QueryPairsOptions(), global_type="vlad_rootsift"
+            it.mapping(), it.query(), QueryPairsOptions(), retrieval=Retrieval(("vlad_rootsift",))
         )
         matcher = NearestNeighbours()
         match_pairs(

@@ -226,7 +226,7 @@ def sift_map(world, tmp_path_factory: pytest.TempPathFactory) -> KaptureFolder:
     mapping = KaptureFolder(world.root / "mapping", features_dirs=[root])
     extract_local_features([mapping], ColmapSift(ColmapSiftOptions(first_octave=0)), root)
     mapping = KaptureFolder(world.root / "mapping", features_dirs=[root])
-    pairs = pair_map_images(mapping, MappingPairsOptions(by=("exhaustive",)), global_type=None)
+    pairs = pair_map_images(mapping, MappingPairsOptions(by=("exhaustive",)), retrieval=None)
     match_pairs(
         mapping, mapping, pairs, "sift", NearestNeighbours(), KnownPoseOptions(), root / "matches"
     )

@@ -26,12 +26,11 @@ from megloc_kapture.io.side_tables import ImageGroup
 from megloc_kapture.mapping.pairs_by_covisibility import PairsByCovisibilityOptions
 from megloc_kapture.mapping.pairs_by_poses import PairsByPosesOptions
 from megloc_kapture.mapping.pairs_by_sequence import PairsBySequenceOptions
+from megloc_kapture.stages.candidates import QueryPairsOptions, Retrieval, vectors_of
 from megloc_kapture.stages.image_pairs import (
     MappingPairsOptions,
-    QueryPairsOptions,
     pair_map_images,
     pair_queries,
-    read_global_features,
 )
 from megloc_kapture.stages.restrictions import Restrictions
 
@@ -80,7 +79,9 @@ def test_map_pairs_by_retrieval(
         for j in others[:top_k]:
             key = (images[min(i, j)], images[max(i, j)])
             expected[key] = float(np.dot(unit(VECTORS[key[0]]), unit(VECTORS[key[1]])))
-    found = pair_map_images(folders[0], MappingPairsOptions(top_k=top_k), global_type="toy")
+    found = pair_map_images(
+        folders[0], MappingPairsOptions(top_k=top_k), retrieval=Retrieval(("toy",))
+    )
     assert names(found) == sorted(expected)
     np.testing.assert_allclose(
         [p.score for p in found], [expected[k] for k in sorted(expected)], atol=1e-6
@@ -90,7 +91,7 @@ def test_map_pairs_by_retrieval(
 def test_an_image_is_never_paired_with_itself_even_among_copies(
     folders: tuple[KaptureFolder, KaptureFolder],
 ) -> None:
-    found = pair_map_images(folders[0], MappingPairsOptions(top_k=1), global_type="toy")
+    found = pair_map_images(folders[0], MappingPairsOptions(top_k=1), retrieval=Retrieval(("toy",)))
     assert ("left/0.png", "left/1.png") in names(found)
     assert all(pair.query < pair.map for pair in found)
 
@@ -102,7 +103,7 @@ def test_copies_do_not_take_more_places_than_there_are(world: Any, tmp_path: Pat
             writer.write(image, np.ones(3, dtype=np.float32))
     folder = KaptureFolder(world.mapping().root, features_dirs=[tmp_path])
     first, *others = sorted(world.map_poses)
-    found = pair_map_images(folder, MappingPairsOptions(top_k=1), global_type="toy")
+    found = pair_map_images(folder, MappingPairsOptions(top_k=1), retrieval=Retrieval(("toy",)))
     # each has one partner, the first of the others
     assert names(found) == [(first, other) for other in others]
 
@@ -110,7 +111,7 @@ def test_copies_do_not_take_more_places_than_there_are(world: Any, tmp_path: Pat
 def test_map_pairs_by_poses_and_exhaustively(world: Any) -> None:
     images = sorted(world.map_poses)
     everything = pair_map_images(
-        world.mapping(), MappingPairsOptions(by=("exhaustive",)), global_type=None
+        world.mapping(), MappingPairsOptions(by=("exhaustive",)), retrieval=None
     )
     assert names(everything) == list(combinations(images, 2))
     assert {pair.score for pair in everything} == {1.0}
@@ -124,14 +125,16 @@ def test_map_pairs_by_poses_and_exhaustively(world: Any) -> None:
             key=lambda o: float(np.linalg.norm(centers[o] - centers[image])),
         )
         expected.add((min(image, other), max(image, other)))
-    assert names(pair_map_images(world.mapping(), options, global_type=None)) == sorted(expected)
+    assert names(pair_map_images(world.mapping(), options, retrieval=None)) == sorted(expected)
 
 
 @pytest.mark.parametrize("by", [("exhaustive", "retrieval"), ("retrieval", "exhaustive")])
 def test_methods_add_up_and_retrieval_gives_the_score(
     folders: tuple[KaptureFolder, KaptureFolder], by: Any
 ) -> None:
-    found = pair_map_images(folders[0], MappingPairsOptions(by=by, top_k=1), global_type="toy")
+    found = pair_map_images(
+        folders[0], MappingPairsOptions(by=by, top_k=1), retrieval=Retrieval(("toy",))
+    )
     assert len(found) == 10
     scores = {(pair.query, pair.map): pair.score for pair in found}
     assert scores["left/0.png", "left/1.png"] == pytest.approx(1.0, abs=1e-6)
@@ -157,13 +160,13 @@ def test_map_pairs_by_covisibility(world: Any) -> None:
     )
     expected = sorted(pair for pair, count in shared.items() if count >= least)
     assert 0 < len(expected) < 10
-    found = pair_map_images(world.map(), options, global_type=None)
+    found = pair_map_images(world.map(), options, retrieval=None)
     assert names(found) == expected and {pair.score for pair in found} == {1.0}
     # images of one kapture, points of another
     mapping = world.mapping()
-    assert pair_map_images(mapping, options, global_type=None, covisible=world.map()) == found
+    assert pair_map_images(mapping, options, retrieval=None, covisible=world.map()) == found
     with pytest.raises(DataError, match="mapping: co-visibility and overlap need a map's points"):
-        pair_map_images(mapping, options, global_type=None)
+        pair_map_images(mapping, options, retrieval=None)
 
 
 def test_points_of_all_types_count(world: Any, tmp_path: Path) -> None:
@@ -183,7 +186,7 @@ def test_points_of_all_types_count(world: Any, tmp_path: Path) -> None:
     most = max(shared.values())
     covisibility = PairsByCovisibilityOptions(min_shared_points=2 * most)
     options = MappingPairsOptions(by=("covisibility",), covisibility=covisibility)
-    found = pair_map_images(KaptureFolder(tmp_path), options, global_type=None)
+    found = pair_map_images(KaptureFolder(tmp_path), options, retrieval=None)
     assert names(found) == sorted(pair for pair, count in shared.items() if count == most)
 
 
@@ -195,15 +198,13 @@ def test_a_map_of_other_images_is_refused(world: Any, tmp_path: Path) -> None:
     write_observations(tmp_path, {"rootsift": strangers})
     options = MappingPairsOptions(by=("covisibility",))
     with pytest.raises(DataError, match="no image to be paired observes its points"):
-        pair_map_images(
-            world.mapping(), options, global_type=None, covisible=KaptureFolder(tmp_path)
-        )
+        pair_map_images(world.mapping(), options, retrieval=None, covisible=KaptureFolder(tmp_path))
 
 
 def test_near_images_that_see_other_things_are_no_pairs(world: Any) -> None:
     folder = world.map()
     near = MappingPairsOptions(by=("poses",))
-    assert len(pair_map_images(folder, near, global_type=None)) == 10
+    assert len(pair_map_images(folder, near, retrieval=None)) == 10
     shares = {}
     xyz = folder.points3d()[:, :3]
     observations = folder.observations()["rootsift"]
@@ -220,11 +221,11 @@ def test_near_images_that_see_other_things_are_no_pairs(world: Any) -> None:
     by_overlap = MappingPairsOptions(by=("poses",), poses=PairsByPosesOptions(min_overlap=least))
     expected = sorted(pair for pair, share in shares.items() if share >= least)
     found = pair_map_images(
-        world.mapping(), by_overlap, global_type=None, covisible=KaptureFolder(folder.root)
+        world.mapping(), by_overlap, retrieval=None, covisible=KaptureFolder(folder.root)
     )
     assert names(found) == expected
     with pytest.raises(DataError, match="need a map's points"):
-        pair_map_images(world.mapping(), by_overlap, global_type=None)
+        pair_map_images(world.mapping(), by_overlap, retrieval=None)
 
 
 def test_map_pairs_by_sequence_are_within_a_camera(world: Any, tmp_path: Path) -> None:
@@ -232,7 +233,7 @@ def test_map_pairs_by_sequence_are_within_a_camera(world: Any, tmp_path: Path) -
     sequence = PairsBySequenceOptions(window=1)
     options = MappingPairsOptions(by=("sequence",), sequence=sequence)
     # the images were taken in the order of their names
-    found = pair_map_images(world.mapping(), options, global_type=None)
+    found = pair_map_images(world.mapping(), options, retrieval=None)
     assert names(found) == list(pairwise(images))
     data = world.mapping().read()
     sensors, taken = {**data.sensors, "other": data.sensors["cam"]}, {}
@@ -246,8 +247,8 @@ def test_map_pairs_by_sequence_are_within_a_camera(world: Any, tmp_path: Path) -
     backwards = KaptureFolder(tmp_path)
     left, right = images[:2], images[2:]
     expected = [tuple(left), *pairwise(right)]
-    assert names(pair_map_images(backwards, options, global_type=None)) == expected
-    assert names(pair_map_images(backwards, looped, global_type=None)) == [
+    assert names(pair_map_images(backwards, options, retrieval=None)) == expected
+    assert names(pair_map_images(backwards, looped, retrieval=None)) == [
         tuple(left),
         *combinations(right, 2),
     ]
@@ -271,7 +272,7 @@ def test_frames_never_mix(
         MappingPairsOptions(
             by=by, covisibility=PairsByCovisibilityOptions(top_k=1, min_shared_points=1)
         ),
-        global_type="toy",
+        retrieval=Retrieval(("toy",)),
         restrictions=FRAMES,
         covisible=world.map(),
     )
@@ -298,7 +299,7 @@ def test_all_methods_together_name_each_pair_once(
             found = pair_map_images(
                 folders[0],
                 MappingPairsOptions(by=by, **options),
-                global_type="toy",
+                retrieval=Retrieval(("toy",)),
                 covisible=world.map(),
             )
             each[by] = found
@@ -309,7 +310,7 @@ def test_all_methods_together_name_each_pair_once(
 
 
 def test_query_pairs_are_best_first(folders: tuple[KaptureFolder, KaptureFolder]) -> None:
-    found = pair_queries(*folders, QueryPairsOptions(top_k=3), global_type="toy")
+    found = pair_queries(*folders, QueryPairsOptions(top_k=3), retrieval=Retrieval(("toy",)))
     assert names(found) == [
         ("query/a.png", "right/2.png"),
         ("query/a.png", "left/0.png"),  # equal to its copy: the order of names
@@ -324,7 +325,7 @@ def test_query_pairs_are_best_first(folders: tuple[KaptureFolder, KaptureFolder]
 
 def test_query_pairs_exhaustively(world: Any) -> None:
     found = pair_queries(
-        world.mapping(), world.query(), QueryPairsOptions(by="exhaustive"), global_type=None
+        world.mapping(), world.query(), QueryPairsOptions(by="exhaustive"), retrieval=None
     )
     assert names(found) == [
         (q, m) for q in sorted(world.query_poses) for m in sorted(world.map_poses)
@@ -333,7 +334,7 @@ def test_query_pairs_exhaustively(world: Any) -> None:
 
 def test_vlad_ranks_the_nearest_view_first(world: Any) -> None:
     found = pair_queries(
-        world.mapping(), world.query(), QueryPairsOptions(), global_type="vlad_rootsift"
+        world.mapping(), world.query(), QueryPairsOptions(), retrieval=Retrieval(("vlad_rootsift",))
     )
     for query, pose in world.query_poses.items():
         ranked = [pair.map for pair in found if pair.query == query]
@@ -346,15 +347,15 @@ def test_vlad_ranks_the_nearest_view_first(world: Any) -> None:
 
 def test_retrieval_needs_global_features(world: Any) -> None:
     with pytest.raises(DataError, match="need global features"):
-        pair_map_images(world.mapping(), MappingPairsOptions(), global_type=None)
+        pair_map_images(world.mapping(), MappingPairsOptions(), retrieval=None)
     with pytest.raises(DataError, match="needs global features"):
-        pair_queries(world.mapping(), world.query(), QueryPairsOptions(), global_type=None)
+        pair_queries(world.mapping(), world.query(), QueryPairsOptions(), retrieval=None)
 
 
 def test_images_without_global_features_are_named(world: Any) -> None:
     reader = world.mapping().global_features("vlad_rootsift")
     with pytest.raises(DataError, match=r"2 images have no .* vlad_rootsift, the first is x\.png"):
-        read_global_features(reader, ["left/0.png", "x.png", "y.png"])
+        vectors_of([reader], ["left/0.png", "x.png", "y.png"])
 
 
 def test_global_features_come_at_unit_length_and_zero_stays_zero(tmp_path: Path) -> None:
@@ -363,5 +364,6 @@ def test_global_features_come_at_unit_length_and_zero_stays_zero(tmp_path: Path)
         writer.write("a.png", np.array([3.0, 4.0]))
         writer.write("b.png", np.zeros(2))
     folder = KaptureFolder(tmp_path / "none", features_dirs=[tmp_path])
-    rows = read_global_features(folder.global_features("toy"), ["a.png", "b.png"])
+    (source,) = vectors_of([folder.global_features("toy")], ["a.png", "b.png"])
+    rows = source.read(0, 2)
     np.testing.assert_allclose(rows, [[0.6, 0.8], [0, 0]])

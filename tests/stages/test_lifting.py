@@ -15,7 +15,8 @@ from megloc_kapture.geometry.cameras import px_from_cam
 from megloc_kapture.io.depth_maps import read_depth_map
 from megloc_kapture.io.kapture_store import KaptureFolder, write_sensors
 from megloc_kapture.mapping.lifting import LiftingOptions
-from megloc_kapture.stages.lifting import depth_records, lift_map
+from megloc_kapture.stages.depth_records import depth_records
+from megloc_kapture.stages.lifting import lift_map
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.shared_index import index_map
 from megloc_kapture.values import RigidTransform

@@ -10,7 +10,8 @@ import kapture.io.csv
 from megloc_kapture.io.cluster_table import CLUSTERS_FILE, read_clusters
 from megloc_kapture.io.kapture_store import KaptureFolder
 from megloc_kapture.io.status_table import STATUS_FILE, read_status
-from megloc_kapture.stages.image_pairs import QueryPairsOptions, pair_queries
+from megloc_kapture.stages.candidates import QueryPairsOptions, Retrieval
+from megloc_kapture.stages.image_pairs import pair_queries
 from megloc_kapture.stages.localized_folder import write_localized
 from megloc_kapture.stages.query_poses import LocalizationOptions, localize_from_matches
 from megloc_kapture.values import Failure, Pose, RigidTransform
@@ -20,7 +21,7 @@ Results = list[tuple[str, Pose | Failure]]
 
 def localize(world: Any) -> Results:
     pairs = pair_queries(
-        world.mapping(), world.query(), QueryPairsOptions(), global_type="vlad_rootsift"
+        world.mapping(), world.query(), QueryPairsOptions(), retrieval=Retrieval(("vlad_rootsift",))
     )
     matches = world.with_matches("query")
     found = localize_from_matches(

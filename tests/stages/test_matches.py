@@ -18,6 +18,7 @@ from megloc_kapture.io.kapture_store import (
     ImagePair,
     KaptureFolder,
 )
+from megloc_kapture.io.match_counts import read_match_counts
 from megloc_kapture.matching.nearest_neighbours import NearestNeighbours, match_nearest
 from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
 from megloc_kapture.pipeline.executors import single_threaded
@@ -68,8 +69,20 @@ def test_workers_write_the_same_bytes(
     assert here["pairs"] == here["pairs_with_matches"] == 10
     assert here["matches"] > 2000
     written = folder_bytes(tmp_path / "here")
-    assert len(written) == 10
+    assert len(written) == 11  # of ten pairs, and the table of their numbers
     assert written == folder_bytes(tmp_path / "there")
+
+
+def test_the_table_says_what_was_found_and_what_is_verified(world: Any, tmp_path: Path) -> None:
+    run(world, "query", TwoViewOptions(), tmp_path / "verified")
+    run(world, "query", NoVerification(), tmp_path / "all")
+    verified = read_match_counts(tmp_path / "verified", "rootsift")
+    everything = {(c.image, c.other): c for c in read_match_counts(tmp_path / "all", "rootsift")}
+    reader = KaptureFolder(world.query().root, features_dirs=[tmp_path / "verified"])
+    for count in verified:
+        assert count.verified == len(reader.matches("rootsift").read(count.image, count.other)[0])
+        assert count.matches == everything[count.image, count.other].verified
+    assert any(count.verified < count.matches for count in verified)
 
 
 def test_without_verification_all_of_the_matchers_matches_are_kept(
@@ -200,10 +213,11 @@ def test_the_matchers_rows_are_those_that_verification_judges() -> None:
         seen.append(matches.tolist())
         return np.array([True, False, True])
 
-    matches, scores = match_and_verify(features(4), [features(3)], Fixed(), [verify])[0]
+    matches, scores, found = match_and_verify(features(4), [features(3)], Fixed(), [verify])[0]
     assert seen == [[[0, 2], [1, 1], [3, 0]]]
     assert matches.tolist() == [[0, 2], [3, 0]]
     np.testing.assert_allclose(scores, [0.9, 0.7])
+    assert found == 3
 
 
 def test_the_cache_is_bounded_and_forgets_what_was_used_longest_ago() -> None:

@@ -26,8 +26,8 @@ from megloc_kapture.io.json_model import read_json_model
 from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.mapping.lifting import lift_keypoints
 from megloc_kapture.preprocessing.fixed_masks import FixedMask
+from megloc_kapture.stages.depth_records import depth_records
 from megloc_kapture.stages.image_masks import MaskOptions
-from megloc_kapture.stages.lifting import depth_records
 from megloc_kapture.stages.local_features import extract_local_features, read_mask
 from megloc_kapture.stages.preprocessing import PreprocessingOptions, preprocess_images
 from megloc_kapture.stages.preprocessing_report import PreprocessingReport, pixel_maps, read_report

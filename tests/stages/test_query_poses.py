@@ -16,7 +16,8 @@ from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder
 from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions
 from megloc_kapture.plugins import PluginChoice
-from megloc_kapture.stages.image_pairs import QueryPairsOptions, pair_queries
+from megloc_kapture.stages.candidates import QueryPairsOptions, Retrieval
+from megloc_kapture.stages.image_pairs import pair_queries
 from megloc_kapture.stages.query_poses import (
     LocalizationOptions,
     localize_from_matches,
@@ -29,7 +30,10 @@ Results = list[tuple[str, Pose | Failure]]
 def localize(world: Any, pairs: list[ImagePair] | None = None, **more: Any) -> Results:
     if pairs is None:
         pairs = pair_queries(
-            world.mapping(), world.query(), QueryPairsOptions(), global_type="vlad_rootsift"
+            world.mapping(),
+            world.query(),
+            QueryPairsOptions(),
+            retrieval=Retrieval(("vlad_rootsift",)),
         )
     options = more.pop("options", LocalizationOptions())
     return list(
@@ -159,8 +163,8 @@ def fountain(
         query = KaptureFolder(scene / "query", features_dirs=[root / "features"])
         extractor, matcher = RootSift(RootSiftOptions(max_keypoints=1500)), NearestNeighbours()
         extract_local_features([mapping, query], extractor, root / "features")
-        map_pairs = pair_map_images(mapping, MappingPairsOptions(by=("poses",)), global_type=None)
-        pairs = pair_queries(mapping, query, QueryPairsOptions(by="exhaustive"), global_type=None)
+        map_pairs = pair_map_images(mapping, MappingPairsOptions(by=("poses",)), retrieval=None)
+        pairs = pair_queries(mapping, query, QueryPairsOptions(by="exhaustive"), retrieval=None)
         match_pairs(
             mapping,
             mapping,

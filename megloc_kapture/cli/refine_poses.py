@@ -1,0 +1,73 @@
+"""``megloc refine-poses``: better poses of localized queries, by ICP or by rendering."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from megloc_kapture.cli.common import Force, Input, Output, side_tables_beside
+from megloc_kapture.cli.localize import LOCALIZED
+from megloc_kapture.cli.stage_command import StageCommand
+from megloc_kapture.errors import OptionError
+from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.outputs import staged_output
+from megloc_kapture.pipeline.executors import open_executor, single_threaded
+from megloc_kapture.plugins import POSE_REFINERS, plugin_names
+from megloc_kapture.stages.pose_refinement import refine_poses
+from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefinePoses(StageCommand):
+    """Refine the poses of localized queries; a pose that gets no better stays, and says why."""
+
+    input: Input
+    """Kapture map, with images and depth maps. Read only."""
+    query: Path
+    """Kapture folder with the queries' images, and their depth maps for icp."""
+    poses: Path
+    """Result of megloc localize or megloc eval: kapture folder with status.csv."""
+    output: Output
+    """Kapture folder of the refined result, with status.csv and refinement.csv."""
+    by: tuple[str, ...] = ()
+    """Pose refiners, one after another: icp, rendering; the preset's unless given."""
+    force: Force = False
+    """Write into a folder that has other things in it."""
+
+    def run(self) -> int:
+        """Run it."""
+        console = self.console()
+        options = self.options().pose_refinement
+        if self.by:
+            known = {one.name: one.options for one in options.by}
+            chosen = [{"name": name, "options": known.get(name, {})} for name in self.by]
+            options = options.model_validate({**options.model_dump(), "by": chosen})
+        if not options.refines():
+            names = ", ".join(plugin_names(POSE_REFINERS))
+            raise OptionError(f"no pose refiner is chosen; --by takes: {names}")
+        tables = side_tables_beside(self.query)
+        with (
+            single_threaded(),
+            staged_output(self.output, kind=LOCALIZED, force=self.force) as out,
+            open_executor(self.executor, self.workers) as executor,
+        ):
+            counts = refine_poses(
+                KaptureFolder(self.input),
+                KaptureFolder(self.query),
+                KaptureFolder(self.poses),
+                out,
+                options,
+                restrictions=UNRESTRICTED if tables is None else Restrictions.read(tables),
+                executor=executor,
+                track=console.track,
+            )
+        accepted = ", ".join(
+            f"{count:g} accepted by {name.removeprefix('accepted_by_')}"
+            for name, count in counts.items()
+            if name.startswith("accepted_by_")
+        )
+        console.result(
+            f"{counts['queries']:g} poses, {accepted}; status.csv and refinement.csv in "
+            f"{self.output}"
+        )
+        return 0

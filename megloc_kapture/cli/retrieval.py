@@ -1,0 +1,263 @@
+"""Commands of retrieval: global features, and which images are matched."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from megloc_kapture.cli.common import Force, Input, Output, existing, side_tables_beside
+from megloc_kapture.cli.stage_command import FeaturesDirs, StageCommand, only_type
+from megloc_kapture.errors import OptionError
+from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder, write_pairs
+from megloc_kapture.pipeline.executors import single_threaded
+from megloc_kapture.pipeline.global_choice import GlobalFeaturesChoice
+from megloc_kapture.pipeline.options import PipelineOptions
+from megloc_kapture.retrieval.fusion import FusionMethod
+from megloc_kapture.stages.candidates import Retrieval
+from megloc_kapture.stages.global_features import extract_global_features
+from megloc_kapture.stages.global_vlad import extract_vlad, vlad_type
+from megloc_kapture.stages.image_pairs import PairingMethod, pair_map_images, pair_queries
+from megloc_kapture.stages.matches import match_pairs
+from megloc_kapture.stages.reranking import RerankingOptions, reranked
+from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExtractGlobal(StageCommand):
+    """Describe every image by one vector: VLAD trained on the map, or image networks."""
+
+    input: Input
+    """Kapture folder of the map; VLAD is trained on its descriptors."""
+    query: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = ()
+    """Kapture folder of queries to describe as well; may be repeated."""
+    output: Output
+    """Features folder: global_features/T/global_features."""
+    features: tuple[str, ...] = ()
+    """Global features: vlad, or plugins; those of the preset unless given."""
+    features_dir: FeaturesDirs = ()
+    """Features folder with the local features; may be repeated."""
+    local_type: str | None = None
+    """Local features that VLAD aggregates; needed where there are several types."""
+    force: Force = False
+    """Write into a folder that has other things in it."""
+
+    def run(self) -> int:
+        """Run it."""
+        console = self.console()
+        named = {chosen.name: chosen for chosen in self.options().global_features}
+        choices = [
+            named.get(name, GlobalFeaturesChoice(name=name)) for name in self.features or named
+        ]
+        folders = [
+            KaptureFolder(folder, features_dirs=existing(self.features_dir))
+            for folder in (self.input, *self.query)
+        ]
+        extractors = {chosen.name: chosen.make() for chosen in choices if not chosen.is_vlad}
+        with self.features_folder(self.output, force=self.force) as (out, executor):
+            for chosen in choices:
+                if chosen.is_vlad:
+                    options = chosen.vlad_options()
+                    local_type = only_type(
+                        folders[0], "descriptors", self.local_type or options.local_type
+                    )
+                    type_name = vlad_type(local_type)
+                    counts = extract_vlad(
+                        folders[0],
+                        folders,
+                        local_type,
+                        out,
+                        options.of_vlad(),
+                        executor=executor,
+                        track=console.track,
+                    )
+                else:
+                    extractor = extractors[chosen.name]
+                    type_name = extractor.name
+                    counts = extract_global_features(
+                        folders, extractor, out, executor=executor, track=console.track
+                    )
+                console.say(f"{type_name}: {counts['images']} images")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairsMapping(StageCommand):
+    """Choose which images of a map are matched with each other."""
+
+    input: Input
+    """Kapture folder with poses."""
+    output: Output
+    """Pairs file."""
+    by: tuple[PairingMethod, ...] = ("retrieval",)
+    """How; several methods are united."""
+    topk: int | None = None
+    """Most similar images per image (retrieval)."""
+    covisibility_map: Path | None = None
+    """Kapture map of the same images, for the points they share; the input's own without it."""
+    features_dir: FeaturesDirs = ()
+    """Features folder with the global features; may be repeated."""
+    features: tuple[str, ...] = ()
+    """Types of global features; several are fused; needed where there are several."""
+    fusion: FusionMethod | None = None
+    """How several are fused; as the preset has it unless given."""
+    force: Force = False
+    """Overwrite the pairs file."""
+
+    def run(self) -> int:
+        """Run it."""
+        mapping = KaptureFolder(self.input, features_dirs=existing(self.features_dir))
+        changes: dict[str, object] = {"by": self.by}
+        if self.topk is not None:
+            changes["top_k"] = self.topk
+        chosen = self.options({"mapping_pairs": changes})
+        options = chosen.mapping_pairs
+        covisible = self.covisibility_map
+        if covisible is not None and not options.needs_points():
+            raise OptionError("--covisibility-map is for --by covisibility, or poses.min_overlap")
+        retrieval = None
+        if "retrieval" in self.by:
+            retrieval = _retrieval(mapping, self.features, self.fusion, chosen)
+        with single_threaded():
+            pairs = pair_map_images(
+                mapping,
+                options,
+                retrieval=retrieval,
+                restrictions=_restrictions(self.input),
+                covisible=None if covisible is None else KaptureFolder(covisible),
+            )
+        _write_pairs(self.output, pairs, force=self.force)
+        self.console().say(f"{len(pairs)} pairs")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairsQuery(StageCommand):
+    """Choose the map images each query is matched with."""
+
+    input: Input
+    """Kapture folder of the map."""
+    query: Path
+    """Kapture folder of the queries."""
+    output: Output
+    """Pairs file."""
+    topk: int | None = None
+    """Most similar map images per query."""
+    features: tuple[str, ...] = ()
+    """Types of global features; several are fused; needed where there are several."""
+    fusion: FusionMethod | None = None
+    """How several are fused; as the preset has it unless given."""
+    features_dir: FeaturesDirs = ()
+    """Features folder with global features (and local ones to rerank); may be repeated."""
+    exhaustive: bool = False
+    """All map images for each query; for small maps."""
+    rerank: int | None = None
+    """Match local features with all candidates, and keep this many with the most matches."""
+    rerank_by: Literal["coverage", "verified", "matches"] = "coverage"
+    """What counts: matches, those that two-view geometry leaves, or of these the keypoints that
+    the images before do not match."""
+    local_features: tuple[str, ...] = ()
+    """Types of local features to rerank by; all that map and queries have unless given."""
+    matches_dir: Path | None = None
+    """Features folder that gets the matches of reranking, for the steps after it."""
+    force: Force = False
+    """Overwrite the pairs file, and what is in the folder of matches."""
+
+    def run(self) -> int:
+        """Run it."""
+        console = self.console()
+        if (self.rerank is None) != (self.matches_dir is None):
+            raise OptionError("--rerank N and --matches-dir DIR go together: matches are kept")
+        _refuse_existing(self.output, force=self.force)
+        mapping = KaptureFolder(self.input, features_dirs=existing(self.features_dir))
+        query = KaptureFolder(self.query, features_dirs=existing(self.features_dir))
+        changes: dict[str, object] = {"by": "exhaustive" if self.exhaustive else "retrieval"}
+        if self.topk is not None:
+            changes["top_k"] = self.topk
+        options = self.options({"query_pairs": changes})
+        retrieval = None
+        if not self.exhaustive:
+            retrieval = _retrieval(mapping, self.features, self.fusion, options)
+        with single_threaded():
+            pairs = pair_queries(
+                mapping,
+                query,
+                options.query_pairs,
+                retrieval=retrieval,
+                restrictions=_restrictions(self.query),
+            )
+        if self.rerank is not None and self.matches_dir is not None:
+            pairs = self._rerank(mapping, query, pairs, self.rerank, self.matches_dir, options)
+        _write_pairs(self.output, pairs, force=self.force)
+        console.say(f"{len(pairs)} pairs")
+        return 0
+
+    def _rerank(
+        self,
+        mapping: KaptureFolder,
+        query: KaptureFolder,
+        pairs: Sequence[ImagePair],
+        keep: int,
+        matches_dir: Path,
+        options: PipelineOptions,
+    ) -> list[ImagePair]:
+        both = set(mapping.types("descriptors")) & set(query.types("descriptors"))
+        local_types = [
+            only_type(mapping, "descriptors", asked)
+            for asked in self.local_features or sorted(both)
+        ]
+        if not local_types:
+            raise OptionError(
+                f"{query.root}: no local features that the map has as well; give their folder "
+                "with --features-dir"
+            )
+        track = self.console().track
+        with self.features_folder(matches_dir, force=self.force) as (out, executor):
+            for local_type in local_types:
+                match_pairs(
+                    query,
+                    mapping,
+                    pairs,
+                    local_type,
+                    options.make_matcher(local_type),
+                    options.verify_queries(),
+                    out,
+                    executor=executor,
+                    track=track,
+                )
+            matched = KaptureFolder(query.root, features_dirs=[*query.features_dirs, out])
+            how = RerankingOptions(by=self.rerank_by, keep=keep)
+            return reranked(pairs, matched, out, local_types, how)
+
+
+def _retrieval(
+    mapping: KaptureFolder,
+    asked: Sequence[str],
+    fusion: FusionMethod | None,
+    options: PipelineOptions,
+) -> Retrieval:
+    """The types of global features to compare; their weights are the preset's."""
+    types = tuple(only_type(mapping, "global_features", one) for one in asked or (None,))
+    how = options.fusion
+    if fusion is not None:
+        how = how.model_copy(update={"method": fusion})
+    return Retrieval(types, fusion=how)
+
+
+def _restrictions(folder: Path) -> Restrictions:
+    """Of the dataset whose tables lie beside a kapture folder; none where there are none."""
+    tables = side_tables_beside(folder)
+    return UNRESTRICTED if tables is None else Restrictions.read(tables)
+
+
+def _write_pairs(path: Path, pairs: Sequence[ImagePair], *, force: bool) -> None:
+    _refuse_existing(path, force=force)
+    write_pairs(path, pairs)
+
+
+def _refuse_existing(path: Path, *, force: bool) -> None:
+    if path.exists() and not force:
+        raise OptionError(f"{path} exists; -f overwrites it")

@@ -1,0 +1,62 @@
+"""What the commands of single stages share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import Executor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from megloc_kapture.cli.common import Choosing, Common, Working
+from megloc_kapture.errors import OptionError
+from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.outputs import staged_output
+from megloc_kapture.pipeline.executors import open_executor, single_threaded
+from megloc_kapture.pipeline.options import PipelineOptions
+from megloc_kapture.pipeline.presets import DEFAULT_PRESET, options_of_preset
+
+FEATURES = "features"
+
+FeaturesDirs = Annotated[tuple[Path, ...], tyro.conf.UseAppendAction]
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageCommand(Choosing, Working, Common):
+    def options(self, changes: dict[str, object] | None = None) -> PipelineOptions:
+        """The preset's options, with what the flags change."""
+        return options_of_preset(
+            self.preset or DEFAULT_PRESET, changes=changes, assignments=self.set
+        )
+
+    @contextmanager
+    def features_folder(
+        self, output: Path, *, force: bool
+    ) -> Iterator[tuple[Path, Executor | None]]:
+        """Where to write features or matches, and what to work with."""
+        with (
+            single_threaded(),
+            staged_output(output, kind=FEATURES, force=force) as out,
+            open_executor(self.executor, self.workers) as executor,
+        ):
+            yield out, executor
+
+
+def only_type(folder: KaptureFolder, kind: str, asked: str | None) -> str:
+    """The type of a kind that is meant: the one asked for, or the only one; raises OptionError."""
+    types = folder.types(kind)  # type: ignore[arg-type]
+    if asked is not None:
+        if asked not in types:
+            there = ", ".join(types) or "none"
+            raise OptionError(f"{folder.root}: no {kind} of type {asked!r}; there are: {there}")
+        return asked
+    if len(types) != 1:
+        raise OptionError(
+            f"{folder.root}: "
+            + (f"several types of {kind}, name one: {', '.join(types)}" if types else f"no {kind}")
+            + ("" if types else "; give their folder with --features-dir")
+        )
+    return types[0]

@@ -1,0 +1,84 @@
+"""``refinement.csv``: what refining each query's pose came to, step by step."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.csv_table import read_csv_table, write_csv_table
+
+REFINEMENT_FILE = "refinement.csv"
+_COLUMNS = ("image", "method", "accepted", "reason", "moved_m", "turned_deg", "measures")
+
+
+@dataclass(frozen=True)
+class RefinementRow:
+    """One refiner's work on one query.
+
+    Attributes
+    ----------
+    reason : why the old pose stays; empty where the new one is accepted.
+    moved_m, turned_deg : of the new pose against the old, unit of the map; 0 where it stays.
+    measures : ``name=value`` texts, e.g. of residuals before and after.
+    """
+
+    image: str
+    method: str
+    reason: str
+    moved_m: float
+    turned_deg: float
+    measures: tuple[str, ...]
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the pose is a new one."""
+        return not self.reason
+
+
+def write_refinement(path: Path, rows: Iterable[RefinementRow]) -> None:
+    """Write the table (the file itself), sorted by image; the steps of an image stay in order.
+
+    Raises
+    ------
+    OutputError : the file cannot be written.
+    """
+    cells = (
+        (
+            row.image,
+            row.method,
+            "yes" if row.accepted else "no",
+            row.reason,
+            f"{row.moved_m:.6f}",
+            f"{row.turned_deg:.6f}",
+            ";".join(row.measures),
+        )
+        for row in sorted(rows, key=lambda row: row.image)
+    )
+    write_csv_table(path, _COLUMNS, cells)
+
+
+def read_refinement(path: Path | str) -> list[RefinementRow]:
+    """Read the table (the file itself), in its order.
+
+    Raises
+    ------
+    DataError : absent or broken table, a value that is not of its kind; names file and line.
+    """
+    rows = []
+    for line, row in read_csv_table(path, _COLUMNS):
+        try:
+            moved, turned = float(row["moved_m"]), float(row["turned_deg"])
+        except ValueError:
+            raise DataError("moved_m and turned_deg are numbers", path=path, line=line) from None
+        measures = tuple(row["measures"].split(";")) if row["measures"] else ()
+        found = RefinementRow(row["image"], row["method"], row["reason"], moved, turned, measures)
+        if row["accepted"] != ("yes" if found.accepted else "no"):
+            raise DataError(
+                f"accepted {row['accepted']!r} and reason {row['reason']!r} contradict each other",
+                path=path,
+                line=line,
+            )
+        rows.append(found)
+    return rows

@@ -1,0 +1,154 @@
+"""Stage: which map images resemble a query most, by one or several global features."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.global_vectors import KaptureVectors
+from megloc_kapture.io.kapture_store import FeatureReader, KaptureFolder
+from megloc_kapture.retrieval.blocks import VectorSource, as_blocks, common_length
+from megloc_kapture.retrieval.diversity import DiversityOptions, diversified
+from megloc_kapture.retrieval.fusion import FusionOptions
+from megloc_kapture.retrieval.search import rank_fused
+from megloc_kapture.values import Options, RigidTransform
+
+_QUERY_ELEMENTS = 1 << 27  # of query vectors held at once: 512 MiB of float32
+_POOL = 5  # images looked at for each that a diversified ranking keeps
+
+
+class QueryPairsOptions(Options):
+    """How a query's candidates among the map's images are chosen."""
+
+    by: Literal["retrieval", "exhaustive"] = "retrieval"
+    top_k: int = Field(default=50, gt=0, description="most similar map images per query")
+    diversity: DiversityOptions | None = Field(
+        default=None, description="few views of one place; none: as similar as they are"
+    )
+
+
+@dataclass(frozen=True)
+class Retrieval:
+    """Global features that are compared, and how they are fused.
+
+    Attributes
+    ----------
+    types : kapture type names.
+    weights : of the types in fusion; all equal where empty.
+    """
+
+    types: tuple[str, ...]
+    weights: tuple[float, ...] = ()
+    fusion: FusionOptions = field(default_factory=FusionOptions)
+
+    def readers(self, folder: KaptureFolder) -> list[FeatureReader]:
+        """Readers of a folder's vectors, by type; raises DataError where it has not one of them."""
+        return [folder.global_features(name) for name in self.types]
+
+    def rank(
+        self, queries: Sequence[VectorSource], database: Sequence[VectorSource], top_k: int
+    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """The most similar rows of the database: indices and scores (Q, at most ``top_k``).
+
+        Parameters
+        ----------
+        queries, database : of each type, unit rows; neither is held in memory as a whole.
+        """
+        sources = [as_blocks(source) for source in queries]
+        total, width = common_length(sources), sum(source.dimension for source in sources)
+        step = max(1, _QUERY_ELEMENTS // max(width, 1))
+        found = [
+            rank_fused(
+                [source.read(start, min(start + step, total)) for source in sources],
+                database,
+                top_k,
+                fusion=self.fusion,
+                weights=self.weights or None,
+            )
+            for start in range(0, total, step) or (0,)
+        ]
+        indices, scores = zip(*found, strict=True)
+        return np.concatenate(indices), np.concatenate(scores)
+
+
+def vectors_of(readers: Sequence[FeatureReader], images: Sequence[str]) -> list[KaptureVectors]:
+    """Vectors of the images by type, unit rows, read when they are asked for.
+
+    Raises
+    ------
+    DataError : an image has none.
+    """
+    for reader in readers:
+        missing = [image for image in images if image not in reader]
+        if missing:
+            raise DataError(
+                f"{len(missing)} images have no global feature of type {reader.type_name}, "
+                f"the first is {missing[0]}"
+            )
+    return [KaptureVectors(reader, images) for reader in readers]
+
+
+class Candidates:
+    """Ranks the images of a map.
+
+    Parameters
+    ----------
+    database : gives vectors of the images at some positions, by type.
+    poses : ``cam_from_world`` of the images.
+    """
+
+    def __init__(
+        self,
+        database: Callable[[NDArray[np.int64]], Sequence[VectorSource]],
+        poses: Sequence[RigidTransform],
+        retrieval: Retrieval,
+    ) -> None:
+        self._database, self._poses, self._retrieval = database, poses, retrieval
+
+    def of(
+        self,
+        queries: Sequence[VectorSource],
+        permitted: NDArray[np.int64],
+        options: QueryPairsOptions,
+    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """Positions of the most similar images, best first, and scores: (Q, K), -1 for none.
+
+        Parameters
+        ----------
+        queries : vectors (Q, D) by type, unit rows.
+        permitted : sorted positions of the images that these queries may have.
+        """
+        few = options.diversity is None
+        wanted = options.top_k if few else options.top_k * _POOL
+        index, scores = self._retrieval.rank(queries, self._database(permitted), wanted)
+        if options.diversity is not None:
+            index, scores = self._spread(index, scores, permitted, options.top_k, options.diversity)
+        return np.where(index >= 0, permitted[np.maximum(index, 0)], -1), scores
+
+    def _spread(
+        self,
+        index: NDArray[np.int64],
+        scores: NDArray[np.float32],
+        permitted: NDArray[np.int64],
+        top_k: int,
+        options: DiversityOptions,
+    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        poses = [self._poses[at] for at in permitted.tolist()]
+        centers = np.array([pose.center() for pose in poses])
+        directions = np.array([pose.rotation_matrix()[2] for pose in poses])
+        width = min(top_k, index.shape[1])
+        kept = np.full((len(index), width), -1, np.int64)
+        of_kept = np.full((len(index), width), -np.inf, np.float32)
+        for row, (ranking, row_scores) in enumerate(zip(index, scores, strict=True)):
+            there = ranking >= 0
+            chosen = diversified(ranking[there], centers, directions, top_k, options)
+            kept[row, : len(chosen)] = ranking[chosen]
+            # fillers stand behind what is kept, though they are more similar
+            of_kept[row, : len(chosen)] = np.minimum.accumulate(row_scores[chosen])
+        return kept, of_kept

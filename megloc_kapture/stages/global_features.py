@@ -1,0 +1,136 @@
+"""Stage: one vector per image from an image network, as a kapture global feature."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.errors import DataError, PluginError
+from megloc_kapture.io.kapture_store import FeatureConfig, FeatureWriter, KaptureFolder
+from megloc_kapture.plugins import GlobalFeatureExtractor
+from megloc_kapture.stages.local_features import read_image_of
+from megloc_kapture.stages.parallel import Track, ordered_map, untracked
+from megloc_kapture.values import Camera
+
+BATCH = 4  # images of one size that a network gets at once, where it can use them
+
+
+@dataclass(frozen=True)
+class _Job:
+    extractor: GlobalFeatureExtractor
+    images: tuple[tuple[str, Path, Camera], ...]
+
+
+def extract_global_features(
+    folders: Sequence[KaptureFolder],
+    extractor: GlobalFeatureExtractor,
+    output: Path,
+    *,
+    executor: Executor | None = None,
+    track: Track = untracked,
+) -> dict[str, int]:
+    """Describe all images of the folders, into ``output`` (orphan layout).
+
+    Returns
+    -------
+    Counts for the log: images.
+
+    Raises
+    ------
+    DataError : an image is absent, unreadable, or not of its camera's size; two folders have an
+        image of the same name; there are no images.
+    PluginError : the extractor breaks its protocol.
+    """
+    jobs = _jobs(folders, extractor)
+    writer: FeatureWriter | None = None
+    results = ordered_map(_describe, jobs, executor)
+    count, size = 0, 0
+    for job, vectors in zip(jobs, track(results, len(jobs), extractor.name), strict=True):
+        if writer is None:
+            size = vectors.shape[1]
+            config = FeatureConfig(extractor.name, np.dtype(np.float32), size, metric_type="L2")
+            writer = FeatureWriter(output, "global_features", extractor.name, config, orphan=True)
+        if vectors.shape[1] != size:
+            raise PluginError(
+                f"plugin {extractor.name!r} on image {job.images[0][0]}: {vectors.shape[1]} "
+                f"values, {size} of the images before"
+            )
+        for (image, _, _), vector in zip(job.images, vectors, strict=True):
+            writer.write(image, vector)
+        count += len(job.images)
+    return {"images": count}
+
+
+def describe_images(
+    extractor: GlobalFeatureExtractor, images: Sequence[NDArray[np.uint8]], label: str
+) -> NDArray[np.float32]:
+    """Vectors of RGB images of one size: float32 (B, D), unit length.
+
+    Parameters
+    ----------
+    label : names the images in messages.
+
+    Raises
+    ------
+    PluginError : the extractor returns something else.
+    """
+    at_once: Any = getattr(extractor, "describe_many", None)
+    if at_once is not None and len(images) > 1:
+        found = at_once(images)
+    else:
+        found = [extractor.describe(image) for image in images]
+    return _checked(extractor, found, len(images), label)
+
+
+def _checked(
+    extractor: GlobalFeatureExtractor, found: Any, count: int, label: str
+) -> NDArray[np.float32]:
+    def refuse(what: str) -> PluginError:
+        return PluginError(f"plugin {extractor.name!r} on image {label}: {what}")
+
+    for vector in found:
+        if not isinstance(vector, np.ndarray) or vector.dtype != np.float32 or vector.ndim != 1:
+            what = getattr(vector, "shape", type(vector).__name__)
+            raise refuse(f"describe returned {what}, not float32 (D,)")
+    if len({len(vector) for vector in found}) != 1 or len(found) != count:
+        raise refuse(f"{len(found)} vectors for {count} images, or of different lengths")
+    vectors = np.stack(found)
+    if not np.isfinite(vectors).all():
+        raise refuse("values that are not finite")
+    norms = np.linalg.norm(vectors, axis=1)
+    if np.abs(norms - 1.0).max() > 1e-3:
+        raise refuse(f"a vector of length {norms[np.abs(norms - 1.0).argmax()]:.4g}, not 1")
+    return vectors
+
+
+def _jobs(folders: Sequence[KaptureFolder], extractor: GlobalFeatureExtractor) -> list[_Job]:
+    """Images in order of their names, neighbours of one size together."""
+    named = sorted(
+        (image, folder.image_path(image), folder.read().camera_of(image))
+        for folder in folders
+        for image in folder.read().image_names()
+    )
+    for before, after in zip(named, named[1:], strict=False):
+        if before[0] == after[0]:
+            raise DataError(f"image {before[0]} stands in two kapture folders at once")
+    if not named:
+        raise DataError("there are no images to describe")
+    batch = BATCH if hasattr(extractor, "describe_many") else 1
+    jobs = []
+    for _, group in groupby(named, key=lambda item: (item[2].width, item[2].height)):
+        alike = tuple(group)
+        for start in range(0, len(alike), batch):
+            jobs.append(_Job(extractor, alike[start : start + batch]))
+    return jobs
+
+
+def _describe(job: _Job) -> NDArray[np.float32]:
+    images = [read_image_of(path, camera) for _, path, camera in job.images]
+    return describe_images(job.extractor, images, job.images[0][0])

@@ -1,0 +1,214 @@
+"""Stage: better poses of localized queries, or the old ones with the reason why they stay."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from pydantic import Field
+
+from megloc_kapture.errors import PluginError
+from megloc_kapture.geometry.poses import rotation_angles_deg
+from megloc_kapture.io.cluster_table import CLUSTERS_FILE
+from megloc_kapture.io.csv_table import write_csv_table
+from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, write_sensors
+from megloc_kapture.io.links import link_images
+from megloc_kapture.io.refinement_table import REFINEMENT_FILE, RefinementRow, write_refinement
+from megloc_kapture.io.status_table import STATUS_FILE, QueryStatus, read_status, write_status
+from megloc_kapture.plugins import (
+    POSE_REFINERS,
+    PluginChoice,
+    PoseRefinement,
+    PoseRefiner,
+    load_plugin,
+)
+from megloc_kapture.refinement.references import ReferenceImages
+from megloc_kapture.stages.parallel import FolderSpec, Track, ordered_map, untracked
+from megloc_kapture.stages.ranking_scene import KaptureScene
+from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
+from megloc_kapture.values import Options, RigidTransform
+
+
+class PoseRefinementOptions(Options):
+    """How the poses of localized queries are refined."""
+
+    by: tuple[PluginChoice, ...] = Field(
+        default=(), description="pose refiners, one after another; none: poses stay"
+    )
+    max_references: int = Field(
+        default=8, gt=0, description="map images that look the query's way, the nearest ones"
+    )
+
+    def refines(self) -> bool:
+        """Whether anything is done."""
+        return bool(self.by)
+
+    def make_refiners(self) -> list[PoseRefiner]:
+        """The refiners, in order; raises PluginError, MissingWeightsError."""
+        return [load_plugin(POSE_REFINERS, one.name, one.options) for one in self.by]
+
+
+@dataclass(frozen=True)
+class _Job:
+    map: FolderSpec
+    query: FolderSpec
+    refiners: tuple[PoseRefiner, ...]
+    image: str
+    cam_from_world: RigidTransform
+    references: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Refined:
+    cam_from_world: RigidTransform
+    rows: tuple[RefinementRow, ...]
+    seconds: dict[str, float]
+
+
+def refine_poses(
+    map_folder: KaptureFolder,
+    query: KaptureFolder,
+    localized: KaptureFolder,
+    output: Path,
+    options: PoseRefinementOptions,
+    *,
+    restrictions: Restrictions = UNRESTRICTED,
+    executor: Executor | None = None,
+    track: Track = untracked,
+    timing: Path | None = None,
+) -> dict[str, float]:
+    """Refine the poses of queries that were localized, and write them as a result of their own.
+
+    A query that failed, or has a fallback pose, is left as it is. What became of each pose stands
+    in ``status.csv``, with measures in ``refinement.csv``.
+
+    Parameters
+    ----------
+    map_folder : kapture with poses, and whatever the refiners need: images, depth maps, points.
+    query : images of the queries, their masks and depth maps.
+    localized : what localization wrote.
+    restrictions : the coordinate frames of the map's images, which are never mixed.
+    timing : where to write seconds per query and refiner.
+
+    Returns
+    -------
+    Counts for the log.
+
+    Raises
+    ------
+    DataError : ``status.csv`` is absent or broken; images or depth maps cannot be read.
+    PluginError : there is no such refiner, or it breaks its protocol.
+    """
+    refiners = tuple(options.make_refiners())
+    statuses = read_status(localized.root / STATUS_FILE)
+    data = localized.read()
+    map_spec, query_spec = (FolderSpec(f.root, f.features_dirs) for f in (map_folder, query))
+    map_poses = map_folder.read().poses()
+    images = sorted(map_poses)
+    by_frame = {
+        restrictions.frame(images[members[0]]): ReferenceImages(
+            {images[member]: map_poses[images[member]] for member in members}
+        )
+        for members in restrictions.frames(images)
+    }
+    jobs = []
+    for image, status in statuses.items():
+        pose = data.cam_from_world(image)
+        if status.status == "localized" and pose is not None:
+            frame = restrictions.frame(status.candidates[0]) if status.candidates else ""
+            near = by_frame[frame].near(
+                pose, status.candidates, max_references=options.max_references
+            )
+            jobs.append(_Job(map_spec, query_spec, refiners, image, pose, tuple(near)))
+    results = track(ordered_map(_refine, jobs, executor), len(jobs), "refining")
+    found = {job.image: refined for job, refined in zip(jobs, results, strict=True)}
+    _write(output, data, localized, statuses, found)
+    if timing is not None:
+        rows = (
+            (image, step, f"{seconds:.5f}")
+            for image, refined in found.items()
+            for step, seconds in refined.seconds.items()
+        )
+        write_csv_table(timing, ("image", "step", "seconds"), rows)
+    counts: dict[str, float] = {"queries": len(jobs)}
+    for refiner in refiners:
+        counts[f"accepted_by_{refiner.name}"] = sum(
+            row.accepted
+            for refined in found.values()
+            for row in refined.rows
+            if row.method == refiner.name
+        )
+    return counts
+
+
+def _write(
+    output: Path,
+    data: KaptureData,
+    localized: KaptureFolder,
+    statuses: dict[str, QueryStatus],
+    found: dict[str, _Refined],
+) -> None:
+    poses = dict(data.trajectories)
+    for image, refined in found.items():
+        poses[data.record_of(image)] = refined.cam_from_world
+    write_sensors(output, replace(data, trajectories=poses))
+    link_images(localized.root, output)
+    write_status(
+        output / STATUS_FILE,
+        (
+            status.model_copy(update={"refinement": _said(found[image].rows)})
+            if image in found
+            else status
+            for image, status in statuses.items()
+        ),
+    )
+    clusters = localized.root / CLUSTERS_FILE
+    if clusters.is_file():
+        shutil.copyfile(clusters, output / CLUSTERS_FILE)
+    write_refinement(
+        output / REFINEMENT_FILE, (row for refined in found.values() for row in refined.rows)
+    )
+
+
+def _said(rows: Sequence[RefinementRow]) -> str:
+    return "; ".join(f"{row.method}: {'accepted' if row.accepted else row.reason}" for row in rows)
+
+
+def _refine(job: _Job) -> _Refined:
+    mapping, query = job.map.open(), job.query.open()
+    scene = KaptureScene(mapping, query)
+    camera = query.read().camera_of(job.image)
+    pose, rows, seconds = job.cam_from_world, [], {}
+    for refiner in job.refiners:
+        started = time.perf_counter()
+        refined = refiner.refine(job.image, camera, pose, job.references, scene)
+        rows.append(_row(refiner, job.image, pose, refined))
+        if refined.accepted:
+            pose = refined.cam_from_world
+        seconds[refiner.name] = time.perf_counter() - started
+    return _Refined(pose, tuple(rows), seconds)
+
+
+def _row(
+    refiner: PoseRefiner, image: str, before: RigidTransform, refined: PoseRefinement
+) -> RefinementRow:
+    if not isinstance(refined, PoseRefinement):
+        raise PluginError(
+            f"plugin {refiner.name!r} on image {image}: refine returned "
+            f"{type(refined).__name__}, not PoseRefinement"
+        )
+    after = refined.cam_from_world if refined.accepted else before
+    turned_deg = rotation_angles_deg(np.array(before.quat_wxyz), np.array(after.quat_wxyz))
+    return RefinementRow(
+        image=image,
+        method=refiner.name,
+        reason=refined.reason,
+        moved_m=float(np.linalg.norm(after.center() - before.center())),
+        turned_deg=float(turned_deg),
+        measures=tuple(f"{name}={value:.6g}" for name, value in refined.measures.items()),
+    )

@@ -1,0 +1,151 @@
+"""Stage: candidates of queries in a new order, by what local matching makes of them.
+
+MegLoc, section "Image retrieval": M images are retrieved, local features of the query are matched
+with each, and the N with the most valid correspondences are kept.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder
+from megloc_kapture.io.match_counts import read_match_counts
+from megloc_kapture.retrieval.coverage import most_covering
+from megloc_kapture.stages.matches import iterate_candidates
+from megloc_kapture.values import Options
+
+Pair = tuple[str, str]
+Counted = Literal["matches", "verified"]
+
+
+class RerankingOptions(Options):
+    """How the retrieved images of a query are put in a new order."""
+
+    by: Literal["none", "matches", "verified", "coverage"] = Field(
+        default="none",
+        description="matches: their number; verified: of those that two-view geometry leaves; "
+        "coverage: of these, at keypoints that the images before do not match. All types of local "
+        "features together",
+    )
+    keep: int = Field(default=20, gt=0, description="images that stay, N")
+
+    def reranks(self) -> bool:
+        """Whether anything is done."""
+        return self.by != "none"
+
+
+def rerank_pairs(
+    pairs: Sequence[ImagePair], counts: Mapping[Pair, int], keep: int
+) -> list[ImagePair]:
+    """The ``keep`` candidates of each query with the most correspondences, best first.
+
+    Of equal counts, and so where nothing matches, retrieval's order stays. Sorted by query. The
+    score is the count, and below one a part that keeps that order in the file.
+
+    Parameters
+    ----------
+    counts : (query, map image) to correspondences; 0 for pairs that are not in it.
+    """
+    found = []
+    for query, images in iterate_candidates(pairs):
+        order = sorted(
+            range(len(images)), key=lambda rank: (-counts.get((query, images[rank]), 0), rank)
+        )
+        for place, rank in enumerate(order[:keep]):
+            count = counts.get((query, images[rank]), 0)
+            found.append(ImagePair(query, images[rank], count + 1.0 / (2.0 + place)))
+    return found
+
+
+def reranked(
+    pairs: Sequence[ImagePair],
+    query: KaptureFolder,
+    matches: Path,
+    local_types: Sequence[str],
+    options: RerankingOptions,
+) -> list[ImagePair]:
+    """Candidates as the options want them, from matches that are stored.
+
+    Parameters
+    ----------
+    query : with keypoints and matches of the types.
+    matches : the features folder that the matches are in.
+
+    Raises
+    ------
+    DataError : matches are missing or broken.
+    """
+    if options.by == "none":
+        return list(pairs)
+    if options.by == "coverage":
+        return cover_pairs(pairs, matched_keypoints(query, local_types), options.keep)
+    return rerank_pairs(pairs, correspondences(matches, local_types, options.by), options.keep)
+
+
+def cover_pairs(
+    pairs: Sequence[ImagePair],
+    matched: Callable[[str, str], NDArray[np.int64]],
+    keep: int,
+) -> list[ImagePair]:
+    """The ``keep`` candidates of each query that together match most of its keypoints.
+
+    As :func:`rerank_pairs`; the score counts the keypoints that an image adds.
+
+    Parameters
+    ----------
+    matched : of (query, map image) the query's keypoints that are matched, numbered through its
+        types; see :func:`matched_keypoints`.
+    """
+    found = []
+    for query, images in iterate_candidates(pairs):
+        order, added = most_covering([matched(query, image) for image in images], keep)
+        for place, (at, count) in enumerate(zip(order, added, strict=True)):
+            found.append(ImagePair(query, images[at], count + 1.0 / (2.0 + place)))
+    return found
+
+
+def matched_keypoints(
+    query: KaptureFolder, local_types: Sequence[str]
+) -> Callable[[str, str], NDArray[np.int64]]:
+    """Reads the keypoints of a query that a map image matches; see :func:`cover_pairs`.
+
+    Parameters
+    ----------
+    query : with keypoints and matches of the types.
+    """
+    readers = [(query.keypoints(name), query.matches(name)) for name in local_types]
+
+    def matched(image: str, other: str) -> NDArray[np.int64]:
+        ids, first = [np.zeros(0, np.int64)], 0
+        for keypoints, matches in readers:
+            if (image, other) in matches:
+                ids.append(first + np.unique(matches.read(image, other)[0][:, 0]))
+            first += keypoints.length(image)
+        return np.concatenate(ids)
+
+    return matched
+
+
+def correspondences(features_dir: Path, local_types: Iterable[str], by: Counted) -> Counter[Pair]:
+    """(query, map image) to correspondences, the sum over types of local features.
+
+    Parameters
+    ----------
+    features_dir : where :func:`~megloc_kapture.stages.matches.match_pairs` wrote them.
+
+    Raises
+    ------
+    DataError : there is no table of counts, or a broken one.
+    """
+    total: Counter[Pair] = Counter()
+    for local_type in local_types:
+        for row in read_match_counts(features_dir, local_type):
+            total[row.image, row.other] += row.matches if by == "matches" else row.verified
+    return total

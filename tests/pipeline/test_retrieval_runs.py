@@ -1,0 +1,149 @@
+"""Several global features, fused, and reranking, in whole runs and from Python."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from megloc_kapture import KaptureMap, Localizer
+from megloc_kapture.errors import OptionError
+from megloc_kapture.io.kapture_store import KaptureFolder, read_pairs
+from megloc_kapture.io.match_counts import read_match_counts
+from megloc_kapture.io.weights import MissingWeightsError
+from megloc_kapture.nets.eigenplaces import EigenPlacesNet
+from megloc_kapture.pipeline.datasets import choose_dataset
+from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
+from megloc_kapture.pipeline.options import PipelineOptions
+from megloc_kapture.pipeline.plan import StageReport, run_plan
+from megloc_kapture.pipeline.presets import options_of_preset
+from megloc_kapture.pipeline.queries import KaptureQueries, Query
+from megloc_kapture.pipeline.run import Run
+from megloc_kapture.pipeline.workspace import Workspace
+
+
+@pytest.fixture(scope="module")
+def options(tmp_path_factory: pytest.TempPathFactory) -> PipelineOptions:
+    """VLAD and a network of random weights, which ranks at random, of small images."""
+    torch.manual_seed(0)
+    file = tmp_path_factory.mktemp("weights") / "random.pth"
+    torch.save(EigenPlacesNet(50, 32).state_dict(), file)
+    return options_of_preset(
+        assignments=[
+            "local_features.options.max_keypoints=500",
+            "preprocessing.max_size_px=400",
+            'global_features=["vlad","eigenplaces"]',
+            f"global_features.eigenplaces.options.weights={file}",
+            "global_features.vlad.options.num_clusters=8",
+            "global_features.vlad.weight=3",
+            "query_pairs.top_k=5",
+            "reranking.by=coverage",
+            "reranking.keep=3",
+        ]
+    )
+
+
+def run(fountain: Path, workspace: Workspace, options: PipelineOptions) -> dict[str, StageReport]:
+    chosen = Run(choose_dataset("kapture", fountain), "classic", options, workspace)
+    with workspace.lock():
+        reports = run_plan(plan_evaluation(chosen), workspace)
+    return {report.name: report for report in reports}
+
+
+@pytest.fixture(scope="module")
+def finished(
+    fountain: Path, options: PipelineOptions, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Workspace, dict[str, StageReport]]:
+    workspace = Workspace(tmp_path_factory.mktemp("fused") / "workspace")
+    return workspace, run(fountain, workspace, options)
+
+
+def test_all_candidates_are_matched_once_and_the_best_are_localized_with(
+    finished: tuple[Workspace, dict[str, StageReport]],
+) -> None:
+    workspace, reports = finished
+    assert reports["evaluation"].counts["recall at 0.25 m, 2 deg"] == 1
+    candidates = read_pairs(workspace.path("pairs/query_candidates.txt"))
+    kept = read_pairs(workspace.path("pairs/query.txt"))
+    counted = read_match_counts(workspace.path("matches/query"), "rootsift")
+    assert len(candidates) == 4 * 5 and len(kept) == 4 * 3
+    assert {(c.image, c.other) for c in counted} == {(p.query, p.map) for p in candidates}
+    assert {(p.query, p.map) for p in kept} < {(p.query, p.map) for p in candidates}
+    assert not workspace.path("matches/query_candidates").exists()
+    types = workspace.folder("mapping", "").types("global_features")
+    assert types == ["eigenplaces-random", "vlad_rootsift"]
+
+
+def test_another_number_to_keep_matches_nothing_again(
+    finished: tuple[Workspace, dict[str, StageReport]], fountain: Path, options: PipelineOptions
+) -> None:
+    workspace, _ = finished
+    fewer = options.model_copy(
+        update={"reranking": options.reranking.model_copy(update={"keep": 2, "by": "verified"})}
+    )
+    reports = run(fountain, workspace, fewer)
+    again = {name for name, report in reports.items() if report.state == "run"}
+    assert again == {"query_pairs", "localization", "submission", "evaluation"}
+    run(fountain, workspace, options)
+
+
+def test_the_localizer_ranks_and_keeps_the_same_images(
+    finished: tuple[Workspace, dict[str, StageReport]], options: PipelineOptions
+) -> None:
+    workspace, _ = finished
+    kept: dict[str, list[str]] = {}
+    for pair in read_pairs(workspace.path("pairs/query.txt")):
+        kept.setdefault(pair.query, []).append(pair.map)
+    opened = KaptureMap.open(workspace.path("map"), features_dirs=[workspace.root])
+    localizer = Localizer(opened, options=options)
+    queries = KaptureFolder(workspace.path("preprocessed/query"), features_dirs=[workspace.root])
+    for query in KaptureQueries(queries, opened):
+        assert query.global_features.keys() == {"vlad_rootsift", "eigenplaces-random"}
+        found = localizer.localize_query(query)
+        assert found, found
+        assert set(found.candidates) <= set(kept[query.name])
+        ranked = localizer.ranked(query)
+        assert set(kept[query.name]) <= set(ranked[:5])
+
+
+def test_vectors_that_the_map_lacks_are_made_from_its_images(
+    finished: tuple[Workspace, dict[str, StageReport]], options: PipelineOptions, tmp_path: Path
+) -> None:
+    workspace, _ = finished
+    only = options.model_copy(update={"global_features": options.global_features[1:]})
+    bare = Path(shutil.copytree(workspace.path("map"), tmp_path / "map", symlinks=True))
+    shutil.rmtree(bare / "reconstruction" / "global_features" / "eigenplaces-random")
+    opened = KaptureMap.open(bare)
+    assert opened.global_types() == ["vlad_rootsift"]
+    localizer = Localizer(opened, options=only)
+    for image in opened.images:
+        # a map image is most like itself
+        query = Query(opened.camera(image), opened.folder.image_path(image), "query")
+        assert localizer.ranked(query)[0] == image
+
+
+def test_all_missing_weights_are_told_at_once(fountain: Path, tmp_path: Path) -> None:
+    workspace = Workspace(tmp_path / "workspace")
+    with pytest.raises(MissingWeightsError) as caught:
+        run(fountain, workspace, options_of_preset("megloc"))
+    said = str(caught.value).splitlines()
+    assert len(said) == len(set(said)) == 7
+    for name in ("superpoint_v1", "superglue", "aslfeat", "netvlad", "delg", "apgem", "openibl"):
+        assert any(name in line for line in said), name
+    assert not workspace.root.exists()
+
+
+def test_the_same_vectors_twice_are_refused(fountain: Path, tmp_path: Path) -> None:
+    twice = options_of_preset(assignments=['global_features=["vlad","vlad"]'])
+    with pytest.raises(OptionError, match="global features 'vlad_rootsift' are asked for twice"):
+        run(fountain, Workspace(tmp_path / "workspace"), twice)
+
+
+def test_options_of_vlad_are_checked_by_name() -> None:
+    wrong = options_of_preset(assignments=["global_features.options.num_clusters=0"])
+    with pytest.raises(OptionError, match="global features vlad: option num_clusters"):
+        wrong.retrieval()
+    assert np.isfinite(options_of_preset().global_features[0].weight)

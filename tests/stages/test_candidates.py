@@ -1,0 +1,92 @@
+"""Candidates by several global features, against rankings made by hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from megloc_kapture.io.kapture_store import FeatureConfig, FeatureWriter, KaptureFolder
+from megloc_kapture.retrieval.diversity import DiversityOptions
+from megloc_kapture.retrieval.fusion import FusionOptions, fuse
+from megloc_kapture.stages import candidates
+from megloc_kapture.stages.candidates import Candidates, QueryPairsOptions, Retrieval
+from megloc_kapture.stages.image_pairs import MappingPairsOptions, pair_map_images, pair_queries
+from megloc_kapture.values import RigidTransform
+
+SIZES = {"short": 3, "long": 8}
+
+
+@pytest.fixture
+def folders(world: Any, tmp_path: Path) -> tuple[KaptureFolder, KaptureFolder]:
+    rng = np.random.default_rng(4)
+    for name, size in SIZES.items():
+        config = FeatureConfig(name, np.dtype("float32"), size, None, "L2")
+        with FeatureWriter(tmp_path, "global_features", name, config, orphan=True) as writer:
+            for image in [*sorted(world.map_poses), *sorted(world.query_poses)]:
+                writer.write(image, rng.normal(size=size).astype(np.float32))
+    return (
+        KaptureFolder(world.mapping().root, features_dirs=[tmp_path]),
+        KaptureFolder(world.query().root, features_dirs=[tmp_path]),
+    )
+
+
+def cosines(folders: tuple[KaptureFolder, KaptureFolder], name: str) -> np.ndarray:
+    def rows(folder: KaptureFolder) -> np.ndarray:
+        reader = folder.global_features(name)
+        found = np.stack([reader.read(i).reshape(-1) for i in folder.read().image_names()])
+        found = found.astype(np.float64)
+        return np.asarray(found / np.linalg.norm(found, axis=1, keepdims=True))
+
+    return np.asarray(rows(folders[1]) @ rows(folders[0]).T)
+
+
+@pytest.mark.parametrize("method", ["ghm", "mean", "minimum", "power", "early"])
+@pytest.mark.parametrize("weights", [(), (1.0, 3.0)])
+def test_fused_pairs_are_those_of_the_fused_similarities(
+    folders: tuple[KaptureFolder, KaptureFolder], method: Any, weights: tuple[float, ...]
+) -> None:
+    fusion = FusionOptions(method=method)
+    retrieval = Retrieval(("short", "long"), weights, fusion)
+    found = pair_queries(*folders, QueryPairsOptions(top_k=2), retrieval=retrieval)
+    images, queries = (folder.read().image_names() for folder in folders)
+    fused = fuse([cosines(folders, name) for name in SIZES], fusion, weights or None)
+    expected = [
+        (query, images[at], row[at])
+        for query, row in zip(queries, fused, strict=True)
+        for at in np.argsort(-row, kind="stable")[:2]
+    ]
+    assert [(p.query, p.map) for p in found] == [(q, m) for q, m, _ in expected]
+    np.testing.assert_allclose([p.score for p in found], [s for _, _, s in expected], atol=1e-6)
+
+
+def test_few_queries_at_a_time_give_the_same(
+    folders: tuple[KaptureFolder, KaptureFolder], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    retrieval = Retrieval(("short", "long"))
+    options = MappingPairsOptions(top_k=2)
+    everything = pair_map_images(folders[0], options, retrieval=retrieval)
+    monkeypatch.setattr(candidates, "_QUERY_ELEMENTS", 1)  # one row at a time
+    assert pair_map_images(folders[0], options, retrieval=retrieval) == everything
+
+
+def test_diversity_spreads_over_places_and_keeps_the_scores_order() -> None:
+    # three copies of a place, the best ones, and two other places
+    database = np.array([[1, 0], [0.99, 0.141], [0.98, 0.199], [0.8, 0.6], [0.6, 0.8]], np.float32)
+    at = [0.0, 0.1, 0.2, 10.0, 20.0]
+    poses = [RigidTransform((1, 0, 0, 0), (-x, 0, 0)) for x in at]
+    ranked = Candidates(lambda positions: [database[positions]], poses, Retrieval(("toy",)))
+    query = [np.array([[1, 0]], np.float32)]
+    diversity = DiversityOptions(max_per_place=1, radius=1.0)
+    plain, _ = ranked.of(query, np.arange(5), QueryPairsOptions(top_k=3))
+    spread, scores = ranked.of(query, np.arange(5), QueryPairsOptions(top_k=3, diversity=diversity))
+    assert plain.tolist() == [[0, 1, 2]]
+    assert spread.tolist() == [[0, 3, 4]]
+    filled, scores = ranked.of(query, np.arange(5), QueryPairsOptions(top_k=5, diversity=diversity))
+    assert filled.tolist() == [[0, 3, 4, 1, 2]]
+    assert (np.diff(scores) <= 0).all()
+    # only what is permitted, by positions in the whole map
+    some, _ = ranked.of(query, np.array([1, 2, 4]), QueryPairsOptions(top_k=2, diversity=diversity))
+    assert some.tolist() == [[1, 4]]

@@ -1,0 +1,271 @@
+"""The ranker by pictures, in rooms that are alike but for what hangs on their walls."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from megloc_kapture.geometry.cameras import bearing_rays, project
+from megloc_kapture.localization.distinctive_inliers import DistinctiveInliers
+from megloc_kapture.localization.ranking import InlierCount
+from megloc_kapture.localization.structure import StructureDistance
+from megloc_kapture.plugins import DepthView, HypothesisView, PoseHypothesis, PoseRanker
+from megloc_kapture.stages import perceptual_ranking
+from megloc_kapture.stages.perceptual_ranking import (
+    AlignedViewOptions,
+    PerceptualRanker,
+    aligned_view,
+    query_at_size,
+)
+from megloc_kapture.values import Camera, RigidTransform
+
+CAMERA = Camera("SIMPLE_PINHOLE", 160, 120, (120.0, 80.0, 60.0))
+WALL_M = 3.0
+APART_M = 20.0  # between rooms
+
+
+@pytest.fixture(autouse=True)
+def distances(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The distance as it is registered, wherever this is installed."""
+    known = {"structure": StructureDistance}
+
+    def load(group: str, name: str, options: dict[str, object]) -> StructureDistance:
+        assert group == "megloc_kapture.image_distances"
+        return known[name](StructureDistance.Options.model_validate(options))
+
+    monkeypatch.setattr(perceptual_ranking, "load_plugin", load)
+
+
+def stripes(seed: int, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    rng = np.random.default_rng(seed)
+    waves = rng.uniform(-6, 6, (8, 2))
+    phases = rng.uniform(0, 6.3, 8)
+    return sum(np.sin(w[0] * x + w[1] * y + p) for w, p in zip(waves, phases, strict=True))
+
+
+def colours(room: int, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """A wall: what every room has, and a poster of its own."""
+    poster = (np.abs(x - 0.6) < 0.45) & (np.abs(y) < 0.6)
+    value = np.where(poster, stripes(100 + room, x, y), stripes(0, x, y))
+    return np.repeat((128 + 18 * value).clip(0, 255).astype(np.uint8)[..., None], 3, axis=-1)
+
+
+def standing(room: int, x: float = 0.0, z: float = 0.0) -> RigidTransform:
+    """Looking straight at the wall of a room."""
+    return RigidTransform((1.0, 0.0, 0.0, 0.0), (-(APART_M * room + x), 0.0, -z))
+
+
+def photograph(room: int, pose: RigidTransform) -> NDArray[np.uint8]:
+    columns, rows = np.meshgrid(np.arange(CAMERA.width) + 0.5, np.arange(CAMERA.height) + 0.5)
+    rays = bearing_rays(CAMERA, np.stack([columns.ravel(), rows.ravel()], axis=1))
+    centre = pose.center()
+    at = centre + rays * (WALL_M - centre[2])
+    image = colours(room, at[:, 0] - APART_M * room, at[:, 1])
+    return image.reshape(CAMERA.height, CAMERA.width, 3)
+
+
+@dataclass
+class Scene:
+    """Rooms with two map images each; some without depth."""
+
+    query: NDArray[np.uint8]
+    without_depth: tuple[str, ...] = ()
+    mask: NDArray[np.bool_] | None = None
+    asked: list[str] = field(default_factory=list)
+
+    @staticmethod
+    def place(name: str) -> tuple[int, RigidTransform]:
+        room, number = (int(part) for part in name.removesuffix(".jpg").split("_"))
+        return room, standing(room, (-0.4, 0.5)[number], -0.2)
+
+    def query_image(self, name: str) -> NDArray[np.uint8]:
+        self.asked.append(name)
+        return self.query
+
+    def query_mask(self, name: str) -> NDArray[np.bool_] | None:
+        return self.mask
+
+    def query_depth(self, name: str) -> None:
+        return None
+
+    def map_image(self, name: str) -> NDArray[np.uint8]:
+        self.asked.append(name)
+        return photograph(*self.place(name))
+
+    def map_mask(self, name: str) -> None:
+        return None
+
+    def map_depth(self, name: str) -> DepthView | None:
+        if name in self.without_depth:
+            return None
+        depth = np.full((CAMERA.height, CAMERA.width), WALL_M + 0.2, np.float32)
+        return DepthView(CAMERA, depth, RigidTransform.identity())
+
+    def map_points(self, name: str) -> NDArray[np.float64]:
+        raise AssertionError
+
+    def map_camera(self, name: str) -> Camera:
+        return CAMERA
+
+    def map_pose(self, name: str) -> RigidTransform:
+        return self.place(name)[1]
+
+
+def hypothesis(room: int, inliers: int, views: Sequence[str] = ("q",)) -> PoseHypothesis:
+    """The query's pose as one room explains it, with so many inliers of what all rooms share."""
+    rng = np.random.default_rng(0)
+    pose = standing(room)
+    points = rng.uniform((-1.5, -1.0, WALL_M), (0.1, 1.0, WALL_M + 1e-9), (300, 3))[:inliers]
+    world = points + (APART_M * room, 0.0, 0.0)
+    posed = HypothesisView(
+        name="q",
+        camera=CAMERA,
+        cam_from_world=pose,
+        points_px=project(CAMERA, pose, world),
+        points_world=world,
+        errors_px=np.zeros(inliers),
+        inliers=np.ones(inliers, bool),
+    )
+    return PoseHypothesis((f"{room}_0.jpg", f"{room}_1.jpg"), (posed,) * len(views), 4.0)
+
+
+def ranker(**options: object) -> PerceptualRanker:
+    return PerceptualRanker(PerceptualRanker.Options.model_validate(options))
+
+
+RIGHT = 2
+HYPOTHESES = [hypothesis(0, 300), hypothesis(1, 280), hypothesis(RIGHT, 120), hypothesis(3, 200)]
+
+
+@pytest.fixture
+def scene() -> Scene:
+    return Scene(photograph(RIGHT, standing(RIGHT)))
+
+
+def test_the_room_that_looks_like_the_query_wins(scene: Scene) -> None:
+    assert isinstance(ranker(), PoseRanker)
+    assert np.argmax(InlierCount().score(HYPOTHESES, scene)) == 0
+    assert np.argmax(DistinctiveInliers().score(HYPOTHESES, scene)) == 0
+    scores = ranker().score(HYPOTHESES, scene)
+    assert scores.shape == (4,) and np.isfinite(scores).all()
+    assert np.argmax(scores) == 2
+    assert scores[2] - np.delete(scores, 2).max() > 0.05
+    assert len(scene.asked) == len(set(scene.asked)) == 1 + 8  # every picture is read once
+
+
+def test_scores_follow_the_hypotheses(scene: Scene) -> None:
+    forward = ranker().score(HYPOTHESES, scene)
+    np.testing.assert_allclose(ranker().score(HYPOTHESES[::-1], scene)[::-1], forward, atol=1e-6)
+    few = ranker(finalists=2).score(HYPOTHESES, scene)
+    assert np.argmax(few) == 2
+    # those that are no finalists follow, in the order of their own distances
+    by_alone = ranker(finalists=1).score(HYPOTHESES, scene)
+    np.testing.assert_array_equal(np.argsort(-few)[2:], np.argsort(-by_alone)[2:])
+
+
+def test_pictures_are_compared_where_both_rooms_show_something(scene: Scene) -> None:
+    # a wrong room of which only the part that all have in common is known: nothing against it
+    narrow = PoseHypothesis(("0_0.jpg",), HYPOTHESES[0].views, 4.0)
+    poor = Scene(scene.query)
+    original = poor.map_depth
+
+    def depth(name: str) -> DepthView | None:
+        view = original(name)
+        if name == "0_0.jpg" and view is not None:
+            view.depth_m[:, 60:] = 0
+        return view
+
+    poor.map_depth = depth  # type: ignore[method-assign]
+    # and noise on the query where the right room is known as well
+    noise = np.random.default_rng(0).normal(0, 12, poor.query.shape)
+    poor.query = (poor.query + noise).clip(0, 255).astype(np.uint8)
+    poor.query[:, 100:] = poor.query[:, 100:] // 2 + np.random.default_rng(1).integers(
+        0, 60, poor.query[:, 100:].shape, dtype=np.uint8
+    )
+    pair = [narrow, hypothesis(RIGHT, 120)]
+    alone = ranker(finalists=1).score(pair, poor)
+    together = ranker().score(pair, poor)
+    assert alone[0] > alone[1] + 0.05
+    assert abs(together[0] - together[1]) < 0.3 * (alone[0] - alone[1])
+
+
+def test_hopeless_clusters_are_not_looked_at(scene: Scene) -> None:
+    scores = ranker(min_inlier_share=0.5).score(HYPOTHESES, scene)
+    assert np.argmin(scores) == 2  # 120 of 300
+    assert not any(name.startswith("2_") for name in scene.asked)
+
+
+def test_what_cannot_be_told_stands_last(scene: Scene) -> None:
+    scene.without_depth = ("3_0.jpg", "3_1.jpg")
+    scores = ranker().score(HYPOTHESES, scene)
+    assert np.argmax(scores) == 2 and np.argmin(scores) == 3
+    assert np.isfinite(scores).all()
+
+
+def test_where_the_best_by_inliers_cannot_be_told_inliers_decide(scene: Scene) -> None:
+    expected = DistinctiveInliers().score(HYPOTHESES, scene)
+    scene.without_depth = ("0_0.jpg", "0_1.jpg")
+    np.testing.assert_array_equal(ranker().score(HYPOTHESES, scene), expected)
+    scene.without_depth = ()
+    scene.mask = np.zeros((CAMERA.height, CAMERA.width), bool)
+    np.testing.assert_array_equal(ranker().score(HYPOTHESES, scene), expected)
+
+
+def test_masked_parts_of_the_query_do_not_count(scene: Scene) -> None:
+    plain = ranker().score(HYPOTHESES, scene)
+    # a person before the right part of the view
+    scene.query = scene.query.copy()
+    scene.query[:, 125:] = 255 * (np.indices((CAMERA.height, 35)).sum(0) % 2)[..., None]
+    spoilt = ranker().score(HYPOTHESES, scene)
+    scene.mask = np.ones((CAMERA.height, CAMERA.width), bool)
+    scene.mask[:, 125:] = False
+    masked = ranker().score(HYPOTHESES, scene)
+    assert np.argmax(masked) == 2
+    assert masked[2] - masked[0] > spoilt[2] - spoilt[0]
+    assert plain[2] > 0
+
+
+def test_the_views_of_a_rig_count_together(scene: Scene) -> None:
+    both = [hypothesis(room, count, ("q", "q")) for room, count in ((0, 300), (RIGHT, 120))]
+    alone = [hypothesis(room, count) for room, count in ((0, 300), (RIGHT, 120))]
+    np.testing.assert_allclose(ranker().score(both, scene), ranker().score(alone, scene), atol=1e-9)
+
+
+def test_one_hypothesis_or_none(scene: Scene) -> None:
+    assert ranker().score([], scene).shape == (0,)
+    np.testing.assert_array_equal(ranker().score(HYPOTHESES[:1], scene), [0.0])
+    assert scene.asked == []
+
+
+def test_it_can_be_sent_to_another_process(scene: Scene) -> None:
+    again = pickle.loads(pickle.dumps(ranker()))
+    np.testing.assert_array_equal(again.score(HYPOTHESES, scene), ranker().score(HYPOTHESES, scene))
+
+
+def test_an_aligned_view_is_what_the_query_would_see(scene: Scene) -> None:
+    view = aligned_view(CAMERA, standing(RIGHT), ["2_0.jpg", "2_1.jpg"], scene)
+    assert view.valid.mean() > 0.95
+    difference = np.abs(view.image.astype(int) - scene.query)[view.valid]
+    assert difference.mean() < 3
+    small = aligned_view(
+        CAMERA, standing(RIGHT), ["2_0.jpg"], scene, AlignedViewOptions(long_side=80)
+    )
+    assert small.image.shape == (60, 80, 3)
+    reduced = query_at_size(scene.query, 80, 60)
+    assert np.abs(small.image.astype(int) - reduced)[small.valid].mean() < 4
+
+
+def test_the_nearest_references_with_depth_are_taken(scene: Scene) -> None:
+    one = AlignedViewOptions(references=1)
+    near = standing(RIGHT, 0.45)
+    aligned_view(CAMERA, near, ["2_0.jpg", "2_1.jpg"], scene, one)
+    assert scene.asked == ["2_1.jpg"]
+    scene.without_depth, scene.asked = ("2_1.jpg",), []
+    aligned_view(CAMERA, near, ["2_0.jpg", "2_1.jpg"], scene, one)
+    assert scene.asked == ["2_0.jpg"]
+    assert not aligned_view(CAMERA, near, [], scene).valid.any()
