@@ -50,7 +50,7 @@ from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.plugins import PoseHypothesis, PoseRanker
 from megloc_kapture.stages.matches import iterate_candidates
 from megloc_kapture.stages.query_poses import LocalizationOptions, localize_views
-from megloc_kapture.stages.ranking_scene import KaptureScene, query_reader
+from megloc_kapture.stages.ranking_scene import KaptureScene
 from megloc_kapture.stages.shared_index import index_map
 from megloc_kapture.values import Failure, Pose, RigidTransform
 
@@ -64,8 +64,8 @@ PIPELINE = (
     'mapping_pairs.by=["poses"]',
     "mapping_pairs.poses.max_distance=6",
     f"query_pairs.top_k={TOP_K}",
-    "vlad.num_clusters=64",
-    "vlad.training_descriptors=50000",
+    "global_features.options.num_clusters=64",
+    "global_features.options.training_descriptors=50000",
 )
 FEATURES = "rootsift"
 SHOWN = 6  # of the options tried, the best
@@ -215,7 +215,7 @@ def read_scene(run: Path) -> Scene:
         )
         queries.append(Query(view, tuple(images), truth[name]))
     centers = {image: pose.center() for image, pose in mapping.read().poses().items()}
-    return Scene(tuple(queries), centers, KaptureScene(mapping, query_reader(query)))
+    return Scene(tuple(queries), centers, KaptureScene(mapping, query))
 
 
 def localize(scene: Scene, query: Query, method: Method) -> Pose | Failure:

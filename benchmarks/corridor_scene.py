@@ -1,8 +1,8 @@
 """A corridor of offices that are alike, rendered: map images, and queries from elsewhere in them.
 
-Plain kapture: ``mapping/``, ``query/`` and ``query_gt/``, for ``megloc eval kapture``. The offices
-are those of the InLoc twin, :mod:`megloc_kapture.datasets.synthetic.indoor_rooms`: posters, a rug
-and a cupboard are a room's own, all else, dirt included, every room has.
+Plain kapture: ``mapping/`` with depth, ``query/`` and ``query_gt/``, for ``megloc eval kapture``.
+The offices are those of the InLoc twin, :mod:`megloc_kapture.datasets.synthetic.indoor_rooms`:
+posters, a rug and a cupboard are a room's own, all else, dirt included, every room has.
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ from megloc_kapture.datasets.synthetic.render import (
 from megloc_kapture.datasets.synthetic.shots import Shot, noise_seed
 from megloc_kapture.datasets.synthetic.studio import draw_shots
 from megloc_kapture.datasets.synthetic.views import View
+from megloc_kapture.io.depth_maps import write_depth_map
 from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture_store import KaptureData, Sensor, write_sensors
 from megloc_kapture.values import RigidTransform
@@ -125,8 +126,14 @@ def write_corridor(root: Path, seed: int) -> Seen:
     """Draw the corridor of a seed and write it below ``root``."""
     mapping, map_views = _mapping(seed)
     queries, query_views = _queries(seed)
-    draw_shots(_world(seed), [*mapping, *queries], partial(_write_image, root), build=_build_place)
-    write_sensors(root / "mapping", _records(mapping, poses=True))
+    draw_shots(
+        _world(seed),
+        [*mapping, *queries],
+        partial(_write_view, root),
+        with_depth=[shot.name for shot in mapping],
+        build=_build_place,
+    )
+    write_sensors(root / "mapping", _with_depth(_records(mapping, poses=True)))
     write_sensors(root / "query", _records(queries, poses=False))
     write_sensors(root / "query_gt", _records(queries, poses=True))
     surface = np.mean([build(seed, index).own_share for index in range(ROOMS)])
@@ -242,6 +249,28 @@ def _records(shots: Sequence[Shot], *, poses: bool) -> KaptureData:
     return data
 
 
-def _write_image(root: Path, shot: Shot, view: View) -> None:
+def _with_depth(data: KaptureData) -> KaptureData:
+    """The records, with a depth sensor in each camera's place."""
+    for sensor in sorted(data.sensors):
+        camera = data.sensors[sensor].camera()
+        data.sensors[f"{sensor}_depth"] = Sensor.from_camera(
+            camera, name=f"{sensor}_depth", sensor_type="depth"
+        )
+        still = RigidTransform.identity()
+        data.rigs[f"{sensor}_rig"] = {sensor: still, f"{sensor}_depth": still}
+    for timestamp, sensor in list(data.trajectories):
+        data.trajectories[timestamp, f"{sensor}_rig"] = data.trajectories.pop((timestamp, sensor))
+    for (timestamp, sensor), name in data.records_camera.items():
+        data.records_depth[timestamp, f"{sensor}_depth"] = _depth_record(name)
+    return data
+
+
+def _depth_record(name: str) -> str:
+    return f"depth/{name.removesuffix('.jpg')}.depth"
+
+
+def _write_view(root: Path, shot: Shot, view: View) -> None:
     folder = root / shot.role / "sensors" / "records_data"
     write_image(folder / shot.name, view.image, jpeg_quality=92)
+    if view.depth_m is not None:
+        write_depth_map(folder / _depth_record(shot.name), view.depth_m)

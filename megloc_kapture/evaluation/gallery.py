@@ -11,6 +11,7 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
+from megloc_kapture.evaluation.aligned_views import aligned_views
 from megloc_kapture.evaluation.match_lines import MatchLines, StoredMatches, fits_poses
 from megloc_kapture.evaluation.pictures import (
     AGREES,
@@ -80,6 +81,8 @@ class Exhibit:
     best : the map image on the right of ``picture``; empty: none.
     caption : of the lines between the two.
     others : further map images.
+    aligned : the best two places, brought to their poses; empty where there is no choice, or the
+        map has no depth.
     """
 
     name: str
@@ -88,6 +91,7 @@ class Exhibit:
     best: str
     caption: str
     others: tuple[Shown, ...]
+    aligned: tuple[Shown, ...] = ()
 
 
 class Gallery:
@@ -135,7 +139,22 @@ class Gallery:
                 for image, facts, small in pictures
                 if small is not None
             ),
+            aligned=self._aligned(chosen.image),
         )
+
+    def _aligned(self, query: str) -> tuple[Shown, ...]:
+        shown = []
+        for number, view in enumerate(aligned_views(self._around, query), 1):
+            row = view.row
+            facts = (
+                f"cluster {row.cluster}, {'chosen' if row.chosen == 'yes' else 'not chosen'}",
+                f"score {row.score:.3g}",
+                counted(row.num_inliers, "inlier", "inliers"),
+                f"{100 * view.share:.0f} % of the view is shown",
+            )
+            name = f"what place {number} shows of {query}"
+            shown.append(Shown(row.images[0], facts, image_tag(view.picture, name)))
+        return tuple(shown)
 
     def _clusters(self, query: str) -> tuple[str, ...]:
         """One line on the clusters of candidates, the chosen one first; none where all are one."""

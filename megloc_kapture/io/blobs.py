@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.atomic import output_error, write_bytes
 from megloc_kapture.io.paths import check_no_escape, check_relative, safe_join
-from megloc_kapture.io.row_reading import read_file_row, read_fully, read_rows_at
+from megloc_kapture.io.row_reading import map_rows, read_file_row, read_fully, read_rows_at
 from megloc_kapture.io.tar_runs import names_of_run, stride_of
 
 _TAR_BLOCK = 512
@@ -170,9 +170,7 @@ class TarBlobs:
         return content
 
     def read_rows(self, names: Sequence[str], rows: NDArray[np.uint8]) -> NDArray[np.int64]:
-        absent = (0, -1)
-        places = [self._index.get(name, absent) for name in names]
-        offsets, sizes = np.array(places, dtype=np.int64).reshape(-1, 2).T
+        offsets, sizes = self._places(names)
         wanted = np.flatnonzero(sizes == rows.shape[1])
         try:
             if not read_rows_at(self._file.fileno(), offsets[wanted], wanted, rows):
@@ -181,8 +179,25 @@ class TarBlobs:
             raise _unreadable(self._path, error) from error
         return sizes
 
+    def map_rows(self, names: Sequence[str], width: int) -> NDArray[np.uint8] | None:
+        """Blobs of ``width`` bytes that lie at a constant stride, see :func:`.map_rows`."""
+        offsets, sizes = self._places(names)
+        if (sizes != width).any():
+            return None
+        try:
+            return map_rows(self._file.fileno(), offsets, width)
+        except OSError as error:
+            raise _unreadable(self._path, error) from error
+
     def where(self, name: str) -> str:
         return f"{self._path}[{name}]"
+
+    def _places(self, names: Sequence[str]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Offsets and sizes of blobs; size -1 of those that are not there."""
+        absent = (0, -1)
+        places = [self._index.get(name, absent) for name in names]
+        offsets, sizes = np.array(places, dtype=np.int64).reshape(-1, 2).T
+        return offsets, sizes
 
     def _place(self, name: str) -> tuple[int, int]:
         place = self._index.get(name)

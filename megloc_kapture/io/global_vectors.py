@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,7 +63,8 @@ class KaptureVectors:
 
         Parameters
         ----------
-        out : where to write them, C-contiguous; a new array by default.
+        out : where to write them, C-contiguous; a new array by default. It stays as it is where
+            the rows lie as they should in a tar: then those are returned, and cannot be written.
 
         Raises
         ------
@@ -70,6 +72,10 @@ class KaptureVectors:
             finite; names it.
         """
         images = self._images[start:stop]
+        mapped = self._reader.map_rows(images)
+        if mapped is not None and _are_unit(mapped):
+            return mapped
+        chunks = _chunks(len(images), self._reader.config.row_bytes)
         shape = (len(images), self.dimension)
         rows = np.empty(shape, dtype=np.float32) if out is None else out
 
@@ -80,7 +86,7 @@ class KaptureVectors:
                 where = self._reader.where(images[chunk][bad])
                 raise DataError("the vector has values that are not finite", path=where)
 
-        _each(read_chunk, _chunks(len(images), self._reader.config.row_bytes))
+        _each(read_chunk, chunks)
         return rows
 
 
@@ -113,6 +119,16 @@ def _read(reader: FeatureReader, images: Sequence[str], rows: NDArray[np.float32
     rows[:] = stored
 
 
+def _are_unit(rows: NDArray[Any]) -> bool:
+    """Whether the rows are float32 of unit length, as most methods store them."""
+    if rows.dtype != np.dtype("<f4") or not rows.dtype.isnative:
+        return False
+    with np.errstate(over="ignore", invalid="ignore"):
+        # in one thread: it is as fast as the memory is
+        lengths = np.vecdot(rows, rows)
+    return bool((np.abs(lengths - 1) <= _UNIT).all())
+
+
 def _scale_to_unit_length(rows: NDArray[np.float32]) -> int | None:
     """Scale rows (N, D) in place; the first that cannot be, or None."""
     with np.errstate(over="ignore", invalid="ignore"):
@@ -128,7 +144,7 @@ def _scale_to_unit_length(rows: NDArray[np.float32]) -> int | None:
         length = np.linalg.norm(row)
         if length > 0:
             rows[k] = row / length
-    scale[np.abs(squared - 1) <= _UNIT] = 1  # as most methods store them
+    scale[np.abs(squared - 1) <= _UNIT] = 1
     if (scale != 1).any():
         np.multiply(rows, scale[:, None], out=rows)
     return None

@@ -293,6 +293,18 @@ class FeatureReader:
                 f"the first is {images[int(todo[0])]}"
             )
 
+    def map_rows(self, images: Sequence[str]) -> NDArray[Any] | None:
+        """Global features (N, dsize) where they lie, if they lie alike in one tar; else None.
+
+        Nothing is copied and nothing can be written. The tar must not be cut while they are used.
+        """
+        source = self._sources[0]
+        if self.kind != "global_features" or not isinstance(source, TarBlobs):
+            return None
+        names = [image + SUFFIX[self.kind] for image in images]
+        rows = source.map_rows(names, self.config.row_bytes)
+        return None if rows is None else rows.view(self.config.dtype)
+
     def where(self, image: str) -> str:
         """The file (or member of a tar) that holds an image's array, for messages."""
         source, name = self._source(image)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import mmap
 import os
 import stat
 
@@ -56,6 +57,41 @@ def read_rows_at(
                     return False
             first = last
     return True
+
+
+def map_rows(descriptor: int, offsets: NDArray[np.int64], width: int) -> NDArray[np.uint8] | None:
+    """Pieces of a file at a constant stride, as they lie in the system's cache: not copied.
+
+    New memory costs more than reading does: the system clears each page before it is written.
+
+    Parameters
+    ----------
+    offsets : int64 (K,), where the pieces begin.
+    width : bytes of a piece.
+
+    Returns
+    -------
+    uint8 (K, width), not writable, or None where the pieces lie otherwise or beyond the file's end.
+    The file must not be cut while the rows are used: the system would end the process.
+
+    Raises
+    ------
+    OSError : as the system says it.
+    """
+    if len(offsets) < 2:
+        return None
+    stride = int(offsets[1] - offsets[0])
+    first, end = int(offsets[0]), int(offsets[-1]) + width
+    if stride < width or (np.diff(offsets) != stride).any():
+        return None
+    if end > os.fstat(descriptor).st_size:
+        return None
+    begin = first - first % mmap.ALLOCATIONGRANULARITY
+    # populated: one call instead of an interruption for every few pages
+    flags = mmap.MAP_SHARED | getattr(mmap, "MAP_POPULATE", 0)
+    mapped = mmap.mmap(descriptor, end - begin, flags=flags, prot=mmap.PROT_READ, offset=begin)
+    shape, strides = (len(offsets), width), (stride, 1)
+    return np.ndarray(shape, np.uint8, buffer=mapped, offset=first - begin, strides=strides)
 
 
 def read_fully(descriptor: int, view: memoryview, offset: int) -> bool:

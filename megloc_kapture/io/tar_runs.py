@@ -51,17 +51,26 @@ def names_of_run(
     while len(names) < most:
         count = min(batch, most - len(names))
         first = start + len(names) * stride
-        places = range(first, first + count * stride, stride)
-        content = b"".join([os.pread(descriptor, header_bytes, place) for place in places])
-        if len(content) != count * header_bytes:
+        headers = _headers(descriptor, first, count, stride, header_bytes)
+        if headers is None:
             break  # being cut while we read
-        headers = np.frombuffer(content, dtype=np.uint8).reshape(count, header_bytes)
         found = _names(headers, size)
         names += found
         if len(found) < count:
             break  # of a batch with a name that cannot be used, none is taken
         batch = min(2 * batch, _LARGEST_BATCH)
     return names
+
+
+def _headers(
+    descriptor: int, first: int, count: int, stride: int, header_bytes: int
+) -> NDArray[np.uint8] | None:
+    """Headers (N, header_bytes) at a constant stride; None where the file has not all of them."""
+    places = range(first, first + count * stride, stride)
+    content = b"".join([os.pread(descriptor, header_bytes, place) for place in places])
+    if len(content) != count * header_bytes:
+        return None
+    return np.frombuffer(content, dtype=np.uint8).reshape(count, header_bytes)
 
 
 def _names(headers: NDArray[np.uint8], size: int) -> list[str]:
@@ -79,12 +88,15 @@ def _names(headers: NDArray[np.uint8], size: int) -> list[str]:
         paths = [prefix + b"/" + path if prefix else path for prefix, path in joint]
     if headers.shape[1] > _BLOCK:
         paths = _extended_paths(headers[:count], paths)
+    joined = b"\0".join(paths)
+    if b"/\0" in joined or joined.endswith(b"/"):
+        return []  # folders: tarfile meets them
     try:
-        names = b"\0".join(paths).decode("utf-8").split("\0")
+        names = joined.decode("utf-8").split("\0")
     except UnicodeDecodeError:
-        return []  # tarfile meets it
+        return []
     # a zero within a name would have made two
-    return names if len(names) == len(paths) and not any(n.endswith("/") for n in names) else []
+    return names if len(names) == len(paths) else []
 
 
 def _extended_paths(headers: NDArray[np.uint8], paths: list[bytes]) -> list[bytes]:

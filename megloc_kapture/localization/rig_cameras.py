@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.geometry.poses import cross_matrix
 from megloc_kapture.localization.cluster_poses import ClusterLocalization, QueryView
-from megloc_kapture.values import Failure, Pose, RigidTransform
+from megloc_kapture.values import ClusterPose, Failure, Pose, RigidTransform
 
 
 def poses_of_cameras(
@@ -34,7 +34,7 @@ def poses_of_cameras(
                     "no inlier in this camera; others of its rig were localized",
                     num_matches=len(inliers),
                     candidates=result.candidates,
-                    clusters=result.clusters,
+                    clusters=_of_camera(result.clusters, view.cam_from_rig),
                     seconds=result.seconds,
                 )
             )
@@ -43,6 +43,7 @@ def poses_of_cameras(
             replace(
                 result,
                 cam_from_world=view.cam_from_rig @ result.cam_from_world,
+                clusters=_of_camera(result.clusters, view.cam_from_rig),
                 num_matches=len(inliers),
                 num_inliers=num_inliers,
                 inliers=inliers,
@@ -52,6 +53,18 @@ def poses_of_cameras(
             )
         )
     return cameras
+
+
+def _of_camera(
+    clusters: Sequence[ClusterPose], cam_from_rig: RigidTransform
+) -> tuple[ClusterPose, ...]:
+    """The clusters of a rig, with the poses of one of its cameras."""
+    return tuple(
+        cluster
+        if cluster.cam_from_world is None
+        else replace(cluster, cam_from_world=cam_from_rig @ cluster.cam_from_world)
+        for cluster in clusters
+    )
 
 
 def moved_covariance(

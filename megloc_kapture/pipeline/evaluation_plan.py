@@ -81,8 +81,11 @@ def plan_evaluation(run: Run) -> list[Stage]:
         *(_pyramid_stages(run, dump) if options.matches_again() else ()),
         Stage(
             "localization",
-            3,
-            {"localization": dump["localization"]},
+            4,
+            {
+                "localization": dump["localization"],
+                "weights": weights_of(options.localization.make_ranker()),
+            },
             (
                 "import",
                 run.images_stage,

@@ -34,7 +34,7 @@ class VectorBlocks(Protocol):
         """The rows from ``start`` to ``stop``, float32 (stop - start, D).
 
         They may be in ``out``, a C-contiguous array of that shape: memory that is used again and
-        again is much faster than new memory.
+        again is much faster than new memory. They are not written to.
         """
         ...
 

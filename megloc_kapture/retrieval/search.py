@@ -6,10 +6,7 @@ what the search needs does not grow with the database.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -29,11 +26,11 @@ from megloc_kapture.retrieval.fusion import FusionOptions, check_features, fuse
 from megloc_kapture.retrieval.rank_fusion import borda, reciprocal_rank, round_robin
 from megloc_kapture.retrieval.weights import normalized_weights
 
-_BLOCK_ELEMENTS = 1 << 22  # similarities held at once, per feature: 16 MiB of float32
-_VECTOR_ELEMENTS = 1 << 24  # of a block of database rows: 64 MiB of float32
+# products of large blocks are faster: the matrix library's threads wait for each other less often
+_BLOCK_ELEMENTS = 1 << 24  # similarities held at once, per feature: 64 MiB of float32
+_VECTOR_ELEMENTS = 1 << 25  # of a block of database rows, per feature: 128 MiB of float32
 _MOST_ROWS = 1 << 14  # of a block, however short they are
 _CACHED_ELEMENTS = 1 << 18  # of similarities ranked at once: 1 MiB
-_THREADS = 4  # that fuse and rank; products have the matrix library's own
 
 Permitted = NDArray[np.bool_] | Callable[[int, int], NDArray[np.bool_]] | None
 Found = tuple[NDArray[np.int64], NDArray[np.float32]]
@@ -145,26 +142,29 @@ def _search(
     step = max(1, min(step, _MOST_ROWS, _BLOCK_ELEMENTS))
     height = min(step, num_rows)
     buffers = [np.empty((height, source.dimension), dtype=np.float32) for source in sources]
-    at_once = max(1, _BLOCK_ELEMENTS // step)
-    with ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool:
-        for left in range(0, num_rows, step) if num_queries else ():
-            right = min(left + step, num_rows)
-            blocks = [
-                source.read(left, right, out=buffer[: right - left])
-                for source, buffer in zip(sources, buffers, strict=True)
+    at_once = min(max(1, _BLOCK_ELEMENTS // step), num_queries)
+    products = [np.empty(at_once * height, dtype=np.float32) for _ in sources]
+    for left in range(0, num_rows, step) if num_queries else ():
+        right = min(left + step, num_rows)
+        blocks = [
+            source.read(left, right, out=buffer[: right - left])
+            for source, buffer in zip(sources, buffers, strict=True)
+        ]
+        allowed = permitted(left, right) if callable(permitted) else permitted
+        if allowed is not None and not callable(permitted):
+            allowed = allowed[:, left:right]
+        for first in range(0, num_queries, at_once):
+            matrices = [
+                _similarities(rows[first : first + at_once], block, left, out)
+                for rows, block, out in zip(vectors, blocks, products, strict=True)
             ]
-            allowed = permitted(left, right) if callable(permitted) else permitted
-            if allowed is not None and not callable(permitted):
-                allowed = allowed[:, left:right]
-            for first in range(0, num_queries, at_once):
-                matrices = [
-                    _similarities(rows[first : first + at_once], block, left)
-                    for rows, block in zip(vectors, blocks, strict=True)
-                ]
-                mask = None if allowed is None else allowed[first : first + at_once]
-                rank = partial(_rank, matrices, mask, combine, best, first, left)
-                for _ in pool.map(rank, _parts(*matrices[0].shape)):
-                    pass
+            mask = None if allowed is None else allowed[first : first + at_once]
+            for part in _parts(*matrices[0].shape):
+                fused = combine([matrix[part] for matrix in matrices])
+                for scores, ranking in zip(fused, best, strict=True):
+                    if mask is not None:
+                        scores = np.where(mask[part], scores, -np.inf)
+                    ranking.add(first + part.start, left, scores)
     return [ranking.result() for ranking in best]
 
 
@@ -172,23 +172,6 @@ def _parts(num_queries: int, width: int) -> list[slice]:
     """Queries whose scores a processor's cache holds."""
     step = max(1, _CACHED_ELEMENTS // width)
     return [slice(start, start + step) for start in range(0, num_queries, step)]
-
-
-def _rank(
-    matrices: Matrices,
-    allowed: NDArray[np.bool_] | None,
-    combine: Callable[[Matrices], Matrices],
-    best: Sequence[BestRows],
-    first_query: int,
-    first_row: int,
-    part: slice,
-) -> None:
-    """Fuse and rank the similarities of some of a block's queries."""
-    fused = combine([matrix[part] for matrix in matrices])
-    for scores, ranking in zip(fused, best, strict=True):
-        if allowed is not None:
-            scores = np.where(allowed[part], scores, -np.inf)
-        ranking.add(first_query + part.start, first_row, scores)
 
 
 def _checked(queries: NDArray[np.floating[Any]], source: VectorBlocks) -> NDArray[np.float32]:
@@ -204,10 +187,16 @@ def _checked(queries: NDArray[np.floating[Any]], source: VectorBlocks) -> NDArra
 
 
 def _similarities(
-    queries: NDArray[np.float32], rows: NDArray[np.float32], first_row: int
+    queries: NDArray[np.float32],
+    rows: NDArray[np.float32],
+    first_row: int,
+    out: NDArray[np.float32],
 ) -> NDArray[np.float32]:
+    """Inner products (q, b), in the memory of ``out``, which is flat."""
+    shape = (len(queries), len(rows))
+    products = out[: shape[0] * shape[1]].reshape(shape)
     with np.errstate(over="ignore", invalid="ignore"):
-        products = queries @ rows.T
+        np.matmul(queries, rows.T, out=products)
         # a value that is not finite makes its whole column so, and thereby the column's sum: less
         # to look at than all values
         sums = np.ones(len(products), dtype=np.float32) @ products

@@ -106,6 +106,39 @@ def test_a_tar_cut_after_it_was_indexed(tmp_path: Path) -> None:
         read_vectors(features, NAMES)
 
 
+def unit(count: int = len(NAMES)) -> NDArray[np.float32]:
+    rows = vectors(count=count)
+    return (rows / np.linalg.norm(rows, axis=1)[:, None]).astype(np.float32)
+
+
+def test_unit_rows_of_a_tar_are_not_copied(tmp_path: Path) -> None:
+    rows = unit()
+    features = write(tmp_path, NAMES, rows, tar=True)
+    out = np.zeros((10, 5), dtype=np.float32)
+    found = KaptureVectors(features, NAMES).read(7, 17, out=out)
+    np.testing.assert_array_equal(found, rows[7:17])
+    assert not found.flags.writeable and not out.any()
+    every_other = KaptureVectors(features, NAMES[::2])
+    np.testing.assert_array_equal(every_other.read(0, 10, out=out), rows[:20:2])
+    assert not out.any()
+    # in another order, or of other lengths, they are copied
+    turned = KaptureVectors(features, NAMES[::-1])
+    assert turned.read(0, 10, out=out) is out
+    np.testing.assert_allclose(out, rows[::-1][:10], atol=1e-6)
+    longer = KaptureVectors(write(tmp_path / "2", NAMES, 2 * rows, tar=True), NAMES)
+    assert longer.read(0, 10, out=out) is out
+    np.testing.assert_allclose(out, rows[:10], atol=1e-6)
+
+
+def test_a_block_beyond_the_end_of_a_cut_tar_is_not_touched(tmp_path: Path) -> None:
+    features = write(tmp_path, NAMES, unit(), tar=True)
+    os.truncate(tmp_path / FOLDER / "global_features.tar", 20 * 1024)
+    blocks = KaptureVectors(features, NAMES)
+    with pytest.raises(DataError, match=r"global_features\.tar: truncated"):
+        blocks.read(0, len(NAMES))
+    np.testing.assert_array_equal(blocks.read(0, 20), unit()[:20])
+
+
 def test_reads_that_stop_short_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rows = vectors()
     features = {tar: write(tmp_path / str(tar), NAMES, rows, tar=tar) for tar in (False, True)}

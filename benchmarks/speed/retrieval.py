@@ -1,0 +1,341 @@
+"""Retrieval from kapture's files: ours, the bare matrix product and kapture-localization's tool.
+
+    .venv/bin/python benchmarks/speed/retrieval.py [--million]
+
+The top 50 of 1,000 queries in 10,000 images of 4096 dimensions, from the vectors in the page cache:
+in one tar, and as one file per image. The product has its vectors in memory and knows no order; it
+is what no search can do without. All run in turn in this process, several times over, on the same
+threads. Two lengths are measured of ours and of kapture-localization: the search alone, from the
+opening of the vectors to the ranking, and the whole tool, from the kapture folders to the pairs
+file. The pairs of all are compared. ``--million`` searches a million vectors that are made block by
+block, in a process of its own, and prints the memory that took.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import importlib
+import json
+import os
+import resource
+import runpy
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from timing import table
+
+from megloc_kapture.errors import OptionError
+from megloc_kapture.io.global_vectors import KaptureVectors
+from megloc_kapture.io.kapture_localization import tool_scripts
+from megloc_kapture.io.kapture_store import (
+    FeatureConfig,
+    FeatureWriter,
+    ImagePair,
+    KaptureData,
+    KaptureFolder,
+    Sensor,
+    read_pairs,
+    write_pairs,
+    write_sensors,
+)
+from megloc_kapture.retrieval.search import rank_by_similarity
+from megloc_kapture.values import Camera, RigidTransform
+
+TYPE = "generated"
+CAMERA = Camera("SIMPLE_PINHOLE", 640, 480, (500.0, 320.0, 240.0))
+HERE = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+SAME = 1e-6  # scores of one pair may differ by this
+MILLION = 1_000_000
+Vectors = NDArray[np.float32]
+Pairs = dict[str, dict[str, float]]
+
+
+def random_vectors(
+    seed: Sequence[int], count: int, dimension: int, out: Vectors | None = None
+) -> Vectors:
+    """Unit rows (count, dimension)."""
+    rng = np.random.default_rng(seed)
+    rows: Vectors = rng.standard_normal((count, dimension), dtype=np.float32, out=out)
+    rows /= np.sqrt(np.vecdot(rows, rows))[:, None]
+    return rows
+
+
+def generate(folder: Path, names: Sequence[str], vectors: Vectors, *, tar: bool) -> None:
+    """A kapture folder with global features; nothing is done where there is one."""
+    if (folder / "complete").exists():
+        return
+    data = KaptureData(sensors={"camera": Sensor.from_camera(CAMERA)})
+    for timestamp, name in enumerate(names):
+        data.records_camera[timestamp, "camera"] = name
+        data.trajectories[timestamp, "camera"] = HERE
+    write_sensors(folder, data)
+    config = FeatureConfig(TYPE, np.dtype("float32"), vectors.shape[1], None, "L2")
+    with FeatureWriter(folder, "global_features", TYPE, config, tar=tar) as writer:
+        for name, vector in zip(names, vectors, strict=True):
+            if name not in writer:
+                writer.write(name, vector)
+    (folder / "complete").touch()
+
+
+# ------------------------------------------------------------------------------------------ ours
+
+
+class Ours:
+    """Our search of one form of the files."""
+
+    def __init__(self, mapping: Path, query: Path, top_k: int) -> None:
+        self.mapping, self.query, self.top_k = mapping, query, top_k
+        self.images = KaptureFolder(mapping).read().image_names()
+        self.queries = KaptureFolder(query).read().image_names()
+
+    def search(self) -> None:
+        """From the opening of the vectors to the ranking."""
+        self._search(self.images, self.queries)
+
+    def tool(self, path: Path) -> None:
+        """From kapture folders to the pairs file."""
+        images = sorted(KaptureFolder(self.mapping).read().poses())
+        queries = KaptureFolder(self.query).read().image_names()
+        indices, scores = self._search(images, queries)
+        ranked = zip(queries, indices.tolist(), scores.tolist(), strict=True)
+        pairs = [
+            ImagePair(query, images[k], score)
+            for query, row, row_scores in ranked
+            for k, score in zip(row, row_scores, strict=True)
+        ]
+        write_pairs(path, pairs)
+
+    def _search(self, images: Sequence[str], queries: Sequence[str]) -> Any:
+        of_map = KaptureVectors(KaptureFolder(self.mapping).global_features(TYPE), images)
+        of_queries = KaptureVectors(KaptureFolder(self.query).global_features(TYPE), queries)
+        return rank_by_similarity(of_queries.read(0, len(queries)), of_map, self.top_k)
+
+
+def pairs_of(path: Path) -> Pairs:
+    """The pairs of a pairs file and their scores, by query."""
+    found: Pairs = {}
+    for pair in read_pairs(path):
+        found.setdefault(pair.query, {})[pair.map] = pair.score
+    return found
+
+
+# ---------------------------------------------------------------------------- kapture-localization
+
+
+class Theirs:
+    """kapture-localization's compute_image_pairs, in this process."""
+
+    def __init__(self, mapping: Path, query: Path, top_k: int) -> None:
+        script = tool_scripts()["kapture_compute_image_pairs"]
+        sys.path.append(str(script.parent))  # what the script imports lies beside it
+        self._tool: Callable[..., None] = runpy.run_path(str(script))["compute_image_pairs"]
+        self.mapping, self.query, self.top_k = str(mapping), str(query), top_k
+
+    def search(self) -> None:
+        """The tool's own steps, without the tables of the kapture folders and the pairs file."""
+        import kapture
+        from kapture.io.csv import get_all_tar_handlers, global_features_config_from_file
+        from kapture.io.csv import global_features_from_dir as from_folder
+        from kapture.io.features import global_features_to_filepaths
+
+        pairing = importlib.import_module("kapture_localization.image_retrieval.pairing")
+        stacked = []
+        for folder in (self.mapping, self.query):
+            with get_all_tar_handlers(folder) as handlers:
+                features = from_folder(TYPE, folder, None, handlers)
+                paths = global_features_to_filepaths(features, TYPE, folder, handlers)
+                place = kapture.io.csv.get_feature_csv_fullpath(
+                    kapture.GlobalFeatures, TYPE, folder
+                )
+                config = global_features_config_from_file(place)
+                stacked.append(pairing.stack_global_features(config, sorted(paths.items())))
+        similarity = pairing.get_similarity(stacked[1], stacked[0])
+        pairing.get_image_pairs(similarity, self.top_k)
+
+    def tool(self, path: Path) -> None:
+        self._tool(self.mapping, self.query, str(path), TYPE, self.top_k)
+
+
+# --------------------------------------------------------------------------------------- measuring
+
+
+def timed(work: Callable[[], Any]) -> float:
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
+def compared(ours: Pairs, theirs: Pairs) -> str:
+    """Whether the pairs are the same; one that only one has may have the score of the last."""
+    same, largest, level = 0, 0.0, 0
+    for query in sorted(ours.keys() | theirs.keys()):
+        a, b = ours.get(query, {}), theirs.get(query, {})
+        last = min([*a.values(), *b.values()])
+        for image in a.keys() | b.keys():
+            if image in a and image in b:
+                same += 1
+                largest = max(largest, abs(a[image] - b[image]))
+            elif abs({**a, **b}[image] - last) <= SAME:
+                level += 1
+            else:
+                return f"PAIRS DIFFER: {query} with {image}"
+    if largest > SAME:
+        return f"SCORES DIFFER by {largest:.1e}"
+    return f"{same} pairs equal, {level} of equal score differ, scores within {largest:.1e}"
+
+
+def measure(options: argparse.Namespace) -> bool:
+    names = [f"map/{k // 100:04d}/{k % 100:02d}.jpg" for k in range(options.images)]
+    query_names = [f"query/{k:05d}.jpg" for k in range(options.queries)]
+    vectors = random_vectors([0], len(names), options.dimension)
+    queries = random_vectors([1], len(query_names), options.dimension)
+    forms = {"tar": True, "files": False}
+    root = options.cache / f"retrieval_{options.images}_{options.queries}_{options.dimension}"
+    works: dict[str, Callable[[], Any]] = {"bare matrix product": lambda: queries @ vectors.T}
+    pairs: dict[str, Callable[[], Pairs]] = {}
+    folder = root / "pairs"
+    folder.mkdir(parents=True, exist_ok=True)
+    installed = True
+    for form, tar in forms.items():
+        mapping, query = root / form / "map", root / form / "query"
+        generate(mapping, names, vectors, tar=tar)
+        generate(query, query_names, queries, tar=tar)
+        ours = Ours(mapping, query, options.top_k)
+        works[f"ours, {form}, search"] = ours.search
+        works[f"ours, {form}, whole tool"] = partial(ours.tool, folder / f"ours_{form}.txt")
+        pairs[f"ours, {form}"] = partial(pairs_of, folder / f"ours_{form}.txt")
+        try:
+            theirs = Theirs(mapping, query, options.top_k)
+        except OptionError as error:
+            print(error)
+            installed = False
+            continue
+        works[f"kapture-localization, {form}, search"] = theirs.search
+        file = folder / f"theirs_{form}.txt"
+        works[f"kapture-localization, {form}, whole tool"] = partial(theirs.tool, file)
+        pairs[f"kapture-localization, {form}"] = partial(pairs_of, file)
+    seconds: dict[str, list[float]] = {name: [] for name in works}
+    for repetition in range(options.repetitions + 1):
+        for name, work in works.items():
+            with contextlib.redirect_stderr(None):  # a progress bar
+                spent = timed(work)
+            if repetition:  # the first fills the page cache and compiles
+                seconds[name].append(spent)
+    product = float(np.median(seconds["bare matrix product"]))
+    rows = [("", "median s", "min s", "of product")]
+    for name, each in seconds.items():
+        median = float(np.median(each))
+        rows.append((name, f"{median:.3f}", f"{min(each):.3f}", f"{median / product:.2f}"))
+    print(table(rows))
+
+    def ratio(a: str, b: str) -> float:
+        return float(np.median(seconds[a]) / np.median(seconds[b]))
+
+    checks = [
+        ("search of the tar by the bare product", "ours, tar, search", "bare matrix product", 1.3),
+        ("search of files by search of the tar", "ours, files, search", "ours, tar, search", 2.0),
+    ]
+    if installed:
+        for part in ("search", "whole tool"):
+            name = f"tar, {part}"
+            theirs_name = f"kapture-localization, {name}"
+            checks.append((f"{name}, by kapture-localization's", f"ours, {name}", theirs_name, 0.5))
+    met = True
+    for what, a, b, most in checks:
+        found = ratio(a, b)
+        met &= found <= most
+        print(f"{what}: {found:.2f} (at most {most:g}{'' if found <= most else ': MISSED'})")
+    reference = pairs["ours, tar"]()
+    for name, found_pairs in pairs.items():
+        said = compared(reference, found_pairs())
+        met &= "DIFFER" not in said
+        print(f"ours, tar, and {name}: {said}")
+    return met
+
+
+# ------------------------------------------------------------------------------------ one million
+
+
+class GeneratedVectors:
+    """Random unit rows, made when they are read; row ``k * spacing`` is near query k."""
+
+    def __init__(self, length: int, queries: Vectors) -> None:
+        self._length, self._queries = length, queries
+        self._spacing = length // len(queries)
+
+    def __len__(self) -> int:
+        return self._length
+
+    @property
+    def dimension(self) -> int:
+        return self._queries.shape[1]
+
+    def read(self, start: int, stop: int, out: Vectors | None = None) -> Vectors:
+        rows = random_vectors([2, start], stop - start, self.dimension, out)
+        for k in range(-(-start // self._spacing), len(self._queries)):
+            place = k * self._spacing
+            if place >= stop:
+                break
+            rows[place - start] = 0.6 * self._queries[k] + 0.8 * rows[place - start]
+        return rows
+
+
+def million(options: argparse.Namespace) -> None:
+    """Print seconds, gigabytes and how many planted rows were found first."""
+    queries = random_vectors([1], options.queries, options.dimension)
+    database = GeneratedVectors(options.million_images, queries)
+    start = time.perf_counter()
+    indices, _ = rank_by_similarity(queries, database, options.top_k)
+    spent = time.perf_counter() - start
+    planted = np.arange(len(queries)) * (len(database) // len(queries))
+    found = int((indices[:, 0] == planted).sum())
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 << 20)
+    print(json.dumps({"seconds": spent, "gib": memory, "found": found}))
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--images", type=int, default=10_000)
+    parser.add_argument("--queries", type=int, default=1_000)
+    parser.add_argument("--dimension", type=int, default=4096)
+    parser.add_argument("--top-k", type=int, default=50)
+    parser.add_argument("--repetitions", type=int, default=5)
+    parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "megloc-bench")
+    parser.add_argument("--million", action="store_true", help="search generated vectors as well")
+    parser.add_argument("--million-images", type=int, default=MILLION)
+    parser.add_argument("--only-million", action="store_true", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.only_million:
+        million(options)
+        return 0
+    load = os.getloadavg()[0]
+    print(
+        f"{options.queries} queries in {options.images} images x {options.dimension}, "
+        f"top {options.top_k}, {os.environ.get('OMP_NUM_THREADS', os.cpu_count())} threads, "
+        f"load {load:.1f}"
+    )
+    met = measure(options)
+    if options.million:
+        command = [sys.executable, __file__, *sys.argv[1:], "--only-million"]
+        done = subprocess.run(command, check=True, capture_output=True, text=True)
+        found = json.loads(done.stdout)
+        print(
+            f"{options.million_images} generated vectors, made and searched: "
+            f"{found['seconds']:.0f} s, {found['gib']:.2f} GiB at most, "
+            f"{found['found']} of {options.queries} planted rows found first"
+        )
+        met &= found["gib"] < 6 and found["found"] == options.queries
+    return 0 if met else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,266 @@
+"""What reference images with depth show of another view: warping with a z-buffer.
+
+Each reference's depth map is drawn as a surface into the view; the nearest surface of all of them
+is what the view sees. Every pixel of the view then looks its colour up, bilinearly, in the
+references that see that surface.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.geometry.cameras import bearing_rays, focal_px, px_from_cam
+from megloc_kapture.values import ONE_FOCAL_MODELS, Camera, RigidTransform
+
+_NEAR_M = 0.02
+# two references see one surface where their depths in the view differ by less
+_SAME_SURFACE = 0.02
+_MAX_JUMP = 0.05  # of neighbouring depths, share of the nearer
+# rays this much farther off the axis than the image's corners are not projected: distortion is
+# only known inside the image and may fold beyond
+_FIELD_MARGIN = 1.2
+_SAME_CENTRE_M = 1e-9  # an offset that is left over from composing transforms
+_PER_ROW = 1024
+_WHOLE = 0.999  # of a bilinear lookup, the weight on usable pixels
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class WarpSource:
+    """A reference image with depth and pose.
+
+    Parameters
+    ----------
+    image : uint8 (H, W, 3), and ``camera``, ``cam_from_world``, its camera and pose.
+    depth_m : float32, along the axis of ``depth_camera``; 0, less or NaN where unknown.
+    image_from_depth : from the depth camera's frame to the image camera's, metres.
+    mask : bool (H, W), True = use; None without one.
+
+    Raises
+    ------
+    DataError : an array's size is not its camera's.
+    """
+
+    image: NDArray[np.uint8]
+    camera: Camera
+    cam_from_world: RigidTransform
+    depth_m: NDArray[np.float32]
+    depth_camera: Camera
+    image_from_depth: RigidTransform = RigidTransform.identity()
+    mask: NDArray[np.bool_] | None = None
+
+    def __post_init__(self) -> None:
+        shapes = [
+            ("image", self.image.shape[:2], self.camera),
+            ("depth map", self.depth_m.shape, self.depth_camera),
+        ]
+        if self.mask is not None:
+            shapes.append(("mask", self.mask.shape, self.camera))
+        for name, shape, camera in shapes:
+            size = camera.height, camera.width
+            if shape != size:
+                raise DataError(f"{name} has {shape} rows and columns, its camera {size}")
+
+
+@dataclass(frozen=True, eq=False)
+class WarpedView:
+    """What references show of a view.
+
+    Attributes
+    ----------
+    image : uint8 (H, W, 3), RGB; 0 where not valid.
+    valid : bool (H, W), False in holes, behind surfaces and where only a back side is seen.
+    depth_m : float32 (H, W), along the view's axis at the pixels' centres; 0 where nothing is known
+        of what lies there. Back sides of surfaces have depth.
+    source : int16 (H, W), the reference that the colour is of; -1 where not valid.
+    """
+
+    image: NDArray[np.uint8]
+    valid: NDArray[np.bool_]
+    depth_m: NDArray[np.float32]
+    source: NDArray[np.int16]
+
+
+def scaled_camera(camera: Camera, scale: float) -> Camera:
+    """The same view in an image of another size, rounded to whole pixels, at least one.
+
+    Everything scales by what its side really scales by; one focal length for both sides by the
+    mean of the two.
+    """
+    width, height = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
+    x, y = width / camera.width, height / camera.height
+    params = list(camera.params)
+    by = [0.5 * (x + y), x, y] if camera.model in ONE_FOCAL_MODELS else [x, y, x, y]
+    params[: len(by)] = [p * b for p, b in zip(params, by, strict=False)]
+    return replace(camera, width=width, height=height, params=tuple(params))
+
+
+def warp_to_view(
+    sources: Sequence[WarpSource],
+    camera: Camera,
+    cam_from_world: RigidTransform,
+    *,
+    scale: float = 1.0,
+) -> WarpedView:
+    """Bring reference images to a view.
+
+    Of several references that see a surface, each pixel takes the one that looks at it most as the
+    view does: least angle between the two rays, and not from much farther away.
+
+    Parameters
+    ----------
+    sources : references; of equals the first counts.
+    camera, cam_from_world : of the view; any of COLMAP's models.
+    scale : size of the result over the camera's.
+
+    Raises
+    ------
+    DataError : the scale is not positive.
+    """
+    if not scale > 0:
+        raise DataError(f"scale {scale:g} of a view is not positive")
+    camera = scaled_camera(camera, scale)
+    shape = camera.height, camera.width
+    drawn = [_seen_depth(source, camera, cam_from_world) for source in sources]
+    nearest = np.full(shape, np.inf)
+    for depth, _ in drawn:
+        np.minimum(nearest, depth, out=nearest)
+    image = np.zeros((*shape, 3), np.uint8)
+    best = np.full(shape, np.inf)
+    chosen = np.full(shape, -1, np.int16)
+    rays = _rays(camera)
+    centre = cam_from_world.center()
+    for number, (source, (depth, front)) in enumerate(zip(sources, drawn, strict=True)):
+        rows = np.flatnonzero(
+            (front & np.isfinite(depth) & (depth <= (1.0 + _SAME_SURFACE) * nearest)).ravel()
+        )
+        points = cam_from_world.inverse().apply(rays[rows] * depth.ravel()[rows, None])
+        colour, usable = _look_up(source, points, focal_px(camera))
+        cost = np.where(usable, _cost(points, centre, source.cam_from_world.center()), np.inf)
+        better = cost < best.ravel()[rows]
+        rows = rows[better]
+        image.reshape(-1, 3)[rows] = colour[better]
+        best.ravel()[rows] = cost[better]
+        chosen.ravel()[rows] = number
+    depth_m = np.where(np.isfinite(nearest), nearest, 0.0).astype(np.float32)
+    return WarpedView(image, chosen >= 0, depth_m, chosen)
+
+
+def _seen_depth(
+    source: WarpSource, camera: Camera, cam_from_world: RigidTransform
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Depth (H, W) of a reference's surface in a view, and where its front is seen."""
+    # here, as numba takes half a second to import
+    from megloc_kapture.geometry.rasterising import draw_depth_surface
+
+    return draw_depth_surface(
+        source.depth_m,
+        _rays(source.depth_camera),
+        cam_from_world @ source.cam_from_world.inverse() @ source.image_from_depth,
+        camera,
+        max_jump=_MAX_JUMP,
+        near_m=_NEAR_M,
+        field=_field(camera),
+    )
+
+
+@lru_cache(maxsize=8)
+def _rays(camera: Camera) -> Floats:
+    """Rays (H * W, 3) through the centres of a camera's pixels, z = 1; the maps of a scan share
+    few cameras, and distortion is slow to undo."""
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    rays = bearing_rays(camera, np.stack([x.ravel(), y.ravel()], axis=1))
+    rays.flags.writeable = False
+    return rays
+
+
+@lru_cache(maxsize=8)
+def _field(camera: Camera) -> float:
+    """Tangent of the angle off the axis beyond which nothing is projected."""
+    x, y = camera.width, camera.height
+    middle = 0.5 * x, 0.5 * y
+    border = np.array(
+        [(0, 0), (x, 0), (0, y), (x, y), (middle[0], 0), (middle[0], y), (0, middle[1])]
+        + [(x, middle[1])],
+        np.float64,
+    )
+    rays = bearing_rays(camera, border)
+    reach = np.hypot(rays[:, 0], rays[:, 1]).max()
+    return float(_FIELD_MARGIN * reach) if np.isfinite(reach) else np.inf
+
+
+def _look_up(
+    source: WarpSource, points: Floats, focal: float
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """Colours uint8 (N, 3) of world points in a reference, and which it sees, bool (N,)."""
+    image, mask, shrink = _at_resolution(source, focal)
+    in_image = source.cam_from_world.apply(points)
+    px = px_from_cam(source.camera, in_image)
+    usable = np.asarray(np.isfinite(px).all(axis=1))
+    if np.linalg.norm(source.image_from_depth.translation) > _SAME_CENTRE_M:
+        usable &= _not_hidden(source, in_image, px)
+    # OpenCV's coordinates have the centre of the first pixel at (0, 0)
+    in_array = np.where(usable[:, None], px, -1e4) * shrink - 0.5
+    x, y = np.ascontiguousarray(in_array.T, np.float32)
+    height, width = image.shape[:2]
+    # beyond the outer centres there is half a pixel that belongs to the image still
+    usable &= (x >= -0.5) & (y >= -0.5) & (x <= width - 0.5) & (y <= height - 0.5)
+    colour = _remap(image, x, y)
+    if mask is not None:
+        usable &= _remap(mask, x, y) >= _WHOLE
+    return colour.reshape(-1, 3), usable
+
+
+def _remap(array: NDArray[Any], x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[Any]:
+    """Values (N, ...) of an array (H, W, ...) at N places, bilinear."""
+    if not len(x):
+        return np.zeros((0, *array.shape[2:]), array.dtype)
+    # OpenCV takes no more than 32767 rows or columns
+    missing = -len(x) % _PER_ROW
+    x, y = (np.pad(v, (0, missing)).reshape(-1, _PER_ROW) for v in (x, y))
+    found = cv2.remap(array, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(found).reshape(-1, *array.shape[2:])[: x.size - missing]
+
+
+def _at_resolution(
+    source: WarpSource, focal: float
+) -> tuple[NDArray[np.uint8], NDArray[np.float32] | None, Floats]:
+    """Image and mask, reduced where their pixels are finer than the view's; by how much (2,)."""
+    height, width = source.image.shape[:2]
+    factor = min(1.0, focal / focal_px(source.camera))
+    mask = None if source.mask is None else source.mask.astype(np.float32)
+    if factor >= 1.0:
+        return source.image, mask, np.ones(2)
+    size = max(1, round(width * factor)), max(1, round(height * factor))
+    image = np.asarray(cv2.resize(source.image, size, interpolation=cv2.INTER_AREA), np.uint8)
+    if mask is not None:
+        mask = np.asarray(cv2.resize(mask, size, interpolation=cv2.INTER_AREA), np.float32)
+    return image, mask, np.array(size) / (width, height)
+
+
+def _not_hidden(source: WarpSource, in_image: Floats, px: Floats) -> NDArray[np.bool_]:
+    """Which points (N, 3) the image sees, though it was the depth sensor beside it that did."""
+    own, _ = _seen_depth(source, source.camera, source.cam_from_world)
+    height, width = own.shape
+    with np.errstate(invalid="ignore"):
+        inside = (px >= 0).all(axis=1) & (px[:, 0] < width) & (px[:, 1] < height)
+    columns, rows = np.floor(np.where(inside[:, None], px, 0)).astype(np.int64).T
+    return inside & (in_image[:, 2] <= (1.0 + _SAME_SURFACE) * own[rows, columns])
+
+
+def _cost(points: Floats, view_centre: Floats, source_centre: Floats) -> Floats:
+    """Angle between two rays to points (N, 3), radians, and how much coarser the other sees it."""
+    to_view, to_source = view_centre - points, source_centre - points
+    near, far = np.linalg.norm(to_view, axis=1), np.linalg.norm(to_source, axis=1)
+    sine = np.linalg.norm(np.cross(to_view, to_source), axis=1)
+    angle = np.arctan2(sine, (to_view * to_source).sum(axis=1))
+    return angle + np.log(np.maximum(far / np.maximum(near, 1e-9), 1.0))

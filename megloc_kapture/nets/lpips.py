@@ -1,0 +1,125 @@
+"""LPIPS 0.1: a learned distance of two images (Zhang et al., "The Unreasonable Effectiveness of
+Deep Features as a Perceptual Metric", CVPR 2018, eq. 1), over those of their pixels that count."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Literal
+
+import torch
+from torch import nn
+from torch.nn import functional as F
+
+from megloc_kapture.nets.alexnet import AlexNetFeatures
+from megloc_kapture.nets.loading import load_strictly
+from megloc_kapture.nets.squeezenet import SqueezeNetFeatures
+from megloc_kapture.nets.vgg import Vgg16Features
+
+Trunk = Literal["alex", "vgg", "squeeze"]
+
+# layers whose outputs are compared, by their numbers, and their channels
+_TAPS: dict[Trunk, tuple[tuple[int, int], ...]] = {
+    "alex": ((1, 64), (4, 192), (7, 384), (9, 256), (11, 256)),
+    "vgg": ((3, 64), (8, 128), (15, 256), (22, 512), (29, 512)),
+    "squeeze": ((1, 64), (4, 128), (7, 256), (9, 384), (10, 384), (11, 512), (12, 512)),
+}
+_TRUNKS: dict[Trunk, Callable[[], nn.Sequential]] = {
+    "alex": AlexNetFeatures,
+    "vgg": lambda: Vgg16Features(last=29),
+    "squeeze": SqueezeNetFeatures,
+}
+# of the published module, for RGB in [-1, 1]
+_SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
+_MIN_LENGTH = 1e-10  # added to a feature's length
+SMALLEST_PX = 64  # of the shorter side: AlexNet pools down to nothing below
+
+
+class _Head(nn.Module):
+    """Weights of one layer's channels, under the key of the published files."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        # the published heads have a dropout first, which does nothing once trained
+        self.model = nn.Sequential(nn.Identity(), nn.Conv2d(channels, 1, 1, bias=False))
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return self.model(x)
+
+
+class Lpips(nn.Module):
+    """LPIPS with one of the three published trunks.
+
+    Keys of the state dict are torchvision's ``features.*`` of the trunk and the published heads'
+    ``lin{k}.model.1.weight``. The stored weights multiply squared differences; the paper's are
+    their roots.
+    """
+
+    def __init__(self, trunk: Trunk) -> None:
+        super().__init__()
+        self.taps = tuple(number for number, _ in _TAPS[trunk])
+        self.features = _TRUNKS[trunk]()
+        for number, (_, channels) in enumerate(_TAPS[trunk]):
+            self.add_module(f"lin{number}", _Head(channels))
+
+    def forward(self, a: torch.Tensor, b: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
+        """Distances of pairs of images.
+
+        The mean over the image in the published formula is one over the valid pixels, whose share
+        in each feature's cell is its weight. Other pixels are the same in both images.
+
+        Parameters
+        ----------
+        a, b : (B, 3, H, W), RGB in [0, 1], at least 64 pixels on either side.
+        valid : (B, 1, H, W), 1 where both images count, else 0.
+
+        Returns
+        -------
+        (B,), 0 for equal images; NaN where nothing is valid.
+        """
+        both = torch.cat([self._normalised(a) * valid, self._normalised(b) * valid])
+        total = torch.zeros(len(a), dtype=both.dtype, device=both.device)
+        for layer, features in enumerate(self._tapped(both)):
+            features = features.to(both.dtype)
+            unit = features / (
+                torch.linalg.vector_norm(features, dim=1, keepdim=True) + _MIN_LENGTH
+            )
+            one, other = unit.chunk(2)
+            different = self.get_submodule(f"lin{layer}")((one - other) ** 2)
+            weight = F.interpolate(valid, size=different.shape[-2:], mode="area")
+            total = total + (different * weight).sum(dim=(1, 2, 3)) / weight.sum(dim=(1, 2, 3))
+        return total
+
+    def _normalised(self, image: torch.Tensor) -> torch.Tensor:
+        shift, scale = (image.new_tensor(v)[:, None, None] for v in (_SHIFT, _SCALE))
+        return (2.0 * image - 1.0 - shift) / scale
+
+    def _tapped(self, x: torch.Tensor) -> list[torch.Tensor]:
+        found = []
+        for number, layer in enumerate(self.features):
+            x = layer(x)
+            if number in self.taps:
+                found.append(x)
+        return found
+
+
+def lpips_from(
+    trunk: Trunk,
+    of_trunk: Mapping[str, torch.Tensor],
+    of_heads: Mapping[str, torch.Tensor],
+    where: str,
+) -> Lpips:
+    """LPIPS from a torchvision checkpoint of a trunk, and a published file of heads.
+
+    Parameters
+    ----------
+    of_trunk : its classifier, and layers after the last one compared, are left out.
+    where : the files, for messages.
+
+    Raises
+    ------
+    DataError : a key is missing, unexpected or of another shape; names it.
+    """
+    module = Lpips(trunk)
+    features = {key: value for key, value in of_trunk.items() if not key.startswith("classifier.")}
+    load_strictly(module, {**features, **of_heads}, where)
+    return module.eval()

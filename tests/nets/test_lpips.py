@@ -1,0 +1,246 @@
+"""LPIPS: the published formula written out in loops, keys, and what a distance must do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from torch import nn
+from torch.nn import functional as F
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.nets.lpips import SMALLEST_PX, Lpips, Trunk, lpips_from
+
+TRUNKS: tuple[Trunk, ...] = ("alex", "vgg", "squeeze")
+# torchvision's layers, as (kind, numbers): written here from the published tables once more
+ALEX = [
+    ("conv", 0, 4, 2),
+    ("relu",),
+    ("pool", False),
+    ("conv", 3, 1, 2),
+    ("relu",),
+    ("pool", False),
+    ("conv", 6, 1, 1),
+    ("relu",),
+    ("conv", 8, 1, 1),
+    ("relu",),
+    ("conv", 10, 1, 1),
+    ("relu",),
+]
+SQUEEZE = [
+    ("conv", 0, 2, 0),
+    ("relu",),
+    ("pool", True),
+    ("fire", 3),
+    ("fire", 4),
+    ("pool", True),
+    ("fire", 6),
+    ("fire", 7),
+    ("pool", True),
+    ("fire", 9),
+    ("fire", 10),
+    ("fire", 11),
+    ("fire", 12),
+]
+TAPS = {
+    "alex": {1: 64, 4: 192, 7: 384, 9: 256, 11: 256},
+    "vgg": {3: 64, 8: 128, 15: 256, 22: 512, 29: 512},
+    "squeeze": {1: 64, 4: 128, 7: 256, 9: 384, 10: 384, 11: 512, 12: 512},
+}
+# values of all heads and of the trunks, without their classifiers
+NUM_VALUES = {"alex": (1152, 2469696), "vgg": (1472, 14714688), "squeeze": (2240, 722496)}
+
+
+def random_lpips(trunk: Trunk, seed: int = 0) -> Lpips:
+    """Random weights whose activations neither vanish nor explode; heads at least 0."""
+    torch.manual_seed(seed)
+    net = Lpips(trunk)
+    for part in net.modules():
+        if isinstance(part, nn.Conv2d):
+            nn.init.kaiming_normal_(part.weight)
+            if part.bias is not None:
+                nn.init.uniform_(part.bias, -0.1, 0.1)
+    for name, value in net.named_parameters():
+        if name.startswith("lin"):
+            nn.init.uniform_(value, 0.0, 1.0)
+    return net.eval()
+
+
+@pytest.fixture(scope="module", params=TRUNKS)
+def trunk(request: pytest.FixtureRequest) -> Trunk:
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def net(trunk: Trunk) -> Lpips:
+    return random_lpips(trunk)
+
+
+def pictures(seed: int, height: int = 65, width: int = 79) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    return tuple(torch.rand(1, 3, height, width, generator=generator) for _ in range(2))
+
+
+def functional_trunk(
+    kind: Trunk, state: dict[str, torch.Tensor], x: torch.Tensor
+) -> list[torch.Tensor]:
+    """Activations at the taps, out of a state dict by torch's functions alone."""
+
+    def conv(name: str, x: torch.Tensor, stride: int = 1, border: int = 0) -> torch.Tensor:
+        return F.conv2d(
+            x, state[f"{name}.weight"], state[f"{name}.bias"], stride=stride, padding=border
+        )
+
+    layers: list[tuple] = {"alex": ALEX, "squeeze": SQUEEZE, "vgg": []}[kind]
+    if kind == "vgg":
+        for number in range(30):
+            pools, convolves = number in (4, 9, 16, 23), f"features.{number}.weight" in state
+            layers.append(
+                ("pool2",) if pools else ("conv", number, 1, 1) if convolves else ("relu",)
+            )
+    found = []
+    for number, (what, *how) in enumerate(layers):
+        if what == "conv":
+            x = conv(f"features.{how[0]}", x, how[1], how[2])
+        elif what == "relu":
+            x = x.clamp(min=0)
+        elif what == "pool":
+            x = F.max_pool2d(x, 3, stride=2, ceil_mode=how[0])
+        elif what == "pool2":
+            x = F.max_pool2d(x, 2)
+        else:
+            at = f"features.{how[0]}"
+            x = conv(f"{at}.squeeze", x).clamp(min=0)
+            halves = [conv(f"{at}.expand1x1", x), conv(f"{at}.expand3x3", x, border=1)]
+            x = torch.cat(halves, dim=1).clamp(min=0)
+        if number in TAPS[kind]:
+            found.append(x)
+    return found
+
+
+def by_formula(
+    kind: Trunk, state: dict[str, torch.Tensor], a: torch.Tensor, b: torch.Tensor
+) -> float:
+    """Eq. 1: sum over layers, mean over places, of || w * (y - y0) ||^2, with w the roots."""
+    shift, scale = np.array([-0.030, -0.088, -0.188]), np.array([0.458, 0.448, 0.450])
+
+    def tapped(image: torch.Tensor) -> list[np.ndarray]:
+        rgb = 2 * image.numpy().astype(np.float64) - 1
+        x = (rgb - shift[:, None, None]) / scale[:, None, None]
+        with torch.inference_mode():
+            found = functional_trunk(kind, state, torch.from_numpy(x).float())
+        return [each[0].numpy().astype(np.float64) for each in found]
+
+    total = 0.0
+    for layer, (one, other) in enumerate(zip(tapped(a), tapped(b), strict=True)):
+        w = np.sqrt(state[f"lin{layer}.model.1.weight"].numpy().astype(np.float64).ravel())
+        height, width = one.shape[1:]
+        places = 0.0
+        for row in range(height):
+            for column in range(width):
+                y, y0 = one[:, row, column], other[:, row, column]
+                y = y / (np.sqrt((y**2).sum()) + 1e-10)
+                y0 = y0 / (np.sqrt((y0**2).sum()) + 1e-10)
+                places += ((w * (y - y0)) ** 2).sum()
+        total += places / (height * width)
+    return total
+
+
+def distance(net: Lpips, a: torch.Tensor, b: torch.Tensor, valid: torch.Tensor | None = None):
+    if valid is None:
+        valid = torch.ones(1, 1, *a.shape[-2:])
+    with torch.inference_mode():
+        return float(net(a, b, valid)[0])
+
+
+def test_it_is_the_published_formula(net: Lpips, trunk: Trunk) -> None:
+    a, b = pictures(1)
+    expected = by_formula(trunk, net.state_dict(), a, b)
+    assert expected > 0.01
+    assert distance(net, a, b) == pytest.approx(expected, rel=1e-4)
+
+
+def test_keys_and_shapes_are_the_published_ones(net: Lpips, trunk: Trunk) -> None:
+    state = net.state_dict()
+    heads = {key: tuple(value.shape) for key, value in state.items() if key.startswith("lin")}
+    assert heads == {
+        f"lin{k}.model.1.weight": (1, channels, 1, 1)
+        for k, channels in enumerate(TAPS[trunk].values())
+    }
+    others = [value.numel() for key, value in state.items() if not key.startswith("lin")]
+    assert (sum(int(np.prod(s)) for s in heads.values()), sum(others)) == NUM_VALUES[trunk]
+    assert all(key.startswith(("lin", "features.")) for key in state)
+
+
+def test_it_is_a_distance(net: Lpips) -> None:
+    a, b = pictures(2)
+    assert distance(net, a, a) == 0.0
+    assert distance(net, a, b) > 0.0
+    assert distance(net, a, b) == pytest.approx(distance(net, b, a), rel=1e-5)
+
+
+def test_invalid_pixels_do_not_count(net: Lpips) -> None:
+    a, b = pictures(3, 64, 80)
+    valid = torch.ones(1, 1, 64, 80)
+    valid[..., :32, :] = 0
+    changed = b.clone()
+    changed[..., :32, :] = torch.rand(3, 32, 80)
+    assert distance(net, a, changed, valid) == distance(net, a, b, valid)
+    assert distance(net, a, changed) != distance(net, a, b)
+    same = torch.cat([b[..., :32, :], a[..., 32:, :]], dim=2)
+    assert distance(net, a, same, valid) == 0.0
+    assert distance(net, a, same) > 0.0
+
+
+def test_smallest_images_work_and_pairs_are_independent(net: Lpips) -> None:
+    a, b = pictures(4, SMALLEST_PX, SMALLEST_PX)
+    valid = torch.ones(2, 1, SMALLEST_PX, SMALLEST_PX)
+    with torch.inference_mode():
+        together = net(torch.cat([a, b]), torch.cat([b, b]), valid)
+    assert float(together[0]) == pytest.approx(distance(net, a, b), rel=1e-4)
+    assert float(together[1]) == 0.0
+
+
+def test_checkpoints_load_strictly(net: Lpips, trunk: Trunk) -> None:
+    state = dict(net.state_dict())
+    heads = {key: state.pop(key) for key in list(state) if key.startswith("lin")}
+    # torchvision's files hold a classifier too
+    of_trunk = {**state, "classifier.1.weight": torch.zeros(3)}
+    loaded = lpips_from(trunk, of_trunk, heads, "file")
+    a, b = pictures(5)
+    assert distance(loaded, a, b) == distance(net, a, b)
+    del of_trunk["features.0.bias"]
+    with pytest.raises(DataError, match=r"missing keys: features\.0\.bias"):
+        lpips_from(trunk, of_trunk, heads, "file")
+    with pytest.raises(DataError, match=r"lin0\.model\.1\.weight"):
+        lpips_from(trunk, state, {**heads, "lin0.model.1.weight": torch.zeros(1, 9, 1, 1)}, "file")
+
+
+def test_published_heads_grow_with_blur_and_noise(trunk: Trunk, shared_data: Path) -> None:
+    heads = torch.load(
+        shared_data / "weights" / "lpips_lin" / "v0.1" / f"{trunk}.pth",
+        map_location="cpu",
+        weights_only=True,
+    )
+    assert all((value >= 0).all() for value in heads.values())
+    random = random_lpips(trunk)
+    state = {k: v for k, v in random.state_dict().items() if k.startswith("features.")}
+    net = lpips_from(trunk, state, heads, "files")
+    rng = np.random.default_rng(0)
+    image = cv2.resize(rng.uniform(0, 1, (16, 20, 3)), (80, 64), interpolation=cv2.INTER_CUBIC)
+    image = np.clip(image + 0.2 * (rng.uniform(0, 1, (64, 80, 3)) - 0.5), 0, 1)
+    noise = rng.standard_normal(image.shape)
+
+    def tensor(pixels: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(np.clip(pixels, 0, 1).transpose(2, 0, 1)[None]).float()
+
+    sharp = tensor(image)
+    blurred = [tensor(cv2.GaussianBlur(image, (0, 0), s)) for s in (0.6, 1.5, 4.0)]
+    noisy = [tensor(image + s * noise) for s in (0.02, 0.06, 0.2)]
+    for series in (blurred, noisy):
+        found = [distance(net, sharp, sharp), *(distance(net, sharp, each) for each in series)]
+        assert found[0] == 0.0
+        assert (np.diff(found) > 0).all(), found
