@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import Field
 
+from megloc_kapture.features.global_network import GlobalNetwork
 from megloc_kapture.features.image_size import sized_tensor
-from megloc_kapture.io.weights import WeightsFile, find_weights, read_weights, sha256_of
+from megloc_kapture.io.weights import WeightsFile, read_weights
 from megloc_kapture.nets.apgem import ApGemNet, Whitening, apgem_from, whitening_from
 from megloc_kapture.nets.runtime import NetworkOptions, inference, pick_device
 
@@ -41,7 +41,7 @@ class ApGemOptions(NetworkOptions):
     )
 
 
-class ApGem:
+class ApGem(GlobalNetwork):
     """AP-GeM vectors of unit length, float32 (2048,).
 
     The name tells the checkpoint and, with one, the whitening and its power: vectors of different
@@ -53,24 +53,9 @@ class ApGem:
 
     def __init__(self, options: ApGemOptions | None = None) -> None:
         self.options = options or ApGemOptions()
-        self._weights = find_weights(self.options.weights)
-        self.name = Path(self._weights.name).stem
+        super().__init__("apgem", self.options.weights)
         if self.options.whitening:
             self.name += f"-{self.options.whitening}-{self.options.whitening_power:g}"
-
-    def weights(self) -> dict[str, str]:
-        """sha256 of the checkpoint by its file's name."""
-        return {self._weights.path.name: sha256_of(self._weights)}
-
-    def describe(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """The vector, float32 (2048,), of an RGB image, uint8 (H, W, 3).
-
-        Raises
-        ------
-        DataError : the checkpoint does not fit.
-        OptionError : the device, or the whitening in the checkpoint, is not there.
-        """
-        return self.describe_many([image])[0]
 
     def describe_many(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
         """The vectors, float32 (B, 2048), of RGB images of one size, in their order."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -12,7 +11,8 @@ from numpy.typing import NDArray
 from PIL import Image
 from pydantic import Field
 
-from megloc_kapture.io.weights import WeightsFile, find_weights, read_weights, sha256_of
+from megloc_kapture.features.global_network import GlobalNetwork
+from megloc_kapture.io.weights import WeightsFile, read_weights
 from megloc_kapture.nets.delg import DelgNet, describe
 from megloc_kapture.nets.delg_variables import delg_from
 from megloc_kapture.nets.runtime import NetworkOptions, inference, pick_device
@@ -36,7 +36,7 @@ class DelgOptions(NetworkOptions):
     )
 
 
-class Delg:
+class Delg(GlobalNetwork):
     """DELG vectors of unit length, float32 (2048,)."""
 
     name = "delg"
@@ -44,23 +44,7 @@ class Delg:
 
     def __init__(self, options: DelgOptions | None = None) -> None:
         self.options = options or DelgOptions()
-        self._weights = find_weights(self.options.weights)
-        # the type's name carries the model: vectors of different ones do not compare
-        self.name = Path(self._weights.name).name.split(".")[0]
-
-    def weights(self) -> dict[str, str]:
-        """sha256 of the checkpoint by its file's name."""
-        return {self._weights.path.name: sha256_of(self._weights)}
-
-    def describe(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """The vector, float32 (2048,), of an RGB image, uint8 (H, W, 3).
-
-        Raises
-        ------
-        DataError : the checkpoint does not fit, or the image is too small.
-        OptionError : the device is not there.
-        """
-        return self.describe_many([image])[0]
+        super().__init__("delg", self.options.weights)
 
     def describe_many(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
         """The vectors, float32 (B, 2048), of RGB images of one size, in their order."""

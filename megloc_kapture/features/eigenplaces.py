@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import Field
 
+from megloc_kapture.features.global_network import GlobalNetwork
 from megloc_kapture.features.image_size import sized_tensor
-from megloc_kapture.io.weights import WeightsFile, find_weights, read_weights, sha256_of
+from megloc_kapture.io.weights import WeightsFile, read_weights
 from megloc_kapture.nets.eigenplaces import EigenPlacesNet, eigenplaces_from
 from megloc_kapture.nets.runtime import NetworkOptions, inference, pick_device
 
@@ -33,7 +33,7 @@ class EigenPlacesOptions(NetworkOptions):
     )
 
 
-class EigenPlaces:
+class EigenPlaces(GlobalNetwork):
     """EigenPlaces' vector of an image, float32 (D,), unit length; D is 2048 or the checkpoint's."""
 
     name = "eigenplaces"
@@ -41,24 +41,7 @@ class EigenPlaces:
 
     def __init__(self, options: EigenPlacesOptions | None = None) -> None:
         self.options = options or EigenPlacesOptions()
-        self._weights = find_weights(self.options.weights)
-        # the type's name carries the model: vectors of different ones cannot be compared
-        stem = Path(self._weights.name).stem
-        self.name = stem if "eigenplaces" in stem else f"eigenplaces-{stem}"
-
-    def weights(self) -> dict[str, str]:
-        """sha256 of the checkpoint by its file's name."""
-        return {self._weights.path.name: sha256_of(self._weights)}
-
-    def describe(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """The vector of an RGB image, uint8 (H, W, 3): float32 (D,), unit length.
-
-        Raises
-        ------
-        DataError : the checkpoint does not fit.
-        OptionError : the device is not there.
-        """
-        return self.describe_many([image])[0]
+        super().__init__("eigenplaces", self.options.weights)
 
     def describe_many(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
         """The vectors of images of one size, float32 (B, D); as one by one but for rounding."""

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.io.weights import WeightsFile, find_weights, read_weights, sha256_of
+from megloc_kapture.features.global_network import GlobalNetwork
+from megloc_kapture.io.weights import WeightsFile, read_weights
 from megloc_kapture.nets.dinov2 import PATCH_PX
 from megloc_kapture.nets.megaloc import MegaLocNet, megaloc_from, squared
 from megloc_kapture.nets.runtime import NetworkOptions, image_tensor, inference, pick_device
@@ -31,7 +31,7 @@ class MegaLocOptions(NetworkOptions):
     )
 
 
-class MegaLoc:
+class MegaLoc(GlobalNetwork):
     """MegaLoc's vector of an image, float32 (8448,), unit length.
 
     The image is scaled to a square, its shape is not kept: so the paper evaluates.
@@ -42,26 +42,9 @@ class MegaLoc:
 
     def __init__(self, options: MegaLocOptions | None = None) -> None:
         self.options = options or MegaLocOptions()
-        self._weights = find_weights(self.options.weights)
-        # the type's name carries what vectors must have in common to be compared
-        stem = Path(self._weights.name).stem
-        self.name = stem if stem.startswith("megaloc") else f"megaloc-{stem}"
+        super().__init__("megaloc", self.options.weights)
         if self.options.size_px != _SIZE_PX:
             self.name += f"-{self.options.size_px}px"
-
-    def weights(self) -> dict[str, str]:
-        """sha256 of the checkpoint by its file's name."""
-        return {self._weights.path.name: sha256_of(self._weights)}
-
-    def describe(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """The vector of an RGB image, uint8 (H, W, 3): float32 (8448,), unit length.
-
-        Raises
-        ------
-        DataError : the checkpoint does not fit.
-        OptionError : the device is not there.
-        """
-        return self.describe_many([image])[0]
 
     def describe_many(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
         """The vectors of images, float32 (B, 8448); as those of one by one but for rounding."""

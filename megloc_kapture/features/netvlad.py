@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -12,8 +11,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.errors import DataError
+from megloc_kapture.features.global_network import GlobalNetwork
 from megloc_kapture.features.image_size import sized_tensor
-from megloc_kapture.io.weights import WeightsFile, find_weights, read_weights, sha256_of
+from megloc_kapture.io.weights import WeightsFile, read_weights
 from megloc_kapture.nets.netvlad import STRIDE_PX, VggNetVlad, netvlad
 from megloc_kapture.nets.runtime import NetworkOptions, inference, pick_device
 
@@ -29,7 +29,7 @@ class NetVladOptions(NetworkOptions):
     )
 
 
-class NetVlad:
+class NetVlad(GlobalNetwork):
     """NetVLAD on VGG-16 with its whitening: one vector of unit length, float32 (4096,)."""
 
     name = "netvlad"
@@ -37,23 +37,7 @@ class NetVlad:
 
     def __init__(self, options: NetVladOptions | None = None) -> None:
         self.options = options or NetVladOptions()
-        self._weights = find_weights(self.options.weights)
-        # the type's name carries the model: vectors of different ones cannot be compared
-        stem = Path(self._weights.name).stem
-        self.name = stem if stem.startswith("netvlad") else f"netvlad-{stem}"
-
-    def weights(self) -> dict[str, str]:
-        """sha256 of the checkpoint by its file's name."""
-        return {self._weights.path.name: sha256_of(self._weights)}
-
-    def describe(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """The vector (4096,) of an RGB image, uint8 (H, W, 3).
-
-        Raises
-        ------
-        DataError : the checkpoint does not fit, or the image is less than 16 pixels a side.
-        """
-        return self.describe_many([image])[0]
+        super().__init__("netvlad", self.options.weights)
 
     def describe_many(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
         """The vectors (B, 4096) of RGB images of one size, each as :meth:`describe` has it."""

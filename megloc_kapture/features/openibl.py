@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -12,9 +11,10 @@ from numpy.typing import NDArray
 from PIL import Image
 from pydantic import Field
 
+from megloc_kapture.features.global_network import GlobalNetwork
 from megloc_kapture.features.image_size import sized_tensor
 from megloc_kapture.features.netvlad import netvlad_vectors
-from megloc_kapture.io.weights import WeightsFile, find_weights, read_weights, sha256_of
+from megloc_kapture.io.weights import WeightsFile, read_weights
 from megloc_kapture.nets.netvlad import STRIDE_PX, VggNetVlad, openibl
 from megloc_kapture.nets.runtime import NetworkOptions, image_tensor, pick_device
 
@@ -33,7 +33,7 @@ class OpenIblOptions(NetworkOptions):
     )
 
 
-class OpenIbl:
+class OpenIbl(GlobalNetwork):
     """OpenIBL's VGG-16 with NetVLAD and PCA: one vector of unit length, float32 (4096,)."""
 
     name = "openibl"
@@ -41,23 +41,7 @@ class OpenIbl:
 
     def __init__(self, options: OpenIblOptions | None = None) -> None:
         self.options = options or OpenIblOptions()
-        self._weights = find_weights(self.options.weights)
-        # the type's name carries the model: vectors of different ones cannot be compared
-        stem = Path(self._weights.name).stem
-        self.name = stem if stem.startswith("openibl") else f"openibl-{stem}"
-
-    def weights(self) -> dict[str, str]:
-        """sha256 of the checkpoint by its file's name."""
-        return {self._weights.path.name: sha256_of(self._weights)}
-
-    def describe(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """The vector (4096,) of an RGB image, uint8 (H, W, 3).
-
-        Raises
-        ------
-        DataError : the checkpoint does not fit, or the image is less than 16 pixels a side.
-        """
-        return self.describe_many([image])[0]
+        super().__init__("openibl", self.options.weights)
 
     def describe_many(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
         """The vectors (B, 4096) of RGB images of one size, each as :meth:`describe` has it."""

@@ -52,9 +52,9 @@ def extractor(weights: Path, **options: object) -> ApGem:
 
 def test_names_tell_the_model_and_the_whitening(weights: Path) -> None:
     assert isinstance(extractor(weights), GlobalFeatureExtractor)
-    assert extractor(weights).name == "mine-Landmarks_clean-0.25"
-    assert extractor(weights, whitening_power=0.5).name == "mine-Landmarks_clean-0.5"
-    assert extractor(weights, whitening="").name == "mine"
+    assert extractor(weights).name == "apgem-mine-Landmarks_clean-0.25"
+    assert extractor(weights, whitening_power=0.5).name == "apgem-mine-Landmarks_clean-0.5"
+    assert extractor(weights, whitening="").name == "apgem-mine"
     with pytest.raises(ValidationError, match="whitening"):
         extractor(weights, whitening="a/b")
 
