@@ -41,7 +41,9 @@ class PoseRefinementOptions(Options):
         default=(), description="pose refiners, one after another; none: poses stay"
     )
     max_references: int = Field(
-        default=8, gt=0, description="map images that look the query's way, the nearest ones"
+        default=30,
+        gt=0,
+        description="map images a refiner may choose from: that look the query's way, the nearest",
     )
 
     def refines(self) -> bool:

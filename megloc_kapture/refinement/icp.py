@@ -1,0 +1,349 @@
+"""Poses of queries that have depth, refined by geometry alone: the plugin ``icp``.
+
+The query's cloud is fitted to the map's around the estimated pose, point to plane, from coarse to
+fine, in the end with every pixel weighted by its noise. Geometry can be wrong as features can: it
+may fit the wrong wall, or slide along the right one. So the new pose counts only where it explains
+more of the query, better, from nearby, and the surfaces say where it is in every direction;
+otherwise the old one stays, with the reason.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from megloc_kapture.geometry.poses import rotation_angles_deg
+from megloc_kapture.plugins import PoseRefinement, RankingScene
+from megloc_kapture.refinement.depth_cloud import DepthCloudOptions, depth_cloud
+from megloc_kapture.refinement.icp_fit import (
+    SurfaceFit,
+    condition_number,
+    fit_covariance,
+    surface_fit,
+)
+from megloc_kapture.refinement.icp_map_cloud import MapCloudOptions, map_cloud
+from megloc_kapture.refinement.icp_registration import (
+    NORMAL_NEIGHBOURS,
+    Surface,
+    fit_to_surface,
+    surface_of,
+    thinned,
+)
+from megloc_kapture.refinement.icp_weighted import fit_weighted
+from megloc_kapture.values import Camera, Options, RigidTransform
+
+Floats = NDArray[np.float64]
+
+# coefficients of z^0, z^1, z^2 of 0.0012 + 0.0019 (z - 0.4)^2
+_STRUCTURED_LIGHT = (0.001504, -0.00152, 0.0019)
+# pixels of the query that count in the last step: more cost time and change nothing
+_MAX_PIXELS = 10000
+
+
+class IcpOptions(Options):
+    """Options of the refinement by ICP.
+
+    The finest distance is three standard deviations of a structured-light sensor's depth at the
+    end of its range; each level's is three of its voxels. The noise is that of such a sensor:
+    0.0012 + 0.0019 (z - 0.4)^2, Nguyen, Izadi and Lovell, Modeling Kinect Sensor Noise for Improved
+    3D Reconstruction and Tracking, 3DIMPVT 2012, eq. 4.
+    """
+
+    voxels_m: tuple[float, ...] = Field(
+        default=(0.1, 0.05, 0.025),
+        min_length=1,
+        description="size of the voxels both clouds are thinned to, metres, coarse to fine",
+    )
+    max_distances_m: tuple[float, ...] = Field(
+        default=(0.3, 0.15, 0.075),
+        min_length=1,
+        description="points of query and map correspond up to this distance, metres, as many as "
+        "voxels_m; the finest also says what overlaps",
+    )
+    depth: DepthCloudOptions = Field(
+        default_factory=DepthCloudOptions, description="which depths are trusted"
+    )
+    noise: tuple[float, float, float] = Field(
+        default=_STRUCTURED_LIGHT,
+        description="a, b, c of the noise a + b z + c z^2 at depth z, metres; its proportions "
+        "weight the pixels of the query",
+    )
+    max_references: int = Field(
+        default=10,
+        gt=0,
+        description="depth maps of the map, those that overlap most, one of views that are alike",
+    )
+    min_points: int = Field(
+        default=1000, ge=NORMAL_NEIGHBOURS, description="in either cloud, of the finest voxels"
+    )
+    min_overlap: float = Field(
+        default=0.5,
+        ge=0,
+        le=1,
+        description="share of the query's points that the refined pose must bring onto the map, "
+        "and that must be within the coarsest distance of it to begin with",
+    )
+    max_moved_m: float = Field(
+        default=0.3, gt=0, description="the camera's centre moves at most this far, metres"
+    )
+    max_moved_deg: float = Field(
+        default=10.0, gt=0, description="the camera turns by at most this angle, degrees"
+    )
+    max_condition: float = Field(
+        default=100.0,
+        gt=1,
+        description="greatest over least eigenvalue of the normal matrix at the coarsest level; "
+        "beyond, the surfaces do not determine the pose: a bare wall has 10000, a corridor 2000, "
+        "a furnished room 15",
+    )
+
+    @model_validator(mode="after")
+    def _coarse_to_fine(self) -> IcpOptions:
+        for name in ("voxels_m", "max_distances_m"):
+            values = getattr(self, name)
+            if min(values) <= 0 or list(values) != sorted(values, reverse=True):
+                raise ValueError(f"{name} must be positive, and fall: {values}")
+        if len(self.voxels_m) != len(self.max_distances_m):
+            raise ValueError("voxels_m and max_distances_m must have the same number of levels")
+        if (_noise(np.linspace(0.0, self.depth.max_depth_m, 256), self.noise) <= 0).any():
+            raise ValueError(f"noise is not positive at every depth: {self.noise}")
+        return self
+
+
+@dataclass(frozen=True, eq=False)
+class _Level:
+    """The map's surface and the query's points, both thinned to one size of voxels."""
+
+    surface: Surface
+    points: Floats
+    max_distance_m: float
+
+
+def refine_by_icp(
+    query_points: Floats,
+    map_points: Floats,
+    cam_from_world: RigidTransform,
+    options: IcpOptions | None = None,
+) -> PoseRefinement:
+    """Fit a query's cloud to the map's.
+
+    Parameters
+    ----------
+    query_points : float64 (N, 3) in the camera's frame, metres.
+    map_points : float64 (M, 3) in the world, metres.
+
+    Returns
+    -------
+    PoseRefinement with ``residual_before_m`` and ``residual_after_m`` (median distance from the
+    map's planes, of points that have map within the coarsest distance), ``overlap_before`` and
+    ``overlap_after`` (share of points that have map within the finest), ``moved_m``,
+    ``moved_deg`` and ``condition``, as far as it came; accepted only if residual and overlap
+    improve and every limit of the options holds. Its covariance is that of
+    :func:`~megloc_kapture.refinement.icp_fit.fit_covariance`.
+    """
+    options = options or IcpOptions()
+    # near the camera coordinates are small, whatever the world's origin
+    center = cam_from_world.center()
+    local_from_cam = RigidTransform(cam_from_world.inverse().quat_wxyz, (0.0, 0.0, 0.0))
+    fine_points = thinned(query_points, options.voxels_m[-1])
+    fine_map = thinned(map_points - center, options.voxels_m[-1])
+    if len(fine_points) < options.min_points:
+        return _kept(cam_from_world, f"the query's depth has {len(fine_points)} points only")
+    if len(fine_map) < options.min_points:
+        return _kept(cam_from_world, f"the map has {len(fine_map)} points here only")
+    levels = _levels(fine_points, fine_map, options)
+    if reason := _hopeless(levels, local_from_cam, options):
+        return _kept(cam_from_world, reason)
+    before = _fit(levels[-1], local_from_cam, options)
+    measures = {"residual_before_m": before.residual_m, "overlap_before": before.overlap}
+    pixels = query_points[:: -(-len(query_points) // _MAX_PIXELS)]
+    moved, reason = _fitted(levels, pixels, local_from_cam, options)
+    if reason:
+        return PoseRefinement(cam_from_world, reason, measures)
+    after = _fit(levels[-1], moved, options)
+    # the finest normals are noisy, which looks like structure on a bare wall
+    condition = condition_number(_fit(levels[0], moved, options))
+    moved_m, moved_deg = _movement(local_from_cam, moved)
+    measures |= {
+        "residual_after_m": after.residual_m,
+        "overlap_after": after.overlap,
+        "moved_m": moved_m,
+        "moved_deg": moved_deg,
+        "condition": condition,
+    }
+    if reason := _refusal(before, after, condition, options):
+        return PoseRefinement(cam_from_world, reason, measures)
+    x, y, z = (center + np.array(moved.translation)).tolist()
+    world_from_cam = RigidTransform(moved.quat_wxyz, (x, y, z))
+    return PoseRefinement(
+        world_from_cam.inverse(), measures=measures, covariance=fit_covariance(after)
+    )
+
+
+def _levels(fine_points: Floats, fine_map: Floats, options: IcpOptions) -> list[_Level]:
+    """Coarse to fine; the finest has the points that it is given."""
+    coarser = [
+        _Level(surface_of(thinned(fine_map, voxel_m)), thinned(fine_points, voxel_m), distance_m)
+        for voxel_m, distance_m in zip(
+            options.voxels_m[:-1], options.max_distances_m[:-1], strict=True
+        )
+    ]
+    return [*coarser, _Level(surface_of(fine_map), fine_points, options.max_distances_m[-1])]
+
+
+def _fit(level: _Level, local_from_cam: RigidTransform, options: IcpOptions) -> SurfaceFit:
+    return surface_fit(
+        level.surface,
+        level.points,
+        local_from_cam,
+        near_m=level.max_distance_m,
+        far_m=options.max_distances_m[0],
+    )
+
+
+def _hopeless(levels: Sequence[_Level], local_from_cam: RigidTransform, options: IcpOptions) -> str:
+    """Why fitting need not be tried; empty where it should be."""
+    spacing, limit = levels[-1].surface.spacing(), options.max_distances_m[-1]
+    if spacing > limit:
+        return (
+            f"the map is too sparse here: {NORMAL_NEIGHBOURS} points take {spacing:.3f} m, "
+            f"at most {limit:g} m is allowed"
+        )
+    # what has no map within the coarsest distance is not drawn anywhere
+    reach = _fit(levels[0], local_from_cam, options).reach
+    if reach < options.min_overlap:
+        return (
+            f"{100 * reach:.0f} % of the query's points are within {options.max_distances_m[0]:g} "
+            f"m of the map, at least {100 * options.min_overlap:g} % must be"
+        )
+    return ""
+
+
+def _fitted(
+    levels: Sequence[_Level], pixels: Floats, start: RigidTransform, options: IcpOptions
+) -> tuple[RigidTransform, str]:
+    """Coarse to fine by voxels, then by pixels: ``local_from_cam``, or why it is none."""
+    moved = start
+    for level in levels:
+        found = fit_to_surface(level.surface, level.points, moved, level.max_distance_m)
+        if found is None:
+            return start, "no point of the map is near the query's"
+        moved = found
+        if reason := _too_far(start, moved, options):
+            return start, reason
+    found = fit_weighted(
+        levels[-1].surface,
+        pixels,
+        _noise(pixels[:, 2], options.noise),
+        moved,
+        levels[-1].max_distance_m,
+    )
+    if found is None:
+        return start, "the surfaces do not determine the pose"
+    return found, _too_far(start, found, options)
+
+
+def _noise(depth_m: Floats, noise: tuple[float, float, float]) -> Floats:
+    a, b, c = noise
+    return a + depth_m * (b + depth_m * c)
+
+
+def _movement(start: RigidTransform, end: RigidTransform) -> tuple[float, float]:
+    """Metres and degrees between two ``local_from_cam``."""
+    moved_m = np.linalg.norm(np.subtract(end.translation, start.translation))
+    angle = rotation_angles_deg(np.array(end.quat_wxyz), np.array(start.quat_wxyz))
+    return float(moved_m), float(angle)
+
+
+def _too_far(start: RigidTransform, end: RigidTransform, options: IcpOptions) -> str:
+    moved_m, moved_deg = _movement(start, end)
+    if moved_m > options.max_moved_m:
+        return f"the pose moved by {moved_m:.3f} m, at most {options.max_moved_m:g} m is allowed"
+    if moved_deg > options.max_moved_deg:
+        return (
+            f"the pose turned by {moved_deg:.2f} deg, at most {options.max_moved_deg:g} deg "
+            "is allowed"
+        )
+    return ""
+
+
+def _refusal(before: SurfaceFit, after: SurfaceFit, condition: float, options: IcpOptions) -> str:
+    """Why a refined pose is not taken; empty where it is."""
+    if after.overlap < options.min_overlap:
+        return (
+            f"{100 * after.overlap:.0f} % of the query's points are on the map, "
+            f"at least {100 * options.min_overlap:g} % must be"
+        )
+    if condition > options.max_condition:
+        return (
+            f"the surfaces do not determine the pose: condition number {condition:.0f}, "
+            f"at most {options.max_condition:g} is allowed"
+        )
+    if after.overlap < before.overlap:
+        return f"the overlap fell from {before.overlap:.4f} to {after.overlap:.4f}"
+    if after.residual_m >= before.residual_m:
+        return (
+            f"the residual did not fall: {1e3 * before.residual_m:.2f} mm before, "
+            f"{1e3 * after.residual_m:.2f} mm after"
+        )
+    return ""
+
+
+def _kept(cam_from_world: RigidTransform, reason: str) -> PoseRefinement:
+    return PoseRefinement(cam_from_world, reason)
+
+
+class Icp:
+    """Plugin ``icp``: the query's depth against the map's depth, or its points where dense.
+
+    A map's points are dense enough where those that a normal is estimated from lie, for half of the
+    points, within the finest distance of correspondence.
+    """
+
+    name = "icp"
+    Options = IcpOptions
+
+    def __init__(self, options: IcpOptions | None = None) -> None:
+        self.options = options or IcpOptions()
+
+    def refine(
+        self,
+        query: str,
+        camera: Camera,
+        cam_from_world: RigidTransform,
+        references: Sequence[str],
+        scene: RankingScene,
+    ) -> PoseRefinement:
+        """Refine the pose of one query image; see :func:`refine_by_icp`.
+
+        Raises
+        ------
+        DataError : a depth map or mask that there should be cannot be read.
+        """
+        options = self.options
+        view = scene.query_depth(query)
+        if view is None:
+            return _kept(cam_from_world, "the query has no depth")
+        points = depth_cloud(
+            view, options.depth, image_camera=camera, image_mask=scene.query_mask(query)
+        )
+        if not len(points):
+            return _kept(cam_from_world, "the query's depth has 0 points only")
+        cloud = map_cloud(
+            view,
+            points,
+            cam_from_world,
+            references,
+            scene,
+            MapCloudOptions(
+                depth=options.depth,
+                max_references=options.max_references,
+                voxel_m=options.voxels_m[-1],
+                margin_m=options.max_distances_m[0],
+            ),
+        )
+        return refine_by_icp(points, cloud, cam_from_world, options)

@@ -1,0 +1,157 @@
+"""Refined results: what is accepted, what stays and why, and what is left alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from megloc_kapture.errors import PluginError
+from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.refinement_table import read_refinement
+from megloc_kapture.io.side_tables import ImageGroup
+from megloc_kapture.io.status_table import read_status
+from megloc_kapture.plugins import POSE_REFINERS, PluginChoice, PoseRefinement, plugin_names
+from megloc_kapture.stages.localized_folder import write_localized
+from megloc_kapture.stages.pose_refinement import PoseRefinementOptions, refine_poses
+from megloc_kapture.stages.restrictions import Restrictions
+from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
+
+SHIFT = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.25))
+
+
+class Shift:
+    """Moves every pose by 0.25 along the axis, of one image it does not."""
+
+    name = "shift"
+
+    def __init__(self, stays: str = "") -> None:
+        self.stays = stays
+        self.asked: dict[str, list[str]] = {}
+
+    def refine(
+        self,
+        query: str,
+        camera: Camera,
+        cam_from_world: RigidTransform,
+        references: Sequence[str],
+        scene: Any,
+    ) -> PoseRefinement:
+        self.asked[query] = list(references)
+        assert scene.query_image(query).shape[:2] == (camera.height, camera.width)
+        if query == self.stays:
+            return PoseRefinement(cam_from_world, "nothing overlaps", {"overlap": 0.125})
+        return PoseRefinement(SHIFT @ cam_from_world, measures={"overlap": 0.5})
+
+
+class Chosen(PoseRefinementOptions):
+    """Options with refiners of their own."""
+
+    refiners: tuple[Any, ...] = ()
+
+    def make_refiners(self) -> list[Any]:
+        return list(self.refiners)
+
+
+@pytest.fixture
+def localized(world: Any, tmp_path: Path) -> KaptureFolder:
+    """One query at its true pose, from the map's first image; the other failed."""
+    first, second = sorted(world.query_poses)
+    found = Pose(world.query_poses[first], 50, 40, candidates=(sorted(world.map_poses)[0],))
+    folder = tmp_path / "localized"
+    write_localized(folder, world.query(), [(first, found), (second, Failure("too dark"))])
+    return KaptureFolder(folder)
+
+
+def test_poses_move_by_each_refiner_in_turn_and_failures_stay(
+    world: Any, localized: KaptureFolder, tmp_path: Path
+) -> None:
+    first, second = sorted(world.query_poses)
+    refiners = (Shift(), Shift(stays=first), Shift())
+    counts = refine_poses(
+        world.mapping(), world.query(), localized, tmp_path / "out", Chosen(refiners=refiners)
+    )
+    assert counts["queries"] == 1
+    refined = KaptureFolder(tmp_path / "out").read().poses()
+    expected = SHIFT @ SHIFT @ world.query_poses[first]
+    assert refined.keys() == {first}
+    np.testing.assert_allclose(refined[first].translation, expected.translation)
+    statuses = read_status(tmp_path / "out" / "status.csv")
+    said = "shift: accepted; shift: nothing overlaps; shift: accepted"
+    assert statuses[first].refinement == said
+    assert (statuses[second].refinement, statuses[second].reason) == ("", "too dark")
+    rows = read_refinement(tmp_path / "out" / "refinement.csv")
+    assert [row.accepted for row in rows] == [True, False, True]
+    assert [row.moved_m for row in rows] == pytest.approx([0.25, 0, 0.25])
+    assert rows[1].measures == ("overlap=0.125",)
+    # what was localized is as it was
+    assert localized.read().poses()[first] == world.query_poses[first]
+
+
+def test_threads_write_the_same_bytes(
+    world: Any, localized: KaptureFolder, tmp_path: Path, folder_bytes: Any
+) -> None:
+    options = Chosen(refiners=(Shift(),))
+    arguments = (world.mapping(), world.query(), localized)
+    refine_poses(*arguments, tmp_path / "here", options)
+    with ThreadPoolExecutor(2) as executor:
+        refine_poses(*arguments, tmp_path / "there", options, executor=executor)
+    assert folder_bytes(tmp_path / "here") == folder_bytes(tmp_path / "there")
+
+
+def test_references_look_the_same_way_and_are_of_one_frame(
+    world: Any, localized: KaptureFolder, tmp_path: Path
+) -> None:
+    first = min(world.query_poses)
+    images = sorted(world.map_poses)
+    groups = {image: ImageGroup(frame="a" if k < 3 else "b") for k, image in enumerate(images)}
+    refiner = Shift()
+    refine_poses(
+        world.mapping(),
+        world.query(),
+        localized,
+        tmp_path / "out",
+        Chosen(refiners=(refiner,)),
+        restrictions=Restrictions(groups=groups),
+    )
+    assert set(refiner.asked[first]) <= set(images[:3])
+    # the image that the pose comes from is among them
+    assert images[0] in refiner.asked[first]
+
+
+def test_a_refiner_that_returns_something_else_is_refused(
+    world: Any, localized: KaptureFolder, tmp_path: Path
+) -> None:
+    class Wrong(Shift):
+        name = "wrong"
+
+        def refine(self, *arguments: Any, **more: Any) -> Any:
+            return None
+
+    with pytest.raises(PluginError, match="'wrong' on image .*: refine returned NoneType"):
+        refine_poses(
+            world.mapping(), world.query(), localized, tmp_path, Chosen(refiners=(Wrong(),))
+        )
+
+
+def test_every_registered_refiner_says_why_a_query_without_depth_stays(
+    world: Any, localized: KaptureFolder, tmp_path: Path
+) -> None:
+    first = min(world.query_poses)
+    for name in plugin_names(POSE_REFINERS):
+        options = PoseRefinementOptions(by=(PluginChoice(name=name),))
+        counts = refine_poses(world.mapping(), world.query(), localized, tmp_path / name, options)
+        assert counts[f"accepted_by_{name}"] == 0
+        row = read_refinement(tmp_path / name / "refinement.csv")[0]
+        assert "depth" in row.reason, row
+        poses = KaptureFolder(tmp_path / name).read().poses()
+        assert poses[first] == localized.read().poses()[first]
+
+
+def test_no_such_refiner() -> None:
+    with pytest.raises(PluginError, match="no plugin 'better'"):
+        PoseRefinementOptions(by=(PluginChoice(name="better"),)).make_refiners()
