@@ -197,7 +197,8 @@ def _threshold(threshold: dict[str, float | None]) -> str:
 def write_outcomes(workspace: Workspace, outcomes: Sequence[Outcome]) -> Path:
     """Write the table ``ablation/ablation.csv``; raises OutputError."""
     path = workspace.path(TABLE)
-    columns = ("run", *outcomes[0].recall, "median_m", "median_deg", "seconds")
+    thresholds = (threshold.replace(", ", " ") for threshold in outcomes[0].recall)
+    columns = ("run", *thresholds, "median_m", "median_deg", "seconds")
     rows = (
         (
             one.name,

@@ -1,0 +1,117 @@
+"""What each step adds: which runs there are, and that they leave the first one alone."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import pytest
+
+from megloc_kapture.pipeline.ablation import (
+    fresh_copy,
+    outcome,
+    outcomes_text,
+    variants,
+    write_outcomes,
+)
+from megloc_kapture.pipeline.datasets import choose_dataset
+from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
+from megloc_kapture.pipeline.plan import run_plan
+from megloc_kapture.pipeline.presets import options_of_preset
+from megloc_kapture.pipeline.run import Run
+from megloc_kapture.pipeline.workspace import Workspace
+
+
+def names(*assignments: str, preset: str = "classic") -> list[str]:
+    return [v.name for v in variants(options_of_preset(preset, assignments=assignments))]
+
+
+def test_only_steps_that_are_there_are_left_out() -> None:
+    assert names() == ["map refinement", "clusters", "pose ranking"]
+    plain = ("localization.rank.name=inliers", "localization.clusters.by=none")
+    assert names(*plain) == ["map refinement"]
+    assert names(preset="megloc") == [
+        "second local features",
+        "fusion",
+        "map refinement",
+        "reranking",
+        "guided pyramid",
+        "clusters",
+        "pose ranking",
+    ]
+    assert names('pose_refinement.by=[{name="icp"}]')[-1] == "icp"
+
+
+def test_a_variant_lacks_its_step_and_nothing_else() -> None:
+    options = options_of_preset("megloc")
+    for variant in variants(options):
+        changed = {
+            name
+            for name, value in variant.options.model_dump().items()
+            if value != options.model_dump()[name]
+        }
+        expected = {
+            "second local features": {"local_features"},
+            "fusion": {"global_features"},
+            "map refinement": {"refinement"},
+            "reranking": {"reranking", "query_pairs"},
+            "guided pyramid": {"guided_pyramid"},
+            "clusters": {"localization"},
+            "pose ranking": {"localization"},
+        }
+        assert changed == expected[variant.name]
+        assert variant.name not in [v.name for v in variants(variant.options)]
+
+
+@pytest.fixture(scope="module")
+def first(fountain: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    workspace = Workspace(tmp_path_factory.mktemp("ablation") / "workspace")
+    options = options_of_preset(
+        assignments=[
+            "local_features.options.max_keypoints=400",
+            "preprocessing.max_size_px=400",
+            "global_features.options.num_clusters=8",
+        ]
+    )
+    run = Run(choose_dataset("kapture", fountain), "classic", options, workspace)
+    with workspace.lock():
+        run_plan(plan_evaluation(run), workspace)
+    return run
+
+
+def folder_bytes(root: Path) -> dict[str, bytes]:
+    files = (path for path in root.rglob("*") if path.is_file() and not path.is_symlink())
+    return {path.relative_to(root).as_posix(): path.read_bytes() for path in files}
+
+
+def test_a_variant_runs_only_what_differs_and_leaves_the_first_run_alone(first: Run) -> None:
+    before = folder_bytes(first.workspace.root)
+    variant = next(v for v in variants(first.options) if v.name == "pose ranking")
+    workspace = fresh_copy(first.workspace, variant.slug)
+    assert workspace.root == first.workspace.root / "ablation" / "without_pose_ranking"
+    changed = Run(first.source, "classic", variant.options, workspace)
+    with workspace.lock():
+        reports = run_plan(plan_evaluation(changed), workspace)
+    again = {report.name for report in reports if report.state == "run"}
+    assert again == {"localization", "submission", "evaluation"}
+    after = folder_bytes(first.workspace.root)
+    kept = {name: content for name, content in after.items() if not name.startswith("ablation/")}
+    assert kept == before
+    # what did not change is the same file, not another with the same bytes
+    place = "map/reconstruction/points3d.txt"
+    assert workspace.path(place).samefile(first.workspace.path(place))
+
+
+def test_the_table_has_recall_medians_and_seconds(first: Run) -> None:
+    stages = plan_evaluation(first)
+    found = outcome("all steps", first.workspace, stages)
+    assert list(found.recall) == ["0.05 m, 5 deg", "0.25 m, 2 deg", "0.5 m, 5 deg", "5 m, 10 deg"]
+    assert found.recall["5 m, 10 deg"] == 1 and 0 < found.median_position_m < 0.1
+    assert found.seconds > 0
+    path = write_outcomes(first.workspace, [found, found])
+    with open(path, newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["run"] for row in rows] == ["all steps", "all steps"]
+    assert float(rows[0]["5 m 10 deg"]) == 1
+    assert float(rows[0]["median_m"]) == pytest.approx(found.median_position_m, abs=1e-6)
+    assert outcomes_text([found]).count("all steps") == 1
