@@ -44,6 +44,9 @@ class KaptureVectors:
     between reads, so any number of images will do.
     """
 
+    finite = True
+    """What is read is finite, or refused."""
+
     def __init__(self, reader: FeatureReader, images: Sequence[str]) -> None:
         self._reader = reader
         self._images = images

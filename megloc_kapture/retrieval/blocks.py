@@ -16,7 +16,8 @@ class VectorBlocks(Protocol):
     """Global descriptors of a database, of which no more than a block has to be in memory.
 
     Rows are of unit length, so that the inner product is the cosine; a zero row, of an image
-    without features, is similar to nothing.
+    without features, is similar to nothing. A source that refuses values that are not finite may
+    have an attribute ``finite = True``: its rows are not looked at again.
     """
 
     def __len__(self) -> int:

@@ -140,6 +140,7 @@ def _search(
     best = [BestRows(num_queries, min(length, num_rows)) for length in lengths]
     step = _VECTOR_ELEMENTS // max(1, *(source.dimension for source in sources))
     step = max(1, min(step, _MOST_ROWS, _BLOCK_ELEMENTS))
+    finites = [bool(getattr(source, "finite", False)) for source in sources]
     height = min(step, num_rows)
     buffers = [np.empty((height, source.dimension), dtype=np.float32) for source in sources]
     at_once = min(max(1, _BLOCK_ELEMENTS // step), num_queries)
@@ -154,11 +155,12 @@ def _search(
         if allowed is not None and not callable(permitted):
             allowed = allowed[:, left:right]
         for first in range(0, num_queries, at_once):
+            some = slice(first, first + at_once)
             matrices = [
-                _similarities(rows[first : first + at_once], block, left, out)
-                for rows, block, out in zip(vectors, blocks, products, strict=True)
+                _similarities(rows[some], block, left, out, finite)
+                for rows, block, out, finite in zip(vectors, blocks, products, finites, strict=True)
             ]
-            mask = None if allowed is None else allowed[first : first + at_once]
+            mask = None if allowed is None else allowed[some]
             for part in _parts(*matrices[0].shape):
                 fused = combine([matrix[part] for matrix in matrices])
                 for scores, ranking in zip(fused, best, strict=True):
@@ -191,12 +193,20 @@ def _similarities(
     rows: NDArray[np.float32],
     first_row: int,
     out: NDArray[np.float32],
+    finite: bool,
 ) -> NDArray[np.float32]:
-    """Inner products (q, b), in the memory of ``out``, which is flat."""
+    """Inner products (q, b), in the memory of ``out``, which is flat.
+
+    Parameters
+    ----------
+    finite : the rows are known to be.
+    """
     shape = (len(queries), len(rows))
     products = out[: shape[0] * shape[1]].reshape(shape)
     with np.errstate(over="ignore", invalid="ignore"):
         np.matmul(queries, rows.T, out=products)
+        if finite:
+            return products
         # a value that is not finite makes its whole column so, and thereby the column's sum: less
         # to look at than all values
         sums = np.ones(len(products), dtype=np.float32) @ products
