@@ -1,0 +1,382 @@
+"""Compiled loops of photometric alignment: residuals, normal equations, visibility, selection.
+
+Imported only when a pose is refined: numba costs half a second to import. A residual is
+``gain I(px) + bias - r`` of a point with value r in a reference image; I is a level of the query,
+read bilinearly where the point falls, and its derivatives are those of the bilinear interpolation:
+exactly those of the objective.
+"""
+
+# mypy: allow-untyped-defs, allow-untyped-calls, allow-untyped-decorators
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.compiling import compiled_loop
+from megloc_kapture.geometry.cameras import normalized_from_px
+from megloc_kapture.geometry.projection import (
+    distorted,
+    model_id,
+    packed_params,
+    project_point,
+)
+from megloc_kapture.values import Camera
+
+_ROWS = 256  # evaluated at a time
+
+
+def camera_of(camera: Camera) -> tuple[int, NDArray[np.float64], float]:
+    """A camera as the loops here take it: model, parameters, and how far off the axis it sees.
+
+    The last is the squared tangent of the angle.
+    """
+    across, down = np.linspace(0, camera.width, 17), np.linspace(0, camera.height, 17)
+    border = np.concatenate(
+        [
+            [(x, y) for x in across for y in down[[0, -1]]],
+            [(x, y) for x in across[[0, -1]] for y in down],
+        ]
+    )
+    reach2 = float(np.nanmax(np.square(normalized_from_px(camera, border)).sum(1)))
+    return model_id(camera), packed_params(camera), reach2
+
+
+@compiled_loop
+def _moved(r, t, points, k):
+    """Point ``k`` by a rotation and a translation."""
+    x, y, z = points[k, 0], points[k, 1], points[k, 2]
+    return (
+        r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + t[0],
+        r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + t[1],
+        r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + t[2],
+    )
+
+
+@compiled_loop
+def _shown(camera, x, y, z):
+    """Whether a camera's image reaches as far off the axis as a point lies.
+
+    A lens' polynomial holds inside the image; past its turning point it may lead back into it.
+    """
+    return z > 0.0 and x * x + y * y <= camera[2] * z * z
+
+
+@compiled_loop
+def _pixel(camera, x, y, z):
+    """Pixel of a point that is shown."""
+    params = camera[1]
+    a, b, _, _, _, _ = distorted(camera[0], params, x / z, y / z)
+    return params[0] * a + params[2], params[1] * b + params[3]
+
+
+@compiled_loop
+def _corner(valid, x, y):
+    """Row and column of the upper left of the four pixels about a place; (-1, -1) where not valid.
+
+    ``x``, ``y`` count from the centre of the first pixel.
+    """
+    h, w = valid.shape
+    # not so for NaN either
+    if not (x >= 0.0 and y >= 0.0 and x < w - 1 and y < h - 1):
+        return -1, -1
+    row, column = int(y), int(x)
+    if (
+        valid[row, column]
+        and valid[row, column + 1]
+        and valid[row + 1, column]
+        and valid[row + 1, column + 1]
+    ):
+        return row, column
+    return -1, -1
+
+
+@compiled_loop
+def read_values(values, valid, x, y, out, found):
+    """Values (N, C) at N places by bilinear interpolation, and where there are any, bool (N,)."""
+    for k in range(len(x)):
+        row, column = _corner(valid, x[k], y[k])
+        found[k] = row >= 0
+        if row < 0:
+            continue
+        a, b = x[k] - column, y[k] - row
+        for c in range(values.shape[2]):
+            top = (1.0 - a) * values[row, column, c] + a * values[row, column + 1, c]
+            low = (1.0 - a) * values[row + 1, column, c] + a * values[row + 1, column + 1, c]
+            out[k, c] = (1.0 - b) * top + b * low
+
+
+@compiled_loop
+def evaluate(
+    points,
+    values,
+    groups,
+    level,
+    valid,
+    scale_xy,
+    camera,
+    rotation,
+    translation,
+    gains,
+    biases,
+    out,
+):
+    """Residuals and what they are made of, for each point: float64 (N, C, 8), NaN where not seen.
+
+    Parameters
+    ----------
+    points : (N, 3), in the world. values : (N, C), in their reference. groups : (N,), of which
+        reference each is.
+    level, valid : (h, w, C) and (h, w), of the query; scale_xy : (2,), its pixels per pixel of the
+        camera. camera : of :func:`camera_of`.
+    rotation, translation : ``cam_from_world``.
+    gains, biases : (G, C).
+    out : filled per point and channel with the residual, its six derivatives by a left
+        perturbation of the pose, rotation first, and the query's value.
+    """
+    projected = np.empty(8)
+    for k in range(len(points)):
+        out[k, 0, 0] = math.nan
+        x, y, z = _moved(rotation, translation, points, k)
+        if not _shown(camera, x, y, z):
+            continue
+        project_point(camera[0], camera[1], x, y, z, projected)
+        px = projected[0] * scale_xy[0] - 0.5
+        py = projected[1] * scale_xy[1] - 0.5
+        i, j = _corner(valid, px, py)
+        if i < 0:
+            continue
+        a, b = px - j, py - i
+        group = groups[k]
+        for c in range(values.shape[1]):
+            v00, v01 = level[i, j, c], level[i, j + 1, c]
+            v10, v11 = level[i + 1, j, c], level[i + 1, j + 1, c]
+            top, low = (1.0 - a) * v00 + a * v01, (1.0 - a) * v10 + a * v11
+            value = (1.0 - b) * top + b * low
+            gain = gains[group, c]
+            gx = gain * scale_xy[0] * ((1.0 - b) * (v01 - v00) + b * (v11 - v10))
+            gy = gain * scale_xy[1] * (low - top)
+            d0 = gx * projected[2] + gy * projected[5]
+            d1 = gx * projected[3] + gy * projected[6]
+            d2 = gx * projected[4] + gy * projected[7]
+            out[k, c, 0] = gain * value + biases[group, c] - values[k, c]
+            # d^T (omega x p) = omega^T (p x d)
+            out[k, c, 1] = y * d2 - z * d1
+            out[k, c, 2] = z * d0 - x * d2
+            out[k, c, 3] = x * d1 - y * d0
+            out[k, c, 4] = d0
+            out[k, c, 5] = d1
+            out[k, c, 6] = d2
+            out[k, c, 7] = value
+
+
+@compiled_loop
+def normal_equations(rows, groups, squared_scale, pose, mixed, own, pose_gradient, own_gradient):
+    """Robust cost and normal equations of the residuals that :func:`evaluate` gives.
+
+    A point's squared length ``e^2`` is the mean of its squared residuals over channels; its cost is
+    Geman and McClure's ``s^2 / 2  e^2 / (s^2 + e^2)`` and its weight ``(1 + e^2 / s^2)^-2``; with
+    an infinite scale s^2 both are those of least squares.
+
+    Parameters
+    ----------
+    rows : (N, C, 8). groups : (N,).
+    pose, pose_gradient : (6, 6), its upper half, and (6,), of the pose. mixed : (G, C, 6, 2), of
+        the pose with gain and bias. own, own_gradient : (G, C, 3), gain gain, gain bias, bias bias,
+        and (G, C, 2). The sums are added to what is there.
+
+    Returns
+    -------
+    The sum of the costs, and of how many points.
+    """
+    channels = rows.shape[1]
+    cost = 0.0
+    count = 0
+    for k in range(len(rows)):
+        if math.isnan(rows[k, 0, 0]):
+            continue
+        e2 = 0.0
+        for c in range(channels):
+            e2 += rows[k, c, 0] * rows[k, c, 0]
+        e2 /= channels
+        shrink = 1.0 / (1.0 + e2 / squared_scale)
+        weight = shrink * shrink / channels
+        cost += 0.5 * e2 * shrink
+        count += 1
+        group = groups[k]
+        for c in range(channels):
+            residual = weight * rows[k, c, 0]
+            value = rows[k, c, 7]
+            own[group, c, 0] += weight * value * value
+            own[group, c, 1] += weight * value
+            own[group, c, 2] += weight
+            own_gradient[group, c, 0] += residual * value
+            own_gradient[group, c, 1] += residual
+            for i in range(6):
+                d = rows[k, c, 1 + i]
+                pose_gradient[i] += residual * d
+                d *= weight
+                mixed[group, c, i, 0] += d * value
+                mixed[group, c, i, 1] += d
+                for j in range(i, 6):
+                    pose[i, j] += d * rows[k, c, 1 + j]
+    return cost, count
+
+
+@compiled_loop
+def evaluated_equations(
+    points,
+    values,
+    groups,
+    level,
+    valid,
+    scale_xy,
+    camera,
+    rotation,
+    translation,
+    gains,
+    biases,
+    squared_scale,
+    pose,
+    mixed,
+    own,
+    pose_gradient,
+    own_gradient,
+):
+    """:func:`normal_equations` of :func:`evaluate`, by a few rows, which stay in the cache."""
+    rows = np.empty((min(len(points), _ROWS), values.shape[1], 8))
+    cost = 0.0
+    count = 0
+    for start in range(0, len(points), _ROWS):
+        stop = min(start + _ROWS, len(points))
+        some = rows[: stop - start]
+        evaluate(
+            points[start:stop],
+            values[start:stop],
+            groups[start:stop],
+            level,
+            valid,
+            scale_xy,
+            camera,
+            rotation,
+            translation,
+            gains,
+            biases,
+            some,
+        )
+        more, seen = normal_equations(
+            some, groups[start:stop], squared_scale, pose, mixed, own, pose_gradient, own_gradient
+        )
+        cost += more
+        count += seen
+    return cost, count
+
+
+@compiled_loop
+def splat_depths(points, camera, size_xy, cell_px, r, t, nearest, cells, depths):
+    """Put points into cells of an image and keep each cell's smallest depth.
+
+    Parameters
+    ----------
+    points : (N, 3), in the world. camera : of :func:`camera_of`.
+    size_xy : (2,), of the image in pixels.
+    nearest : (rows, columns), holding infinity or what other points left; updated.
+    cells, depths : (N,), filled with the flat index of a point's cell, -1 outside the image, and
+        with its depth.
+    """
+    columns = nearest.shape[1]
+    for k in range(len(points)):
+        cells[k] = -1
+        x, y, z = _moved(r, t, points, k)
+        depths[k] = z
+        if not _shown(camera, x, y, z):
+            continue
+        px, py = _pixel(camera, x, y, z)
+        if not (px >= 0.0 and py >= 0.0 and px < size_xy[0] and py < size_xy[1]):
+            continue
+        # a quotient may round up to the next cell
+        row = min(int(py / cell_px), nearest.shape[0] - 1)
+        column = min(int(px / cell_px), columns - 1)
+        cells[k] = row * columns + column
+        if z < nearest[row, column]:
+            nearest[row, column] = z
+
+
+@compiled_loop
+def strongest_per_cell(x, y, energy, wanted, cell_px, best):
+    """Of the wanted points in each cell of a level the one where ``energy`` (h, w) is largest.
+
+    Parameters
+    ----------
+    x, y : (N,), pixels of the level. wanted : bool (N,).
+    best : int64 (rows, columns), filled with the point's index, -1 where none has any energy; of
+        equals the first.
+    """
+    best[:] = -1
+    h, w = energy.shape
+    top = np.zeros(best.shape, np.float32)
+    for k in range(len(x)):
+        if not wanted[k] or not (x[k] >= 0.0 and y[k] >= 0.0 and x[k] < w and y[k] < h):
+            continue
+        value = energy[int(y[k]), int(x[k])]
+        row = min(int(y[k] / cell_px), best.shape[0] - 1)
+        column = min(int(x[k] / cell_px), best.shape[1] - 1)
+        if value > top[row, column]:
+            top[row, column] = value
+            best[row, column] = k
+
+
+@compiled_loop
+def correlations(points, values, groups, level, valid, scale_xy, camera, rotations, sums, out):
+    """Correlation of the query with the references for each of several turns of the camera.
+
+    Parameters
+    ----------
+    points : (N, 3), in the camera. The others down to ``camera`` are those of :func:`evaluate`.
+    rotations : (K, 3, 3), which turn the points.
+    sums : (G, C, 6), space to work in.
+    out : (K,), filled with the correlation over all points about the means of their reference and
+        channel, 0 where nothing is seen.
+    """
+    zero = np.zeros(3)
+    channels = values.shape[1]
+    for turn in range(len(rotations)):
+        sums[:] = 0.0
+        for k in range(len(points)):
+            x, y, z = _moved(rotations[turn], zero, points, k)
+            if not _shown(camera, x, y, z):
+                continue
+            px, py = _pixel(camera, x, y, z)
+            px, py = px * scale_xy[0] - 0.5, py * scale_xy[1] - 0.5
+            row, column = _corner(valid, px, py)
+            if row < 0:
+                continue
+            a, b = px - column, py - row
+            w00, w01, w10, w11 = (1.0 - a) * (1.0 - b), a * (1.0 - b), (1.0 - a) * b, a * b
+            for c in range(channels):
+                q = (
+                    w00 * level[row, column, c]
+                    + w01 * level[row, column + 1, c]
+                    + w10 * level[row + 1, column, c]
+                    + w11 * level[row + 1, column + 1, c]
+                )
+                r = values[k, c]
+                s = sums[groups[k], c]
+                s[0] += 1.0
+                s[1] += q
+                s[2] += r
+                s[3] += q * q
+                s[4] += r * r
+                s[5] += q * r
+        together, query, reference = 0.0, 0.0, 0.0
+        for group in range(len(sums)):
+            for c in range(channels):
+                s = sums[group, c]
+                if s[0] > 0.0:
+                    together += s[5] - s[1] * s[2] / s[0]
+                    query += s[3] - s[1] * s[1] / s[0]
+                    reference += s[4] - s[2] * s[2] / s[0]
+        product = query * reference
+        out[turn] = together / math.sqrt(product) if product > 0.0 else 0.0

@@ -1,0 +1,336 @@
+"""Refinement by rendering on the synthetic world, whose poses and depths are exact."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from megloc_kapture.datasets.synthetic.covisibility import overlap
+from megloc_kapture.datasets.synthetic.looks import Look
+from megloc_kapture.datasets.synthetic.options import SyntheticWorldOptions
+from megloc_kapture.datasets.synthetic.shots import Shot
+from megloc_kapture.datasets.synthetic.views import PlacePainter, View
+from megloc_kapture.datasets.synthetic.world import SyntheticWorld, build_world
+from megloc_kapture.errors import DataError
+from megloc_kapture.geometry.poses import rotation_angles_deg
+from megloc_kapture.plugins import DepthView, PoseRefinement, PoseRefiner
+from megloc_kapture.refinement.rendering import (
+    Rendering,
+    RenderingOptions,
+    RenderingQuery,
+    RenderingReference,
+    refine_by_rendering,
+)
+from megloc_kapture.values import Camera, RigidTransform
+
+OPTIONS = SyntheticWorldOptions(num_places=1, day_queries=2, night_queries=1)
+HERE = RigidTransform.identity()
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    query: RenderingQuery
+    truth: RigidTransform
+    references: tuple[RenderingReference, ...]
+
+
+@pytest.fixture(scope="module")
+def world() -> SyntheticWorld:
+    return build_world(OPTIONS)
+
+
+@pytest.fixture(scope="module")
+def painter(world: SyntheticWorld) -> PlacePainter:
+    return PlacePainter(world.places[0], seed=OPTIONS.seed, supersampling=OPTIONS.supersampling)
+
+
+def darkened(look: Look) -> Look:
+    """The same scene as a camera of the night sees it: a fifth of the light, its colours, noise."""
+    red, green, blue = look.white_balance
+    return replace(
+        look,
+        exposure=0.2 * look.exposure,
+        white_balance=(1.1 * red, 0.92 * green, 0.75 * blue),
+        shot_noise=2.2e-3,
+        read_noise=0.006,
+        blur_px=0.9,
+        vignetting=0.3,
+    )
+
+
+def neighbours(world: SyntheticWorld, query: Shot, count: int) -> list[Shot]:
+    views = world.coarse_views()
+    shares = {shot.name: overlap(views[query.name], views[shot.name]) for shot in world.mapping}
+    return sorted(world.mapping, key=lambda shot: -shares[shot.name])[:count]
+
+
+def reference(shot: Shot, view: View) -> RenderingReference:
+    assert view.depth_m is not None
+    depth = DepthView(shot.camera, view.depth_m, HERE)
+    return RenderingReference(view.image, shot.camera, shot.cam_from_world, depth, view.mask)
+
+
+@pytest.fixture(scope="module")
+def shots(world: SyntheticWorld) -> tuple[Shot, list[Shot]]:
+    query = next(shot for shot in world.queries if shot.condition == "day")
+    return query, neighbours(world, query, 4)
+
+
+@pytest.fixture(scope="module")
+def case(painter: PlacePainter, shots: tuple[Shot, list[Shot]]) -> Case:
+    query, near = shots
+    image = painter.draw(replace(query, look=darkened(query.look))).image
+    references = [reference(shot, painter.draw(shot, depth=True)) for shot in near]
+    return Case(RenderingQuery(image, query.camera), query.cam_from_world, tuple(references))
+
+
+def start_from(
+    truth: RigidTransform, seed: int, m: float = 0.1, deg: float = 2.0
+) -> RigidTransform:
+    rng = np.random.default_rng(seed)
+    axis, shift = rng.normal(size=3), rng.normal(size=3)
+    turn = Rotation.from_rotvec(np.radians(deg) * axis / np.linalg.norm(axis)).as_matrix()
+    rotation = turn @ truth.rotation_matrix()
+    center = truth.center() + m * shift / np.linalg.norm(shift)
+    return RigidTransform.from_matrix(rotation, -rotation @ center)
+
+
+def errors(pose: RigidTransform, truth: RigidTransform) -> tuple[float, float]:
+    """In metres and degrees."""
+    angle = rotation_angles_deg(np.array(pose.quat_wxyz), np.array(truth.quat_wxyz))
+    return float(np.linalg.norm(pose.center() - truth.center())), float(angle)
+
+
+def run(case: Case, start: RigidTransform, **options: object) -> PoseRefinement:
+    chosen = RenderingOptions.model_validate(options)
+    return refine_by_rendering(case.query, case.references, start, chosen)
+
+
+def occluded(image: NDArray[np.uint8], seed: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """The image with something in front of 30 % of it, and where it is not."""
+    height, width = image.shape[:2]
+    free = np.ones((height, width), bool)
+    free[int(0.2 * height) : int(0.9 * height), int(0.3 * width) : int(0.73 * width)] = False
+    assert 0.29 < 1 - free.mean() < 0.31
+    rng = np.random.default_rng(seed)
+    noise = cv2.GaussianBlur(rng.normal(size=image.shape), (0, 0), 3)
+    cloth = np.clip(90 + 40 * noise / noise.std(), 0, 255).astype(np.uint8)
+    return np.where(free[..., None], image, cloth), free
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_gain_colour_and_noise_of_the_night_do_not_matter(case: Case, seed: int) -> None:
+    start = start_from(case.truth, seed)
+    refined = run(case, start)
+    assert refined.accepted, refined.reason
+    m, deg = errors(refined.cam_from_world, case.truth)
+    assert m < 0.005 and deg < 0.1
+    assert refined.measures["cost_after"] < refined.measures["cost_before"]
+    assert refined.measures["moved_m"] == pytest.approx(errors(refined.cam_from_world, start)[0])
+    covariance = refined.covariance
+    assert covariance is not None
+    difference = case.truth @ refined.cam_from_world.inverse()
+    vector = np.concatenate([2 * np.array(difference.quat_wxyz[1:]), difference.translation])
+    # 22.5 is the 99.9 % quantile of six degrees of freedom; it is an estimate, so twice that
+    assert vector @ np.linalg.solve(covariance, vector) < 45
+    assert np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]) < 0.01
+
+
+def test_lamps_instead_of_the_sun_still_let_it_improve(
+    world: SyntheticWorld, painter: PlacePainter
+) -> None:
+    query = next(shot for shot in world.queries if shot.condition == "night")
+    near = [reference(s, painter.draw(s, depth=True)) for s in neighbours(world, query, 4)]
+    night = RenderingQuery(painter.draw(query).image, query.camera)
+    truth = query.cam_from_world
+    refined = refine_by_rendering(night, near, start_from(truth, 3))
+    m, deg = errors(refined.cam_from_world, truth)
+    assert refined.accepted and m < 0.05 and deg < 0.25
+
+
+def test_it_improves_behind_a_moving_object(case: Case) -> None:
+    image, free = occluded(case.query.image, 0)
+    start = start_from(case.truth, 1)
+    hidden = replace(case, query=replace(case.query, image=image))
+    refined = run(hidden, start)
+    m, deg = errors(refined.cam_from_world, case.truth)
+    assert refined.accepted and m < 0.02 and deg < 0.15
+
+
+def test_a_masked_object_changes_nothing(case: Case) -> None:
+    start = start_from(case.truth, 1)
+    found = []
+    for seed in (0, 1):
+        image, free = occluded(case.query.image, seed)
+        found.append(run(replace(case, query=replace(case.query, image=image, mask=free)), start))
+    found.append(run(replace(case, query=replace(case.query, mask=free)), start))
+    assert found[0].accepted and errors(found[0].cam_from_world, case.truth)[0] < 0.01
+    for other in found[1:]:
+        assert other.cam_from_world == found[0].cam_from_world
+        assert other.measures == found[0].measures
+
+
+def test_what_a_references_mask_hides_changes_nothing(case: Case) -> None:
+    start, found = start_from(case.truth, 2), []
+    for seed in (0, 1):
+        references = []
+        for each in case.references:
+            image, free = occluded(each.image, seed)
+            assert each.mask is not None
+            references.append(replace(each, image=image, mask=free & each.mask))
+        found.append(run(replace(case, references=tuple(references)), start))
+    assert found[0].accepted
+    assert found[0].cam_from_world == found[1].cam_from_world
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_hopeless_start_keeps_its_pose(case: Case, seed: int) -> None:
+    start = start_from(case.truth, seed, m=1.5, deg=25.0)
+    refined = run(case, start, min_overlap=0.0)
+    assert not refined.accepted and refined.reason
+    assert refined.cam_from_world is start and refined.covariance is None
+
+
+def test_each_bound_keeps_the_old_pose(case: Case) -> None:
+    start = start_from(case.truth, 0)
+    for options, reason in (
+        ({"max_translation_m": 0.05}, "would move"),
+        ({"max_rotation_deg": 1.0}, "would turn"),
+        ({"min_correlation": 0.99}, "correlate"),
+        ({"min_improvement": 0.9}, "cost improves"),
+        ({"min_overlap": 1.0}, "cover"),
+    ):
+        refined = run(case, start, **options)
+        assert reason in refined.reason and refined.cam_from_world is start
+    refined = run(case, case.truth, search_deg=0.0)
+    assert "cost improves" in refined.reason  # the truth cannot be improved by a margin
+    away = start_from(case.truth, 0, deg=180.0)
+    assert "cover" in run(case, away).reason
+
+
+def test_the_same_twice(case: Case) -> None:
+    first, second = (run(case, start_from(case.truth, 4)) for _ in range(2))
+    assert first.cam_from_world == second.cam_from_world
+    assert first.measures == second.measures
+    assert first.covariance is not None and second.covariance is not None
+    assert first.covariance.tobytes() == second.covariance.tobytes()
+
+
+def test_a_depth_camera_beside_the_image_is_honoured(
+    case: Case, painter: PlacePainter, shots: tuple[Shot, list[Shot]]
+) -> None:
+    depth_camera = Camera("PINHOLE", 320, 240, (220.0, 221.0, 160.5, 119.0))
+    depth_from_image = RigidTransform.from_matrix(
+        Rotation.from_rotvec([0.0, 0.03, 0.01]).as_matrix(), np.array([0.15, 0.02, 0.0])
+    )
+    references, careless = [], []
+    for shot, each in zip(shots[1], case.references, strict=True):
+        pose = depth_from_image @ shot.cam_from_world
+        beside = replace(shot, camera=depth_camera, cam_from_world=pose, bonnet=False)
+        depth_m = painter.draw(beside, depth=True).depth_m
+        assert depth_m is not None
+        view = DepthView(depth_camera, depth_m, depth_from_image.inverse())
+        references.append(replace(each, depth=view))
+        careless.append(replace(each, depth=replace(view, image_from_depth=HERE)))
+    start = start_from(case.truth, 5)
+    refined = run(replace(case, references=tuple(references)), start)
+    m, deg = errors(refined.cam_from_world, case.truth)
+    assert refined.accepted and m < 0.01 and deg < 0.1
+    wrong = run(replace(case, references=tuple(careless)), start)
+    assert not wrong.accepted or errors(wrong.cam_from_world, case.truth)[0] > 0.03
+
+
+@pytest.mark.parametrize("appearance", ["intensity", "gradients"])
+def test_other_appearances_find_a_day_query(
+    case: Case, painter: PlacePainter, shots: tuple[Shot, list[Shot]], appearance: str
+) -> None:
+    day = replace(case, query=replace(case.query, image=painter.draw(shots[0]).image))
+    refined = run(day, start_from(case.truth, 6), appearance=appearance)
+    m, deg = errors(refined.cam_from_world, case.truth)
+    assert refined.accepted and m < 0.02 and deg < 0.1
+
+
+def test_feature_maps_take_the_place_of_brightness(case: Case) -> None:
+    def maps(image: NDArray[np.uint8]) -> NDArray[np.float32]:
+        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+        smooth = cv2.resize(cv2.GaussianBlur(grey, (0, 0), 2.0), (320, 240))
+        down, across = np.gradient(smooth)
+        size = np.sqrt(cv2.blur(down**2 + across**2, (15, 15))) + 0.5
+        return np.stack([down / size, across / size]).astype(np.float32)
+
+    refined = refine_by_rendering(
+        case.query, case.references, start_from(case.truth, 7), features=maps
+    )
+    m, deg = errors(refined.cam_from_world, case.truth)
+    assert refined.accepted and m < 0.03 and deg < 0.15
+
+
+class Scene:
+    """Of one query and the references by name; one of them without depth."""
+
+    def __init__(self, case: Case) -> None:
+        self.case = case
+        self.asked: list[str] = []
+
+    def _reference(self, name: str) -> RenderingReference:
+        return self.case.references[int(name)]
+
+    def query_image(self, name: str) -> NDArray[np.uint8]:
+        return self.case.query.image
+
+    def query_mask(self, name: str) -> NDArray[np.bool_] | None:
+        return self.case.query.mask
+
+    def query_depth(self, name: str) -> DepthView | None:
+        return None
+
+    def map_image(self, name: str) -> NDArray[np.uint8]:
+        self.asked.append(name)
+        return self._reference(name).image
+
+    def map_mask(self, name: str) -> NDArray[np.bool_] | None:
+        return self._reference(name).mask
+
+    def map_depth(self, name: str) -> DepthView | None:
+        return None if name == "flat" else self._reference(name).depth
+
+    def map_points(self, name: str) -> NDArray[np.float64]:
+        return np.zeros((0, 3))
+
+    def map_camera(self, name: str) -> Camera:
+        return self._reference(name).camera
+
+    def map_pose(self, name: str) -> RigidTransform:
+        return self._reference(name).cam_from_world
+
+
+def refined_by_plugin(case: Case, names: Sequence[str]) -> tuple[PoseRefinement, list[str]]:
+    scene, start = Scene(case), start_from(case.truth, 0)
+    plugin = pickle.loads(pickle.dumps(Rendering(RenderingOptions(max_references=2))))
+    assert isinstance(plugin, PoseRefiner) and plugin.name == "rendering"
+    return plugin.refine("query", case.query.camera, start, names, scene), scene.asked
+
+
+def test_the_plugin_takes_the_first_references_that_have_depth(case: Case) -> None:
+    refined, asked = refined_by_plugin(case, ["flat", "0", "1", "2"])
+    assert asked == ["0", "1"]
+    direct = refine_by_rendering(case.query, case.references[:2], start_from(case.truth, 0))
+    assert refined.cam_from_world == direct.cam_from_world and refined.accepted
+
+
+def test_the_plugin_says_that_there_is_no_depth(case: Case) -> None:
+    refined, asked = refined_by_plugin(case, ["flat"])
+    assert refined.reason == "no reference image has depth" and not asked
+
+
+def test_images_of_another_size_are_refused(case: Case) -> None:
+    small = replace(case.query, image=case.query.image[:100])
+    with pytest.raises(DataError, match="does not fit a camera"):
+        refine_by_rendering(small, case.references, case.truth)
