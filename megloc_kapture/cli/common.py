@@ -67,6 +67,6 @@ class Choosing:
     """Flags that choose options."""
 
     preset: str | None = None
-    """A set of options by name: classic."""
+    """A set of options by name: classic, modern, modern-large, megloc."""
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
     """Change an option: key.key=value; may be repeated."""

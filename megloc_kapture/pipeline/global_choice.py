@@ -11,6 +11,7 @@ from megloc_kapture.plugins import (
     GlobalFeatureExtractor,
     PluginChoice,
     load_plugin,
+    plugin_names,
 )
 from megloc_kapture.stages.global_vlad import vlad_type
 
@@ -50,7 +51,18 @@ class GlobalFeaturesChoice(PluginChoice):
             raise OptionError(f"global features vlad: option {where}: {first['msg']}") from error
 
     def make(self) -> GlobalFeatureExtractor:
-        """The extractor of an image network; raises PluginError, MissingWeightsError."""
+        """The extractor of an image network.
+
+        Raises
+        ------
+        OptionError : there are no such global features.
+        PluginError, MissingWeightsError : it cannot be loaded, or refuses its options.
+        """
+        known = plugin_names(GLOBAL_FEATURES)
+        if self.name not in known:
+            raise OptionError(
+                f"unknown global features {self.name!r}; known: {', '.join([VLAD, *known])}"
+            )
         extractor: GlobalFeatureExtractor = load_plugin(GLOBAL_FEATURES, self.name, self.options)
         return extractor
 

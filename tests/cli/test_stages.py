@@ -181,7 +181,7 @@ def test_several_global_features_are_fused(
 def test_unknown_global_features_are_refused(megloc: Any, scene: Path, tmp_path: Path) -> None:
     command = ["extract-global", "-i", scene / "mapping", "-o", tmp_path / "out"]
     megloc(*command, "--features", "nothing").refused(
-        "no plugin 'nothing' in megloc_kapture.global_features; registered: "
+        "unknown global features 'nothing'; known: vlad, apgem, delg"
     )
 
 
