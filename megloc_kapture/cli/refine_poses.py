@@ -5,16 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from megloc_kapture.cli.common import Force, Input, Output, side_tables_beside
+from megloc_kapture.cli.common import Force, Input, Output
 from megloc_kapture.cli.localize import LOCALIZED
-from megloc_kapture.cli.stage_command import StageCommand
+from megloc_kapture.cli.stage_command import StageCommand, restrictions_beside
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.kapture_store import KaptureFolder
 from megloc_kapture.io.outputs import staged_output
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
 from megloc_kapture.plugins import POSE_REFINERS, plugin_names
 from megloc_kapture.stages.pose_refinement import refine_poses
-from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +44,6 @@ class RefinePoses(StageCommand):
         if not options.refines():
             names = ", ".join(plugin_names(POSE_REFINERS))
             raise OptionError(f"no pose refiner is chosen; --by takes: {names}")
-        tables = side_tables_beside(self.query)
         with (
             single_threaded(),
             staged_output(self.output, kind=LOCALIZED, force=self.force) as out,
@@ -57,7 +55,7 @@ class RefinePoses(StageCommand):
                 KaptureFolder(self.poses),
                 out,
                 options,
-                restrictions=UNRESTRICTED if tables is None else Restrictions.read(tables),
+                restrictions=restrictions_beside(self.query),
                 executor=executor,
                 track=console.track,
             )

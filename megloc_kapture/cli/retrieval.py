@@ -9,8 +9,13 @@ from typing import Annotated, Literal
 
 import tyro
 
-from megloc_kapture.cli.common import Force, Input, Output, existing, side_tables_beside
-from megloc_kapture.cli.stage_command import FeaturesDirs, StageCommand, only_type
+from megloc_kapture.cli.common import Force, Input, Output, existing
+from megloc_kapture.cli.stage_command import (
+    FeaturesDirs,
+    StageCommand,
+    only_type,
+    restrictions_beside,
+)
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder, write_pairs
 from megloc_kapture.pipeline.executors import single_threaded
@@ -23,7 +28,6 @@ from megloc_kapture.stages.global_vlad import extract_vlad, vlad_type
 from megloc_kapture.stages.image_pairs import PairingMethod, pair_map_images, pair_queries
 from megloc_kapture.stages.matches import match_pairs
 from megloc_kapture.stages.reranking import RerankingOptions, reranked
-from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,7 +130,7 @@ class PairsMapping(StageCommand):
                 mapping,
                 options,
                 retrieval=retrieval,
-                restrictions=_restrictions(self.input),
+                restrictions=restrictions_beside(self.input),
                 covisible=None if covisible is None else KaptureFolder(covisible),
             )
         _write_pairs(self.output, pairs, force=self.force)
@@ -187,7 +191,7 @@ class PairsQuery(StageCommand):
                 query,
                 options.query_pairs,
                 retrieval=retrieval,
-                restrictions=_restrictions(self.query),
+                restrictions=restrictions_beside(self.query),
             )
         if self.rerank is not None and self.matches_dir is not None:
             pairs = self._rerank(mapping, query, pairs, self.rerank, self.matches_dir, options)
@@ -245,12 +249,6 @@ def _retrieval(
     if fusion is not None:
         how = how.model_copy(update={"method": fusion})
     return Retrieval(types, fusion=how)
-
-
-def _restrictions(folder: Path) -> Restrictions:
-    """Of the dataset whose tables lie beside a kapture folder; none where there are none."""
-    tables = side_tables_beside(folder)
-    return UNRESTRICTED if tables is None else Restrictions.read(tables)
 
 
 def _write_pairs(path: Path, pairs: Sequence[ImagePair], *, force: bool) -> None:

@@ -11,13 +11,14 @@ from typing import Annotated
 
 import tyro
 
-from megloc_kapture.cli.common import Choosing, Common, Working
+from megloc_kapture.cli.common import Choosing, Common, Working, side_tables_beside
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.kapture_store import KaptureFolder
 from megloc_kapture.io.outputs import staged_output
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
 from megloc_kapture.pipeline.options import PipelineOptions
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, options_of_preset
+from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
 
 FEATURES = "features"
 
@@ -60,3 +61,9 @@ def only_type(folder: KaptureFolder, kind: str, asked: str | None) -> str:
             + ("" if types else "; give their folder with --features-dir")
         )
     return types[0]
+
+
+def restrictions_beside(folder: Path) -> Restrictions:
+    """Of the dataset whose tables lie beside a kapture folder; none where there are none."""
+    tables = side_tables_beside(folder)
+    return UNRESTRICTED if tables is None else Restrictions.read(tables)

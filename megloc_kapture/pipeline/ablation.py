@@ -17,14 +17,12 @@ from megloc_kapture.pipeline.manifests import read_manifest
 from megloc_kapture.pipeline.options import PipelineOptions
 from megloc_kapture.pipeline.plan import Stage
 from megloc_kapture.pipeline.run import EVALUATION
-from megloc_kapture.pipeline.workspace import HASHES, LOCK, PARTIAL, Workspace
+from megloc_kapture.pipeline.workspace import LOCK, PARTIAL, Workspace
 
 ABLATION, TABLE = "ablation", "ablation/ablation.csv"
 
 # of a run's stages, those that take time whatever the steps
 _BESIDE = frozenset({"import", "submission", "evaluation"})
-
-Options = PipelineOptions
 
 
 @dataclass(frozen=True)
@@ -76,36 +74,38 @@ def variants(options: PipelineOptions) -> list[Variant]:
     return found
 
 
-def _with(options: Options, **changes: object) -> Options:
+def _with(options: PipelineOptions, **changes: object) -> PipelineOptions:
     return options.model_copy(update=changes)
 
 
-def _plain_ranking(options: Options) -> Options:
+def _plain_ranking(options: PipelineOptions) -> PipelineOptions:
     rank = options.localization.rank.model_copy(update={"name": "inliers", "options": {}})
     return _with(options, localization=options.localization.model_copy(update={"rank": rank}))
 
 
-def _one_cluster(options: Options) -> Options:
+def _one_cluster(options: PipelineOptions) -> PipelineOptions:
     clusters = options.localization.clusters.model_copy(update={"by": "none"})
     return _with(
         options, localization=options.localization.model_copy(update={"clusters": clusters})
     )
 
 
-def _unranked(options: Options) -> Options:
+def _unranked(options: PipelineOptions) -> PipelineOptions:
     # as many images, the first that retrieval finds
     pairs = options.query_pairs.model_copy(update={"top_k": options.reranking.keep})
     reranking = options.reranking.model_copy(update={"by": "none"})
     return _with(options, query_pairs=pairs, reranking=reranking)
 
 
-def _nothing_rejected(options: Options) -> Options:
+def _nothing_rejected(options: PipelineOptions) -> PipelineOptions:
     depth = options.refinement.depth.model_copy(update={"max_sigmas": None})
     kind = type(options.refinement)
     return _with(options, refinement=kind(depth=depth, ply=options.refinement.ply))
 
 
-_STEPS: tuple[tuple[str, Callable[[Options], bool], Callable[[Options], Options]], ...] = (
+_STEPS: tuple[
+    tuple[str, Callable[[PipelineOptions], bool], Callable[[PipelineOptions], PipelineOptions]], ...
+] = (
     (
         "masks",
         lambda o: o.preprocessing.masks != type(o.preprocessing.masks)(),
@@ -161,7 +161,7 @@ def fresh_copy(source: Workspace, slug: str) -> Workspace:
                 if old.is_symlink():
                     new.parent.mkdir(parents=True, exist_ok=True)
                     new.symlink_to(os.readlink(old))
-                elif str(inside / name) != HASHES:
+                else:
                     hard_link(old, new)
     except OSError as error:
         raise output_error(place, error) from error

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from megloc_kapture.values import Camera, RigidTransform
 
 
 class _Images:
-    """Pixels, masks and depth of the images of one folder."""
+    """Pixels, masks, depth and points of the images of one folder; what is looked up stays."""
 
     def __init__(self, folder: KaptureFolder) -> None:
         self.folder = folder
@@ -45,9 +45,35 @@ class _Images:
         )
         return DepthView(record.camera, depth_m, record.image_from_depth)
 
+    def points(self, name: str) -> NDArray[np.float64]:
+        ids = [
+            point_ids[starts[row] : starts[row + 1]]
+            for rows, starts, point_ids in self._observed
+            if (row := rows.get(name)) is not None
+        ]
+        xyz = self.folder.points3d()[:, :3]
+        return xyz[np.unique(np.concatenate([np.zeros(0, np.int64), *ids]))]
+
     @cached_property
     def _depth_records(self) -> dict[str, DepthRecord]:
         return depth_records(self.folder.read())
+
+    @cached_property
+    def _observed(self) -> list[tuple[dict[str, int], NDArray[np.int64], NDArray[np.int64]]]:
+        """Of each keypoints type: image to its row, where each row's points begin, the points."""
+        found = []
+        for _, observed in sorted(self.folder.observations().items()):
+            order = np.argsort(observed.image_ids, kind="stable")
+            rows = {name: row for row, name in enumerate(observed.image_names)}
+            starts = np.searchsorted(observed.image_ids[order], np.arange(len(rows) + 1))
+            found.append((rows, starts, observed.point_ids[order]))
+        return found
+
+
+@lru_cache(maxsize=4)
+def _images_of(folder: KaptureFolder) -> _Images:
+    """The same for every query of a run: a folder is opened once per process."""
+    return _Images(folder)
 
 
 class KaptureScene:
@@ -66,8 +92,8 @@ class KaptureScene:
         *,
         read_query: Callable[[str], NDArray[np.uint8]] | None = None,
     ) -> None:
-        self._map = _Images(mapping)
-        self._query = None if query is None else _Images(query)
+        self._map = _images_of(mapping)
+        self._query = None if query is None else _images_of(query)
         self._read_query = read_query
 
     def query_image(self, name: str) -> NDArray[np.uint8]:
@@ -100,13 +126,7 @@ class KaptureScene:
 
     def map_points(self, name: str) -> NDArray[np.float64]:
         """Points of the map that an image observes, in the world, (N, 3); raises DataError."""
-        ids = [
-            observed.point_ids[observed.image_ids == observed.image_names.index(name)]
-            for observed in self._map.folder.observations().values()
-            if name in observed.image_names
-        ]
-        xyz = self._map.folder.points3d()[:, :3]
-        return xyz[np.unique(np.concatenate([np.zeros(0, np.int64), *ids]))]
+        return self._map.points(name)
 
     def map_camera(self, name: str) -> Camera:
         """Camera of a map image, as stored."""
