@@ -17,7 +17,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, model_validator
 
 from megloc_kapture.errors import MeglocError, PluginError
 from megloc_kapture.values import (
@@ -39,10 +39,15 @@ DATASETS = "megloc_kapture.datasets"
 
 
 class PluginChoice(Options):
-    """A plugin by its registered name, and its options."""
+    """A plugin by its registered name, and its options; a text stands for the name alone."""
 
     name: str
     options: dict[str, Any] = Field(default_factory=dict)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _named(cls, value: Any) -> Any:
+        return {"name": value} if isinstance(value, str) else value
 
 
 @runtime_checkable

@@ -89,12 +89,13 @@ class Eval(Choosing, Working, Common):
 
     def _run(self, console: Console, choice: DatasetChoice, benchmark: BenchmarkFile) -> int:
         preset = self.preset or benchmark.preset
-        options = options_of_preset(preset, changes=benchmark.options, assignments=self.set)
+        choice.check()
+        changes = benchmark.changes(query_depth=choice.has_query_depth())
+        options = options_of_preset(preset, changes=changes, assignments=self.set)
         if self.thresholds:
             parsed = [Threshold.parse(text) for text in self.thresholds]
             pairs = tuple((t.position_m, t.angle_deg) for t in parsed)
             benchmark = benchmark.model_copy(update={"thresholds": pairs})
-        choice.check()
         self._check_judging(choice)
         self._check_ablation(choice)
         place = self.workspace or Path("runs") / f"{self.dataset}-{preset}"

@@ -40,7 +40,7 @@ class RefineMap(Choosing, Working, Common):
         console = self.console()
         changes: dict[str, object] = {"refinement": {"ply": True}} if self.ply else {}
         options = options_of_preset(
-            self.preset or DEFAULT_PRESET, changes=changes, assignments=self.set
+            self.preset or DEFAULT_PRESET, changes=[changes], assignments=self.set
         ).refinement
         source = KaptureFolder(self.input, features_dirs=existing(self.features_dir))
         with (

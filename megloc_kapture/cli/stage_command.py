@@ -30,7 +30,7 @@ class StageCommand(Choosing, Working, Common):
     def options(self, changes: dict[str, object] | None = None) -> PipelineOptions:
         """The preset's options, with what the flags change."""
         return options_of_preset(
-            self.preset or DEFAULT_PRESET, changes=changes, assignments=self.set
+            self.preset or DEFAULT_PRESET, changes=[changes or {}], assignments=self.set
         )
 
     @contextmanager

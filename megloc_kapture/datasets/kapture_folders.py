@@ -62,7 +62,7 @@ def check_root(root: Path) -> Path:
 
 
 def input_files(root: Path) -> Iterator[Path]:
-    """Every file whose content an import depends on: sensors, images, masks, side tables."""
+    """Every file whose content an import depends on: sensors, images, masks, depth, side tables."""
     for part in (MAPPING, QUERY, QUERY_GT):
         sensors = root / part / "sensors"
         if not sensors.is_dir():
@@ -71,6 +71,9 @@ def input_files(root: Path) -> Iterator[Path]:
         folder = KaptureFolder(root / part)
         if part == QUERY_GT:
             continue
+        for name in folder.read().records_depth.values():
+            if folder.depth_path(name).is_file():
+                yield folder.depth_path(name)
         for image in folder.read().image_names():
             yield folder.image_path(image)
             mask = sensors / "masks" / f"{image}.png"
@@ -132,13 +135,13 @@ def import_kapture_folders(
     write_sensors(output / MAPPING, map_data)
     link_images(mapping.root, output / MAPPING)
     # a query folder with poses in it must not let a stage see them
-    write_sensors(output / QUERY, _renamed(query_data, rename, keep_poses=False))
+    write_sensors(output / QUERY, _renamed(query_data, rename, is_truth=False))
     _link_queries(query.root, output / QUERY, query_prefix)
     truth = 0
     if (root / QUERY_GT / "sensors" / "sensors.txt").is_file():
         truth_data = KaptureFolder(root / QUERY_GT).read()
         truth = len(truth_data.poses())
-        write_sensors(output / QUERY_GT, _renamed(truth_data, rename, keep_poses=True))
+        write_sensors(output / QUERY_GT, _renamed(truth_data, rename, is_truth=True))
     _write_side_tables(root, output, rename, map_data, query_data, protocol_change)
     return {
         "map_images": len(map_data.image_names()),
@@ -183,13 +186,15 @@ def prefixed(prefix: str) -> Callable[[str], str]:
     return lambda name: f"{folder}/{name}"
 
 
-def _renamed(data: KaptureData, rename: Callable[[str], str], *, keep_poses: bool) -> KaptureData:
+def _renamed(data: KaptureData, rename: Callable[[str], str], *, is_truth: bool) -> KaptureData:
+    """The queries' records under their names in the workspace, with poses or with depth."""
+    depth = {} if is_truth else data.records_depth
     return KaptureData(
         sensors=dict(data.sensors),
         rigs={rig: dict(members) for rig, members in data.rigs.items()},
-        trajectories=dict(data.trajectories) if keep_poses else {},
+        trajectories=dict(data.trajectories) if is_truth else {},
         records_camera={key: rename(name) for key, name in data.records_camera.items()},
-        records_depth={},
+        records_depth={key: rename(name) for key, name in depth.items()},
     )
 
 

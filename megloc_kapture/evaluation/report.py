@@ -17,6 +17,7 @@ from megloc_kapture.evaluation.gallery import exhibits
 from megloc_kapture.evaluation.mask_pictures import mask_pictures
 from megloc_kapture.evaluation.page import render_page
 from megloc_kapture.evaluation.recall import within
+from megloc_kapture.evaluation.refined_poses import RefinedPoses, refined_poses
 from megloc_kapture.evaluation.surroundings import Surroundings
 from megloc_kapture.evaluation.worst_queries import order_of_badness, worst_queries
 from megloc_kapture.values import RigidTransform
@@ -66,12 +67,20 @@ def render_report(
         inliers=None if inliers is None else Markup(inliers),
         views=views_of_evaluation(evaluation, map_poses, frames),
         exhibits=exhibits(worst_queries(evaluation), around, map_poses or {}),
+        refined=_refined(evaluation, around),
         masks=mask_pictures([] if around is None else around.masked),
         rows=rows[:_MAX_ROWS],
         num_hidden=max(len(rows) - _MAX_ROWS, 0),
         has_conditions=any(query.condition for query in evaluation.queries),
         has_status=any(query.num_inliers is not None for query in evaluation.queries),
     )
+
+
+def _refined(evaluation: Evaluation, around: Surroundings | None) -> RefinedPoses:
+    # a query that is called by its pair may be there several times
+    if evaluation.pairs:
+        return RefinedPoses()
+    return refined_poses(around, evaluation.estimated, evaluation.truth, evaluation.thresholds)
 
 
 def worst_first(evaluation: Evaluation) -> list[QueryRow]:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from megloc_kapture.io.cluster_table import CLUSTERS_FILE, ClusterRow, read_clusters
 from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.refinement_table import (
+    REFINEMENT_FILE,
+    RefinementRow,
+    read_refinement,
+)
 from megloc_kapture.io.side_tables import PROTOCOL_FILE, SIDE_TABLES, read_groups
 from megloc_kapture.values import RigidTransform
 
@@ -31,6 +36,7 @@ class Surroundings:
     mapping : images, cameras and poses of the map.
     frames : map image or query -> its coordinate frame, where a dataset has several.
     clusters : query -> the clusters of candidates it was tried in.
+    refinements : query -> what each step of refining its pose came to.
     masked : folders whose images have masks, with the keypoints that were found in them.
     """
 
@@ -38,6 +44,7 @@ class Surroundings:
     mapping: KaptureFolder | None = None
     frames: Mapping[str, str] = field(default_factory=dict)
     clusters: Mapping[str, Sequence[ClusterRow]] = field(default_factory=dict)
+    refinements: Mapping[str, Sequence[RefinementRow]] = field(default_factory=dict)
     masked: Sequence[KaptureFolder] = ()
 
     def map_poses(self) -> dict[str, RigidTransform]:
@@ -84,9 +91,10 @@ def surroundings_of(result: Path | str, *, mapping: Path | str | None = None) ->
 
     Raises
     ------
-    DataError : broken side tables, or a broken table of clusters.
+    DataError : broken side tables, or a broken table of clusters or of refinement.
     """
     clusters = Path(result) / CLUSTERS_FILE
+    refinement = Path(result) / REFINEMENT_FILE
     workspace = workspace_of(result)
     features = []
     if workspace is not None:
@@ -109,8 +117,16 @@ def surroundings_of(result: Path | str, *, mapping: Path | str | None = None) ->
         mapping=None if map_place is None else KaptureFolder(map_place, features_dirs=features),
         frames={image: group.frame for image, group in groups.items() if group.frame},
         clusters=read_clusters(clusters) if clusters.is_file() else {},
+        refinements=_by_image(read_refinement(refinement)) if refinement.is_file() else {},
         masked=[] if workspace is None else _masked(workspace),
     )
+
+
+def _by_image(rows: Iterable[RefinementRow]) -> dict[str, list[RefinementRow]]:
+    found: dict[str, list[RefinementRow]] = {}
+    for row in rows:
+        found.setdefault(row.image, []).append(row)
+    return found
 
 
 def _masked(workspace: Path) -> list[KaptureFolder]:

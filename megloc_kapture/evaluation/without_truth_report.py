@@ -10,6 +10,7 @@ from megloc_kapture.evaluation.figure_style import colors_of
 from megloc_kapture.evaluation.gallery import exhibits
 from megloc_kapture.evaluation.mask_pictures import mask_pictures
 from megloc_kapture.evaluation.page import render_page
+from megloc_kapture.evaluation.refined_poses import refined_poses
 from megloc_kapture.evaluation.surroundings import Surroundings
 from megloc_kapture.evaluation.without_truth import WithoutTruth
 from megloc_kapture.evaluation.worst_queries import doubtful_queries
@@ -43,6 +44,10 @@ def render_without_truth(
         ],
         exhibits=[
             exhibits(doubtful_queries(result), place, map_poses or {})
+            for result, place in zip(found.results, places, strict=True)
+        ],
+        refined=[
+            refined_poses(place, result.poses)
             for result, place in zip(found.results, places, strict=True)
         ],
         masks=[mask_pictures(place.masked) for place in places],

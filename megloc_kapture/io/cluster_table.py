@@ -11,6 +11,7 @@ from pydantic import Field, ValidationError
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.csv_table import read_csv_table, write_csv_table
 from megloc_kapture.io.json_model import first_problem
+from megloc_kapture.io.pose_cells import pose_cell, read_pose_cell
 from megloc_kapture.values import ClusterPose, Options, RigidTransform
 
 CLUSTERS_FILE = "clusters.csv"
@@ -72,7 +73,7 @@ def write_clusters(
             "" if cluster.score is None else f"{cluster.score:.6g}",
             cluster.reason,
             _SEPARATOR.join(cluster.images),
-            _pose_text(cluster.cam_from_world),
+            pose_cell(cluster.cam_from_world),
         )
         for image, clusters, chosen in sorted(rows, key=lambda row: row[0])
         for number, cluster in enumerate(clusters)
@@ -92,30 +93,12 @@ def read_clusters(path: Path | str) -> dict[str, list[ClusterRow]]:
         values: dict[str, object] = dict(row)
         values["score"] = row["score"] or None
         values["images"] = tuple(row["images"].split(_SEPARATOR)) if row["images"] else ()
-        values["cam_from_world"] = _pose(row["cam_from_world"], path, line)
+        values["cam_from_world"] = read_pose_cell(
+            row["cam_from_world"], "cam_from_world", path=path, line=line
+        )
         try:
             found = ClusterRow.model_validate(values)
         except ValidationError as error:
             raise DataError(first_problem(error), path=path, line=line) from error
         clusters.setdefault(found.image, []).append(found)
     return clusters
-
-
-def _pose_text(pose: RigidTransform | None) -> str:
-    """Quaternion, w first, and translation, as pose files have them; empty without a pose."""
-    if pose is None:
-        return ""
-    return " ".join(repr(float(value)) for value in (*pose.quat_wxyz, *pose.translation))
-
-
-def _pose(text: str, path: Path | str, line: int) -> RigidTransform | None:
-    if not text:
-        return None
-    try:
-        w, x, y, z, *translation = (float(value) for value in text.split(" "))
-        a, b, c = translation
-    except ValueError:
-        raise DataError(
-            f"cam_from_world {text!r} is not qw qx qy qz tx ty tz", path=path, line=line
-        ) from None
-    return RigidTransform((w, x, y, z), (a, b, c))

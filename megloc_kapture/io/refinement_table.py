@@ -8,9 +8,11 @@ from pathlib import Path
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.csv_table import read_csv_table, write_csv_table
+from megloc_kapture.io.pose_cells import pose_cell, read_pose_cell
+from megloc_kapture.values import RigidTransform
 
 REFINEMENT_FILE = "refinement.csv"
-_COLUMNS = ("image", "method", "accepted", "reason", "moved_m", "turned_deg", "measures")
+_COLUMNS = ("image", "method", "accepted", "reason", "moved_m", "turned_deg", "measures", "before")
 
 
 @dataclass(frozen=True)
@@ -22,6 +24,7 @@ class RefinementRow:
     reason : why the old pose stays; empty where the new one is accepted.
     moved_m, turned_deg : of the new pose against the old, unit of the map; 0 where it stays.
     measures : ``name=value`` texts, e.g. of residuals before and after.
+    before : ``cam_from_world`` that the refiner was given.
     """
 
     image: str
@@ -30,6 +33,7 @@ class RefinementRow:
     moved_m: float
     turned_deg: float
     measures: tuple[str, ...]
+    before: RigidTransform
 
     @property
     def accepted(self) -> bool:
@@ -53,6 +57,7 @@ def write_refinement(path: Path, rows: Iterable[RefinementRow]) -> None:
             f"{row.moved_m:.6f}",
             f"{row.turned_deg:.6f}",
             ";".join(row.measures),
+            pose_cell(row.before),
         )
         for row in sorted(rows, key=lambda row: row.image)
     )
@@ -73,7 +78,12 @@ def read_refinement(path: Path | str) -> list[RefinementRow]:
         except ValueError:
             raise DataError("moved_m and turned_deg are numbers", path=path, line=line) from None
         measures = tuple(row["measures"].split(";")) if row["measures"] else ()
-        found = RefinementRow(row["image"], row["method"], row["reason"], moved, turned, measures)
+        before = read_pose_cell(row["before"], "before", path=path, line=line)
+        if before is None:
+            raise DataError("before is empty, a pose is expected", path=path, line=line)
+        found = RefinementRow(
+            row["image"], row["method"], row["reason"], moved, turned, measures, before
+        )
         if row["accepted"] != ("yes" if found.accepted else "no"):
             raise DataError(
                 f"accepted {row['accepted']!r} and reason {row['reason']!r} contradict each other",

@@ -39,6 +39,7 @@ class BenchmarkFile(Options):
     ----------
     import_options : the adapter's.
     options : changes to the preset.
+    options_with_query_depth : further ones, where the queries come with depth maps of their own.
     thresholds, conditions, pools : instead of the dataset's own (see the side tables' Protocol).
     published : what others have reached.
     """
@@ -50,7 +51,12 @@ class BenchmarkFile(Options):
     pools: dict[str, tuple[str, ...]] | None = None
     import_options: dict[str, Any] = Field(default_factory=dict)
     options: dict[str, Any] = Field(default_factory=dict)
+    options_with_query_depth: dict[str, Any] = Field(default_factory=dict)
     published: tuple[PublishedResult, ...] = ()
+
+    def changes(self, *, query_depth: bool) -> list[dict[str, Any]]:
+        """Changes to the preset, in order, for data whose queries have depth or not."""
+        return [self.options, *([self.options_with_query_depth] if query_depth else [])]
 
     def change(self, protocol: Protocol) -> Protocol:
         """A dataset's protocol with what this file wants different."""

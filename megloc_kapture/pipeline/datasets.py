@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from megloc_kapture.datasets.kapture_folders import (
+    QUERY,
     QUERY_GT,
     check_root,
     import_kapture_folders,
@@ -23,6 +24,7 @@ from megloc_kapture.datasets.official import OfficialDataset, write_official
 from megloc_kapture.errors import OptionError, PluginError
 from megloc_kapture.evaluation.protocols import TWIN_PREFIX
 from megloc_kapture.io.atomic import write_bytes
+from megloc_kapture.io.kapture_store import KaptureFolder
 from megloc_kapture.io.side_tables import SIDE_TABLES, Protocol
 from megloc_kapture.plugins import DATASETS, DatasetAdapter, load_plugin, plugin_names
 from megloc_kapture.stages.parallel import Track
@@ -79,6 +81,17 @@ class DatasetChoice:
         if self.root is None or self.adapter is not None:
             return True
         return (self.root / QUERY_GT / "sensors" / "sensors.txt").is_file()
+
+    def has_query_depth(self) -> bool:
+        """Whether the queries come with depth maps; those of official datasets have none.
+
+        Raises
+        ------
+        DataError : the queries' folder is broken.
+        """
+        if self.root is None or self.adapter is not None:
+            return False
+        return bool(KaptureFolder(self.root / QUERY).read().records_depth)
 
     def settings(self) -> dict[str, Any]:
         """What, beside the files, determines an import."""

@@ -87,12 +87,9 @@ class PipelineOptions(Options):
 
     @field_validator("local_features", "global_features", mode="before")
     @classmethod
-    def _named(cls, value: Any) -> Any:
-        """A name alone stands for its choice, and one choice for a list of one."""
-        several = [value] if isinstance(value, str | dict) else value
-        if not isinstance(several, list | tuple):
-            return value
-        return tuple({"name": one} if isinstance(one, str) else one for one in several)
+    def _several(cls, value: Any) -> Any:
+        """One choice stands for a list of one."""
+        return (value,) if isinstance(value, str | dict) else value
 
     def make_extractors(self) -> list[LocalFeatureExtractor]:
         """The extractors of local features, in order; raises PluginError, MissingWeightsError."""

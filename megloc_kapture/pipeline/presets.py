@@ -67,10 +67,10 @@ DEFAULT_PRESET = "classic"
 def options_of_preset(
     preset: str = DEFAULT_PRESET,
     *,
-    changes: dict[str, Any] | None = None,
+    changes: Sequence[dict[str, Any]] = (),
     assignments: Sequence[str] = (),
 ) -> PipelineOptions:
-    """A preset's options with changes: nested tables, then ``key.key=value`` assignments.
+    """A preset's options with changes: nested tables in order, then ``key.key=value`` texts.
 
     Raises
     ------
@@ -79,7 +79,8 @@ def options_of_preset(
     if preset not in PRESETS:
         raise OptionError(f"unknown preset {preset!r}; known: {', '.join(PRESETS)}")
     tree = PRESETS[preset].model_dump()
-    _merge(tree, changes or {})
+    for change in changes:
+        _merge(tree, change)
     _merge(tree, assigned(assignments))
     try:
         return PipelineOptions.model_validate(tree)

@@ -213,4 +213,5 @@ def _row(
         moved_m=float(np.linalg.norm(after.center() - before.center())),
         turned_deg=float(turned_deg),
         measures=tuple(f"{name}={value:.6g}" for name, value in refined.measures.items()),
+        before=before,
     )

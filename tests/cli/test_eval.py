@@ -5,16 +5,19 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from megloc_kapture.io.depth_maps import write_depth_map
 from megloc_kapture.io.images import write_image
-from megloc_kapture.io.kapture_store import KaptureFolder, read_pairs
+from megloc_kapture.io.kapture_store import KaptureFolder, Sensor, read_pairs, write_sensors
 from megloc_kapture.io.status_table import read_status
 from megloc_kapture.pipeline.workspace import Workspace
+from megloc_kapture.values import RigidTransform
 
 Contents = Callable[[Path], dict[str, bytes]]
 
@@ -240,6 +243,30 @@ def test_a_dry_run_says_what_would_run_and_why(
     assert told["query_pairs"] == "would run (options changed: query_pairs.top_k)"
     assert told["localization"].startswith("would run (")
     assert contents(workspace) == before
+
+
+def test_queries_with_depth_are_refined_and_others_are_not(
+    evaluate: Any, dataset: Path, tmp_path: Path
+) -> None:
+    assert "refine_poses" not in evaluate(dataset, tmp_path / "run", "--dry-run").err
+    folder = KaptureFolder(dataset / "query")
+    data = folder.read()
+    (timestamp, camera), *_ = data.records_camera
+    depth = Sensor.from_camera(data.sensors[camera].camera(), name="tof", sensor_type="depth")
+    rig = {sensor: RigidTransform.identity() for sensor in (camera, "tof")}
+    with_depth = replace(
+        data,
+        sensors={**data.sensors, "tof": depth},
+        rigs={"rig": rig},
+        records_depth={(timestamp, "tof"): "a.depth"},
+    )
+    write_sensors(dataset / "query", with_depth)
+    size = depth.camera()
+    write_depth_map(folder.depth_path("a.depth"), np.ones((size.height, size.width)))
+    told = evaluate(dataset, tmp_path / "run", "--dry-run").err.splitlines()
+    assert "refine_poses: would run (not done yet)" in told
+    off = evaluate(dataset, tmp_path / "run", "--dry-run", "--set", "pose_refinement.by=[]")
+    assert "refine_poses" not in off.err
 
 
 def test_until_stops_behind_a_stage(evaluate: Any, scene: Path, tmp_path: Path) -> None:

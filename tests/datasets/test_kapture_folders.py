@@ -94,6 +94,26 @@ def test_what_is_imported(root: Path, tmp_path: Path) -> None:
     assert sorted(path.name for path in (out / "megloc").iterdir()) == ["protocol.json"]
 
 
+@pytest.mark.parametrize("prefix", ["", "q"])
+def test_queries_keep_their_depth(root: Path, tmp_path: Path, prefix: str) -> None:
+    data = KaptureFolder(root / "query").read()
+    data.sensors["depth"] = Sensor.from_camera(CAMERA, sensor_type="depth")
+    data.rigs["rig"] = {name: RigidTransform.identity() for name in ("cam", "depth")}
+    data.records_depth[0, "depth"] = "b/q.depth"
+    write_sensors(root / "query", data)
+    depth = root / "query/sensors/records_data/b/q.depth"
+    before = set(input_files(root))
+    depth.write_bytes(np.ones((6, 8), np.float32).tobytes())
+    # another depth map is another data set
+    assert set(input_files(root)) - before == {depth}
+    import_kapture_folders(root, tmp_path / "out", query_prefix=prefix)
+    query = KaptureFolder(tmp_path / "out" / "query")
+    (name,) = query.read().records_depth.values()
+    assert query.depth_path(name).read_bytes() == depth.read_bytes()
+    assert query.read().poses() == {}
+    assert KaptureFolder(tmp_path / "out" / "query_gt").read().records_depth == {}
+
+
 def test_without_truth(root: Path, tmp_path: Path) -> None:
     (root / "query_gt/sensors/sensors.txt").unlink()
     assert import_kapture_folders(root, tmp_path / "out")["queries_with_truth"] == 0

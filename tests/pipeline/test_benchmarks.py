@@ -20,18 +20,22 @@ def test_a_benchmark_file(tmp_path: Path) -> None:
     path.write_text(
         'dataset = "kapture"\nthresholds = [[0.25, 2], [0.5, 5]]\n'
         "[options.query_pairs]\ntop_k = 9\n"
+        "[options_with_query_depth.pose_refinement]\nby = ['icp']\n"
     )
     benchmark = read_benchmark(path)
     assert benchmark.thresholds == ((0.25, 2.0), (0.5, 5.0))
-    options = options_of_preset(benchmark.preset, changes=benchmark.options)
-    assert options.query_pairs.top_k == 9
+    for query_depth, refiners in ((False, []), (True, ["icp"])):
+        changes = benchmark.changes(query_depth=query_depth)
+        options = options_of_preset(benchmark.preset, changes=changes)
+        assert options.query_pairs.top_k == 9
+        assert [one.name for one in options.pose_refinement.by] == refiners
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
 def test_our_own_benchmark_files_are_good(path: Path) -> None:
     benchmark = read_benchmark(path)
     assert benchmark.dataset == path.stem
-    options_of_preset(benchmark.preset, changes=benchmark.options)
+    options_of_preset(benchmark.preset, changes=benchmark.changes(query_depth=True))
     benchmark.change(Protocol())
     if benchmark.import_options:
         choose_dataset(benchmark.dataset, Path(), import_options=benchmark.import_options)

@@ -41,7 +41,7 @@ def localized(folder: Path, changes: Sequence[str]) -> Workspace:
     source = choose_dataset(dataset, None, import_options=benchmark.import_options)
     source = replace(source, twin=twin_of("robotcar", **SMALL))
     cheap = ["local_features.options.max_keypoints=1500", "global_features.options.num_clusters=32"]
-    options = options_of_preset(changes=benchmark.options, assignments=[*cheap, *changes])
+    options = options_of_preset(changes=[benchmark.options], assignments=[*cheap, *changes])
     workspace = Workspace(folder)
     with workspace.lock(), single_threaded(), open_executor("processes", 2) as executor:
         run = Run(source, "classic", options, workspace, benchmark, executor=executor)

@@ -20,19 +20,21 @@ def test_a_preset_unchanged_is_the_preset() -> None:
 def test_assignments_and_tables_build_the_same() -> None:
     changes = {"matching": {"options": {"max_ratio": 0.9}}, "query_pairs": {"top_k": 5}}
     assignments = ["matching.options.max_ratio=0.9", "query_pairs.top_k = 5"]
-    options = options_of_preset(changes=changes)
+    options = options_of_preset(changes=[changes])
     assert options == options_of_preset(assignments=assignments)
     assert options.matching.options == {"max_ratio": 0.9}
     assert options.matching.name == "nn"
     assert options.query_pairs.top_k == 5
 
 
-def test_the_last_assignment_counts_and_beats_the_table() -> None:
+def test_the_last_assignment_counts_and_beats_the_tables() -> None:
     options = options_of_preset(
-        changes={"query_pairs": {"top_k": 5}},
+        changes=[{"query_pairs": {"top_k": 4}}, {"query_pairs": {"top_k": 5}}],
         assignments=["query_pairs.top_k=6", "query_pairs.top_k=7"],
     )
     assert options.query_pairs.top_k == 7
+    tables = [{"query_pairs": {"top_k": 4}}, {"query_pairs": {"top_k": 5}}]
+    assert options_of_preset(changes=tables).query_pairs.top_k == 5
 
 
 @pytest.mark.parametrize(

@@ -52,7 +52,7 @@ def finished(
         "local_features.options.max_keypoints=1500",
         "global_features.options.num_clusters=32",
     ]
-    options = options_of_preset(changes=benchmark.options, assignments=changes)
+    options = options_of_preset(changes=[benchmark.options], assignments=changes)
 
     def again() -> list[Any]:
         with workspace.lock(), single_threaded(), open_executor("processes", 2) as executor:
