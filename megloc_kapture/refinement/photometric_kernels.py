@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from megloc_kapture.compiling import compiled_loop
 from megloc_kapture.geometry.cameras import normalized_from_px
 from megloc_kapture.geometry.projection import (
+    PINHOLES,
     distorted,
     model_id,
     packed_params,
-    project_point,
 )
 from megloc_kapture.values import Camera
 
@@ -45,67 +45,82 @@ def camera_of(camera: Camera) -> tuple[int, NDArray[np.float64], float]:
 
 
 @compiled_loop
-def _moved(r, t, points, k):
-    """Point ``k`` by a rotation and a translation."""
-    x, y, z = points[k, 0], points[k, 1], points[k, 2]
-    return (
-        r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + t[0],
-        r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + t[1],
-        r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + t[2],
-    )
+def _project(camera, r, t, points, places):
+    """Points in the camera of pose ``r``, ``t``, and where its image shows them.
 
+    A lens' polynomial holds inside the image; past its turning point it may lead back into it. So a
+    point is shown only as far off the axis as the image reaches.
 
-@compiled_loop
-def _shown(camera, x, y, z):
-    """Whether a camera's image reaches as far off the axis as a point lies.
-
-    A lens' polynomial holds inside the image; past its turning point it may lead back into it.
+    Parameters
+    ----------
+    places : (11, N or more), filled with the points' coordinates there; px and py, NaN where not
+        shown; and the derivatives of px by these coordinates, and of py.
     """
-    return z > 0.0 and x * x + y * y <= camera[2] * z * z
-
-
-@compiled_loop
-def _pixel(camera, x, y, z):
-    """Pixel of a point that is shown."""
-    params = camera[1]
-    a, b, _, _, _, _ = distorted(camera[0], params, x / z, y / z)
-    return params[0] * a + params[2], params[1] * b + params[3]
+    model, p, reach2 = camera
+    for k in range(len(points)):
+        a, b, c = points[k, 0], points[k, 1], points[k, 2]
+        x = r[0, 0] * a + r[0, 1] * b + r[0, 2] * c + t[0]
+        y = r[1, 0] * a + r[1, 1] * b + r[1, 2] * c + t[1]
+        z = r[2, 0] * a + r[2, 1] * b + r[2, 2] * c + t[2]
+        shown = (z > 0.0) & (x * x + y * y <= reach2 * z * z)
+        inverse = 1.0 / z
+        fx, fy = p[0] * inverse, p[1] * inverse
+        places[0, k], places[1, k], places[2, k] = x, y, z
+        # those of a pinhole, by the dozen
+        places[3, k] = fx * x + p[2] if shown else math.nan
+        places[4, k] = fy * y + p[3] if shown else math.nan
+        places[5, k], places[6, k], places[7, k] = fx, 0.0, -fx * x * inverse
+        places[8, k], places[9, k], places[10, k] = 0.0, fy, -fy * y * inverse
+    if model <= PINHOLES:
+        return
+    for k in range(len(points)):
+        if math.isnan(places[3, k]):
+            continue
+        inverse = 1.0 / places[2, k]
+        u, v = places[0, k] * inverse, places[1, k] * inverse
+        a, b, au, av, bu, bv = distorted(model, p, u, v)
+        fx, fy = p[0] * inverse, p[1] * inverse
+        places[3, k], places[4, k] = p[0] * a + p[2], p[1] * b + p[3]
+        places[5, k], places[6, k], places[7, k] = fx * au, fx * av, -fx * (au * u + av * v)
+        places[8, k], places[9, k], places[10, k] = fy * bu, fy * bv, -fy * (bu * u + bv * v)
 
 
 @compiled_loop
 def _corner(valid, x, y):
-    """Row and column of the upper left of the four pixels about a place; (-1, -1) where not valid.
+    """Row and column of the upper left of the four pixels about a place, and how far it is off it.
 
-    ``x``, ``y`` count from the centre of the first pixel.
+    ``x``, ``y`` count from the centre of the first pixel. Row and column are -1 where not all four
+    are valid.
     """
     h, w = valid.shape
     # not so for NaN either
-    if not (x >= 0.0 and y >= 0.0 and x < w - 1 and y < h - 1):
-        return -1, -1
-    row, column = int(y), int(x)
-    if (
-        valid[row, column]
-        and valid[row, column + 1]
-        and valid[row + 1, column]
-        and valid[row + 1, column + 1]
-    ):
-        return row, column
-    return -1, -1
+    if x >= 0.0 and y >= 0.0 and x < w - 1 and y < h - 1:
+        i, j = int(y), int(x)
+        if valid[i, j] and valid[i, j + 1] and valid[i + 1, j] and valid[i + 1, j + 1]:
+            return i, j, x - j, y - i
+    return -1, -1, 0.0, 0.0
+
+
+@compiled_loop
+def _read(values, row, column, a, b, c):
+    """Channel ``c`` at a place that :func:`_corner` gave, and its derivatives by x and y."""
+    v00, v01 = values[row, column, c], values[row, column + 1, c]
+    v10, v11 = values[row + 1, column, c], values[row + 1, column + 1, c]
+    top, low = (1.0 - a) * v00 + a * v01, (1.0 - a) * v10 + a * v11
+    value = (1.0 - b) * top + b * low
+    return value, (1.0 - b) * (v01 - v00) + b * (v11 - v10), low - top
 
 
 @compiled_loop
 def read_values(values, valid, x, y, out, found):
     """Values (N, C) at N places by bilinear interpolation, and where there are any, bool (N,)."""
     for k in range(len(x)):
-        row, column = _corner(valid, x[k], y[k])
+        row, column, a, b = _corner(valid, x[k], y[k])
         found[k] = row >= 0
         if row < 0:
             continue
-        a, b = x[k] - column, y[k] - row
         for c in range(values.shape[2]):
-            top = (1.0 - a) * values[row, column, c] + a * values[row, column + 1, c]
-            low = (1.0 - a) * values[row + 1, column, c] + a * values[row + 1, column + 1, c]
-            out[k, c] = (1.0 - b) * top + b * low
+            out[k, c] = _read(values, row, column, a, b, c)[0]
 
 
 @compiled_loop
@@ -136,40 +151,37 @@ def evaluate(
     out : filled per point and channel with the residual, its six derivatives by a left
         perturbation of the pose, rotation first, and the query's value.
     """
-    projected = np.empty(8)
-    for k in range(len(points)):
-        out[k, 0, 0] = math.nan
-        x, y, z = _moved(rotation, translation, points, k)
-        if not _shown(camera, x, y, z):
-            continue
-        project_point(camera[0], camera[1], x, y, z, projected)
-        px = projected[0] * scale_xy[0] - 0.5
-        py = projected[1] * scale_xy[1] - 0.5
-        i, j = _corner(valid, px, py)
-        if i < 0:
-            continue
-        a, b = px - j, py - i
-        group = groups[k]
-        for c in range(values.shape[1]):
-            v00, v01 = level[i, j, c], level[i, j + 1, c]
-            v10, v11 = level[i + 1, j, c], level[i + 1, j + 1, c]
-            top, low = (1.0 - a) * v00 + a * v01, (1.0 - a) * v10 + a * v11
-            value = (1.0 - b) * top + b * low
-            gain = gains[group, c]
-            gx = gain * scale_xy[0] * ((1.0 - b) * (v01 - v00) + b * (v11 - v10))
-            gy = gain * scale_xy[1] * (low - top)
-            d0 = gx * projected[2] + gy * projected[5]
-            d1 = gx * projected[3] + gy * projected[6]
-            d2 = gx * projected[4] + gy * projected[7]
-            out[k, c, 0] = gain * value + biases[group, c] - values[k, c]
-            # d^T (omega x p) = omega^T (p x d)
-            out[k, c, 1] = y * d2 - z * d1
-            out[k, c, 2] = z * d0 - x * d2
-            out[k, c, 3] = x * d1 - y * d0
-            out[k, c, 4] = d0
-            out[k, c, 5] = d1
-            out[k, c, 6] = d2
-            out[k, c, 7] = value
+    channels = values.shape[1]
+    places = np.empty((11, min(len(points), _ROWS)))
+    for start in range(0, len(points), _ROWS):
+        stop = min(start + _ROWS, len(points))
+        _project(camera, rotation, translation, points[start:stop], places)
+        for k in range(start, stop):
+            n = k - start
+            px, py = places[3, n] * scale_xy[0] - 0.5, places[4, n] * scale_xy[1] - 0.5
+            row, column, a, b = _corner(valid, px, py)
+            if row < 0:
+                for c in range(channels):
+                    out[k, c, 0] = math.nan
+                continue
+            x, y, z = places[0, n], places[1, n], places[2, n]
+            group = groups[k]
+            for c in range(channels):
+                value, by_x, by_y = _read(level, row, column, a, b, c)
+                gain = gains[group, c]
+                gx, gy = gain * scale_xy[0] * by_x, gain * scale_xy[1] * by_y
+                d0 = gx * places[5, n] + gy * places[8, n]
+                d1 = gx * places[6, n] + gy * places[9, n]
+                d2 = gx * places[7, n] + gy * places[10, n]
+                out[k, c, 0] = gain * value + biases[group, c] - values[k, c]
+                # d^T (omega x p) = omega^T (p x d)
+                out[k, c, 1] = y * d2 - z * d1
+                out[k, c, 2] = z * d0 - x * d2
+                out[k, c, 3] = x * d1 - y * d0
+                out[k, c, 4] = d0
+                out[k, c, 5] = d1
+                out[k, c, 6] = d2
+                out[k, c, 7] = value
 
 
 @compiled_loop
@@ -267,7 +279,14 @@ def evaluated_equations(
             some,
         )
         more, seen = normal_equations(
-            some, groups[start:stop], squared_scale, pose, mixed, own, pose_gradient, own_gradient
+            some,
+            groups[start:stop],
+            squared_scale,
+            pose,
+            mixed,
+            own,
+            pose_gradient,
+            own_gradient,
         )
         cost += more
         count += seen
@@ -287,21 +306,22 @@ def splat_depths(points, camera, size_xy, cell_px, r, t, nearest, cells, depths)
         with its depth.
     """
     columns = nearest.shape[1]
-    for k in range(len(points)):
-        cells[k] = -1
-        x, y, z = _moved(r, t, points, k)
-        depths[k] = z
-        if not _shown(camera, x, y, z):
-            continue
-        px, py = _pixel(camera, x, y, z)
-        if not (px >= 0.0 and py >= 0.0 and px < size_xy[0] and py < size_xy[1]):
-            continue
-        # a quotient may round up to the next cell
-        row = min(int(py / cell_px), nearest.shape[0] - 1)
-        column = min(int(px / cell_px), columns - 1)
-        cells[k] = row * columns + column
-        if z < nearest[row, column]:
-            nearest[row, column] = z
+    places = np.empty((11, min(len(points), _ROWS)))
+    for start in range(0, len(points), _ROWS):
+        stop = min(start + _ROWS, len(points))
+        _project(camera, r, t, points[start:stop], places)
+        for k in range(start, stop):
+            z, px, py = places[2, k - start], places[3, k - start], places[4, k - start]
+            cells[k] = -1
+            depths[k] = z
+            # not so for NaN either
+            if not (px >= 0.0 and py >= 0.0 and px < size_xy[0] and py < size_xy[1]):
+                continue
+            # a quotient may round up to the next cell
+            row = min(int(py / cell_px), nearest.shape[0] - 1)
+            column = min(int(px / cell_px), columns - 1)
+            cells[k] = row * columns + column
+            nearest[row, column] = min(nearest[row, column], z)
 
 
 @compiled_loop
@@ -342,26 +362,17 @@ def correlations(points, values, groups, level, valid, scale_xy, camera, rotatio
     """
     zero = np.zeros(3)
     channels = values.shape[1]
+    places = np.empty((11, len(points)))
     for turn in range(len(rotations)):
         sums[:] = 0.0
+        _project(camera, rotations[turn], zero, points, places)
         for k in range(len(points)):
-            x, y, z = _moved(rotations[turn], zero, points, k)
-            if not _shown(camera, x, y, z):
-                continue
-            px, py = _pixel(camera, x, y, z)
-            px, py = px * scale_xy[0] - 0.5, py * scale_xy[1] - 0.5
-            row, column = _corner(valid, px, py)
+            px, py = places[3, k] * scale_xy[0] - 0.5, places[4, k] * scale_xy[1] - 0.5
+            row, column, a, b = _corner(valid, px, py)
             if row < 0:
                 continue
-            a, b = px - column, py - row
-            w00, w01, w10, w11 = (1.0 - a) * (1.0 - b), a * (1.0 - b), (1.0 - a) * b, a * b
             for c in range(channels):
-                q = (
-                    w00 * level[row, column, c]
-                    + w01 * level[row, column + 1, c]
-                    + w10 * level[row + 1, column, c]
-                    + w11 * level[row + 1, column + 1, c]
-                )
+                q = _read(level, row, column, a, b, c)[0]
                 r = values[k, c]
                 s = sums[groups[k], c]
                 s[0] += 1.0

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import bearing_rays, project
 from megloc_kapture.plugins import DepthView
-from megloc_kapture.refinement.photometric_pyramid import Level, gradient_energy
+from megloc_kapture.refinement.photometric_pyramid import Level
 from megloc_kapture.values import Camera, RigidTransform
 
 # depth pixels looked at along the longer side of a depth map; about four per point
@@ -138,9 +138,15 @@ def visibility(
     from megloc_kapture.refinement.photometric_kernels import camera_of, splat_depths
 
     cell_px = max(camera.width, camera.height) / _CELLS
-    shape = (int(np.ceil(camera.height / cell_px)), int(np.ceil(camera.width / cell_px)))
+    shape = (
+        int(np.ceil(camera.height / cell_px)),
+        int(np.ceil(camera.width / cell_px)),
+    )
     nearest = np.full(shape, np.inf)
-    rotation, translation = cam_from_world.rotation_matrix(), np.array(cam_from_world.translation)
+    rotation, translation = (
+        cam_from_world.rotation_matrix(),
+        np.array(cam_from_world.translation),
+    )
     packed = camera_of(camera)
     splats = []
     for reference in references:
@@ -184,7 +190,10 @@ def choose_points(
     levels : of each reference, of one kind.
     wanted : bool (N,) of each reference: those to choose from.
     """
-    from megloc_kapture.refinement.photometric_kernels import read_values, strongest_per_cell
+    from megloc_kapture.refinement.photometric_kernels import (
+        read_values,
+        strongest_per_cell,
+    )
 
     points, values, groups = [], [], []
     for group, (reference, level, ours) in enumerate(zip(references, levels, wanted, strict=True)):
@@ -192,9 +201,12 @@ def choose_points(
         cell_px = max(1.0, float(np.sqrt(h * w / max_points)))
         best = np.empty((int(np.ceil(h / cell_px)), int(np.ceil(w / cell_px))), np.int64)
         x, y = reference.px[:, 0] * level.scale_x, reference.px[:, 1] * level.scale_y
-        strongest_per_cell(x, y, gradient_energy(level), ours, cell_px, best)
+        strongest_per_cell(x, y, level.gradient_energy, ours, cell_px, best)
         rows = best[best >= 0]
-        read, found = np.empty((len(rows), level.values.shape[2])), np.empty(len(rows), np.bool_)
+        read, found = (
+            np.empty((len(rows), level.values.shape[2])),
+            np.empty(len(rows), np.bool_),
+        )
         read_values(level.values, level.valid, x[rows] - 0.5, y[rows] - 0.5, read, found)
         points.append(reference.points[rows[found]])
         values.append(read[found])

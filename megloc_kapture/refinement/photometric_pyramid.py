@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import cv2
@@ -46,6 +47,21 @@ class Level:
     valid: NDArray[np.bool_]
     scale_x: float
     scale_y: float
+
+    @cached_property
+    def gradient_energy(self) -> Float32:
+        """Squared gradient by central differences, summed over channels: float32 (h, w).
+
+        Zero on the border and where a pixel or one beside it is not valid.
+        """
+        values, valid = self.values, self.valid
+        energy = np.zeros(valid.shape, np.float32)
+        across = values[1:-1, 2:] - values[1:-1, :-2]
+        down = values[2:, 1:-1] - values[:-2, 1:-1]
+        energy[1:-1, 1:-1] = np.square(across).sum(2) + np.square(down).sum(2)
+        inside = valid[1:-1, 1:-1] & valid[1:-1, 2:] & valid[1:-1, :-2] & valid[2:, 1:-1]
+        energy[1:-1, 1:-1] *= inside & valid[:-2, 1:-1]
+        return energy
 
 
 def build_pyramid(
@@ -109,21 +125,6 @@ def build_pyramid(
         values, used = (_resized(each, w // 2, h // 2) for each in (values, smooth_used))
 
 
-def gradient_energy(level: Level) -> Float32:
-    """Squared gradient by central differences, summed over channels: float32 (h, w).
-
-    Zero on the border and where a pixel or one beside it is not valid.
-    """
-    values, valid = level.values, level.valid
-    energy = np.zeros(valid.shape, np.float32)
-    across = values[1:-1, 2:] - values[1:-1, :-2]
-    down = values[2:, 1:-1] - values[:-2, 1:-1]
-    energy[1:-1, 1:-1] = np.square(across).sum(2) + np.square(down).sum(2)
-    inside = valid[1:-1, 1:-1] & valid[1:-1, 2:] & valid[1:-1, :-2] & valid[2:, 1:-1]
-    energy[1:-1, 1:-1] *= inside & valid[:-2, 1:-1]
-    return energy
-
-
 def _feature_values(image: NDArray[np.uint8], used: Float32, features: FeatureMaps) -> Float32:
     if not used.all():
         keep = used > 0
@@ -172,6 +173,8 @@ def _gradient_magnitude(
     down, across = np.gradient(plane)
     magnitude = np.sqrt(down * down + across * across).astype(np.float32)
     eroded = cv2.erode(
-        valid.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE
+        valid.astype(np.uint8),
+        np.ones((3, 3), np.uint8),
+        borderType=cv2.BORDER_REPLICATE,
     )
     return magnitude[..., None], eroded.astype(bool)

@@ -2,39 +2,40 @@
 
 The pose is the one under which they look like the query, up to a gain and a bias per reference
 (:mod:`megloc_kapture.refinement.photometric`). A result counts only where it is better than what
-there was; otherwise the old pose stays, with the reason.
+there was (:mod:`megloc_kapture.refinement.rendering_acceptance`); otherwise the old pose stays,
+with the reason.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import partial
 
-import numpy as np
-from numpy.typing import NDArray
-from pydantic import Field
-
-from megloc_kapture.errors import DataError
-from megloc_kapture.geometry.poses import rotation_angles_deg
-from megloc_kapture.plugins import DepthView, PoseRefinement, RankingScene
+from megloc_kapture.plugins import PoseRefinement, RankingScene
 from megloc_kapture.refinement.photometric import MIN_POINTS, Alignment, LevelProblem
+from megloc_kapture.refinement.photometric_directions import beside
+from megloc_kapture.refinement.photometric_fit import correlation
+from megloc_kapture.refinement.photometric_minimum import minimised
+from megloc_kapture.refinement.photometric_occluders import agreeing
 from megloc_kapture.refinement.photometric_points import (
     Visibility,
     choose_points,
-    lift_points,
     usable_cells,
     visibility,
 )
-from megloc_kapture.refinement.photometric_pyramid import (
-    Appearance,
-    FeatureMaps,
-    Level,
-    build_pyramid,
-)
+from megloc_kapture.refinement.photometric_pyramid import FeatureMaps
 from megloc_kapture.refinement.photometric_search import best_turns
-from megloc_kapture.values import Camera, Options, RigidTransform
+from megloc_kapture.refinement.rendering_acceptance import Candidate, judged
+from megloc_kapture.refinement.rendering_options import RenderingOptions
+from megloc_kapture.refinement.rendering_views import (
+    REFERENCES,
+    PyramidKind,
+    RenderingQuery,
+    RenderingReference,
+    pyramid_of,
+)
+from megloc_kapture.values import Camera, RigidTransform
 
 # turns of the camera, of those tried, from which the alignment begins
 _MAX_STARTS = 5
@@ -42,89 +43,10 @@ _MAX_STARTS = 5
 _SEARCH_POINTS, _START_POINTS = 1500, 2500
 # of a level: an alignment is done when it moves points by less, the last of all, the others
 _LAST_STEP_PX, _COARSE_STEP_PX = 0.01, 0.2
-# of a level, for each point that is chosen there
-_PX_PER_POINT = 6
-
-
-class RenderingOptions(Options):
-    """Options of the refinement by rendering."""
-
-    appearance: Appearance = Field(
-        default="normalised",
-        description="what is compared: brightness of locally normalised contrast (day and night), "
-        "plain brightness (intensity), or magnitudes of its gradient (gradients)",
-    )
-    max_references: int = Field(
-        default=4, gt=0, description="reference images with depth that are used, best first"
-    )
-    max_points: int = Field(
-        default=12000, ge=MIN_POINTS, description="points of a reference and level of its pyramid"
-    )
-    max_side_px: int = Field(
-        default=640, ge=64, description="longer side of the finest level; larger images are reduced"
-    )
-    levels: int = Field(
-        default=3, ge=1, description="of the pyramids, each of half the size; begin at the coarsest"
-    )
-    search_deg: float = Field(
-        default=4.0, ge=0, description="turns of the camera that are tried at the coarsest level"
-    )
-    max_translation_m: float = Field(
-        default=0.5, gt=0, description="a pose whose centre moves further is not accepted"
-    )
-    max_rotation_deg: float = Field(
-        default=5.0, gt=0, description="a pose that turns further is not accepted"
-    )
-    min_improvement: float = Field(
-        default=0.02, ge=0, lt=1, description="share by which the robust cost must fall"
-    )
-    min_correlation: float = Field(
-        default=0.12,
-        ge=-1,
-        le=1,
-        description="of the query with the warped references, below which a pose is not accepted",
-    )
-    min_overlap: float = Field(
-        default=0.2, ge=0, le=1, description="share of the query that references must cover"
-    )
-    max_overlap_loss: float = Field(
-        default=0.1, ge=0, le=1, description="share of that overlap that a new pose may lose"
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class RenderingQuery:
-    """The image whose pose is refined.
-
-    Attributes
-    ----------
-    image : uint8 (H, W, 3), RGB.
-    camera : its intrinsics.
-    mask : bool (H, W), True = use; None for all.
-    """
-
-    image: NDArray[np.uint8]
-    camera: Camera
-    mask: NDArray[np.bool_] | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class RenderingReference:
-    """An image of the map that is warped into the query.
-
-    Attributes
-    ----------
-    image : uint8 (H, W, 3), RGB.
-    camera, cam_from_world : of the image.
-    depth : taken with it, maybe by another camera.
-    mask : bool (H, W), True = use; None for all.
-    """
-
-    image: NDArray[np.uint8]
-    camera: Camera
-    cam_from_world: RigidTransform
-    depth: DepthView
-    mask: NDArray[np.bool_] | None = None
+# of a level, for each point that is chosen there; of a reference on coarse levels
+_PX_PER_POINT, _COARSE_POINTS = 24, 3200
+# standard errors by which the cost falls where nobody need ask whether the start was as good
+_CLEAR = 4.0
 
 
 def refine_by_rendering(
@@ -146,8 +68,8 @@ def refine_by_rendering(
     Returns
     -------
     The new pose with its covariance, or the old one and the reason. ``measures``: cost (of the
-    robust loss, 0 to 0.5), correlation and overlap before and after, how far the pose moved in m
-    and deg, the points and references used.
+    robust loss, 0 to 0.5), correlation and overlap before and after, by how many of its standard
+    errors the cost falls, how far the pose moved in m and deg, the points and references used.
 
     Raises
     ------
@@ -172,162 +94,115 @@ class _Refining:
     ) -> None:
         self.options = options
         self.camera = query.camera
-        self.features = features
         self.threads = threads
-        self.query_levels, *self.levels = threads.map(self._pyramid, [query, *references])
-        self.points = list(
-            threads.map(
-                lambda each: lift_points(each.camera, each.cam_from_world, each.depth), references
-            )
-        )
-
-    def _pyramid(self, view: RenderingQuery | RenderingReference) -> list[Level]:
-        image, camera, mask = view.image, view.camera, view.mask
-        if image.shape != (camera.height, camera.width, 3):
-            raise DataError(
-                f"an image of {image.shape} does not fit a camera of {camera.width}x{camera.height}"
-            )
-        return build_pyramid(
-            image,
-            mask,
-            levels=self.options.levels,
-            max_side_px=self.options.max_side_px,
-            appearance=self.options.appearance,
-            features=self.features,
-        )
+        kind = PyramidKind(options.levels, options.max_side_px, options.appearance, features)
+        ours = threads.submit(pyramid_of, query, kind)
+        prepared = list(threads.map(lambda each: REFERENCES.prepared(each, kind), references))
+        self.query_levels = ours.result()
+        self.levels = [each.pyramid for each in prepared]
+        self.points = [each.points for each in prepared]
 
     def refine(self, start: RigidTransform) -> PoseRefinement:
         """See :func:`refine_by_rendering`."""
         sight = visibility(self.points, self.camera, start)
-        old_overlap = self._overlap(sight)
-        if old_overlap < max(self.options.min_overlap, 1e-9):
-            reason = f"references with depth cover {old_overlap:.0%} of the query"
-            return PoseRefinement(start, reason, {"overlap_before": old_overlap})
-        pose = start
+        overlap = self._overlap(sight)
+        if overlap < max(self.options.min_overlap, 1e-9):
+            reason = f"references with depth cover {overlap:.0%} of the query"
+            return PoseRefinement(start, reason, {"overlap_before": overlap})
         coarsest = min([len(self.query_levels), *map(len, self.levels)]) - 1
-        for number in range(coarsest, -1, -1):
-            problem = self._problem(number, pose, sight)
-            if len(problem.chosen.points) < MIN_POINTS:
-                reason = f"fewer than {MIN_POINTS} points to compare"
-                return PoseRefinement(start, reason, {"overlap_before": old_overlap})
-            if number == coarsest:
-                pose = self._begun(problem, pose)
-            if number > 0 or coarsest == 0:
-                pose = self._begun_beside(problem, pose)
-            found = problem.nuisance_at(pose)
-            for last_step_px in (
-                _COARSE_STEP_PX,
-                _LAST_STEP_PX if number == 0 else _COARSE_STEP_PX,
-            ):
-                # what is in front of the scene shows the better the better the pose
-                free = self._without_occluders(problem, found)
-                found = free.minimised(found, last_step_px=last_step_px)
-            pose = found.cam_from_world
-            if number == coarsest:  # later steps are too small to uncover anything
+        searched = self._judged(start, overlap, self._searched(coarsest, start, sight))
+        clear = searched.accepted and searched.measures["significance"] >= _CLEAR
+        if clear or coarsest == 0:
+            return searched
+        # looking around may lead away from a pose that was nearly right
+        direct = self._judged(start, overlap, self._aligned(0, start, sight))
+        if not searched.accepted:
+            return direct if direct.accepted else searched
+        return max((direct, searched), key=_correlation_after)
+
+    def _searched(
+        self, coarsest: int, start: RigidTransform, sight: Visibility
+    ) -> Candidate | None:
+        """Coarse to fine, from the best of what is found around the start."""
+        problem = self._problem(coarsest, start, sight)
+        if len(problem.chosen.points) < MIN_POINTS:
+            return None
+        pose = self._begun_beside(problem, self._begun(problem, start))
+        found = self._aligned(coarsest, pose, sight)
+        for number in range(coarsest - 1, -1, -1):
+            if found is None:
+                break
+            pose = found.alignment.cam_from_world
+            if number == coarsest - 1:  # later steps are too small to uncover anything
                 sight = visibility(self.points, self.camera, pose)
-        return self._judged(start, old_overlap, problem, free, found)
+            found = self._aligned(number, pose, sight)
+        return found
+
+    def _aligned(self, number: int, pose: RigidTransform, sight: Visibility) -> Candidate | None:
+        """The alignment of one level; None where there are too few points."""
+        problem = self._problem(number, pose, sight)
+        if len(problem.chosen.points) < MIN_POINTS:
+            return None
+        found = problem.nuisance_at(pose)
+        for step_px in (_COARSE_STEP_PX, _COARSE_STEP_PX if number else _LAST_STEP_PX):
+            # what is in front of the scene shows the better the better the pose
+            free = self._without_occluders(problem, found)
+            found = minimised(free, found, last_step_px=step_px, rounds=1 if number else 2)
+        return Candidate(problem, free, found)
 
     def _problem(self, number: int, pose: RigidTransform, sight: Visibility) -> LevelProblem:
         level = self.query_levels[number]
         levels = [pyramid[number] for pyramid in self.levels]
-        count = min(self.options.max_points, max(MIN_POINTS, level.valid.size // _PX_PER_POINT))
-        chosen = choose_points(self.points, levels, sight.seen, count)
+        count = max(_COARSE_POINTS, level.valid.size // _PX_PER_POINT)
+        chosen = choose_points(self.points, levels, sight.seen, min(self.options.max_points, count))
         return LevelProblem(chosen, level, self.camera, pose)
 
     def _begun(self, problem: LevelProblem, pose: RigidTransform) -> RigidTransform:
         """Of the turns of the camera that may be right the one that leads to the best pose."""
-        chosen, level = problem.chosen, problem.level
         starts = best_turns(
-            chosen.thinned(_SEARCH_POINTS),
-            level,
+            problem.chosen.thinned(_SEARCH_POINTS),
+            problem.level,
             self.camera,
             pose,
             max_deg=self.options.search_deg,
             count=_MAX_STARTS,
         )
-        fewer = LevelProblem(chosen.thinned(_START_POINTS), level, self.camera, pose)
+        fewer = problem.thinned(_START_POINTS)
         return self._best(fewer, self.threads.map(fewer.nuisance_at, starts))
 
     def _begun_beside(self, problem: LevelProblem, pose: RigidTransform) -> RigidTransform:
         """The same beside it, where the alignment looks much the same and may have stopped."""
-        chosen = problem.chosen.thinned(_START_POINTS)
-        fewer = LevelProblem(chosen, problem.level, self.camera, pose)
-        here = fewer.minimised(fewer.nuisance_at(pose), last_step_px=_COARSE_STEP_PX)
-        return self._best(fewer, [here, *fewer.beside(here)[:_MAX_STARTS]])
+        fewer = problem.thinned(_START_POINTS)
+        here = minimised(fewer, fewer.nuisance_at(pose), last_step_px=_COARSE_STEP_PX)
+        return self._best(fewer, [here, *beside(fewer, here)[:_MAX_STARTS]])
 
     def _best(self, problem: LevelProblem, starts: Iterable[Alignment]) -> RigidTransform:
-        align = partial(problem.minimised, last_step_px=_COARSE_STEP_PX, rounds=1)
+        align = partial(minimised, problem, last_step_px=_COARSE_STEP_PX, rounds=1)
         tried = list(self.threads.map(align, starts))
-        return max(tried, key=problem.correlation).cam_from_world
+        return max(tried, key=partial(correlation, problem)).cam_from_world
 
     def _without_occluders(self, problem: LevelProblem, at: Alignment) -> LevelProblem:
-        agreeing = problem.agreeing(at)
-        if agreeing.sum() < MIN_POINTS:
-            return problem
-        chosen = problem.chosen.subset(agreeing)
-        return LevelProblem(
-            chosen, problem.level, self.camera, at.cam_from_world, num_groups=problem.num_groups
-        )
+        free = agreeing(problem, at)
+        return problem.subset(free) if free.sum() >= MIN_POINTS else problem
+
+    def _judged(
+        self, start: RigidTransform, old_overlap: float, found: Candidate | None
+    ) -> PoseRefinement:
+        if found is None:
+            reason = f"fewer than {MIN_POINTS} points to compare"
+            return PoseRefinement(start, reason, {"overlap_before": old_overlap})
+        pose = found.alignment.cam_from_world
+        overlap = self._overlap(visibility(self.points, self.camera, pose))
+        return judged(start, found, (old_overlap, overlap), self.options)
 
     def _overlap(self, sight: Visibility) -> float:
         """Share of the query's usable cells in which references have points."""
         usable = usable_cells(self.query_levels[0].valid, sight.covered.shape)
         return float((sight.covered & usable).sum() / max(usable.sum(), 1))
 
-    def _judged(
-        self,
-        start: RigidTransform,
-        old_overlap: float,
-        problem: LevelProblem,
-        free: LevelProblem,
-        found: Alignment,
-    ) -> PoseRefinement:
-        """The acceptance rule: cost, correlation, overlap, and how far the pose moved.
 
-        They are judged on all points of ``problem``, also those that ``free`` leaves out.
-        """
-        options, pose = self.options, found.cam_from_world
-        overlap = self._overlap(visibility(self.points, self.camera, pose))
-        before, after = problem.compared(start, pose)
-        moved_m = float(np.linalg.norm(pose.center() - start.center()))
-        turned_deg = float(rotation_angles_deg(np.array(pose.quat_wxyz), np.array(start.quat_wxyz)))
-        improvement = 1.0 - after.cost / before.cost if before.cost > 0 else 0.0
-        measures = {
-            "cost_before": before.cost,
-            "cost_after": after.cost,
-            "correlation_before": before.correlation,
-            "correlation_after": after.correlation,
-            "overlap_before": old_overlap,
-            "overlap_after": overlap,
-            "moved_m": moved_m,
-            "turned_deg": turned_deg,
-            "points": float(after.count),
-            "references": float(len(np.unique(problem.chosen.groups))),
-        }
-        reason = ""
-        if after.count < MIN_POINTS:
-            reason = f"only {after.count} points are seen from both poses"
-        elif moved_m > options.max_translation_m:
-            reason = f"would move {moved_m:.2f} m, more than {options.max_translation_m:g} m"
-        elif turned_deg > options.max_rotation_deg:
-            reason = f"would turn {turned_deg:.2f} deg, more than {options.max_rotation_deg:g} deg"
-        elif after.correlation < options.min_correlation:
-            reason = (
-                f"references and query correlate by {after.correlation:.2f}, "
-                f"less than {options.min_correlation:g}"
-            )
-        elif improvement < options.min_improvement:
-            reason = (
-                f"the cost improves by {improvement:.1%}, less than {options.min_improvement:.1%}"
-            )
-        elif overlap < (1.0 - options.max_overlap_loss) * old_overlap:
-            reason = f"the overlap falls from {old_overlap:.0%} to {overlap:.0%}"
-        if reason:
-            return PoseRefinement(start, reason, measures)
-        covariance = free.covariance(found)
-        if covariance is None:
-            return PoseRefinement(start, "the images do not determine the pose", measures)
-        return PoseRefinement(pose, "", measures, covariance)
+def _correlation_after(refined: PoseRefinement) -> float:
+    return refined.measures.get("correlation_after", -1.0)
 
 
 class Rendering:
@@ -340,7 +215,10 @@ class Rendering:
     Options = RenderingOptions
 
     def __init__(
-        self, options: RenderingOptions | None = None, *, features: FeatureMaps | None = None
+        self,
+        options: RenderingOptions | None = None,
+        *,
+        features: FeatureMaps | None = None,
     ) -> None:
         self.options = options or RenderingOptions()
         self.features = features

@@ -17,7 +17,7 @@ from megloc_kapture.refinement.photometric_points import (
     usable_cells,
     visibility,
 )
-from megloc_kapture.refinement.photometric_pyramid import Level, build_pyramid, gradient_energy
+from megloc_kapture.refinement.photometric_pyramid import Level, build_pyramid
 from megloc_kapture.values import Camera, RigidTransform
 
 CAMERA = Camera("SIMPLE_RADIAL", 320, 240, (250.0, 161.0, 118.5, -0.05))
@@ -109,7 +109,7 @@ def test_the_strongest_of_each_cell_are_chosen() -> None:
     wanted = [np.ones(len(lifted[0].points), bool), lifted[1].px[:, 0] < 160]
     chosen = choose_points(lifted, levels, wanted, 768)  # cells of 10 px
     for group, level in enumerate(levels):
-        energy = gradient_energy(level)
+        energy = level.gradient_energy
         energy[[0, -1]] = energy[:, [0, -1]] = 0
         ours = chosen.groups == group
         pose = (HERE, POSE)[group]

@@ -10,7 +10,6 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.refinement.photometric_pyramid import (
     Appearance,
     build_pyramid,
-    gradient_energy,
 )
 
 APPEARANCES: tuple[Appearance, ...] = ("normalised", "intensity", "gradients")
@@ -80,7 +79,7 @@ def test_gradient_energy_is_that_of_central_differences() -> None:
     mask = np.ones((150, 200), bool)
     mask[70, 100] = False
     level = build_pyramid(picture(), mask, levels=1, appearance="intensity")[0]
-    energy = gradient_energy(level)
+    energy = level.gradient_energy
     values = level.values[..., 0]
     expected = (values[50, 81] - values[50, 79]) ** 2 + (values[51, 80] - values[49, 80]) ** 2
     assert energy[50, 80] == pytest.approx(expected)

@@ -1,0 +1,84 @@
+"""Points whose values are what a query shows, for the tests of photometric alignment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from megloc_kapture.geometry.cameras import bearing_rays
+from megloc_kapture.refinement.photometric import LevelProblem
+from megloc_kapture.refinement.photometric_points import ChosenPoints
+from megloc_kapture.refinement.photometric_pyramid import Level
+from megloc_kapture.values import Camera, RigidTransform
+
+Array = NDArray[np.float64]
+F, CX, CY = 500.0, 321.0, 238.5
+PARAMS = {
+    "SIMPLE_PINHOLE": (F, CX, CY),
+    "PINHOLE": (F, 510.0, CX, CY),
+    "SIMPLE_RADIAL": (F, CX, CY, -0.05),
+    "OPENCV": (F, 510.0, CX, CY, -0.05, 0.01, 1e-3, -2e-3),
+    "OPENCV_FISHEYE": (F, 510.0, CX, CY, 0.02, -0.01, 3e-3, -1e-3),
+    "FOV": (F, 510.0, CX, CY, 0.9),
+    "THIN_PRISM_FISHEYE": (F, 510.0, CX, CY, 0.02, -0.01, 1e-3, -1e-3, 1e-3, 0.0, 1e-3, -1e-3),
+}
+CAMERAS = {model: Camera(model, 640, 480, params) for model, params in PARAMS.items()}
+WIDTH, HEIGHT = 160, 120
+
+
+def random_pose(rng: np.random.Generator) -> RigidTransform:
+    return RigidTransform.from_matrix(Rotation.random(rng=rng).as_matrix(), 5 * rng.normal(size=3))
+
+
+def texture(rng: np.random.Generator, channels: int, deviation_px: float = 1.5) -> Array:
+    noise = rng.normal(size=(HEIGHT, WIDTH, channels))
+    smooth = cv2.GaussianBlur(noise, (0, 0), deviation_px).reshape(noise.shape)
+    return np.asarray(smooth / smooth.std())
+
+
+def bilinear(values: Array, x: Array, y: Array) -> Array:
+    column, row = np.floor(x).astype(int), np.floor(y).astype(int)
+    a, b = (x - column)[:, None], (y - row)[:, None]
+    top = (1 - a) * values[row, column] + a * values[row, column + 1]
+    low = (1 - a) * values[row + 1, column] + a * values[row + 1, column + 1]
+    return np.asarray((1 - b) * top + b * low)
+
+
+def made_problem(
+    model: str = "PINHOLE",
+    *,
+    channels: int = 1,
+    count: int = 400,
+    noise: float = 0.0,
+    wrong: float = 0.0,
+    seed: int = 0,
+) -> tuple[LevelProblem, RigidTransform]:
+    """Points whose values are what the query shows at the true pose, up to gain and bias."""
+    rng = np.random.default_rng(seed)
+    camera, pose = CAMERAS[model], random_pose(rng)
+    image = texture(rng, channels)
+    px = rng.uniform((20, 20), (camera.width - 20, camera.height - 20), (count, 2))
+    points = pose.inverse().apply(bearing_rays(camera, px) * rng.uniform(2.0, 9.0, (count, 1)))
+    scale = WIDTH / camera.width
+    # as float32, as the level has it
+    values = bilinear(image.astype(np.float32).astype(float), *(scale * px.T - 0.5))
+    groups = rng.integers(0, 2, count)
+    values = np.array([0.7, 1.3])[groups, None] * values + np.array([0.2, -0.4])[groups, None]
+    outliers = rng.random(count) < wrong
+    values[outliers] += rng.normal(size=(outliers.sum(), channels)) * 3
+    # a level's noise is blurred as the level is
+    query = (image + noise * texture(rng, channels, 0.8)).astype(np.float32)
+    level = Level(query, np.ones((HEIGHT, WIDTH), bool), scale, scale)
+    chosen = ChosenPoints(points, values, groups)
+    return LevelProblem(chosen, level, camera, pose), pose
+
+
+@pytest.fixture(scope="session")
+def problem() -> Callable[..., tuple[LevelProblem, RigidTransform]]:
+    """Makes problems and their true poses."""
+    return made_problem
