@@ -21,7 +21,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import subprocess
 import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -33,25 +32,15 @@ from pathlib import Path
 
 import numpy as np
 from corridor_scene import ROOM_DISTANCE_M, Seen, write_corridor
-from numpy.typing import NDArray
+from mapped_scene import Query, Scene, errors, hypotheses, megloc, read_scene
 
-from megloc_kapture.io.kapture_store import KaptureFolder, read_pairs
 from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions, absolute_pose
-from megloc_kapture.localization.cluster_poses import (
-    QueryView,
-    TypedMatches,
-    localize_in_clusters,
-)
-from megloc_kapture.localization.clusters import ClusterOptions, cluster_candidates
+from megloc_kapture.localization.clusters import ClusterOptions
 from megloc_kapture.localization.correspondences import observed_matches
 from megloc_kapture.localization.distinctive_inliers import DistinctiveInliers
 from megloc_kapture.localization.ranking import InlierCount, InlierSpread, ReprojectionScore
-from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.plugins import PoseHypothesis, PoseRanker
-from megloc_kapture.stages.matches import iterate_candidates
 from megloc_kapture.stages.query_poses import LocalizationOptions, localize_views
-from megloc_kapture.stages.ranking_scene import KaptureScene
-from megloc_kapture.stages.shared_index import index_map
 from megloc_kapture.values import Failure, Pose, RigidTransform
 
 sys.path.append(str(Path(__file__).resolve().parent / "speed"))
@@ -67,7 +56,6 @@ PIPELINE = (
     "global_features.options.num_clusters=64",
     "global_features.options.training_descriptors=50000",
 )
-FEATURES = "rootsift"
 SHOWN = 6  # of the options tried, the best
 RANKERS: dict[str, PoseRanker] = {
     "inliers": InlierCount(),
@@ -148,43 +136,6 @@ GRIDS[POSES.name] = [replace(POSES, clusters=_with_radius(radius)) for radius in
 GRIDS[SHARED.name] = [replace(SHARED, clusters=_with_shared(count)) for count in (5, 10, 20)]
 
 
-@dataclass(frozen=True, eq=False)
-class Query:
-    """A query's matches with its candidates, best first, and its true pose."""
-
-    view: QueryView
-    candidates: tuple[str, ...]
-    truth: RigidTransform
-
-    def best(self, count: int) -> Query:
-        """With the best of its candidates only."""
-        kept = self.candidates[:count]
-        typed = self.view.matches[0]
-        matches = [each for each in typed.matches if each[0] in kept]
-        return replace(
-            self,
-            view=replace(self.view, matches=(replace(typed, matches=matches),)),
-            candidates=kept,
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """A corridor, mapped and matched."""
-
-    queries: tuple[Query, ...]
-    centers: Mapping[str, NDArray[np.float64]]
-    pixels: KaptureScene
-
-
-def megloc(*arguments: str) -> None:
-    """Run the ``megloc`` beside this Python; a failure ends this run with its exit code."""
-    program = str(Path(sys.executable).with_name("megloc"))
-    done = subprocess.run([program, *arguments, "-q"], check=False)
-    if done.returncode != 0:
-        sys.exit(done.returncode)
-
-
 def prepare(workspace: Path, seed: int) -> tuple[Path, Seen]:
     """Render, map and match the scene of a seed, as far as that is not done yet."""
     folder = workspace / f"seed{seed}"
@@ -197,25 +148,6 @@ def prepare(workspace: Path, seed: int) -> tuple[Path, Seen]:
     where = ("--root", str(root), "--workspace", str(run), "--executor", "inline")
     megloc("eval", "kapture", *where, *settings, "--until", "query_matches")
     return run, Seen(**json.loads(done.read_text()))
-
-
-def read_scene(run: Path) -> Scene:
-    """Read what :func:`prepare` made."""
-    workspace = Workspace(run)
-    mapping, query = workspace.folder("map"), workspace.folder("query", "")
-    index = index_map(mapping, FEATURES)
-    reader = workspace.folder("query", "matches/query").matches(FEATURES)
-    truth = KaptureFolder(workspace.path("query_gt")).read().poses()
-    queries = []
-    for name, images in iterate_candidates(read_pairs(workspace.path("pairs/query.txt"))):
-        matches = [(i, *reader.read(name, i)) for i in images if (name, i) in reader]
-        keypoints = query.keypoints(FEATURES).read(name)
-        view = QueryView(
-            name, query.read().camera_of(name), (TypedMatches(index, keypoints, matches),)
-        )
-        queries.append(Query(view, tuple(images), truth[name]))
-    centers = {image: pose.center() for image, pose in mapping.read().poses().items()}
-    return Scene(tuple(queries), centers, KaptureScene(mapping, query))
 
 
 def localize(scene: Scene, query: Query, method: Method) -> Pose | Failure:
@@ -247,38 +179,10 @@ def _localize_with_all(query: Query, options: AbsolutePoseOptions) -> Pose | Fai
     )
 
 
-def hypotheses(scene: Scene, query: Query, method: Method) -> Sequence[PoseHypothesis]:
-    """The poses of a query's clusters, before one is chosen and refined."""
-    query = query.best(method.top_k)
-    typed = query.view.matches[0]
-    images = [image for image in query.candidates if image in query.view.matched_images()]
-    clusters = cluster_candidates(
-        images, [""] * len(images), method.clusters, centers=scene.centers, indices=[typed.index]
-    )
-    found: list[PoseHypothesis] = []
-
-    def keep(poses: Sequence[PoseHypothesis]) -> NDArray[np.float64]:
-        found.extend(poses)
-        return np.zeros(len(poses))
-
-    localize_in_clusters(
-        [query.view],
-        clusters,
-        AbsolutePoseOptions(max_error_px=method.max_error_px),
-        rank=keep,
-        max_clusters=method.clusters.max_clusters,
-    )
-    return found
-
-
-def errors(found: RigidTransform | None, truth: RigidTransform) -> tuple[float, float]:
-    """Metres and degrees, infinite without a pose."""
-    if found is None:
-        return np.inf, np.inf
-    turn = found.rotation_matrix() @ truth.rotation_matrix().T
-    angle = np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))
-    distance = np.linalg.norm(found.center() - truth.center())
-    return float(distance), float(np.degrees(angle))
+def hypotheses_by(method: Method, scene: Scene, query: Query) -> Sequence[PoseHypothesis]:
+    """The poses of a query's clusters as a method makes them."""
+    pose = AbsolutePoseOptions(max_error_px=method.max_error_px)
+    return hypotheses(scene, query.best(method.top_k), method.clusters, pose)
 
 
 def judged(found: RigidTransform | None, truth: RigidTransform) -> list[float]:
@@ -286,6 +190,30 @@ def judged(found: RigidTransform | None, truth: RigidTransform) -> list[float]:
     distance, angle = errors(found, truth)
     hits = [float(distance <= m and angle <= deg) for m, deg in THRESHOLDS]
     return [*hits, float(distance < ROOM_DISTANCE_M / 2)]
+
+
+@dataclass(frozen=True)
+class CorridorRooms:
+    """The corridors as scenes to compare rankers in; clusters by poses."""
+
+    method: Method = CHOSEN[2]
+    thresholds = THRESHOLDS
+
+    def told(self) -> str:
+        """What they are, in words."""
+        return f"corridors, {self.method.name}, inliers within {self.method.max_error_px:g} px"
+
+    def run(self, workspace: Path, seed: int) -> Path:
+        """Render, map and match the scene of a seed, as far as that is not done yet."""
+        return prepare(workspace, seed)[0]
+
+    def hypotheses(self, scene: Scene, query: Query) -> Sequence[PoseHypothesis]:
+        """The poses of a query's clusters."""
+        return hypotheses_by(self.method, scene, query)
+
+    def judged(self, scene: Scene, query: Query, found: PoseHypothesis | None) -> list[float]:
+        """1 or 0 for each threshold, and for the right room."""
+        return judged(None if found is None else found.views[0].cam_from_world, query.truth)
 
 
 def measure(
@@ -308,7 +236,7 @@ def _best(scene: Scene, query: Query, method: Method) -> list[float]:
     """What a ranker that knows the truth would make of the clusters."""
     of_all = [
         judged(each.views[0].cam_from_world, query.truth)
-        for each in hypotheses(scene, query, method)
+        for each in hypotheses_by(method, scene, query)
     ]
     return max(of_all, default=judged(None, query.truth))
 
@@ -331,7 +259,7 @@ def try_all(workspace: Path, seed: int) -> dict[str, list[float]]:
             continue
         of_rankers: dict[str, list[list[float]]] = {name: [] for name in RANKERS}
         for query in scene.queries:
-            poses_of = hypotheses(scene, query, method)
+            poses_of = hypotheses_by(method, scene, query)
             for name, ranker in RANKERS.items():
                 best = None
                 if poses_of:

@@ -32,12 +32,17 @@ from megloc_kapture.values import Camera, Options, RigidTransform
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+_ANOTHER_VIEW = 0.2  # of references, how unlike; radians: with equal centres, 11 degrees
+
 
 class AlignedViewOptions(Options):
     """How map images are brought to a pose."""
 
     references: int = Field(
-        default=5, ge=1, le=1000, description="map images with depth per view, those nearest"
+        default=5,
+        ge=1,
+        le=1000,
+        description="map images with depth per view: those nearest that differ",
     )
     long_side: int = Field(
         default=320, ge=16, description="of the views compared, pixels; never enlarged"
@@ -272,16 +277,32 @@ def _mask_at_size(mask: Mask, width: int, height: int) -> Mask:
 def _nearest_first(
     images: Sequence[str], cam_from_world: RigidTransform, scene: RankingScene
 ) -> list[str]:
-    """Images by how much like the pose they look: angle of the axes, and distance of the centres.
+    """Images by how much like the pose they look; those that show what an earlier one does, last.
 
-    A radian weighs as much as the median distance, whatever the size of the place.
+    How unlike two views are is the angle of their axes and the distance of their centres; a radian
+    weighs as much as the median distance to the pose, whatever the size of the place. The frames of
+    a film and repeated photographs show the same: a few of them would leave most of a view empty.
     """
     if not images:
         return []
     poses = [scene.map_pose(name) for name in images]
-    centre, axis = cam_from_world.center(), cam_from_world.rotation_matrix()[2]
-    distances = np.array([np.linalg.norm(pose.center() - centre) for pose in poses])
-    cosines = np.array([pose.rotation_matrix()[2] @ axis for pose in poses])
-    angles = np.arccos(np.clip(cosines, -1.0, 1.0))
-    unlike = angles + distances / max(float(np.median(distances)), 1e-9)
-    return [images[at] for at in np.argsort(unlike, kind="stable")]
+    centres = np.array([pose.center() for pose in poses])
+    axes = np.array([pose.rotation_matrix()[2] for pose in poses])
+    distances = np.linalg.norm(centres - cam_from_world.center(), axis=1)
+    scale = max(float(np.median(distances)), 1e-9)
+
+    def unlike(centre: Floats, axis: Floats) -> Floats:
+        angles = np.arccos(np.clip(axes @ axis, -1.0, 1.0))
+        return np.asarray(angles + np.linalg.norm(centres - centre, axis=1) / scale)
+
+    nearest = unlike(cam_from_world.center(), cam_from_world.rotation_matrix()[2])
+    repeated = np.zeros(len(images), np.bool_)
+    waiting = []
+    order = []
+    for at in np.argsort(nearest, kind="stable"):
+        if repeated[at]:
+            waiting.append(at)
+            continue
+        order.append(at)
+        repeated |= unlike(centres[at], axes[at]) < _ANOTHER_VIEW
+    return [images[at] for at in (*order, *waiting)]

@@ -13,7 +13,7 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.io.weights import MissingWeightsError
 from megloc_kapture.localization.lpips import LpipsDistance, LpipsOptions
 from megloc_kapture.nets.lpips import Lpips
-from megloc_kapture.plugins import ImageDistance
+from megloc_kapture.plugins import IMAGE_DISTANCES, ImageDistance, load_plugin
 
 
 @pytest.fixture(scope="module")
@@ -60,6 +60,61 @@ def test_it_is_the_networks_distance(files: tuple[Path, Path]) -> None:
     assert plugin.distance(a, a, valid) == 0.0
     again = pickle.loads(pickle.dumps(plugin))
     assert again.distance(a, b, valid) == plugin.distance(a, b, valid)
+
+
+def test_it_is_found_by_its_name(files: tuple[Path, Path]) -> None:
+    trunk, heads = (str(file) for file in files)
+    options = {"net": "squeeze", "trunk": trunk, "heads": heads}
+    assert isinstance(load_plugin(IMAGE_DISTANCES, "lpips", options), LpipsDistance)
+
+
+def masks(height: int = 80, width: int = 96) -> list[np.ndarray]:
+    """A full one, one without the left, one without a patch."""
+    found = np.ones((3, height, width), bool)
+    found[1, :, :40] = False
+    found[2, 20:50, 30:70] = False
+    return list(found)
+
+
+def test_a_query_is_paid_for_once_per_mask(
+    files: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[torch.Tensor] = []
+    described = Lpips.described
+
+    def counted(self: Lpips, image: torch.Tensor, valid: torch.Tensor) -> list[torch.Tensor]:
+        seen.append(image)
+        return described(self, image, valid)
+
+    monkeypatch.setattr(Lpips, "described", counted)
+    plugin = distance(files)
+    rng = np.random.default_rng(1)
+    query, *views = rng.integers(0, 256, (4, 80, 96, 3), dtype=np.uint8)
+    for valid in masks():
+        for view in views:
+            plugin.distance(query.copy(), view, valid.copy())
+    assert len(seen) == 3 * (1 + 3)
+
+
+def test_what_is_kept_changes_nothing(files: tuple[Path, Path]) -> None:
+    plugin = distance(files)
+    rng = np.random.default_rng(2)
+    query, *views = rng.integers(0, 256, (4, 80, 96, 3), dtype=np.uint8)
+    net = Lpips("squeeze")
+    net.load_state_dict({k: v for f in files for k, v in torch.load(f, weights_only=True).items()})
+
+    def anew(a: np.ndarray, b: np.ndarray, valid: np.ndarray) -> float:
+        tensors = [torch.from_numpy(x.transpose(2, 0, 1)[None] / 255.0).float() for x in (a, b)]
+        with torch.inference_mode():
+            return float(net(*tensors, torch.from_numpy(valid)[None, None].float())[0])
+
+    # the same array with other pixels is another image
+    for shade in (0, 90):
+        query[:40] = shade
+        for valid in masks():
+            for view in views:
+                expected = anew(query, view, valid)
+                assert plugin.distance(query, view, valid) == pytest.approx(expected, abs=1e-6)
 
 
 def test_half_precision_is_near(files: tuple[Path, Path]) -> None:
