@@ -10,6 +10,7 @@ from megloc_kapture.values import RigidTransform
 
 _UNIT = 1e-6  # of the length of a quaternion that is written with every digit
 
+
 def pose_cell(pose: RigidTransform | None) -> str:
     """Quaternion, w first, and translation; every digit, so that it reads back the same."""
     if pose is None:

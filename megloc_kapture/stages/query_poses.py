@@ -221,7 +221,7 @@ def localize_from_matches(
 
     Raises
     ------
-    DataError : the map has no observations of a type.
+    DataError : the map does not know a type.
     PluginError : there is no such ranker, or it refuses its options.
     """
     ranker = options.make_ranker()
@@ -230,10 +230,8 @@ def localize_from_matches(
     )
     candidates = {name: tuple(images) for name, images in iterate_candidates(pairs)}
     units = query_units(query.read(), rigs=options.rigs)
-    observed = map_folder.observations()
-    of_map = {name: name if name in observed else base_type(name) for name in local_types}
     with shared_index(
-        {name: index_map(map_folder, of_map[name]) for name in local_types}
+        {name: index_map(map_folder, _type_in_map(map_folder, name)) for name in local_types}
     ) as indices:
         jobs = []
         for unit in units:
@@ -255,3 +253,10 @@ def localize_from_matches(
             )
         for results in track(ordered_map(_localize, jobs, executor), len(jobs), "localizing"):
             yield from results
+
+
+def _type_in_map(map_folder: KaptureFolder, local_type: str) -> str:
+    """The type that a map knows keypoints by; one without any point is known by its keypoints."""
+    names = (local_type, base_type(local_type))
+    known = (map_folder.observations(), map_folder.types("keypoints"))
+    return next((name for where in known for name in names if name in where), names[-1])

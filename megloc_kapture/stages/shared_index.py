@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.atomic import atomic_write, output_error, write_bytes
-from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.kapture_store import KaptureFolder, Observations
 from megloc_kapture.io.point_covariances import read_point_covariances
 from megloc_kapture.localization.map_index import MapIndex
 
@@ -36,14 +36,19 @@ _COVARIANCES = (6, np.float64)
 def index_map(folder: KaptureFolder, local_type: str) -> MapIndex:
     """Read the points, their uncertainty and the observations of one keypoints type.
 
+    A type whose keypoints the map has, but none with a point, has an index without points: nothing
+    of it could be triangulated.
+
     Raises
     ------
-    DataError : no observations of the type, or covariances of another map's points.
+    DataError : the map does not know the type, or has covariances of another map's points.
     """
-    seen = folder.observations()
-    if local_type not in seen:
-        raise DataError(f"the map has no observations of type {local_type!r}", path=folder.root)
-    observations = seen[local_type]
+    observations = folder.observations().get(local_type)
+    if observations is None:
+        if local_type not in folder.types("keypoints"):
+            raise DataError(f"the map has no observations of type {local_type!r}", path=folder.root)
+        nothing = np.zeros(0, np.int32)
+        observations = Observations(local_type, (), nothing.astype(np.int64), nothing, nothing)
     points = folder.points3d()
     return MapIndex.build(
         points[:, :3],

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from megloc_kapture.errors import DataError, OutputError
-from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.kapture_store import KaptureFolder, write_observations, write_points3d
 from megloc_kapture.io.point_covariances import write_point_covariances
 from megloc_kapture.localization.map_index import MapIndex
 from megloc_kapture.stages.shared_index import (
@@ -148,6 +148,23 @@ def test_the_index_is_of_one_keypoints_type(world: Any) -> None:
     assert index.covariances is None
     with pytest.raises(DataError, match="no observations of type 'other'"):
         index_map(world.map(), "other")
+
+
+def test_a_type_that_nothing_was_triangulated_of_has_an_index_without_points(
+    world: Any, tmp_path: Path
+) -> None:
+    whole = world.map()
+    root = Path(shutil.copytree(whole.root, tmp_path / "map", symlinks=True))
+    write_points3d(root, np.zeros((0, 6)))
+    write_observations(root, {})
+    empty = KaptureFolder(root, features_dirs=whole.features_dirs)
+    index = index_map(empty, "rootsift")
+    assert index.xyz.shape == (0, 3) and not index.row_of_image
+    image = whole.read().image_names()[0]
+    found = index.points_of_keypoints(image, np.arange(3, dtype=np.int32))
+    np.testing.assert_array_equal(found, -1)
+    with shared_index({"rootsift": index}) as folders:
+        assert open_index(folders["rootsift"]).xyz.shape == (0, 3)
 
 
 def test_the_covariances_of_the_map_are_taken(world: Any, tmp_path: Path) -> None:

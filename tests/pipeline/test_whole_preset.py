@@ -1,0 +1,223 @@
+"""The preset ``megloc`` with random weights in every official container: all stages, end to end."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from megloc_kapture.cli.main import main
+from megloc_kapture.io.cluster_table import read_clusters
+from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.refinement_table import read_refinement
+from megloc_kapture.io.status_table import read_status
+from megloc_kapture.io.weights import find_weights, read_weights
+from megloc_kapture.io.weights_registry import registry
+
+sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
+from whole_preset import (  # noqa: E402
+    WIRINGS,
+    Wiring,
+    add_weights,
+    pair_by_covisibility,
+    refine_displaced,
+    run,
+)
+from whole_preset_artefacts import artefacts, read_features  # noqa: E402
+from whole_preset_scene import RANDOM_SCENE, Scene  # noqa: E402
+from whole_preset_weights import Sizes, write_random_weights  # noqa: E402
+
+KEYS = Path(__file__).parents[1] / "nets" / "keys"
+SLIM = Path(__file__).parents[1] / "nets" / "data" / "delg" / "slim.txt"
+SCENE = Scene(
+    RANDOM_SCENE.world.model_copy(
+        update={"num_places": 1, "day_queries": 2, "width": 192, "height": 144, "supersampling": 1}
+    ),
+    steps=2,
+    beside=True,
+)
+MAP_IMAGES, QUERIES = 18, 2
+# whitenings of full size are a gigabyte
+SMALL = Sizes(clusters=4, whitened=32)
+CHANGES = (
+    "preprocessing.max_size_px=160",
+    "local_features.superpoint.options.max_keypoints=150",
+    "local_features.aslfeat.options.max_keypoints=150",
+    "global_features.openibl.options.max_size_px=160",
+    "global_features.delg.options.scales=[1.0]",
+    "local_features.superpoint.matching.options.sinkhorn_iterations=20",
+    "guided_pyramid.scales=[0.5]",
+    "guided_pyramid.rotations_deg=[0]",
+    "mapping_pairs.top_k=1",
+    "mapping_pairs.poses.num_neighbours=2",
+    "query_pairs.top_k=4",
+    "reranking.keep=3",
+)
+STAGES = [
+    *("import", "preprocess", "local_features", "global_features"),
+    *("mapping_pairs", "mapping_matches", "mapping_pyramid", "points", "map"),
+    *("query_candidates", "query_matches", "query_pairs", "query_pyramid"),
+    *("localization", "refine_poses", "submission", "evaluation"),
+]
+
+
+def megloc(_: str, arguments: Sequence[str]) -> float:
+    """Our command, in this process."""
+    with pytest.raises(SystemExit) as end:
+        main([*arguments, "--quiet"])
+    assert end.value.code == 0, arguments
+    return 0.0
+
+
+def changed(*more: str) -> list[str]:
+    return ["--executor", "inline", *(p for c in (*CHANGES, *more) for p in ("--set", c))]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    return write_random_weights(tmp_path_factory.mktemp("made"), seed=0, sizes=SMALL)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def added(made: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A folder of weights that all of them were added to."""
+    folder = tmp_path_factory.mktemp("weights")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MEGLOC_WEIGHTS", str(folder))
+        add_weights(made, megloc)
+        yield folder
+
+
+@pytest.fixture(scope="module")
+def workspace(added: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run; not to be written into."""
+    wiring = Wiring("random", SCENE, WIRINGS["random"].options)
+    return run(wiring, tmp_path_factory.mktemp("whole"), megloc, changed())
+
+
+def keys(file: str) -> set[str]:
+    return {row.split()[0] for row in (KEYS / file).read_text().splitlines()}
+
+
+def test_every_container_has_the_published_name_and_keys(
+    made: dict[str, Path], added: Path
+) -> None:
+    found = {name: set(read_weights(find_weights(name))) for name in made}
+    for name, path in made.items():
+        assert path.name in {Path(file.name).name for file in registry()[name].files}
+        assert find_weights(name).path.is_relative_to(added / "unverified")
+    assert found["superpoint_v1"] == keys("superpoint.txt")
+    assert found["superglue_outdoor"] == keys("superglue.txt")
+    assert found["aslfeat"] == keys("aslfeat.txt")
+    assert found["openibl"] == keys("openibl.txt")
+    assert found["netvlad-pitts30k"] == keys("openibl.txt") | {"average_image"}
+    assert found["deeplabv3plus-mobilenet"] == keys("deeplabv3plus-mobilenet.txt")
+    whitening = {key for key in found["apgem-resnet101-lm18"] if key.startswith("pca.")}
+    assert "pca.Landmarks_clean.components" in whitening and len(whitening) == 4
+    assert keys("apgem-resnet101.txt") <= found["apgem-resnet101-lm18"]
+    # of the first and second stage, which ResNet-50 and ResNet-101 have in common, and around them
+    slim = {row.split()[0].replace("_v1_50", "_v1_101") for row in SLIM.read_text().splitlines()}
+    common = {name for name in slim if "block3" not in name and "attention" not in name}
+    assert common <= found["delg-r101-gldv2clean"]
+
+
+def test_every_stage_leaves_what_kapture_reads(workspace: Path) -> None:
+    found = artefacts(workspace)
+    assert list(dict.fromkeys(one.stage for one in found)) == STAGES
+    assert sorted(p.stem for p in (workspace / "stages").glob("[!.]*.json")) == sorted(STAGES)
+
+
+def test_every_network_was_asked(workspace: Path) -> None:
+    images = tuple(workspace / "preprocessed" / part for part in ("mapping", "query"))
+    features = read_features(workspace, images)
+    assert {name for name in features if name.endswith(" vectors")} == {
+        "netvlad-pitts30k vectors",
+        "delg-r101-gldv2clean vectors",
+        "apgem-resnet101-lm18-Landmarks_clean-0.25 vectors",
+        "openibl vectors",
+    }
+    for name, rows in features.items():
+        if name.endswith(" vectors"):
+            assert rows == MAP_IMAGES + QUERIES, name
+    for local_type in ("superpoint", "aslfeat"):
+        assert features[f"{local_type} keypoints"] == features[f"{local_type} descriptors"] > 100
+        before = read_features(workspace / "matches" / "mapping", images)
+        after = read_features(workspace / "pyramid" / "mapping", images)
+        assert after[f"{local_type}-pyramid matches"] >= before[f"{local_type} matches"] > 0
+        # reranking leaves some of the queries' pairs
+        after = read_features(workspace / "pyramid" / "query", images)
+        assert after[f"{local_type}-pyramid keypoints"] > 0
+    classes = list((workspace / "preprocessed" / "query" / "sensors" / "classes").rglob("*.png"))
+    assert len(classes) == QUERIES
+
+
+def test_queries_are_undistorted_and_keep_their_depth(workspace: Path) -> None:
+    before = KaptureFolder(workspace / "query").read()
+    after = KaptureFolder(workspace / "preprocessed" / "query").read()
+    for image in after.image_names():
+        assert before.camera_of(image).model == "SIMPLE_RADIAL"
+        assert after.camera_of(image).model in ("PINHOLE", "SIMPLE_PINHOLE")
+    assert len(after.records_depth) == QUERIES
+
+
+def test_what_became_of_each_query_is_said(workspace: Path) -> None:
+    statuses = read_status(workspace / "localized" / "status.csv")
+    poses = KaptureFolder(workspace / "localized").read().poses()
+    assert len(statuses) == QUERIES
+    for image, status in statuses.items():
+        assert (image in poses) == (status.status == "localized")
+        assert bool(status.reason) == (status.status == "failed")
+
+
+def test_the_map_has_points_that_were_judged(workspace: Path) -> None:
+    report = json.loads((workspace / "map" / "reconstruction" / "refinement.json").read_text())
+    assert report["points_before"] > report["points_after"] > 50
+    checked = {each["name"]: each["checked"] for each in report["filters"]}
+    assert checked["depth"] > 0 and checked["uncertainty"] > 0
+    assert len(KaptureFolder(workspace / "map").points3d()) == report["points_after"]
+    # so there is something to pair by, and to find places with
+    assert pair_by_covisibility(workspace, megloc) > 0
+    assert read_clusters(workspace / "localized" / "clusters.csv")
+
+
+def test_both_refiners_work_on_displaced_poses(workspace: Path) -> None:
+    refined = refine_displaced(workspace, megloc, ["--executor", "inline"])
+    rows = read_refinement(refined / "refinement.csv")
+    assert [row.method for row in rows] == ["icp", "rendering"] * QUERIES
+    truth = KaptureFolder(workspace / "query_gt").read().poses()
+    before, after = (
+        KaptureFolder(folder).read().poses() for folder in (workspace.parent / "displaced", refined)
+    )
+    for image, pose in truth.items():
+        displaced, found = (
+            float(np.linalg.norm(poses[image].center() - pose.center()))
+            for poses in (before, after)
+        )
+        assert displaced == pytest.approx(0.05, abs=1e-9)
+        assert found < 0.05
+    assert any(row.accepted for row in rows if row.method == "icp")
+
+
+def test_nothing_breaks_where_nothing_matches(workspace: Path, tmp_path: Path) -> None:
+    place = tmp_path / "whole"
+    for part in ("scene", "workspace"):
+        shutil.copytree(workspace.parent / part, place / part, symlinks=True)
+    wiring = Wiring("random", SCENE, WIRINGS["random"].options)
+    nothing = (
+        "local_features.superpoint.matching.options.match_threshold=0.9999999",
+        "local_features.aslfeat.matching.options.max_ratio=0.0001",
+    )
+    empty = run(wiring, place, megloc, changed(*nothing))
+    assert len(KaptureFolder(empty / "map").points3d()) == 0
+    statuses = read_status(empty / "localized" / "status.csv")
+    assert {status.status for status in statuses.values()} == {"failed"}
+    assert all(status.reason for status in statuses.values())
+    assert [one.stage for one in artefacts(empty) if one.path == "map"] == ["map"]
+    (empty / "localized" / "clusters.csv").unlink()
+    with pytest.raises(FileNotFoundError, match=r"localization|refine_poses: .*clusters\.csv"):
+        artefacts(empty)
