@@ -26,7 +26,7 @@ from megloc_kapture.values import RigidTransform
 Poses = Mapping[str, RigidTransform]
 
 _REASONS_TOLD = 4
-_NUMBER = re.compile(r"\d+(\.\d+)?")
+_NUMBER = re.compile(r"-?\d+(\.\d+)?")
 
 
 @dataclass(frozen=True)
