@@ -111,7 +111,8 @@ def run_plan(
             report = StageReport(stage.name, "pending", 0.0, {}, why)
         else:
             on_start(stage.name, why)
-            report = _run(stage, workspace, mark, inputs, why)
+            former = [] if manifest is None else _former_outputs(stage, manifest)
+            report = _run(stage, workspace, mark, inputs, why, former)
         reports.append(report)
         on_report(report)
     return reports
@@ -147,6 +148,8 @@ def _why(
     gone = [output for output in manifest.outputs if not workspace.path(output).exists()]
     if gone:
         return f"{gone[0]} is gone"
+    if before := _former_outputs(stage, manifest):
+        return f"{before[0]} is written no more"
     if manifest.fingerprint == mark:
         return ""
     if manifest.version != stage.version:
@@ -160,6 +163,21 @@ def _why(
     return f"options changed: {', '.join(_differences(manifest.options, options)[:3])}"
 
 
+def _former_outputs(stage: Stage, manifest: Manifest) -> list[str]:
+    """What a stage wrote and does not write now: options may give an output another name."""
+    return sorted(set(manifest.outputs) - set(stage.outputs))
+
+
+def _take_over(outputs: Sequence[str], workspace: Workspace, stage: str) -> None:
+    """Let no other stage count as done that wrote, under other options, what this one writes."""
+    for path in workspace.manifest_paths():
+        other = read_manifest(path)
+        if other is None or other.stage == stage:
+            continue
+        if not set(other.outputs).isdisjoint(outputs):
+            path.unlink(missing_ok=True)
+
+
 def _differences(old: Any, new: Any, prefix: str = "") -> list[str]:
     if isinstance(old, Mapping) and isinstance(new, Mapping):
         found: list[str] = []
@@ -170,7 +188,12 @@ def _differences(old: Any, new: Any, prefix: str = "") -> list[str]:
 
 
 def _run(
-    stage: Stage, workspace: Workspace, mark: str, inputs: Mapping[str, str], why: str
+    stage: Stage,
+    workspace: Workspace,
+    mark: str,
+    inputs: Mapping[str, str],
+    why: str,
+    former_outputs: Sequence[str],
 ) -> StageReport:
     started = datetime.now(UTC).isoformat(timespec="seconds")
     clock = time.perf_counter()
@@ -179,8 +202,10 @@ def _run(
         # without its manifest a stage counts as not done: killed between here and the end, it
         # runs again whatever of its output has moved by then
         workspace.manifest_path(stage.name).unlink(missing_ok=True)
+        _take_over(stage.outputs, workspace, stage.name)
         written = tuple(o for o in stage.outputs if (folder / o).exists())
         workspace.publish(folder, stage.outputs)
+        workspace.remove(former_outputs)
     seconds = time.perf_counter() - clock
     manifest = Manifest(
         stage=stage.name,

@@ -6,7 +6,7 @@ import contextlib
 import fcntl
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -40,6 +40,11 @@ class Workspace:
     def manifest_path(self, stage: str) -> Path:
         """Where the manifest of a stage stands."""
         return self.root / "stages" / f"{stage}.json"
+
+    def manifest_paths(self) -> list[Path]:
+        """The manifests that there are."""
+        folder = self.root / "stages"
+        return sorted(path for path in folder.glob("*.json") if path.name[0] != ".")
 
     def folder(self, name: str, *features: str) -> KaptureFolder:
         """A kapture folder of the workspace, with features folders of the workspace."""
@@ -79,8 +84,7 @@ class Workspace:
     def _release_if_unused(self) -> None:
         stages = self.root / "stages"
         with contextlib.suppress(OSError):
-            manifests = (path for path in stages.glob("*.json") if path.name[0] != ".")
-            if self._published or any(manifests):
+            if self._published or self.manifest_paths():
                 return
             for path in (self.path(HASHES), self.root / LOCK):
                 path.unlink(missing_ok=True)
@@ -115,9 +119,23 @@ class Workspace:
                     replace_directory(new, place)
                 elif new.exists():
                     os.replace(new, place)
-                elif place.is_dir() and not place.is_symlink():
-                    shutil.rmtree(place)
                 else:
-                    place.unlink(missing_ok=True)
+                    _remove(place)
             except OSError as error:
                 raise output_error(place, error) from error
+
+    def remove(self, outputs: Iterable[str]) -> None:
+        """Take outputs away; raises OutputError."""
+        for output in outputs:
+            place = self.root / output
+            try:
+                _remove(place)
+            except OSError as error:
+                raise output_error(place, error) from error
+
+
+def _remove(place: Path) -> None:
+    if place.is_dir() and not place.is_symlink():
+        shutil.rmtree(place)
+    else:
+        place.unlink(missing_ok=True)

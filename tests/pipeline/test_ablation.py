@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from megloc_kapture.io.status_table import read_status
 from megloc_kapture.pipeline.ablation import (
     fresh_copy,
     outcome,
@@ -100,6 +101,29 @@ def test_a_variant_runs_only_what_differs_and_leaves_the_first_run_alone(first: 
     # what did not change is the same file, not another with the same bytes
     place = "map/reconstruction/points3d.txt"
     assert workspace.path(place).samefile(first.workspace.path(place))
+
+
+def test_refinement_is_turned_on_and_off_in_one_workspace(first: Run) -> None:
+    workspace = fresh_copy(first.workspace, "with_rendering")
+    plain = folder_bytes(first.workspace.path("localized"))
+    refined = first.options.model_validate(
+        {**first.options.model_dump(), "pose_refinement": {"by": ["rendering"]}}
+    )
+    for options in (refined, first.options, refined):
+        stages = plan_evaluation(Run(first.source, "classic", options, workspace))
+        outputs = [output for stage in stages for output in stage.outputs]
+        assert len(outputs) == len(set(outputs))
+        with workspace.lock():
+            run_plan(stages, workspace)
+        statuses = read_status(workspace.path("localized/status.csv")).values()
+        said = {status.refinement for status in statuses}
+        if options is refined:
+            assert said == {"rendering: no reference image has depth"}
+            assert folder_bytes(workspace.path("localized_unrefined")) == plain
+        else:
+            assert said == {""}
+            assert folder_bytes(workspace.path("localized")) == plain
+            assert not workspace.path("localized_unrefined").exists()
 
 
 def test_the_table_has_recall_medians_and_seconds(first: Run) -> None:

@@ -123,6 +123,47 @@ def test_an_output_a_stage_no_longer_writes_is_taken_away(kitchen: Kitchen) -> N
     assert all_kept(kitchen.cook())
 
 
+@dataclass
+class Diner(Kitchen):
+    """A soup that is served as it is, or seasoned first: then the plain one is another file."""
+
+    seasoned: bool = False
+
+    def stages(self) -> list[Stage]:
+        plain = "plain.txt" if self.seasoned else "soup.txt"
+        soup = [Stage("cook", 1, {}, (), (plain,), self.put(plain, "soup"))]
+        if self.seasoned:
+            salted = self.put("soup.txt", "soup, salted")
+            soup.append(Stage("season", 1, {}, ("cook",), ("soup.txt",), salted))
+        return soup
+
+    def put(self, name: str, text: str) -> Callable[[Path], Mapping[str, float]]:
+        def run(out: Path) -> Mapping[str, float]:
+            self.log.append(name)
+            (out / name).write_text(text)
+            return {}
+
+        return run
+
+
+def test_an_output_that_another_stage_wrote_under_other_options_is_made_again(
+    tmp_path: Path,
+) -> None:
+    diner = Diner(Workspace(tmp_path / "w"))
+    soup, plain = (diner.workspace.path(name) for name in ("soup.txt", "plain.txt"))
+    for seasoned in (False, True, False, True, True):
+        kept = diner.seasoned and seasoned
+        diner.seasoned = seasoned
+        reports = diner.cook()
+        assert all_kept(reports) == kept
+        assert soup.read_text() == ("soup, salted" if seasoned else "soup")
+        assert plain.exists() == seasoned
+    assert diner.workspace.manifest_path("season").is_file()
+    diner.seasoned = False
+    assert diner.cook()[0].why == "plain.txt is written no more"
+    assert not diner.workspace.manifest_path("season").exists()
+
+
 def test_a_stage_that_fails_leaves_the_old_output(kitchen: Kitchen) -> None:
     kitchen.cook()
     kitchen.options["b"] = {"extra": "!", "burns": True}
