@@ -26,9 +26,9 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from scenes import DRAWS, SEEDED, megloc
+from scenes import SEEDED, errors_of, interval, megloc
 
-from megloc_kapture.evaluation.outputs import PER_QUERY_CSV, RECALL_JSON
+from megloc_kapture.evaluation.outputs import RECALL_JSON
 from megloc_kapture.io.refinement_table import REFINEMENT_FILE, read_refinement
 
 sys.path.append(str(Path(__file__).resolve().parent / "speed"))
@@ -81,7 +81,8 @@ def measure(
     megloc("eval", name, *place, "--workspace", str(workspace), *seeds, *off, *more)
     evaluation = workspace / "evaluation"
     thresholds = Thresholds.read(evaluation)
-    parts = [errors_of(evaluation, NONE, seed)]
+    same = {"chain": NONE, "seed": seed, "accepted": False, "seconds": 0.0}
+    parts = [errors_of(evaluation).assign(**same)]
     for chain in chains:
         found, report = workspace / f"refined-{chain}-{seed}", workspace / f"report-{chain}-{seed}"
         steps = [part for step in chain.split(",") for part in ("--by", step)]
@@ -92,29 +93,12 @@ def measure(
         seconds = time.perf_counter() - started
         truth = ("--gt", str(workspace / "query_gt"), "--side-tables", str(workspace / "megloc"))
         megloc("evaluate", "-i", str(found), *truth, "-o", str(report), "-f")
-        errors = errors_of(report, chain, seed)
         rows = read_refinement(found / REFINEMENT_FILE)
         accepted = {row.image for row in rows if row.accepted}
-        errors["accepted"] = errors["query"].isin(accepted)
-        errors["seconds"] = seconds / max(len({row.image for row in rows}), 1)
-        parts.append(errors)
+        errors = errors_of(report).assign(chain=chain, seed=seed)
+        per_query = seconds / max(len({row.image for row in rows}), 1)
+        parts.append(errors.assign(accepted=errors["query"].isin(accepted), seconds=per_query))
     return pd.concat(parts), thresholds
-
-
-def errors_of(evaluation: Path, chain: str, seed: int) -> pd.DataFrame:
-    """Errors of every query; those of a query without a pose are infinite."""
-    rows = pd.read_csv(evaluation / PER_QUERY_CSV)
-    return pd.DataFrame(
-        {
-            "chain": chain,
-            "seed": seed,
-            "query": rows["image"],
-            "error_m": rows["position_error_m"].fillna(np.inf),
-            "error_deg": rows["angle_error_deg"].fillna(np.inf),
-            "accepted": False,
-            "seconds": 0.0,
-        }
-    )
 
 
 def comparison(name: str, errors: pd.DataFrame, thresholds: Thresholds) -> str:
@@ -130,8 +114,7 @@ def comparison(name: str, errors: pd.DataFrame, thresholds: Thresholds) -> str:
             for each in (before, after)
         ]
         difference = (means[1] - means[0]).to_numpy()
-        draws = np.random.default_rng(0).integers(0, len(difference), (DRAWS, len(difference)))
-        low, high = np.quantile(difference[draws].mean(axis=1), (0.025, 0.975), axis=0)
+        low, high = interval(difference)
         for column, threshold in enumerate(means[0].columns):
             worse, better = high[column] < 0, low[column] > 0
             change = difference[:, column].mean()

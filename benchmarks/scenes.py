@@ -24,6 +24,9 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
+
+from megloc_kapture.evaluation.outputs import PER_QUERY_CSV
 
 sys.path.append(str(Path(__file__).resolve().parent / "speed"))
 from timing import table  # noqa: E402
@@ -63,17 +66,19 @@ def measure(scene: Path, seed: int, workspace: Path, arguments: Sequence[str]) -
         places = ("--root", str(scene), "--workspace", str(workspace))
         megloc("eval", "kapture", *places, *seeds, *arguments)
         report = workspace / "evaluation"
-    rows = pd.read_csv(report / "per_query.csv")
-    errors = pd.DataFrame(
+    return errors_of(report).assign(scene=scene.name, seed=seed)[list(COLUMNS)]
+
+
+def errors_of(report: Path) -> pd.DataFrame:
+    """Errors of every query of an evaluation; those of a query without a pose are infinite."""
+    rows = pd.read_csv(report / PER_QUERY_CSV)
+    return pd.DataFrame(
         {
-            "scene": scene.name,
-            "seed": seed,
             "query": rows["image"],
             "error_m": rows["position_error_m"].fillna(np.inf),
             "error_deg": rows["angle_error_deg"].fillna(np.inf),
         }
     )
-    return errors[list(COLUMNS)]
 
 
 def hits(errors: pd.DataFrame) -> pd.DataFrame:
@@ -102,6 +107,13 @@ def summary(errors: pd.DataFrame) -> str:
     return table(rows)
 
 
+def interval(difference: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """95 % bootstrap interval of the mean over queries, of each column of (queries, columns)."""
+    draws = np.random.default_rng(0).integers(0, len(difference), (DRAWS, len(difference)))
+    low, high = np.quantile(difference[draws].mean(axis=1), (0.025, 0.975), axis=0)
+    return low, high
+
+
 def comparison(now: pd.DataFrame, before: pd.DataFrame) -> str:
     """Differences now minus before per scene and threshold, with 95 % bootstrap intervals."""
     rows: list[tuple[str, ...]] = [("scene", "figure", "before", "now", "difference", "verdict")]
@@ -113,8 +125,7 @@ def comparison(now: pd.DataFrame, before: pd.DataFrame) -> str:
         if not means[0].index.equals(means[1].index):
             sys.exit(f"{scene}: the two results are not of the same queries")
         difference = (means[0] - means[1]).to_numpy()
-        draws = np.random.default_rng(0).integers(0, len(difference), (DRAWS, len(difference)))
-        low, high = np.quantile(difference[draws].mean(axis=1), (0.025, 0.975), axis=0)
+        low, high = interval(difference)
         for column, name in enumerate(means[0].columns):
             verdict = "better" if low[column] > 0 else "worse" if high[column] < 0 else "equal"
             rows.append(
