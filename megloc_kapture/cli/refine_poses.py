@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+
+import tyro
 
 from megloc_kapture.cli.common import Force, Input, Output
 from megloc_kapture.cli.localize import LOCALIZED
@@ -28,8 +30,8 @@ class RefinePoses(StageCommand):
     """Result of megloc localize or megloc eval: kapture folder with status.csv."""
     output: Output
     """Kapture folder of the refined result, with status.csv and refinement.csv."""
-    by: tuple[str, ...] = ()
-    """Pose refiners, one after another: icp, rendering; the preset's unless given."""
+    by: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
+    """Pose refiner: icp or rendering; repeated, one after another; the preset's unless given."""
     force: Force = False
     """Write into a folder that has other things in it."""
 

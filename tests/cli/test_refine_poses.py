@@ -33,6 +33,15 @@ def test_poses_without_depth_stay_and_say_so(megloc: Any, finished: Path, tmp_pa
     again.refused("no pose refiner is chosen; --by takes: icp, rendering")
 
 
+def test_refiners_work_one_after_another(megloc: Any, finished: Path, tmp_path: Path) -> None:
+    out = tmp_path / "refined"
+    done = megloc(*command(finished, out), "--by", "icp", "--by", "rendering", "-q")
+    assert done.out.startswith("4 poses, 0 accepted by icp, 0 accepted by rendering;")
+    for status in read_status(out / "status.csv").values():
+        first, second = status.refinement.split("; ")
+        assert first.startswith("icp: ") and second.startswith("rendering: ")
+
+
 def test_what_is_refused(megloc: Any, finished: Path, tmp_path: Path) -> None:
     megloc(*command(finished, tmp_path / "out"), "--by", "magic").refused(
         "no plugin 'magic' in megloc_kapture.pose_refiners; registered: icp, rendering"
