@@ -63,7 +63,10 @@ class InLocRooms:
         if not twin.is_dir():
             settings = [part for setting in self.settings for part in ("--set", setting)]
             chosen = ("--seed", str(seed), *settings, "--executor", "inline")
-            megloc("synth", DATASET, "-o", str(twin), *chosen)
+            # a twin that was cut short is not taken for a whole one
+            unfinished = folder / "unfinished"
+            megloc("synth", DATASET, "-o", str(unfinished), "-f", *chosen)
+            unfinished.rename(twin)
         where = ("--root", str(twin), "--workspace", str(run), "--executor", "inline")
         megloc("eval", DATASET, *where, "--until", "query_matches")
         return run

@@ -21,6 +21,7 @@ import argparse
 import json
 import os
 import re
+import shutil
 import sys
 import tempfile
 from collections import Counter
@@ -289,8 +290,11 @@ def execute(wiring: Wiring, place: Path, arguments: Sequence[str]) -> bool:
     """Run a wiring and print its tables; whether it reaches what it has to."""
     place.mkdir(parents=True, exist_ok=True)
     megloc = program(weights_environment(wiring, place), place / "logs")
-    if wiring.name == "random" and not (place / "weights").is_dir():
+    added = place / "weights_added"  # marks that all of them are there
+    if wiring.name == "random" and not added.exists():
+        shutil.rmtree(place / "weights", ignore_errors=True)
         seconds = add_weights(write_random_weights(place / "made"), megloc)
+        added.touch()
         print(f"random weights added in {seconds:.1f} s")
     workspace = run(wiring, place, megloc, arguments)
     covisible = pair_by_covisibility(workspace, megloc)
