@@ -32,7 +32,8 @@ from pathlib import Path
 
 import numpy as np
 from corridor_scene import ROOM_DISTANCE_M, Seen, write_corridor
-from mapped_scene import Query, Scene, errors, hypotheses, megloc, read_scene
+from mapped_scene import Query, Scene, errors, hypotheses, read_scene
+from scenes import megloc
 
 from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions, absolute_pose
 from megloc_kapture.localization.clusters import ClusterOptions

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from mapped_scene import Query, Scene, errors, hypotheses, megloc
+from mapped_scene import Query, Scene, errors, hypotheses
+from scenes import megloc
 
 from megloc_kapture.datasets.synthetic.indoor_rooms import MODULE_M
 from megloc_kapture.pipeline.benchmarks import find_benchmark

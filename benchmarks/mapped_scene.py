@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -65,14 +63,6 @@ class Scene:
     centers: Mapping[str, NDArray[np.float64]]
     pixels: KaptureScene
     restrictions: Restrictions
-
-
-def megloc(*arguments: str) -> None:
-    """Run the ``megloc`` beside this Python; a failure ends this run with its exit code."""
-    program = str(Path(sys.executable).with_name("megloc"))
-    done = subprocess.run([program, *arguments, "-q"], check=False)
-    if done.returncode != 0:
-        sys.exit(done.returncode)
 
 
 def read_scene(run: Path) -> Scene:

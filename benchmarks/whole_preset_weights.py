@@ -8,11 +8,8 @@ and matches to descriptors: then every stage after them has something to do.
 
 from __future__ import annotations
 
-import io
-import struct
 import sys
-import tarfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,9 +21,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.io import savemat
+from tensorflow_checkpoints import write_saved_model, write_tensorflow_checkpoint
 from torch import nn
 
-from megloc_kapture.io.crc32c import crc32c
 from megloc_kapture.io.weights_registry import registry
 from megloc_kapture.nets.apgem import ApGemNet
 from megloc_kapture.nets.aslfeat import AslFeatNet
@@ -37,9 +34,6 @@ from megloc_kapture.nets.netvlad import VggNetVlad
 from megloc_kapture.nets.superglue import SuperGlueNet
 from megloc_kapture.nets.superpoint import SuperPointNet
 
-Arrays = Mapping[str, NDArray[np.float32]]
-
-SHARD = ".data-00000-of-00001"
 _PCA_MODULE = "sklearn.decomposition.pca"
 _MEAN_RGB = (123.68, 116.779, 103.939)
 _STANDING_CLASSES = 11  # of Cityscapes, before person, rider and the vehicles
@@ -184,13 +178,7 @@ def _delg(path: Path, _: Sizes) -> None:
         for key, value in net.state_dict().items()
         if not key.endswith("num_batches_tracked")
     }
-    index, data = tensorflow_checkpoint(variables)
-    members = {"saved_model.pb": b"", "variables/variables.index": index}
-    with tarfile.open(path, "w:gz", compresslevel=0) as archive:
-        for name, content in (members | {f"variables/variables{SHARD}": data}).items():
-            member = tarfile.TarInfo(f"{path.name.removesuffix('.tar.gz')}/{name}")
-            member.size = len(content)
-            archive.addfile(member, io.BytesIO(content))
+    write_saved_model(path, path.name.removesuffix(".tar.gz"), variables)
 
 
 def _delg_values(key: str, value: torch.Tensor) -> torch.Tensor:
@@ -310,58 +298,3 @@ def _tensorflow_layout(value: torch.Tensor) -> NDArray[np.float32]:
     if value.ndim == 4:
         value = value.permute(2, 3, 1, 0)
     return np.ascontiguousarray(value.numpy(), np.float32).reshape(value.shape)
-
-
-def write_tensorflow_checkpoint(path: Path, variables: Arrays) -> None:
-    """Write ``X.index``, which is ``path``, and the data beside it."""
-    index, data = tensorflow_checkpoint(variables)
-    path.write_bytes(index)
-    path.with_name(path.stem + SHARD).write_bytes(data)
-
-
-def tensorflow_checkpoint(variables: Arrays) -> tuple[bytes, bytes]:
-    """Index and data of a TensorFlow checkpoint: a sorted string table of one block.
-
-    The format is that which :mod:`megloc_kapture.io.tensor_bundle` describes; every key is written
-    whole.
-    """
-    data, rows = io.BytesIO(), [(b"", b"\x08\x01")]
-    for name in sorted(variables):
-        content = variables[name].tobytes()
-        dims = [b"\x08" + _varint(n) for n in variables[name].shape]
-        shape = b"".join(b"\x12" + _varint(len(dim)) + dim for dim in dims)
-        entry = b"\x08\x01\x12" + _varint(len(shape)) + shape
-        entry += b"\x20" + _varint(data.tell()) + b"\x28" + _varint(len(content))
-        rows.append((name.encode(), entry + b"\x35" + struct.pack("<I", _masked(content))))
-        data.write(content)
-    table = io.BytesIO()
-    handle = _add_block(table, rows)
-    footer = _add_block(table, []) + _add_block(table, [(b"\xff", handle)])
-    end = footer.ljust(40, b"\0") + struct.pack("<Q", 0xDB4775248B80FB57)
-    return table.getvalue() + end, data.getvalue()
-
-
-def _add_block(table: io.BytesIO, rows: list[tuple[bytes, bytes]]) -> bytes:
-    """Append a block with its trailer; its handle: where it lies, and how long it is."""
-    block, restarts = b"", []
-    for key, value in rows:
-        restarts.append(len(block))
-        block += b"\0" + _varint(len(key)) + _varint(len(value)) + key + value
-    restarts = restarts or [0]
-    block += struct.pack(f"<{len(restarts) + 1}I", *restarts, len(restarts))
-    handle = _varint(table.tell()) + _varint(len(block))
-    table.write(block + b"\0" + struct.pack("<I", _masked(block + b"\0")))
-    return handle
-
-
-def _varint(number: int) -> bytes:
-    out = b""
-    while number >= 0x80:
-        out += bytes([number & 0x7F | 0x80])
-        number >>= 7
-    return out + bytes([number])
-
-
-def _masked(content: bytes) -> int:
-    crc = crc32c(content)
-    return ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache, partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 from markupsafe import Markup
@@ -17,7 +19,10 @@ from megloc_kapture.evaluation.surroundings import Surroundings
 from megloc_kapture.evaluation.tables import format_degrees, format_metres
 from megloc_kapture.io.refinement_table import RefinementRow
 from megloc_kapture.plugins import RankingScene
-from megloc_kapture.values import RigidTransform
+from megloc_kapture.values import Camera, RigidTransform
+
+if TYPE_CHECKING:
+    from megloc_kapture.geometry.warping import WarpSource
 
 Poses = Mapping[str, RigidTransform]
 
@@ -58,6 +63,7 @@ def refined_views(
     if around.mapping is None or around.queries is None:
         return []
     # only a report with such pictures waits for what warps them
+    from megloc_kapture.stages.perceptual_ranking import warp_source
     from megloc_kapture.stages.ranking_scene import KaptureScene
 
     refined = [i for i, rows in refinements.items() if any(row.accepted for row in rows)]
@@ -67,7 +73,16 @@ def refined_views(
         scene = KaptureScene(around.mapping, around.queries)
         for image in sorted(refined, key=lambda name: (-_moved_m(refinements[name]), name)):
             poses = {"before": refinements[image][0].before, "after": estimated[image]}
-            pictures = [_picture(around, scene, image, step, pose) for step, pose in poses.items()]
+            places = [row.images for row in around.clusters.get(image, ()) if row.chosen == "yes"]
+            if not places:
+                continue
+            camera = around.queries.read().camera_of(image)
+            # both pictures show the same map images, or nearly
+            read = cache(partial(warp_source, scene=scene))
+            pictures = [
+                _picture(camera, pose, places[0], scene, read, (image, step))
+                for step, pose in poses.items()
+            ]
             if not all(pictures):
                 continue
             captions = [step + _error(pose, image, truth) for step, pose in poses.items()]
@@ -83,24 +98,28 @@ def _moved_m(rows: Sequence[RefinementRow]) -> float:
 
 
 def _picture(
-    around: Surroundings, scene: RankingScene, image: str, step: str, pose: RigidTransform
+    camera: Camera,
+    pose: RigidTransform,
+    images: Sequence[str],
+    scene: RankingScene,
+    read: Callable[[str], WarpSource | None],
+    title: tuple[str, str],
 ) -> Markup:
-    """The query's pixels and those of the map in turn; empty where the map shows too little."""
+    """The query's pixels and those of the map in turn; empty where the map shows too little.
+
+    ``title`` is the query, and which of its poses this is.
+    """
     from megloc_kapture.stages.perceptual_ranking import (
         AlignedViewOptions,
         aligned_view,
         query_at_size,
     )
 
-    if around.queries is None:
-        return Markup()
-    camera = around.queries.read().camera_of(image)
-    places = [row.images for row in around.clusters.get(image, ()) if row.chosen == "yes"]
-    if not places:
-        return Markup()
-    view = aligned_view(camera, pose, places[0], scene, AlignedViewOptions(long_side=_LONG_SIDE_PX))
+    options = AlignedViewOptions(long_side=_LONG_SIDE_PX)
+    view = aligned_view(camera, pose, images, scene, options, source_of=read)
     if view.valid.mean() < _LEAST_SHOWN:
         return Markup()
+    image, step = title
     height, width = view.valid.shape
     mixed = in_tiles(query_at_size(scene.query_image(image), width, height), view.image, view.valid)
     return image_tag(data_picture(mixed, width / camera.width), f"{image} and the map {step}")

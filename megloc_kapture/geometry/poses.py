@@ -124,6 +124,13 @@ def rotation_angles_deg(quats_a: Float64Array, quats_b: Float64Array) -> Float64
     return np.rad2deg(2.0 * np.linalg.norm(scale[..., None] * vector, axis=-1))
 
 
+def movement(old: RigidTransform, new: RigidTransform) -> tuple[float, float]:
+    """How far a camera goes between two ``cam_from_world``: its centre in metres, and degrees."""
+    moved_m = float(np.linalg.norm(new.center() - old.center()))
+    turned_deg = rotation_angles_deg(np.array(new.quat_wxyz), np.array(old.quat_wxyz))
+    return moved_m, float(turned_deg)
+
+
 def cross_matrix(vector: Float64Array) -> Float64Array:
     """``[v]_x`` (3, 3) with ``[v]_x w = v x w``."""
     x, y, z = vector

@@ -168,13 +168,13 @@ def _former_outputs(stage: Stage, manifest: Manifest) -> list[str]:
     return sorted(set(manifest.outputs) - set(stage.outputs))
 
 
-def _take_over(outputs: Sequence[str], workspace: Workspace, stage: str) -> None:
+def _take_over(stage: Stage, workspace: Workspace) -> None:
     """Let no other stage count as done that wrote, under other options, what this one writes."""
     for path in workspace.manifest_paths():
         other = read_manifest(path)
-        if other is None or other.stage == stage:
+        if other is None or other.stage == stage.name:
             continue
-        if not set(other.outputs).isdisjoint(outputs):
+        if not set(other.outputs).isdisjoint(stage.outputs):
             path.unlink(missing_ok=True)
 
 
@@ -202,7 +202,7 @@ def _run(
         # without its manifest a stage counts as not done: killed between here and the end, it
         # runs again whatever of its output has moved by then
         workspace.manifest_path(stage.name).unlink(missing_ok=True)
-        _take_over(stage.outputs, workspace, stage.name)
+        _take_over(stage, workspace)
         written = tuple(o for o in stage.outputs if (folder / o).exists())
         workspace.publish(folder, stage.outputs)
         workspace.remove(former_outputs)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.geometry.poses import rotation_angles_deg
+from megloc_kapture.geometry.poses import movement
 from megloc_kapture.plugins import PoseRefinement
 from megloc_kapture.refinement.photometric import MIN_POINTS, Alignment, LevelProblem
 from megloc_kapture.refinement.photometric_covariance import covariance
@@ -58,8 +58,7 @@ def judged(
     """
     pose = found.alignment.cam_from_world
     comparison = compared(found.problem, start, pose)
-    moved_m = float(np.linalg.norm(pose.center() - start.center()))
-    turned_deg = float(rotation_angles_deg(np.array(pose.quat_wxyz), np.array(start.quat_wxyz)))
+    moved_m, turned_deg = movement(start, pose)
     measures = {
         "cost_before": comparison.before.cost,
         "cost_after": comparison.after.cost,

@@ -9,11 +9,10 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 from pydantic import Field
 
 from megloc_kapture.errors import PluginError
-from megloc_kapture.geometry.poses import rotation_angles_deg
+from megloc_kapture.geometry.poses import movement
 from megloc_kapture.io.cluster_table import CLUSTERS_FILE
 from megloc_kapture.io.csv_table import write_csv_table
 from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, write_sensors
@@ -205,13 +204,13 @@ def _row(
             f"{type(refined).__name__}, not PoseRefinement"
         )
     after = refined.cam_from_world if refined.accepted else before
-    turned_deg = rotation_angles_deg(np.array(before.quat_wxyz), np.array(after.quat_wxyz))
+    moved_m, turned_deg = movement(before, after)
     return RefinementRow(
         image=image,
         method=refiner.name,
         reason=refined.reason,
-        moved_m=float(np.linalg.norm(after.center() - before.center())),
-        turned_deg=float(turned_deg),
+        moved_m=moved_m,
+        turned_deg=turned_deg,
         measures=tuple(f"{name}={value:.6g}" for name, value in refined.measures.items()),
         before=before,
     )

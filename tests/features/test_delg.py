@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import pickle
-import struct
-import tarfile
+import sys
 import zlib
 from pathlib import Path
 
@@ -17,14 +15,14 @@ from PIL import Image as PillowImage
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.features.delg import Delg, DelgOptions, _with_longer_side
-from megloc_kapture.io.crc32c import crc32c
 from megloc_kapture.io.weights import MissingWeightsError
 from megloc_kapture.plugins import GlobalFeatureExtractor
 
+sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
+from tensorflow_checkpoints import write_saved_model  # noqa: E402
+
 # written by TensorFlow, see make_reference.py there
 WRITTEN = Path(__file__).parents[1] / "nets" / "data" / "delg"
-SHARD = ".data-00000-of-00001"
-Arrays = dict[str, NDArray[np.float32]]
 
 
 def values_of(name: str, shape: tuple[int, ...]) -> NDArray[np.float32]:
@@ -38,67 +36,13 @@ def values_of(name: str, shape: tuple[int, ...]) -> NDArray[np.float32]:
     return random.uniform(low, high, shape).astype(np.float32)
 
 
-def varint(number: int) -> bytes:
-    out = b""
-    while number >= 0x80:
-        out += bytes([number & 0x7F | 0x80])
-        number >>= 7
-    return out + bytes([number])
-
-
-def masked(content: bytes) -> int:
-    crc = crc32c(content)
-    return ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF
-
-
-def bundle(arrays: Arrays) -> tuple[bytes, bytes]:
-    """Index and data of a TensorFlow checkpoint, each key written whole."""
-
-    def block(rows: list[tuple[bytes, bytes]]) -> bytes:
-        out, restarts = b"", []
-        for key, value in rows:
-            restarts.append(len(out))
-            out += b"\0" + varint(len(key)) + varint(len(value)) + key + value
-        restarts = restarts or [0]
-        return out + struct.pack(f"<{len(restarts) + 1}I", *restarts, len(restarts))
-
-    def add(content: bytes) -> bytes:
-        nonlocal table
-        handle = varint(len(table)) + varint(len(content))
-        table += content + b"\0" + struct.pack("<I", masked(content + b"\0"))
-        return handle
-
-    data, rows = io.BytesIO(), [(b"", b"\x08\x01")]
-    for name in sorted(arrays):
-        content = arrays[name].tobytes()
-        dims = [b"\x08" + varint(n) for n in arrays[name].shape]
-        shape = b"".join(b"\x12" + varint(len(dim)) + dim for dim in dims)
-        entry = b"\x08\x01\x12" + varint(len(shape)) + shape
-        entry += b"\x20" + varint(data.tell()) + b"\x28" + varint(len(content))
-        rows.append((name.encode(), entry + b"\x35" + struct.pack("<I", masked(content))))
-        data.write(content)
-    table = b""
-    handle = add(block(rows))
-    footer = add(block([])) + add(block([(b"\xff", handle)]))
-    return table + footer.ljust(40, b"\0") + struct.pack("<Q", 0xDB4775248B80FB57), data.getvalue()
-
-
-def saved_model(path: Path, arrays: Arrays) -> Path:
-    index, data = bundle(arrays)
-    members = {"saved_model.pb": b"graph", "variables/variables.index": index}
-    with tarfile.open(path, "w:gz", compresslevel=1) as archive:
-        for name, content in (members | {f"variables/variables{SHARD}": data}).items():
-            member = tarfile.TarInfo(f"r50delg/{name}")
-            member.size = len(content)
-            archive.addfile(member, io.BytesIO(content))
-    return path
-
-
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rows = [row.split() for row in (WRITTEN / "slim.txt").read_text().splitlines()]
     arrays = {name: values_of(name, tuple(map(int, s.split("x")))) for name, s in rows}
-    return saved_model(tmp_path_factory.mktemp("weights") / "r50delg_mine.tar.gz", arrays)
+    path = tmp_path_factory.mktemp("weights") / "r50delg_mine.tar.gz"
+    write_saved_model(path, "r50delg", arrays)
+    return path
 
 
 @pytest.fixture(scope="module")
@@ -161,7 +105,8 @@ def test_missing_weights_and_names(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 def test_models_of_other_things(tmp_path: Path, image: NDArray[np.uint8]) -> None:
-    path = saved_model(tmp_path / "other.tar.gz", {"dense/kernel": np.ones((2, 3), np.float32)})
+    path = tmp_path / "other.tar.gz"
+    write_saved_model(path, "r50delg", {"dense/kernel": np.ones((2, 3), np.float32)})
     message = r"other\.tar\.gz: no DELG .*resnet_v1_101.*found: dense/kernel$"
     with pytest.raises(DataError, match=message):
         extractor(path).describe(image)

@@ -14,6 +14,7 @@ from megloc_kapture.geometry.poses import (
     cross_matrix,
     invert,
     invert_quats,
+    movement,
     multiply_quats,
     normalize_quats,
     rotate,
@@ -156,3 +157,22 @@ def test_a_zero_quaternion_has_no_direction() -> None:
 def test_cross_matrix_is_the_cross_product(values: list[float]) -> None:
     a, b = np.array(values[:3]), np.array(values[3:])
     np.testing.assert_allclose(cross_matrix(a) @ b, np.cross(a, b), atol=1e-12)
+
+
+@given(st.tuples(*[st.floats(-1.0, 1.0)] * 3), st.floats(0.0, 179.0), st.integers(0, 2**32 - 1))
+def test_movement_is_of_the_centre_and_about_any_axis(
+    step_m: tuple[float, float, float], angle_deg: float, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    rotation = Rotation.random(random_state=rng)
+    axis = rng.normal(size=3)
+    axis /= np.linalg.norm(axis)
+    turned = Rotation.from_rotvec(np.deg2rad(angle_deg) * axis) * rotation
+    center = rng.normal(size=3)
+    old, new = (
+        RigidTransform.from_matrix(r.as_matrix(), -r.as_matrix() @ c)
+        for r, c in ((rotation, center), (turned, center + step_m))
+    )
+    moved_m, turned_deg = movement(old, new)
+    assert moved_m == pytest.approx(np.linalg.norm(step_m), abs=1e-9)
+    assert turned_deg == pytest.approx(angle_deg, abs=1e-6)
