@@ -359,6 +359,8 @@ def _observation_lines(of_types: Sequence[Observations]) -> Iterator[str]:
         rows: list[tuple[int, str]] = []
         for ordered, texts in parts:
             first, last = np.searchsorted(ordered.point_ids, [block[0], block[-1] + 1])
+            if first == last:  # this type sees no point of the block
+                continue
             ids = ordered.point_ids[first:last]
             tokens = [
                 texts[image] + str(keypoint)

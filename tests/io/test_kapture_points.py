@@ -289,6 +289,49 @@ def test_the_layout_of_observations_is_kapture_s(tmp_path: Path) -> None:
     assert (tmp_path / "reconstruction/observations.txt").read_text() == OBSERVATIONS
 
 
+def of_points(keypoints_type: str, image: str, points: range) -> Observations:
+    """Observations of some points, one each, by one image."""
+    ids = np.asarray(points)
+    return Observations(
+        keypoints_type,
+        (image,),
+        ids,
+        np.zeros(len(ids), np.int32),
+        np.arange(len(ids), dtype=np.int32),
+    )
+
+
+@BOTH
+def test_types_of_disjoint_points_over_many_blocks(tmp_path: Path, large_bytes: int) -> None:
+    """As maps of several keypoints types have them: each type's points behind the other's."""
+    written = {
+        "aliked": of_points("aliked", "a.jpg", range(90_000)),
+        "sift": of_points("sift", "b.jpg", range(90_000, 200_000)),
+    }
+    write_observations(
+        tmp_path, {**written, "none": Observations("none", (), *np.empty((3, 0), int))}
+    )
+    path = tmp_path / "reconstruction/observations.txt"
+    assert plain(read_observations(path, large_bytes=large_bytes)) == plain(written)
+
+
+def test_kapture_reads_types_of_disjoint_points(tmp_path: Path) -> None:
+    from kapture.io.csv import observations_from_file
+
+    write_observations(
+        tmp_path,
+        {
+            "aliked": of_points("aliked", "a.jpg", range(70_000)),
+            "none": Observations("none", (), *np.empty((3, 0), int)),
+            "sift": of_points("sift", "b.jpg", range(69_999, 140_000)),
+        },
+    )
+    found = observations_from_file(str(tmp_path / "reconstruction/observations.txt"))
+    assert len(found) == 140_000
+    assert found[69_999] == {"aliked": [("a.jpg", 69_999)], "sift": [("b.jpg", 0)]}
+    assert found[139_999] == {"sift": [("b.jpg", 70_000)]}
+
+
 @BOTH
 @pytest.mark.usefixtures("small_chunks")
 def test_unusual_but_good_observations_are_read(tmp_path: Path, large_bytes: int) -> None:
