@@ -38,6 +38,18 @@ class Options(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
 
+    def idle(self) -> dict[str, str]:
+        """Options that change nothing while the others are as they are: name to the reason.
+
+        Who sets one of them meant something else: it is refused (pipeline/assignments.py).
+        """
+        return {}
+
+    @classmethod
+    def all_but(cls, *names: str) -> list[str]:
+        """Names of all options but these."""
+        return [name for name in cls.model_fields if name not in names]
+
 
 @dataclass(frozen=True, slots=True)
 class Camera:
@@ -234,6 +246,34 @@ class ClusterPose:
     reason: str = ""
 
 
+@dataclass(frozen=True)
+class RefinementRow:
+    """One refiner's work on one query.
+
+    Attributes
+    ----------
+    image : name of the query.
+    method : name of the refiner.
+    reason : why the old pose stays; empty where the new one is accepted.
+    moved_m, turned_deg : of the new pose against the old, unit of the map; 0 where it stays.
+    measures : ``name=value`` texts, e.g. of residuals before and after.
+    before : ``cam_from_world`` that the refiner was given.
+    """
+
+    image: str
+    method: str
+    reason: str
+    moved_m: float
+    turned_deg: float
+    measures: tuple[str, ...]
+    before: RigidTransform
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the pose is a new one."""
+        return not self.reason
+
+
 @dataclass(frozen=True, eq=False)
 class Pose:
     """A query that was localized; truthy.
@@ -248,6 +288,8 @@ class Pose:
     candidates : map images that took part, best first.
     clusters : all clusters of candidates that were tried, that of the best candidate first.
     cluster : the one this pose comes from, an index into ``clusters``.
+    refinements : what each pose refiner made of it, in their order.
+    remarks : steps that were left out because the query, or the map, lacks what they need.
     seconds : by step.
     """
 
@@ -259,6 +301,8 @@ class Pose:
     candidates: tuple[str, ...] = ()
     clusters: tuple[ClusterPose, ...] = ()
     cluster: int | None = None
+    refinements: tuple[RefinementRow, ...] = ()
+    remarks: tuple[str, ...] = ()
     seconds: Mapping[str, float] = field(default_factory=dict)
 
     def __bool__(self) -> bool:
@@ -272,7 +316,7 @@ class Failure:
     Attributes
     ----------
     num_matches, num_inliers, candidates : of the cluster that came nearest to a pose.
-    clusters, seconds : as of :class:`Pose`.
+    clusters, remarks, seconds : as of :class:`Pose`.
     """
 
     reason: str
@@ -280,6 +324,7 @@ class Failure:
     num_inliers: int = 0
     candidates: tuple[str, ...] = ()
     clusters: tuple[ClusterPose, ...] = ()
+    remarks: tuple[str, ...] = ()
     seconds: Mapping[str, float] = field(default_factory=dict, compare=False)
 
     def __bool__(self) -> bool:

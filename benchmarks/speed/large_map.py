@@ -144,7 +144,8 @@ def measure(folder: Path, street: Street) -> dict[str, float]:
     for x, features, center in queries:
         candidates = tuple(street.names[i] for i in nearest_images(street, x, NUM_CANDIDATES))
         start = time.perf_counter()
-        found = localizer.localize_query(Query(CAMERA, features=features, candidates=candidates))
+        brought = {local.name: features for local in localizer.types}
+        found = localizer.localize_query(Query(CAMERA, features=brought, candidates=candidates))
         seconds.append(time.perf_counter() - start)
         if isinstance(found, Failure):
             raise SystemExit(f"a query failed: {found.reason}")

@@ -11,6 +11,7 @@ import tyro
 
 from megloc_kapture.cli.console import Console, configure_logging
 from megloc_kapture.errors import DataError
+from megloc_kapture.io.kapture_store import KaptureFolder
 from megloc_kapture.io.side_tables import PROTOCOL_FILE, SIDE_TABLES
 from megloc_kapture.pipeline.executors import ExecutorKind
 
@@ -60,6 +61,35 @@ class Working:
     """Where the work runs: in this process, or in local processes."""
     workers: int | None = None
     """Number of processes; all cores unless given."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Linked:
+    """Flags of commands that read kapture folders, which may consist of links."""
+
+    allow_links_below: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = ()
+    """Folder that links in the kapture folders may lead to, as those of kapture-localization's
+    proxy folders do; may be repeated."""
+
+    def kapture(self, root: Path) -> KaptureFolder:
+        """A kapture folder; raises DataError where a folder that links may lead to is not there."""
+        return KaptureFolder(root, allow_links_below=existing(self.allow_links_below))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reading(Linked):
+    """Flags of commands that read features of kapture folders."""
+
+    features_dir: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = ()
+    """Features folder beside the kapture folders; may be repeated."""
+
+    def kapture(self, root: Path) -> KaptureFolder:
+        """A kapture folder with the features beside it; raises DataError for one not there."""
+        return KaptureFolder(
+            root,
+            features_dirs=existing(self.features_dir),
+            allow_links_below=existing(self.allow_links_below),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,15 +10,14 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from megloc_kapture.cli.common import Common, existing
+from megloc_kapture.cli.common import Common, Reading, existing
 from megloc_kapture.cli.console import Console
 from megloc_kapture.cli.refine_map import report_lines
-from megloc_kapture.cli.stage_command import FeaturesDirs
 from megloc_kapture.errors import MeglocError
 from megloc_kapture.io.kapture_store import KaptureFolder
 from megloc_kapture.io.point_covariances import read_point_covariances
 from megloc_kapture.mapping.uncertainty import point_deviations
-from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
+from megloc_kapture.pipeline.kapture_map import KaptureMap, MapKeypoints, PixelOriginChoice
 from megloc_kapture.plugins import LOCAL_FEATURES, PluginChoice, load_plugin
 
 _COLUMN = 18
@@ -26,15 +25,13 @@ _QUANTILES = (0.1, 0.5, 0.9)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Info(Common):
+class Info(Reading, Common):
     """Say what is in a kapture folder, and what a map allows."""
 
     input: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="KAPTURE")]
     """Kapture folder."""
-    features_dir: FeaturesDirs = ()
-    """Features folder beside it; may be repeated."""
-    keypoints_type: str | None = None
-    """Which type to look at, where the map has points of several."""
+    keypoints_type: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
+    """Keypoints type to look at; may be repeated; all that have points unless given."""
     pixel_origin: PixelOriginChoice = "auto"
     """Where the map's intrinsics put the pixel origin; auto finds it out."""
     deep: bool = False
@@ -43,7 +40,7 @@ class Info(Common):
     def run(self) -> int:
         """Print it."""
         console = self.console()
-        folder = KaptureFolder(self.input, features_dirs=existing(self.features_dir))
+        folder = self.kapture(self.input)
         describe_content(console, folder)
         folder.validate(deep=self.deep)
         line(console, "checked", "everything, image by image" if self.deep else "no fault found")
@@ -57,25 +54,27 @@ class Info(Common):
         try:
             opened = KaptureMap.open(
                 self.input,
-                keypoints_type=self.keypoints_type,
+                keypoints_types=self.keypoints_type,
                 features_dirs=existing(self.features_dir),
                 pixel_origin=self.pixel_origin,
+                allow_links_below=existing(self.allow_links_below),
             )
         except MeglocError as error:
             line(console, "localizing", f"not possible: {error}")
             return
-        origin = opened.pixel_origin
-        errors = ", ".join(f"{name} {value:.3f} px" for name, value in origin.error_px.items())
-        line(console, "pixel origin", f"{origin.intrinsics}: {origin.reason}")
-        line(console, "", f"median reprojection error by origin: {errors}")
-        found = opened.extractor()
-        line(console, "localizing with", opened.local_type)
-        line(
-            console,
-            "map descriptors",
-            describe_descriptors(opened, None if found is None else found.name),
-        )
-        line(console, "query features", describe_extraction(opened.local_type, found))
+        for local_type, keypoints in opened.keypoints.items():
+            origin = keypoints.pixel_origin
+            errors = ", ".join(f"{name} {value:.3f} px" for name, value in origin.error_px.items())
+            found = keypoints.extractor()
+            line(console, "localizing with", local_type)
+            line(console, "pixel origin", f"{origin.intrinsics}: {origin.reason}")
+            line(console, "", f"median reprojection error by origin: {errors}")
+            line(
+                console,
+                "map descriptors",
+                describe_descriptors(opened, keypoints, None if found is None else found.name),
+            )
+            line(console, "query features", describe_extraction(local_type, found))
         own = "VLAD over the map's descriptors"
         types = opened.global_types()
         line(
@@ -142,9 +141,9 @@ def describe_extraction(local_type: str, extractor: PluginChoice | None) -> str:
     return f"extracted by plugin {extractor.name}, or given in kapture"
 
 
-def describe_descriptors(opened: KaptureMap, extractor: str | None) -> str:
+def describe_descriptors(opened: KaptureMap, keypoints: MapKeypoints, extractor: str | None) -> str:
     """What is known of a map's descriptors, in words."""
-    if opened.has_descriptors():
+    if keypoints.has_descriptors(opened.images):
         return "there"
     if extractor is None:
         return "missing, and no extractor for the type is installed: localizing is not possible"

@@ -3,44 +3,62 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Any
 
-from megloc_kapture.cli.common import Choosing, Common, Force, Input, Output, existing
-from megloc_kapture.cli.stage_command import FeaturesDirs
-from megloc_kapture.errors import OptionError
+import tyro
+
+from megloc_kapture.cli.common import Choosing, Common, Force, Input, Output, Reading, existing
+from megloc_kapture.cli.console import Console
+from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.kapture_store import KaptureFolder, read_pairs
 from megloc_kapture.io.outputs import staged_output
 from megloc_kapture.pipeline.executors import available_cores
 from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
 from megloc_kapture.pipeline.localizer import Localizer
-from megloc_kapture.pipeline.presets import DEFAULT_PRESET, options_of_preset
+from megloc_kapture.pipeline.presets import DEFAULT_PRESET, assigned, options_of_preset
 from megloc_kapture.pipeline.queries import KaptureQueries, Query
 from megloc_kapture.stages.localized_folder import write_localized
 from megloc_kapture.stages.matches import iterate_candidates
-from megloc_kapture.values import RigidTransform
+from megloc_kapture.values import Failure, Pose, RigidTransform
 
 LOCALIZED = "localized"
+# the others are of maps that are made
+_USED = (
+    "preprocessing",
+    "local_features",
+    "mask_margin_px",
+    "global_features",
+    "fusion",
+    "query_pairs",
+    "reranking",
+    "matching",
+    "verification",
+    "query_verification",
+    "guided_pyramid",
+    "localization",
+    "pose_refinement",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Localize(Choosing, Common):
+class Localize(Reading, Choosing, Common):
     """Localize the images of a kapture folder in a kapture map."""
 
     input: Input
-    """Kapture map: keypoints, points3d and observations of one type. Read only."""
+    """Kapture map: keypoints, points3d and observations. Read only."""
     query: Path
     """Kapture folder with the queries, and their features where the map's cannot be extracted."""
     output: Output = Path("localized")
     """Kapture folder with the queries' poses, and status.csv."""
-    features_dir: FeaturesDirs = ()
-    """Features folder of map or queries; may be repeated."""
     pairs: Path | None = None
     """Candidates of each query, instead of retrieval."""
-    keypoints_type: str | None = None
-    """Needed where the map has points of several types."""
+    keypoints_type: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
+    """Keypoints type to localize with; may be repeated; all that have points unless given."""
     pixel_origin: PixelOriginChoice = "auto"
     """Where the map's intrinsics put the pixel origin; auto finds it out."""
     workers: int | None = None
@@ -56,42 +74,40 @@ class Localize(Choosing, Common):
             raise OptionError(f"{workers} workers cannot work; give 1 or more")
         kapture_map = KaptureMap.open(
             self.input,
-            keypoints_type=self.keypoints_type,
+            keypoints_types=self.keypoints_type,
             features_dirs=existing(self.features_dir),
             pixel_origin=self.pixel_origin,
+            allow_links_below=existing(self.allow_links_below),
         )
-        options = options_of_preset(self.preset or DEFAULT_PRESET, assignments=self.set)
-        folder = KaptureFolder(self.query, features_dirs=existing(self.features_dir))
+        options = options_of_preset(self.preset or DEFAULT_PRESET, assignments=self.set, used=_USED)
+        folder = self.kapture(self.query)
         queries = KaptureQueries(folder, kapture_map)
         given = None if self.pairs is None else dict(iterate_candidates(read_pairs(self.pairs)))
         # what is wrong is found before the first query, and before anything is written
         kapture_map.check()
         queries.check()
+        localizer = Localizer(kapture_map, options=options)
+        _check_extractors(localizer, queries)
+        check_acted_on(assigned(self.set), localizer, queries, folder, pairs=given is not None)
         with staged_output(self.output, kind=LOCALIZED, force=self.force) as out:
-            localizer = Localizer(kapture_map, options=options)
-            with ThreadPoolExecutor(workers) as executor:
-                started = time.perf_counter()
-                results = localizer.localize_many(queries, executor, candidates=given)
-                tracked = console.track(results, len(queries.names), "localizing")
-                named = list(zip(queries.names, tracked, strict=True))
-                seconds = time.perf_counter() - started
+            started = time.perf_counter()
+            named = _localized(localizer, queries, workers, given, console)
+            seconds = time.perf_counter() - started
             fallback = options.localization.fallback
             best = {}
             if fallback == "retrieval":
                 failed = [name for name, result in named if not result]
                 best = best_candidates(localizer, map(queries.query, failed), given)
-            counts = write_localized(
-                out,
-                folder,
-                named,
-                fallback=fallback,
-                first_candidates=best,
-            )
+            counts = write_localized(out, folder, named, fallback=fallback, first_candidates=best)
         how = "as given"
         if given is None:
             how = localizer.describe_retrieval(queries.types_of_all())
+        console.say(f"localizing with {', '.join(local.name for local in localizer.types)}")
         console.say(f"candidates: {how}")
         console.say(f"pixel origin: {kapture_map.pixel_origin.intrinsics}")
+        remarks = Counter(remark for _, result in named for remark in result.remarks)
+        for remark, number in sorted(remarks.items()):
+            console.say(f"left out of {number} queries: {remark}")
         console.result(
             f"{counts['localized']} of {counts['queries']} queries localized in {seconds:.1f} s; "
             f"poses and status.csv in {self.output}"
@@ -100,6 +116,95 @@ class Localize(Choosing, Common):
         if counts["queries"] and not counts["localized"]:
             console.say(f"warning: no query was localized; reasons are in {self.output}/status.csv")
         return 0
+
+
+def check_acted_on(
+    typed: Mapping[str, Any],
+    localizer: Localizer,
+    queries: KaptureQueries,
+    folder: KaptureFolder,
+    *,
+    pairs: bool,
+) -> None:
+    """Refuse options that were typed and change nothing for this map and these queries.
+
+    Parameters
+    ----------
+    typed : nested tables of ``--set``.
+    pairs : whether the candidates are given.
+
+    Raises
+    ------
+    OptionError : names the option, and why it changes nothing.
+    """
+    idle: dict[str, str] = {}
+    brought = ", ".join(local.name for local in localizer.types)
+    if all(queries.lacking(local.name) is None for local in localizer.types):
+        idle |= dict.fromkeys(
+            ("preprocessing", "mask_margin_px"),
+            f"the queries bring their local features ({brought}), nothing is extracted",
+        )
+    if "guided_pyramid" in typed and localizer.options.matches_again():
+        obstacles = [local.pyramid_obstacle for local in localizer.types]
+        if all(obstacles):
+            idle["guided_pyramid"] = obstacles[0]
+    unused = localizer.unused_local_features()
+    if unused:
+        idle["local_features"] = f"the map is of {brought}; nothing in it is of {unused[0]}"
+    shared = queries.types_of_all()
+    if pairs:
+        names = ("query_pairs", "global_features", "fusion")
+        idle |= dict.fromkeys(names, "--pairs gives the candidates")
+    elif shared and not localizer.compares_as_asked(shared):
+        idle["global_features"] = f"map and queries bring {', '.join(shared)}, which is compared"
+    localization = typed.get("localization", {})
+    if not folder.read().rigs:
+        if localization.get("rigs"):
+            idle["localization"] = "rigs: the folder of the queries has none"
+        elif localization.get("fallback") == "rig":
+            idle["localization"] = "fallback = rig: the folder of the queries has none"
+    for name in typed:
+        if name in idle:
+            raise OptionError(f"--set {name} changes nothing: {idle[name]}")
+
+
+def _localized(
+    localizer: Localizer,
+    queries: KaptureQueries,
+    workers: int,
+    given: Mapping[str, Sequence[str]] | None,
+    console: Console,
+) -> list[tuple[str, Pose | Failure]]:
+    """Results by query, with a progress bar."""
+    rigs = localizer.options.localization.rigs
+    units = queries.units(rigs=rigs)
+    named: list[tuple[str, Pose | Failure]] = []
+    with ThreadPoolExecutor(workers) as executor:
+        results = localizer.localize_units(
+            queries.read_units(rigs=rigs), executor, candidates=given
+        )
+        tracked = console.track(results, len(units), "localizing")
+        for names, found in zip(units, tracked, strict=True):
+            named += zip(names, found, strict=True)
+    return named
+
+
+def _check_extractors(localizer: Localizer, queries: KaptureQueries) -> None:
+    """Make the extractors that queries without features need.
+
+    Raises
+    ------
+    DataError : there is no extractor for a type; names the first image that needs it.
+    PluginError, MissingWeightsError : it cannot be made.
+    """
+    for local in localizer.types:
+        lacking = queries.lacking(local.name)
+        if lacking is None:
+            continue
+        try:
+            _ = local.extractor
+        except DataError as error:
+            raise DataError(f"image {lacking!r}: {error.message}", path=error.path) from error
 
 
 def best_candidates(

@@ -10,11 +10,10 @@ from typing import Annotated, Any
 import tyro
 from pydantic import ValidationError
 
-from megloc_kapture.cli.common import Common, Force, Input, Output, Working, existing
+from megloc_kapture.cli.common import Common, Force, Input, Linked, Output, Working, existing
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.atomic import replace_directory
 from megloc_kapture.io.json_model import first_problem
-from megloc_kapture.io.kapture_store import KaptureFolder
 from megloc_kapture.io.outputs import staged_output
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
 from megloc_kapture.pipeline.presets import assigned
@@ -41,7 +40,7 @@ Several = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Preprocess(Working, Common):
+class Preprocess(Linked, Working, Common):
     """Resize, undistort and mask the images of a kapture; poses stay, cameras follow."""
 
     input: Input
@@ -77,8 +76,8 @@ class Preprocess(Working, Common):
         """Run it."""
         console = self.console()
         options = self.options()
-        source = KaptureFolder(self.input)
-        sequences = [KaptureFolder(path) for path in existing(self.sequence)]
+        source = self.kapture(self.input)
+        sequences = [self.kapture(path) for path in existing(self.sequence)]
         with (
             single_threaded(),
             staged_output(self.output, kind=PREPROCESSED, force=self.force) as out,

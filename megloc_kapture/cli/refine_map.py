@@ -5,31 +5,29 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from megloc_kapture.cli.common import Choosing, Common, Force, Input, Output, Working, existing
-from megloc_kapture.cli.stage_command import FeaturesDirs
+from megloc_kapture.cli.common import Force, Input, Output, Reading
+from megloc_kapture.cli.stage_command import StageCommand
 from megloc_kapture.cli.stages import MAP
 from megloc_kapture.io.json_model import read_json_model
-from megloc_kapture.io.kapture_store import KaptureFolder
 from megloc_kapture.io.outputs import staged_output
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
-from megloc_kapture.pipeline.presets import DEFAULT_PRESET, options_of_preset
 from megloc_kapture.stages.map_refinement import REPORT_FILE, RefinementReport, refine_map
 
 
 @dataclass(frozen=True, kw_only=True)
-class RefineMap(Choosing, Working, Common):
+class RefineMap(Reading, StageCommand):
     """Take points and observations out of a map that its images, or depth maps, contradict.
 
     What is rejected is chosen with --set refinement.uncertainty.max_relative_deviation=0.02 and
     its like; without, by the preset.
     """
 
+    uses = ("refinement",)
+
     input: Input
     """Kapture folder of the map; it stays as it is."""
     output: Output
     """Kapture folder of the refined map."""
-    features_dir: FeaturesDirs = ()
-    """Features folder beside the map; may be repeated."""
     ply: bool = False
     """Write the kept and the rejected points as PLY files, coloured by uncertainty."""
     force: Force = False
@@ -39,10 +37,8 @@ class RefineMap(Choosing, Working, Common):
         """Run it."""
         console = self.console()
         changes: dict[str, object] = {"refinement": {"ply": True}} if self.ply else {}
-        options = options_of_preset(
-            self.preset or DEFAULT_PRESET, changes=[changes], assignments=self.set
-        ).refinement
-        source = KaptureFolder(self.input, features_dirs=existing(self.features_dir))
+        options = self.options(changes).refinement
+        source = self.kapture(self.input)
         with (
             single_threaded(),
             staged_output(self.output, kind=MAP, force=self.force) as out,

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import tyro
 
-from megloc_kapture.cli.common import Force, Input, Output
+from megloc_kapture.cli.common import Force, Input, Linked, Output
 from megloc_kapture.cli.localize import LOCALIZED
 from megloc_kapture.cli.stage_command import StageCommand, restrictions_beside
 from megloc_kapture.errors import OptionError
-from megloc_kapture.io.kapture_store import KaptureFolder
 from megloc_kapture.io.outputs import staged_output
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
 from megloc_kapture.plugins import POSE_REFINERS, plugin_names
@@ -19,8 +18,10 @@ from megloc_kapture.stages.pose_refinement import refine_poses
 
 
 @dataclass(frozen=True, kw_only=True)
-class RefinePoses(StageCommand):
+class RefinePoses(Linked, StageCommand):
     """Refine the poses of localized queries; a pose that gets no better stays, and says why."""
+
+    uses = ("pose_refinement",)
 
     input: Input
     """Kapture map, with images and depth maps. Read only."""
@@ -52,9 +53,9 @@ class RefinePoses(StageCommand):
             open_executor(self.executor, self.workers) as executor,
         ):
             counts = refine_poses(
-                KaptureFolder(self.input),
-                KaptureFolder(self.query),
-                KaptureFolder(self.poses),
+                self.kapture(self.input),
+                self.kapture(self.query),
+                self.kapture(self.poses),
                 out,
                 options,
                 restrictions=restrictions_beside(self.query),

@@ -9,9 +9,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-from megloc_kapture.cli.common import Force, Input, Output, existing
+from megloc_kapture.cli.common import Force, Input, Output, Reading
 from megloc_kapture.cli.stage_command import (
-    FeaturesDirs,
     StageCommand,
     only_type,
     restrictions_beside,
@@ -31,8 +30,10 @@ from megloc_kapture.stages.reranking import RerankingOptions, reranked
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExtractGlobal(StageCommand):
+class ExtractGlobal(Reading, StageCommand):
     """Describe every image by one vector: VLAD trained on the map, or image networks."""
+
+    uses = ("global_features",)
 
     input: Input
     """Kapture folder of the map; VLAD is trained on its descriptors."""
@@ -42,8 +43,6 @@ class ExtractGlobal(StageCommand):
     """Features folder: global_features/T/global_features."""
     features: tuple[str, ...] = ()
     """Global features: vlad, or plugins; those of the preset unless given."""
-    features_dir: FeaturesDirs = ()
-    """Features folder with the local features; may be repeated."""
     local_type: str | None = None
     """Local features that VLAD aggregates; needed where there are several types."""
     force: Force = False
@@ -56,10 +55,7 @@ class ExtractGlobal(StageCommand):
         choices = [
             named.get(name, GlobalFeaturesChoice(name=name)) for name in self.features or named
         ]
-        folders = [
-            KaptureFolder(folder, features_dirs=existing(self.features_dir))
-            for folder in (self.input, *self.query)
-        ]
+        folders = [self.kapture(folder) for folder in (self.input, *self.query)]
         extractors = {chosen.name: chosen.make() for chosen in choices if not chosen.is_vlad}
         with self.features_folder(self.output, force=self.force) as (out, executor):
             for chosen in choices:
@@ -89,8 +85,10 @@ class ExtractGlobal(StageCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PairsMapping(StageCommand):
+class PairsMapping(Reading, StageCommand):
     """Choose which images of a map are matched with each other."""
+
+    uses = ("mapping_pairs", "fusion")
 
     input: Input
     """Kapture folder with poses."""
@@ -102,8 +100,6 @@ class PairsMapping(StageCommand):
     """Most similar images per image (retrieval)."""
     covisibility_map: Path | None = None
     """Kapture map of the same images, for the points they share; the input's own without it."""
-    features_dir: FeaturesDirs = ()
-    """Features folder with the global features; may be repeated."""
     features: tuple[str, ...] = ()
     """Types of global features; several are fused; needed where there are several."""
     fusion: FusionMethod | None = None
@@ -113,7 +109,7 @@ class PairsMapping(StageCommand):
 
     def run(self) -> int:
         """Run it."""
-        mapping = KaptureFolder(self.input, features_dirs=existing(self.features_dir))
+        mapping = self.kapture(self.input)
         changes: dict[str, object] = {"by": self.by}
         if self.topk is not None:
             changes["top_k"] = self.topk
@@ -131,7 +127,7 @@ class PairsMapping(StageCommand):
                 options,
                 retrieval=retrieval,
                 restrictions=restrictions_beside(self.input),
-                covisible=None if covisible is None else KaptureFolder(covisible),
+                covisible=None if covisible is None else self.kapture(covisible),
             )
         _write_pairs(self.output, pairs, force=self.force)
         self.console().say(f"{len(pairs)} pairs")
@@ -139,8 +135,10 @@ class PairsMapping(StageCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PairsQuery(StageCommand):
+class PairsQuery(Reading, StageCommand):
     """Choose the map images each query is matched with."""
+
+    uses = ("query_pairs", "fusion")
 
     input: Input
     """Kapture folder of the map."""
@@ -154,8 +152,6 @@ class PairsQuery(StageCommand):
     """Types of global features; several are fused; needed where there are several."""
     fusion: FusionMethod | None = None
     """How several are fused; as the preset has it unless given."""
-    features_dir: FeaturesDirs = ()
-    """Features folder with global features (and local ones to rerank); may be repeated."""
     exhaustive: bool = False
     """All map images for each query; for small maps."""
     rerank: int | None = None
@@ -176,12 +172,14 @@ class PairsQuery(StageCommand):
         if (self.rerank is None) != (self.matches_dir is None):
             raise OptionError("--rerank N and --matches-dir DIR go together: matches are kept")
         _refuse_existing(self.output, force=self.force)
-        mapping = KaptureFolder(self.input, features_dirs=existing(self.features_dir))
-        query = KaptureFolder(self.query, features_dirs=existing(self.features_dir))
+        mapping = self.kapture(self.input)
+        query = self.kapture(self.query)
         changes: dict[str, object] = {"by": "exhaustive" if self.exhaustive else "retrieval"}
         if self.topk is not None:
             changes["top_k"] = self.topk
-        options = self.options({"query_pairs": changes})
+        matching = ("local_features", "matching", "verification", "query_verification")
+        also = () if self.rerank is None else matching
+        options = self.options({"query_pairs": changes}, also=also)
         retrieval = None
         if not self.exhaustive:
             retrieval = _retrieval(mapping, self.features, self.fusion, options)
@@ -232,7 +230,11 @@ class PairsQuery(StageCommand):
                     executor=executor,
                     track=track,
                 )
-            matched = KaptureFolder(query.root, features_dirs=[*query.features_dirs, out])
+            matched = KaptureFolder(
+                query.root,
+                features_dirs=[*query.features_dirs, out],
+                allow_links_below=query.allow_links_below,
+            )
             how = RerankingOptions(by=self.rerank_by, keep=keep)
             return reranked(pairs, matched, out, local_types, how)
 

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
-
-import tyro
+from typing import ClassVar
 
 from megloc_kapture.cli.common import Choosing, Common, Working, side_tables_beside
 from megloc_kapture.errors import OptionError
@@ -22,15 +20,26 @@ from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
 
 FEATURES = "features"
 
-FeaturesDirs = Annotated[tuple[Path, ...], tyro.conf.UseAppendAction]
-
 
 @dataclass(frozen=True, kw_only=True)
 class StageCommand(Choosing, Working, Common):
-    def options(self, changes: dict[str, object] | None = None) -> PipelineOptions:
-        """The preset's options, with what the flags change."""
+    uses: ClassVar[tuple[str, ...]] = ()
+    """The options that the command acts on, by their first key; --set takes no others."""
+
+    def options(
+        self, changes: dict[str, object] | None = None, *, also: Sequence[str] = ()
+    ) -> PipelineOptions:
+        """The preset's options, with what the flags change.
+
+        Parameters
+        ----------
+        also : options that are acted on beside :attr:`uses`, because of other flags.
+        """
         return options_of_preset(
-            self.preset or DEFAULT_PRESET, changes=[changes or {}], assignments=self.set
+            self.preset or DEFAULT_PRESET,
+            changes=[changes or {}],
+            assignments=self.set,
+            used=(*self.uses, *also),
         )
 
     @contextmanager

@@ -9,8 +9,8 @@ from typing import Annotated
 
 import tyro
 
-from megloc_kapture.cli.common import Force, Input, Output, existing
-from megloc_kapture.cli.stage_command import FeaturesDirs, StageCommand, only_type
+from megloc_kapture.cli.common import Force, Input, Linked, Output, Reading
+from megloc_kapture.cli.stage_command import StageCommand, only_type
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder, read_pairs
 from megloc_kapture.io.outputs import staged_output
@@ -26,8 +26,10 @@ Inputs = Annotated[tuple[Path, ...], tyro.conf.arg(aliases=["-i"]), tyro.conf.Us
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExtractLocal(StageCommand):
+class ExtractLocal(Linked, StageCommand):
     """Extract local features of all images of kapture folders."""
+
+    uses = ("local_features", "mask_margin_px")
 
     input: Inputs = ()
     """Kapture folder; may be repeated (map and queries)."""
@@ -41,7 +43,9 @@ class ExtractLocal(StageCommand):
     def run(self) -> int:
         """Run it."""
         console = self.console()
-        folders = _folders(self.input)
+        if not self.input:
+            raise OptionError("no kapture folder given; use -i")
+        folders = [self.kapture(path) for path in self.input]
         options = self.options()
         chosen = {one.name: one.options for one in options.local_features}
         names = self.features or tuple(chosen)
@@ -69,8 +73,10 @@ class ExtractLocal(StageCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Match(StageCommand):
+class Match(Reading, StageCommand):
     """Match and verify image pairs; with known poses within a map, else by a two-view model."""
+
+    uses = ("local_features", "matching", "verification")
 
     input: Input
     """Kapture folder of the map."""
@@ -80,8 +86,6 @@ class Match(StageCommand):
     """Pairs file."""
     output: Output
     """Features folder: local_features/T/matches."""
-    features_dir: FeaturesDirs = ()
-    """Features folder with the local features; may be repeated."""
     features: str | None = None
     """Type of local features; needed where there are several."""
     matcher: str | None = None
@@ -92,17 +96,18 @@ class Match(StageCommand):
     def run(self) -> int:
         """Run it."""
         console = self.console()
-        mapping = KaptureFolder(self.input, features_dirs=existing(self.features_dir))
+        mapping = self.kapture(self.input)
         local_type = only_type(mapping, "descriptors", self.features)
         changes: dict[str, object] = {"matching": {"name": self.matcher}} if self.matcher else {}
-        options = self.options(changes)
+        between = "mapping_verification" if self.query is None else "query_verification"
+        options = self.options(changes, also=(between,))
         if self.matcher:  # also where the preset has another one for this type
             matcher = load_plugin(MATCHERS, self.matcher, options.matching.options)
         else:
             matcher = options.make_matcher(local_type)
         first, verification = mapping, options.verify_mapping()
         if self.query is not None:
-            first = KaptureFolder(self.query, features_dirs=existing(self.features_dir))
+            first = self.kapture(self.query)
             verification = options.verify_queries()
         pairs = read_pairs(self.pairs)
         _check_images_of(pairs, first, mapping, self.pairs)
@@ -123,8 +128,10 @@ class Match(StageCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Triangulate(StageCommand):
+class Triangulate(Reading, StageCommand):
     """Triangulate verified matches of images with known poses into a kapture map."""
+
+    uses = ("triangulation",)
 
     input: Input
     """Kapture folder with images and poses."""
@@ -132,8 +139,6 @@ class Triangulate(StageCommand):
     """Kapture folder of the map."""
     pairs: Path | None = None
     """Use the matches of these pairs only."""
-    features_dir: FeaturesDirs = ()
-    """Features folder with local features and matches; may be repeated."""
     features: tuple[str, ...] = ()
     """Types of local features, each with its own points; needed where there are several."""
     force: Force = False
@@ -142,7 +147,7 @@ class Triangulate(StageCommand):
     def run(self) -> int:
         """Run it."""
         console = self.console()
-        mapping = KaptureFolder(self.input, features_dirs=existing(self.features_dir))
+        mapping = self.kapture(self.input)
         local_types = [only_type(mapping, "matches", asked) for asked in self.features or (None,)]
         pairs = None if self.pairs is None else read_pairs(self.pairs)
         if pairs is not None and self.pairs is not None:
@@ -162,12 +167,6 @@ class Triangulate(StageCommand):
             console.say(f"{type_name}: {points} points, {seen} observations")
         console.say(f"{counts['points']} points, {counts['observations']} observations")
         return 0
-
-
-def _folders(paths: Sequence[Path]) -> list[KaptureFolder]:
-    if not paths:
-        raise OptionError("no kapture folder given; use -i")
-    return [KaptureFolder(path) for path in paths]
 
 
 def _check_images_of(

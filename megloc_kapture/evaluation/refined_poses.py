@@ -20,8 +20,7 @@ from megloc_kapture.evaluation.tables import (
     format_percent,
 )
 from megloc_kapture.evaluation.thresholds import Threshold
-from megloc_kapture.io.refinement_table import RefinementRow
-from megloc_kapture.values import RigidTransform
+from megloc_kapture.values import RefinementRow, RigidTransform
 
 Poses = Mapping[str, RigidTransform]
 

@@ -17,9 +17,8 @@ from megloc_kapture.evaluation.pictures import data_picture, image_tag
 from megloc_kapture.evaluation.pose_errors import pose_errors
 from megloc_kapture.evaluation.surroundings import Surroundings
 from megloc_kapture.evaluation.tables import format_degrees, format_metres
-from megloc_kapture.io.refinement_table import RefinementRow
 from megloc_kapture.plugins import RankingScene
-from megloc_kapture.values import Camera, RigidTransform
+from megloc_kapture.values import Camera, RefinementRow, RigidTransform
 
 if TYPE_CHECKING:
     from megloc_kapture.geometry.warping import WarpSource

@@ -8,13 +8,9 @@ from pathlib import Path
 
 from megloc_kapture.io.cluster_table import CLUSTERS_FILE, ClusterRow, read_clusters
 from megloc_kapture.io.kapture_store import KaptureFolder
-from megloc_kapture.io.refinement_table import (
-    REFINEMENT_FILE,
-    RefinementRow,
-    read_refinement,
-)
+from megloc_kapture.io.refinement_table import REFINEMENT_FILE, read_refinement
 from megloc_kapture.io.side_tables import PROTOCOL_FILE, SIDE_TABLES, read_groups
-from megloc_kapture.values import RigidTransform
+from megloc_kapture.values import RefinementRow, RigidTransform
 
 # parts of a workspace; datasets and the pipeline write them
 # the map's own keypoints are what queries were matched with; before there is one, its images do

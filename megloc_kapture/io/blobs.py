@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.atomic import output_error, write_bytes
-from megloc_kapture.io.paths import check_no_escape, check_relative, safe_join
+from megloc_kapture.io.paths import Roots, check_no_escape, check_relative, safe_join
 from megloc_kapture.io.row_reading import map_rows, read_file_row, read_fully, read_rows_at
 from megloc_kapture.io.tar_runs import names_of_run, stride_of
 
@@ -47,11 +47,11 @@ class BlobSource(Protocol):
 
 
 class FolderBlobs:
-    """Blobs as files below ``folder`` with the given suffix; links may not leave ``root``."""
+    """Blobs as files below ``folder`` with the given suffix; links may not leave ``roots``."""
 
-    def __init__(self, root: Path, folder: Path, suffix: str) -> None:
-        self._root = root
-        self._folder = check_no_escape(root, folder)
+    def __init__(self, roots: Roots, folder: Path, suffix: str) -> None:
+        self._roots = roots
+        self._folder = check_no_escape(roots, folder)
         self._suffix = suffix
 
     def names(self) -> list[str]:
@@ -117,21 +117,21 @@ class FolderBlobs:
 
     def _open_folder(self, relative: str) -> int | None:
         """A descriptor of a folder below, None where there is none."""
-        path = check_no_escape(self._root, self._folder / relative)
+        path = check_no_escape(self._roots, self._folder / relative)
         try:
             return os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         except (FileNotFoundError, NotADirectoryError):
             return None
 
     def _checked(self, name: str) -> Path:
-        return check_no_escape(self._root, safe_join(self._folder, name))
+        return check_no_escape(self._roots, safe_join(self._folder, name))
 
     def _walk(self, folder: Path | str, prefix: str) -> Iterator[str]:
         try:
             with os.scandir(folder) as entries:
                 for entry in entries:
                     if entry.is_symlink():
-                        check_no_escape(self._root, Path(entry.path))
+                        check_no_escape(self._roots, Path(entry.path))
                     if entry.is_dir(follow_symlinks=False):
                         yield from self._walk(entry.path, f"{prefix}{entry.name}/")
                     elif entry.name.endswith(self._suffix) and entry.is_file():
@@ -143,8 +143,8 @@ class FolderBlobs:
 class TarBlobs:
     """Blobs in an uncompressed tar; of members with one name the last counts."""
 
-    def __init__(self, root: Path, path: Path, suffix: str) -> None:
-        self._path = check_no_escape(root, path)
+    def __init__(self, roots: Roots, path: Path, suffix: str) -> None:
+        self._path = check_no_escape(roots, path)
         index, _ = index_tar(path)
         self._index = {name: place for name, place in index.items() if name.endswith(suffix)}
         self._file = _open(path)

@@ -78,9 +78,33 @@ def write_image(path: Path | str, image: NDArray[np.uint8], *, jpeg_quality: int
     ValueError : the array is not such an image or the suffix is none of WRITABLE_SUFFIXES.
     OutputError : the file cannot be written.
     """
+    path = Path(path)
+    write_bytes(path, _encoded(path, image, jpeg_quality))
+
+
+def image_as_read_back(
+    image: NDArray[np.uint8], name: str, *, jpeg_quality: int = 95
+) -> NDArray[np.uint8]:
+    """What reading gives of an image after :func:`write_image`: uint8 (H, W, 3) RGB.
+
+    Parameters
+    ----------
+    name : of the file that it would be; only its suffix counts.
+    """
+    if not name.lower().endswith(_JPEG):
+        return image
     import cv2
 
-    path = Path(path)
+    content = np.frombuffer(_encoded(Path(name), image, jpeg_quality), np.uint8)
+    decoded = cv2.imdecode(content, cv2.IMREAD_COLOR)
+    if decoded is None:
+        raise ValueError(f"{name}: cannot decode what was encoded")
+    return np.ascontiguousarray(decoded[:, :, ::-1], np.uint8)
+
+
+def _encoded(path: Path, image: NDArray[np.uint8], jpeg_quality: int) -> bytes:
+    import cv2
+
     suffix = path.suffix.lower()
     if suffix not in WRITABLE_SUFFIXES:
         raise ValueError(f"{path}: suffix must be one of {', '.join(WRITABLE_SUFFIXES)}")
@@ -95,7 +119,7 @@ def write_image(path: Path | str, image: NDArray[np.uint8], *, jpeg_quality: int
     done, encoded = cv2.imencode(suffix, np.ascontiguousarray(pixels), options)
     if not done:
         raise ValueError(f"{path}: cannot encode an image of shape {image.shape}")
-    write_bytes(path, encoded.tobytes())
+    return bytes(encoded.tobytes())
 
 
 def _content(path: Path) -> bytes:

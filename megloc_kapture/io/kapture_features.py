@@ -32,6 +32,7 @@ from megloc_kapture.io.blobs import (
 from megloc_kapture.io.closing import Closing
 from megloc_kapture.io.kapture_csv import format_table, read_rows
 from megloc_kapture.io.paths import (
+    Roots,
     check_component,
     check_no_escape,
     check_output,
@@ -174,13 +175,13 @@ def format_config(kind: ArrayKind, config: FeatureConfig) -> bytes:
     return format_table(CONFIG_HEADER[kind], [row])
 
 
-def blob_sources(root: Path, folder: Path, kind: FeatureKind) -> list[BlobSource]:
+def blob_sources(roots: Roots, folder: Path, kind: FeatureKind) -> list[BlobSource]:
     """The tar of a type's folder, where there is one, before its loose files."""
     sources: list[BlobSource] = []
     tar = folder / f"{kind}.tar"
     if tar.is_file():
-        sources.append(TarBlobs(root, tar, SUFFIX[kind]))
-    sources.append(FolderBlobs(root, folder, SUFFIX[kind]))
+        sources.append(TarBlobs(roots, tar, SUFFIX[kind]))
+    sources.append(FolderBlobs(roots, folder, SUFFIX[kind]))
     return sources
 
 
@@ -191,9 +192,9 @@ class FeatureReader:
     """
 
     def __init__(
-        self, kind: ArrayKind, type_name: str, places: Sequence[tuple[Path, Path]]
+        self, kind: ArrayKind, type_name: str, places: Sequence[tuple[Roots, Path]]
     ) -> None:
-        """``places``: (root that links may not leave, folder of the type), in order.
+        """``places``: (roots that links may not leave, folder of the type), in order.
 
         Raises
         ------
@@ -205,10 +206,10 @@ class FeatureReader:
         self.type_name = type_name
         self._sources: list[BlobSource] = []
         configs: list[tuple[Path, FeatureConfig]] = []
-        for root, folder in places:
-            path = check_no_escape(root, folder / f"{kind}.txt")
+        for roots, folder in places:
+            path = check_no_escape(roots, folder / f"{kind}.txt")
             configs.append((path, read_config(path, kind)))
-            self._sources += blob_sources(root, folder, kind)
+            self._sources += blob_sources(roots, folder, kind)
         first_path, self.config = configs[0]
         for path, config in configs[1:]:
             if (config.dtype, config.dsize) != (self.config.dtype, self.config.dsize):

@@ -27,7 +27,7 @@ from megloc_kapture.io.kapture_points import (
     read_points3d,
 )
 from megloc_kapture.io.kapture_sensors import read_kapture_data
-from megloc_kapture.io.paths import check_no_escape, safe_join
+from megloc_kapture.io.paths import Roots, check_no_escape, safe_join
 
 _ARRAY_KINDS: tuple[ArrayKind, ...] = ("keypoints", "descriptors", "global_features")
 
@@ -36,18 +36,27 @@ class KaptureFolder:
     """Lazy reader of a kapture folder and of feature folders in the orphan layout beside it.
 
     The kapture's own features come first: a feature folder adds types, and images to a type.
-    Links may not lead out of the folder they are found in, except images under
-    ``sensors/records_data``; the roots themselves may be links.
+    Links may lead to below any of the folders given here, those of images under
+    ``sensors/records_data`` anywhere; the folders themselves may be links.
 
     Parameters
     ----------
     root : folder with ``sensors/`` and perhaps ``reconstruction/``.
     features_dirs : folders with ``local_features/`` and ``global_features/``.
+    allow_links_below : further folders that links may lead to. kapture-localization's proxy
+        folders consist of links: to be read, their targets must be named here.
     """
 
-    def __init__(self, root: Path | str, *, features_dirs: Sequence[Path | str] = ()) -> None:
+    def __init__(
+        self,
+        root: Path | str,
+        *,
+        features_dirs: Sequence[Path | str] = (),
+        allow_links_below: Sequence[Path | str] = (),
+    ) -> None:
         self.root = Path(root)
         self.features_dirs = tuple(Path(d) for d in features_dirs)
+        self.allow_links_below = tuple(Path(d) for d in allow_links_below)
         self._data: KaptureData | None = None
         self._points: NDArray[np.float64] | None = None
         self._observations: dict[str, Observations] | None = None
@@ -60,7 +69,7 @@ class KaptureFolder:
         DataError : names file and line.
         """
         if self._data is None:
-            self._data = read_kapture_data(self.root)
+            self._data = read_kapture_data(self.root, allow_links_below=self._roots()[1:])
         return self._data
 
     def image_path(self, image: str) -> Path:
@@ -121,7 +130,7 @@ class KaptureFolder:
         DataError : missing or broken; names file and line.
         """
         if self._points is None:
-            points = read_points3d(check_no_escape(self.root, self._points_path()))
+            points = read_points3d(check_no_escape(self._roots(), self._points_path()))
             points.setflags(write=False)
             self._points = points
         return self._points
@@ -138,7 +147,7 @@ class KaptureFolder:
         DataError : missing or broken, or ids out of range; names file and line.
         """
         if self._observations is None:
-            path = check_no_escape(self.root, self._observations_path())
+            path = check_no_escape(self._roots(), self._observations_path())
             found = read_observations(path)
             num_points = len(self.points3d())
             for observations in found.values():
@@ -195,10 +204,14 @@ class KaptureFolder:
     def _readers(self, kind: ArrayKind) -> dict[str, FeatureReader]:
         return {name: self._features(kind, name) for name in self.types(kind)}
 
-    def _places(self, kind: FeatureKind, type_name: str) -> list[tuple[Path, Path]]:
+    def _roots(self, first: Path | None = None) -> tuple[Path, ...]:
+        """Where links may lead; the folder they are found in comes first, for messages."""
+        return (first or self.root, self.root, *self.features_dirs, *self.allow_links_below)
+
+    def _places(self, kind: FeatureKind, type_name: str) -> list[tuple[Roots, Path]]:
         candidates = [(self.root, False), *((folder, True) for folder in self.features_dirs)]
         return [
-            (root, feature_folder(root, kind, type_name, orphan=orphan))
+            (self._roots(root), feature_folder(root, kind, type_name, orphan=orphan))
             for root, orphan in candidates
             if type_name in list_types(root, kind, orphan=orphan)
         ]

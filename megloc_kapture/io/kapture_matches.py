@@ -22,7 +22,7 @@ from megloc_kapture.io.kapture_features import (
     check_field,
     feature_folder,
 )
-from megloc_kapture.io.paths import check_output
+from megloc_kapture.io.paths import Roots, check_output
 
 _BETWEEN = ".overlapping/"
 _ROW_BYTES = 3 * 8
@@ -33,8 +33,8 @@ _MAX_INDEX = 2**53
 class MatchesReader:
     """The matches of one keypoints type, from one or several places; the first place counts."""
 
-    def __init__(self, type_name: str, places: Sequence[tuple[Path, Path]]) -> None:
-        """``places``: (root that links may not leave, folder of the type), in order.
+    def __init__(self, type_name: str, places: Sequence[tuple[Roots, Path]]) -> None:
+        """``places``: (roots that links may not leave, folder of the type), in order.
 
         Raises
         ------
@@ -44,8 +44,8 @@ class MatchesReader:
             raise DataError(f"no matches of type {type_name!r}")
         self.type_name = type_name
         self._sources: list[BlobSource] = []
-        for root, folder in places:
-            self._sources += blob_sources(root, folder, "matches")
+        for roots, folder in places:
+            self._sources += blob_sources(roots, folder, "matches")
         self._pairs: list[tuple[str, str]] | None = None
 
     @property

@@ -41,8 +41,12 @@ _QUATERNION_ROUNDING = 1e-14
 # ------------------------------------------------------------------------------------ reading
 
 
-def read_kapture_data(root: Path) -> KaptureData:
+def read_kapture_data(root: Path, *, allow_links_below: Sequence[Path] = ()) -> KaptureData:
     """Read and validate ``sensors/`` of the kapture at ``root``; only sensors.txt must exist.
+
+    Parameters
+    ----------
+    allow_links_below : folders beside ``root`` that links may lead to.
 
     Raises
     ------
@@ -50,14 +54,14 @@ def read_kapture_data(root: Path) -> KaptureData:
     """
     if not root.is_dir():
         raise DataError("no such kapture folder", path=root)
-    folder = root / "sensors"
+    folder, roots = root / "sensors", (root, *allow_links_below)
 
     def present(name: str) -> Path | None:
         path = folder / name
-        return check_no_escape(root, path) if path.exists() or path.is_symlink() else None
+        return check_no_escape(roots, path) if path.exists() or path.is_symlink() else None
 
     data = KaptureData()
-    data.sensors = read_sensors(check_no_escape(root, folder / "sensors.txt"))
+    data.sensors = read_sensors(check_no_escape(roots, folder / "sensors.txt"))
     if path := present("rigs.txt"):
         data.rigs = read_rigs(path, data.sensors)
     if path := present("trajectories.txt"):

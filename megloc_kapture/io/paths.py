@@ -11,6 +11,9 @@ from pathlib import Path
 
 from megloc_kapture.errors import DataError, OutputError
 
+# the folder that something was found in, and others that links in it may lead to
+Roots = Path | tuple[Path, ...]
+
 
 def has_control_characters(text: str) -> bool:
     """Whether a text has characters that no name or line of text should have (NUL, tab, ...)."""
@@ -71,22 +74,24 @@ def safe_join(root: Path, relative_text: str) -> Path:
     return Path(root) / check_relative(relative_text)
 
 
-def check_no_escape(root: Path, path: Path) -> Path:
-    """Return ``path`` if what it is after following links still lies in ``root`` (links followed).
+def check_no_escape(roots: Roots, path: Path) -> Path:
+    """Return ``path`` if what it is after following links still lies in one of the ``roots``.
 
     Raises
     ------
-    DataError : a link on the way leads out of ``root``.
+    DataError : a link on the way leads out of them.
     """
-    real_root = os.path.realpath(root)
+    roots = (roots,) if isinstance(roots, Path) else roots
     real = os.path.realpath(path)
-    if real != real_root and not real.startswith(real_root.rstrip(os.sep) + os.sep):
-        raise DataError(
-            f"is or lies behind a link that leaves {root}; "
-            "links are allowed only as images under records_data",
-            path=path,
-        )
-    return path
+    for root in roots:
+        real_root = os.path.realpath(root)
+        if real == real_root or real.startswith(real_root.rstrip(os.sep) + os.sep):
+            return path
+    raise DataError(
+        f"is or lies behind a link that leaves {roots[0]}, to {real}; images may be links to "
+        "anywhere, anything else only to below a folder that --allow-links-below names",
+        path=path,
+    )
 
 
 def check_output(root: Path, path: Path) -> Path:

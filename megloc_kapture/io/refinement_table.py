@@ -2,43 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.csv_table import read_csv_table, write_csv_table
 from megloc_kapture.io.pose_cells import pose_cell, read_pose_cell
-from megloc_kapture.values import RigidTransform
+from megloc_kapture.values import RefinementRow
 
 REFINEMENT_FILE = "refinement.csv"
 _COLUMNS = ("image", "method", "accepted", "reason", "moved_m", "turned_deg", "measures", "before")
 
 
-@dataclass(frozen=True)
-class RefinementRow:
-    """One refiner's work on one query.
-
-    Attributes
-    ----------
-    reason : why the old pose stays; empty where the new one is accepted.
-    moved_m, turned_deg : of the new pose against the old, unit of the map; 0 where it stays.
-    measures : ``name=value`` texts, e.g. of residuals before and after.
-    before : ``cam_from_world`` that the refiner was given.
-    """
-
-    image: str
-    method: str
-    reason: str
-    moved_m: float
-    turned_deg: float
-    measures: tuple[str, ...]
-    before: RigidTransform
-
-    @property
-    def accepted(self) -> bool:
-        """Whether the pose is a new one."""
-        return not self.reason
+def refinement_text(rows: Sequence[RefinementRow]) -> str:
+    """What became of a query's pose, as ``status.csv`` has it."""
+    return "; ".join(f"{row.method}: {'accepted' if row.accepted else row.reason}" for row in rows)
 
 
 def write_refinement(path: Path, rows: Iterable[RefinementRow]) -> None:

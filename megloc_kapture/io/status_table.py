@@ -25,6 +25,7 @@ STATUS_COLUMNS = (
     "fallback",
     "candidates",
     "refinement",
+    "remarks",
 )
 
 Fallback = Literal["none", "retrieval", "rig"]
@@ -50,6 +51,7 @@ class QueryStatus(Options):
     candidates : the map images the pose comes from, best first.
     refinement : by method, whether a refined pose was accepted or why the one before it stays;
         empty where nothing was refined.
+    remarks : steps that were left out because the query, or the map, lacks what they need.
     """
 
     image: str
@@ -61,6 +63,7 @@ class QueryStatus(Options):
     fallback: Fallback = "none"
     candidates: tuple[str, ...] = ()
     refinement: str = ""
+    remarks: str = ""
 
     @model_validator(mode="after")
     def _consistent(self) -> QueryStatus:
@@ -125,5 +128,6 @@ def write_status(path: Path | str, statuses: Iterable[QueryStatus]) -> None:
             s.fallback,
             _CANDIDATE_SEPARATOR.join(s.candidates),
             s.refinement,
+            s.remarks,
         )
     write_csv_table(path, STATUS_COLUMNS, (rows[image] for image in sorted(rows)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -37,25 +37,93 @@ _NETWORKS = ("aliked", "aslfeat", "r2d2", "superpoint", "xfeat")
 
 
 @dataclass(frozen=True, eq=False)
+class MapKeypoints:
+    """The keypoints of one type in a map, and the points they observe.
+
+    Coordinates leave it in COLMAP's convention, whatever the map's.
+
+    Attributes
+    ----------
+    name : the kapture type name.
+    index : points and observations as arrays; without any where nothing of the type has a point.
+    pixel_origin : of the map's intrinsics and of these keypoints, and why we think so.
+    """
+
+    folder: KaptureFolder
+    name: str
+    index: MapIndex
+    pixel_origin: PixelOrigin
+
+    def __contains__(self, image: str) -> bool:
+        return image in self._keypoints
+
+    def keypoints_px(self, image: str) -> NDArray[np.float32]:
+        """Keypoints float32 (N, 2 or more) of a map image; x, y in COLMAP's convention."""
+        return self.to_colmap(self._keypoints.read(image))
+
+    def to_colmap(self, keypoints: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Keypoints stored as the map stores its own, x and y in COLMAP's convention."""
+        moved = np.array(keypoints, dtype=np.float32)
+        moved[:, :2] += np.float32(self.pixel_origin.keypoints_shift_px)
+        return moved
+
+    def descriptors(self, image: str) -> NDArray[Any]:
+        """Descriptors (N, D) of a map image, as stored."""
+        return np.asarray(self._descriptors.read(image))
+
+    def descriptor_size(self) -> int:
+        """Number of values of a stored descriptor; raises DataError where there are none."""
+        return self._descriptors.config.dsize
+
+    def has_descriptors(self, images: Collection[str]) -> bool:
+        """Whether all of these images that have keypoints have descriptors too."""
+        if self.name not in self.folder.types("descriptors"):
+            return False
+        return all(image in self._descriptors for image in images if image in self._keypoints)
+
+    def extractor(self) -> PluginChoice | None:
+        """The extractor plugin that makes this type of features; None where there is none."""
+        return extractor_of(self.folder, self.name)
+
+    def check(self, images: Collection[str]) -> None:
+        """Compare the sizes of the images' feature files; reads none of them.
+
+        Raises
+        ------
+        DataError : a truncated file, or keypoints and descriptors of different length.
+        """
+        if not self.has_descriptors(images):
+            return
+        for image in images:
+            if image in self._keypoints:
+                check_lengths(self._keypoints, self._descriptors, image)
+
+    # readers are kept: opening one means listing folders, or the members of a tar
+    @cached_property
+    def _keypoints(self) -> FeatureReader:
+        return self.folder.keypoints(self.name)
+
+    @cached_property
+    def _descriptors(self) -> FeatureReader:
+        return self.folder.descriptors(self.name)
+
+
+@dataclass(frozen=True, eq=False)
 class KaptureMap:
-    """A map with keypoints, 3D points and observations of one keypoints type.
+    """A map with keypoints, 3D points and observations, of one keypoints type or several.
 
     Open one with :meth:`open`. Coordinates leave it in COLMAP's convention, whatever the map's.
 
     Attributes
     ----------
     folder : the kapture folder; nothing is ever written to it.
-    local_type : the keypoints type that is localized with.
-    index : points and observations of that type, as arrays.
-    pixel_origin : where the map puts its pixel origin, and why we think so.
+    keypoints : the types that are localized with, sorted by name; all of them have points.
     restrictions : coordinate frames of its images, and priors of queries, where it lies in a
         workspace whose dataset has them.
     """
 
     folder: KaptureFolder
-    local_type: str
-    index: MapIndex
-    pixel_origin: PixelOrigin
+    keypoints: Mapping[str, MapKeypoints]
     restrictions: Restrictions = UNRESTRICTED
 
     @classmethod
@@ -63,17 +131,19 @@ class KaptureMap:
         cls,
         path: Path | str,
         *,
-        keypoints_type: str | None = None,
+        keypoints_types: Sequence[str] = (),
         features_dirs: Sequence[Path | str] = (),
         pixel_origin: PixelOriginChoice = "auto",
+        allow_links_below: Sequence[Path | str] = (),
     ) -> KaptureMap:
         """Open a kapture map.
 
         Parameters
         ----------
-        keypoints_type : needed where the map has points of several types.
+        keypoints_types : those to localize with; all that have points unless given.
         features_dirs : folders with features in the orphan layout beside the map's own.
         pixel_origin : of the map's intrinsics; "auto" finds it out (see ``.pixel_origin``).
+        allow_links_below : folders that links in the map may lead to.
 
         Raises
         ------
@@ -82,7 +152,9 @@ class KaptureMap:
         """
         if pixel_origin not in ("auto", "corner", "centre"):
             raise OptionError(f"pixel_origin is {pixel_origin!r}; give auto, corner or centre")
-        folder = KaptureFolder(path, features_dirs=features_dirs)
+        folder = KaptureFolder(
+            path, features_dirs=features_dirs, allow_links_below=allow_links_below
+        )
         folder.read()
         if not folder.has_points():
             raise DataError(
@@ -90,39 +162,63 @@ class KaptureMap:
                 "missing; `megloc triangulate` makes one from images with poses",
                 path=folder.root,
             )
-        types = sorted(t for t, seen in folder.observations().items() if len(seen.point_ids))
-        if not types:
+        present = sorted(t for t, seen in folder.observations().items() if len(seen.point_ids))
+        if not present:
             raise DataError("the map's points have no observations", path=folder.root)
-        if keypoints_type is None and len(types) > 1:
+        absent = [name for name in keypoints_types if name not in present]
+        if absent:
             raise OptionError(
-                f"{folder.root}: points of several keypoints types, choose one with "
-                f"--keypoints-type: {', '.join(types)}"
+                f"{folder.root}: no points of keypoints type {absent[0]!r}; there are: "
+                f"{', '.join(present)}"
             )
-        local_type = keypoints_type or types[0]
-        if local_type not in types:
-            raise OptionError(
-                f"{folder.root}: no points of keypoints type {local_type!r}; there are: "
-                f"{', '.join(types)}"
-            )
-        index = index_map(folder, local_type)
-        found = _find_origin(folder, local_type, index)
+        types = sorted(set(keypoints_types)) or present
+        indices = {name: index_map(folder, name) for name in types}
+        origins = _find_origins(folder, indices)
         if pixel_origin != "auto":
             given: Origin = pixel_origin
-            found = replace(found, intrinsics=given, reason="as asked for")
+            origins = {
+                name: replace(found, intrinsics=given, reason="as asked for")
+                for name, found in origins.items()
+            }
+        keypoints = {n: MapKeypoints(folder, n, indices[n], origins[n]) for n in types}
         # a workspace's map has its dataset's tables beside it, a foreign map has none
         tables = folder.root.resolve().parent / SIDE_TABLES
         restrictions = UNRESTRICTED
         if (tables / PROTOCOL_FILE).is_file():
             restrictions = Restrictions.read(tables)
-        return cls(folder, local_type, index, found, restrictions)
+        return cls(folder, keypoints, restrictions)
+
+    @property
+    def pixel_origin(self) -> PixelOrigin:
+        """Of the intrinsics, which all types share; ``keypoints`` is that of the first type."""
+        return next(iter(self.keypoints.values())).pixel_origin
+
+    def keypoints_of(self, name: str) -> MapKeypoints:
+        """The keypoints of a type that the map stores, whether any of them has a point.
+
+        Raises
+        ------
+        DataError : the map has no keypoints of that type.
+        """
+        if name in self.keypoints:
+            return self.keypoints[name]
+        index = index_map(self.folder, name)
+        origin = self.pixel_origin
+        if not _is_ours(self.folder, name):
+            return MapKeypoints(self.folder, name, index, origin)
+        return MapKeypoints(self.folder, name, index, replace(origin, keypoints="corner"))
+
+    def stored_types(self) -> list[str]:
+        """Keypoints types that the map stores, whether any of them has a point."""
+        return self.folder.types("keypoints")
 
     @cached_property
     def poses(self) -> dict[str, RigidTransform]:
-        """``cam_from_world`` of the map images that observe points."""
+        """``cam_from_world`` of the map images that have keypoints."""
         return {
             image: pose
             for image, pose in self.folder.read().poses().items()
-            if image in self.index.row_of_image
+            if any(image in keypoints for keypoints in self.keypoints.values())
         }
 
     @cached_property
@@ -138,30 +234,6 @@ class KaptureMap:
         """A camera described as the map describes its own, in COLMAP's convention."""
         shift = self.pixel_origin.intrinsics_shift_px
         return shift_principal_point(camera, shift) if shift else camera
-
-    def keypoints_px(self, image: str) -> NDArray[np.float32]:
-        """Keypoints float32 (N, 2 or more) of a map image; x, y in COLMAP's convention."""
-        return self.keypoints_to_colmap(self._keypoints.read(image))
-
-    def descriptors(self, image: str) -> NDArray[Any]:
-        """Descriptors (N, D) of a map image, as stored."""
-        return np.asarray(self._descriptors.read(image))
-
-    def keypoints_to_colmap(self, keypoints: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Keypoints stored as the map stores its own, x and y in COLMAP's convention."""
-        moved = np.array(keypoints, dtype=np.float32)
-        moved[:, :2] += np.float32(self.pixel_origin.keypoints_shift_px)
-        return moved
-
-    def extractor(self) -> PluginChoice | None:
-        """The extractor plugin that makes this type of features; None where there is none."""
-        return extractor_of(self.folder, self.local_type)
-
-    def has_descriptors(self) -> bool:
-        """Whether every image of the map has descriptors of the type."""
-        if self.local_type not in self.folder.types("descriptors"):
-            return False
-        return all(image in self._descriptors for image in self.images)
 
     def has_images(self) -> bool:
         """Whether the map's image files are there."""
@@ -183,22 +255,12 @@ class KaptureMap:
         ------
         DataError : a truncated file, or keypoints and descriptors of different length.
         """
-        if self.has_descriptors():
-            for image in self.images:
-                check_lengths(self._keypoints, self._descriptors, image)
+        for keypoints in self.keypoints.values():
+            keypoints.check(self.images)
         for name in self._global_types:
             vectors = self.folder.global_features(name)
             for image in self.images:
                 vectors.length(image)
-
-    # readers are kept: opening one means listing folders, or the members of a tar
-    @cached_property
-    def _keypoints(self) -> FeatureReader:
-        return self.folder.keypoints(self.local_type)
-
-    @cached_property
-    def _descriptors(self) -> FeatureReader:
-        return self.folder.descriptors(self.local_type)
 
     @cached_property
     def _global_types(self) -> tuple[str, ...]:
@@ -246,6 +308,27 @@ def _is_ours(folder: KaptureFolder, local_type: str) -> bool:
     refined = (folder.root / "reconstruction" / REPORT_FILE).is_file()
     found = _extractor_named(base_type(local_type))
     return found is not None and (refined or found.name not in _NETWORKS)
+
+
+def _find_origins(folder: KaptureFolder, indices: Mapping[str, MapIndex]) -> dict[str, PixelOrigin]:
+    """The origin of the intrinsics, one for all types, and of each type's keypoints.
+
+    Where types disagree on the intrinsics, that with the most observations is believed, and the
+    others' keypoints are where they fit these intrinsics best.
+    """
+    found = {name: _find_origin(folder, name, index) for name, index in indices.items()}
+    most = max(found, key=lambda name: (len(indices[name].point_ids), name))
+    intrinsics = found[most].intrinsics
+    origins = {}
+    for name, origin in found.items():
+        if origin.intrinsics != intrinsics:
+            # what was measured is the offset of the two
+            agree = origin.keypoints == origin.intrinsics
+            keypoints = intrinsics if agree else origin.keypoints
+            reason = f"{origin.reason}; of the intrinsics {most} says {intrinsics}"
+            origin = replace(origin, intrinsics=intrinsics, keypoints=keypoints, reason=reason)
+        origins[name] = origin
+    return origins
 
 
 def _find_origin(folder: KaptureFolder, local_type: str, index: MapIndex) -> PixelOrigin:

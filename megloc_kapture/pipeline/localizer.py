@@ -4,59 +4,58 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError, PluginError
+from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.kapture_store import KaptureFolder
 from megloc_kapture.localization.cluster_poses import (
-    ClusterLocalization,
+    ImageMatches,
     QueryView,
     TypedMatches,
     in_turn,
 )
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap
-from megloc_kapture.pipeline.map_descriptors import extract_again
+from megloc_kapture.pipeline.local_types import local_types_of
 from megloc_kapture.pipeline.map_retrieval import MapRetrieval
 from megloc_kapture.pipeline.options import PipelineOptions
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.queries import KaptureQueries, Query
-from megloc_kapture.pipeline.query_features import QueryFeatures
-from megloc_kapture.plugins import LOCAL_FEATURES, LocalFeatureExtractor, load_plugin
-from megloc_kapture.retrieval.coverage import most_covering
-from megloc_kapture.stages.matches import (
-    BATCH,
-    FeatureCache,
-    Features,
-    VerifiedMatches,
-    batched,
-    match_and_verify,
-    two_view_verification,
-)
+from megloc_kapture.pipeline.queries import KaptureQueries, Query, Unit
+from megloc_kapture.pipeline.query_images import Preprocessor, QueryImage, QueryImages
+from megloc_kapture.stages.matches import FeatureCache, Features
 from megloc_kapture.stages.parallel import ordered_map
-from megloc_kapture.stages.pyramid_query import retry_query
-from megloc_kapture.stages.query_poses import localize_views
+from megloc_kapture.stages.pose_refinement import PoseReferences, refine_pose
+from megloc_kapture.stages.query_poses import localize_unit, localize_views
 from megloc_kapture.stages.ranking_scene import KaptureScene
-from megloc_kapture.values import Camera, Failure, LocalFeatures, Pose, RigidTransform
+from megloc_kapture.stages.reranking import kept_candidates
+from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
-# a map this small is matched whole where nothing can rank its images
-MAX_EXHAUSTIVE_IMAGES = 50
+_ALONE = RigidTransform.identity()
 
-_Matches = list[tuple[str, NDArray[np.int64], NDArray[np.floating[Any]]]]
+
+@dataclass(frozen=True, eq=False)
+class _Matched:
+    """The cameras of a query with their matches, and what localizing needs beside them."""
+
+    images: tuple[QueryImage, ...]
+    views: tuple[QueryView, ...]
+    candidates: list[str]
+    frames: list[str]
+    remarks: tuple[tuple[str, ...], ...]  # of each camera
 
 
 class Localizer:
-    """Finds camera poses in a map of any tool.
+    """Finds camera poses in a map of any tool, as ``megloc eval`` does with the same options.
 
-    Query features come with the query, or are extracted where the map's type has an extractor
-    plugin. Candidates come from global features that map and query both bring, else from VLAD over
-    the map's own descriptors, else, for small maps, from all images.
+    All keypoints types of the map make one problem. Query features come with the query, or are
+    extracted where the map's type has an extractor plugin. Candidates come from global features
+    (see :class:`~megloc_kapture.pipeline.map_retrieval.MapRetrieval`), or are all images where
+    these are few. Networks are loaded when they are first used.
 
     Parameters
     ----------
@@ -84,16 +83,11 @@ class Localizer:
     ) -> None:
         self.map = kapture_map
         self.options = options or options_of_preset(preset)
-        self._matcher = self.options.make_matcher(kapture_map.local_type)
         self._ranker = self.options.localization.make_ranker()
-        self._query_features = QueryFeatures(self.options)
-        self._descriptors: dict[str, NDArray[Any]] | None = None
-        if not kapture_map.has_descriptors():
-            self._descriptors = extract_again(kapture_map, self._extractor)
-        self._cache = FeatureCache()
-        self._retrieval = MapRetrieval(
-            kapture_map, self.options, self._query_features, self._map_descriptors
-        )
+        self._refiners = self.options.pose_refinement.make_refiners()
+        self._preprocessor = Preprocessor(self.options)
+        self.types = local_types_of(kapture_map, self.options, FeatureCache())
+        self._retrieval = MapRetrieval(kapture_map, self.options, self.types, self._preprocessor)
 
     # ------------------------------------------------------------------ the public calls
 
@@ -131,7 +125,7 @@ class Localizer:
         *,
         candidates: Mapping[str, Sequence[str]] | None = None,
     ) -> Iterator[Pose | Failure]:
-        """Localize lazily, results in the order of the queries.
+        """Localize each query by itself, lazily, results in the order of the queries.
 
         Parameters
         ----------
@@ -139,23 +133,46 @@ class Localizer:
         candidates : query name to the map images it is matched with, instead of retrieval.
         """
         wrapped = (q if isinstance(q, Query) else _query_of(*q) for q in queries)
-        if candidates is not None:
-            wrapped = (replace(q, candidates=tuple(candidates.get(q.name, ()))) for q in wrapped)
-        return ordered_map(self.localize_query, wrapped, executor)
+        units = (((query, _ALONE),) for query in wrapped)
+        for results in self.localize_units(units, executor, candidates=candidates):
+            yield from results
 
     def localize_kapture(
         self, folder: KaptureFolder | Path | str, executor: Executor | None = None
     ) -> Iterator[tuple[str, Pose | Failure]]:
-        """Localize the images of a kapture folder: (name, result), sorted by name."""
+        """Localize the images of a kapture folder: (name, result).
+
+        Sorted by name; with ``localization.rigs`` the cameras of a rig stand together.
+        """
         opened = folder if isinstance(folder, KaptureFolder) else KaptureFolder(folder)
         queries = KaptureQueries(opened, self.map)
-        results = self.localize_many(queries, executor)
-        return zip(queries.names, results, strict=True)
+        rigs = self.options.localization.rigs
+        results = self.localize_units(queries.read_units(rigs=rigs), executor)
+        for names, found in zip(queries.units(rigs=rigs), results, strict=True):
+            yield from zip(names, found, strict=True)
+
+    def localize_units(
+        self,
+        units: Iterable[Unit],
+        executor: Executor | None = None,
+        *,
+        candidates: Mapping[str, Sequence[str]] | None = None,
+    ) -> Iterator[list[Pose | Failure]]:
+        """Localize images, or the cameras of a rig together: one result per camera of each unit.
+
+        A rig that has no pose is tried camera by camera. Parameters as of :meth:`localize_many`.
+        """
+        if candidates is not None:
+            known = candidates
+            units = (
+                tuple((replace(q, candidates=tuple(known.get(q.name, ()))), at) for q, at in unit)
+                for unit in units
+            )
+        return ordered_map(self._localize_unit, units, executor)
 
     def localize_query(self, query: Query) -> Pose | Failure:
         """Localize a query that may bring its features."""
-        with single_threaded():
-            return self._localize([(query, RigidTransform.identity())]).result
+        return self._localize_unit(((query, _ALONE),))[0]
 
     def localize_rig(self, views: Sequence[tuple[Query, RigidTransform]]) -> Pose | Failure:
         """Localize several cameras of a rig at once.
@@ -167,54 +184,131 @@ class Localizer:
         Returns
         -------
         Pose whose ``cam_from_world`` is ``rig_from_world``, or Failure.
-        """
-        with single_threaded():
-            return self._localize(views).result
 
-    def _localize(self, views: Sequence[tuple[Query, RigidTransform]]) -> ClusterLocalization:
-        matched = []
-        for query, cam_from_rig in views:
-            keypoints_px, matches = self._match(query)
-            typed = TypedMatches(self.map.index, keypoints_px[:, :2], matches)
-            matched.append(QueryView(query.name, query.camera, (typed,), cam_from_rig))
-        candidates = in_turn(
-            [[image for image, _, _ in typed.matches] for view in matched for typed in view.matches]
-        )
-        named = {query.name: query for query, _ in views}
-        return localize_views(
-            matched,
-            candidates,
-            [self.map.restrictions.frame(image) for image in candidates],
-            self.options.localization,
-            centers={image: self.map.poses[image].center() for image in candidates},
-            ranker=self._ranker,
-            scene=KaptureScene(self.map.folder, read_query=lambda name: named[name].read_image()),
-        )
+        Raises
+        ------
+        OptionError : the options have pose refiners, which refine cameras one by one:
+            :meth:`localize_units` gives the poses of the cameras.
+        """
+        if self._refiners:
+            raise OptionError(
+                "pose_refinement refines the poses of cameras, not of rigs: use localize_units"
+            )
+        with single_threaded():
+            matched = self._match(tuple(views))
+            return localize_views(
+                matched.views,
+                matched.candidates,
+                matched.frames,
+                self.options.localization,
+                centers=self._centers,
+                ranker=self._ranker,
+                scene=self._scene(matched.images),
+            ).result
 
     # ------------------------------------------------------------------ the steps
 
-    def candidates(self, query: Query, local: LocalFeatures) -> list[str]:
-        """The map images to match a query with: few as they are, many by retrieval, best first."""
+    def _localize_unit(self, unit: Unit) -> list[Pose | Failure]:
+        with single_threaded():
+            matched = self._match(unit)
+            scene = self._scene(matched.images)
+            results = localize_unit(
+                matched.views,
+                matched.candidates,
+                matched.frames,
+                self.options.localization,
+                centers=self._centers,
+                ranker=self._ranker,
+                scene=scene,
+            )
+            remarked = [
+                replace(result, remarks=remarks)
+                for result, remarks in zip(results, matched.remarks, strict=True)
+            ]
+            return [
+                self._refined(image, result, scene) if isinstance(result, Pose) else result
+                for image, result in zip(matched.images, remarked, strict=True)
+            ]
+
+    def _refined(self, image: QueryImage, pose: Pose, scene: KaptureScene) -> Pose:
+        if not self._refiners:
+            return pose
+        near = self._references.near(pose.cam_from_world, pose.candidates)
+        name = image.query.name
+        found = refine_pose(name, image.camera, pose.cam_from_world, near, self._refiners, scene)
+        moved = any(row.accepted for row in found.rows)
+        return replace(
+            pose,
+            cam_from_world=found.cam_from_world,
+            covariance=found.covariance if moved else pose.covariance,
+            refinements=found.rows,
+            seconds={**pose.seconds, **found.seconds},
+        )
+
+    def _scene(self, images: Iterable[QueryImage]) -> KaptureScene:
+        return KaptureScene(self.map.folder, QueryImages(images), map_camera=self.map.camera)
+
+    @cached_property
+    def _references(self) -> PoseReferences:
+        poses = self.map.folder.read().poses()
+        return PoseReferences(poses, self.map.restrictions, self.options.pose_refinement)
+
+    @cached_property
+    def _centers(self) -> dict[str, NDArray[np.float64]]:
+        return {image: pose.center() for image, pose in self.map.poses.items()}
+
+    def _match(self, unit: Unit) -> _Matched:
+        """Match each camera's features with its candidates."""
+        images = tuple(self._preprocessor.of(query) for query, _ in unit)
+        views, rankings, remarks = [], [], []
+        for image, (query, cam_from_rig) in zip(images, unit, strict=True):
+            features = [local.of_query(image) for local in self.types]
+            ranked = self._candidates(image, features)
+            of_types = [
+                local.match(own, ranked) for local, own in zip(self.types, features, strict=True)
+            ]
+            kept = kept_candidates(of_types, self.options.reranking)
+            typed, left_out = [], []
+            for local, own, found in zip(self.types, features, of_types, strict=True):
+                named: list[ImageMatches] = [
+                    (ranked[at], found[at].matches, found[at].scores) for at in kept
+                ]
+                keypoints_px, named, remark = local.match_again(own, named, image)
+                left_out += [remark] if remark else []
+                typed.append(TypedMatches(local.points.index, keypoints_px, named))
+            views.append(QueryView(query.name, image.camera, tuple(typed), cam_from_rig))
+            rankings.append([ranked[at] for at in kept])
+            remarks.append(tuple(left_out))
+        candidates = in_turn(rankings)
+        frames = [self.map.restrictions.frame(name) for name in candidates]
+        return _Matched(images, tuple(views), candidates, frames, tuple(remarks))
+
+    def _candidates(self, image: QueryImage, features: Sequence[Features]) -> list[str]:
+        """The map images to match a query with, best first where they can be ranked."""
+        query = image.query
         if query.candidates is not None:
             return self._usable(query, query.candidates)
         permitted = self._permitted(query)
         options = self.options.query_pairs
-        if options.by == "exhaustive" or len(permitted) <= options.top_k:
+        if options.by == "exhaustive" or not permitted:
             return permitted
-        return self._rank(query, local, permitted)
+        if len(permitted) <= options.top_k and not self._retrieval.is_at_hand(query):
+            return permitted
+        return self._retrieval.rank(image, features, permitted)
 
     def ranked(self, query: Query) -> list[str]:
         """The most similar map images of a query, best first, however few there are."""
-        local = query.features or self._extract(query)
-        return self._rank(query, local, self._permitted(query))
+        image = self._preprocessor.of(query)
+        features = [local.of_query(image) for local in self.types]
+        return self._retrieval.rank(image, features, self._permitted(query))
 
     def _permitted(self, query: Query) -> list[str]:
         if query.prior is None:
             return self.map.images
-        return self._usable(query, query.prior)
+        return sorted(self._usable(query, query.prior))
 
     def _usable(self, query: Query, images: Sequence[str]) -> list[str]:
-        """Those of the images that have a pose and see points; the others cannot help."""
+        """Those of the images that have a pose and keypoints; the others cannot help."""
         unknown = set(images) - self._known_images
         if unknown:
             raise DataError(
@@ -228,8 +322,14 @@ class Localizer:
     def _known_images(self) -> frozenset[str]:
         return frozenset(self.map.folder.read().image_names())
 
-    def _rank(self, query: Query, local: LocalFeatures, permitted: Sequence[str]) -> list[str]:
-        return self._retrieval.rank(query, local, permitted)
+    def unused_local_features(self) -> list[str]:
+        """Names of the options' local features that no type of the map is made of."""
+        used = {local.choice.name for local in self.types if local.choice is not None}
+        return [one.name for one in self.options.local_features if one.name not in used]
+
+    def compares_as_asked(self, global_types: Collection[str]) -> bool:
+        """Whether queries that bring these global features are compared by the options' own."""
+        return self._retrieval.names_one_of(global_types)
 
     def describe_retrieval(self, global_types: Collection[str]) -> str:
         """How the candidates of queries that bring these global features are found, for people."""
@@ -238,101 +338,6 @@ class Localizer:
             return f"all {len(self.map.images)} map images"
         return self._retrieval.describe(global_types)
 
-    def _match(self, query: Query) -> tuple[NDArray[np.float32], _Matches]:
-        """The query's keypoints, and their matches with each candidate."""
-        local = query.features or self._extract(query)
-        features = Features.of(query.camera, local.keypoints_px, local.descriptors)
-        verification = two_view_verification(self.options.query_verification)
-        if self.options.verification == "none":
-            verification = _keep_all
-        found: list[tuple[str, VerifiedMatches]] = []
-        for images in batched(self.candidates(query, local), BATCH):
-            pairs = match_and_verify(
-                features,
-                [self._map_features(image) for image in images],
-                self._matcher,
-                [verification] * len(images),
-            )
-            found += zip(images, pairs, strict=True)
-        matches = [(image, pair.matches, pair.scores) for image, pair in self._reranked(found)]
-        if not self.options.matches_again():
-            return features.keypoints_px, matches
-        return retry_query(
-            features,
-            matches,
-            self._map_features,
-            self._extractor,
-            self._matcher,
-            image=query.read_image,
-            mask=lambda: self._query_features.mask(query),
-            verification=self.options.query_verification,
-            options=self.options.guided_pyramid,
-            name=query.name,
-        )
-
-    def _reranked(
-        self, found: list[tuple[str, VerifiedMatches]]
-    ) -> list[tuple[str, VerifiedMatches]]:
-        """Those of the candidates that are kept, best first; all without reranking."""
-        options = self.options.reranking
-        if not options.reranks():
-            return found
-        if options.by == "coverage":
-            keypoints = [np.unique(pair.matches[:, 0]) for _, pair in found]
-            order, _ = most_covering(keypoints, options.keep)
-            return [found[rank] for rank in order]
-
-        def count(rank: int) -> int:
-            pair = found[rank][1]
-            return pair.num_found if options.by == "matches" else len(pair.matches)
-
-        best = sorted(range(len(found)), key=lambda rank: (-count(rank), rank))
-        return [found[rank] for rank in best[: options.keep]]
-
-    def _extract(self, query: Query) -> LocalFeatures:
-        return self._query_features.extract(query, self._extractor)
-
-    @cached_property
-    def _extractor(self) -> LocalFeatureExtractor:
-        found = self.map.extractor()
-        if found is None:
-            raise DataError(
-                f"features of type {self.map.local_type!r} are missing and no extractor for them "
-                "is installed; give them with --features-dir, or in the kapture folder",
-                path=self.map.folder.root,
-            )
-        chosen = {one.name: one.options for one in self.options.local_features}
-        options = {**chosen.get(found.name, {}), **found.options}
-        extractor: LocalFeatureExtractor = load_plugin(LOCAL_FEATURES, found.name, options)
-        if not isinstance(extractor, LocalFeatureExtractor):
-            raise PluginError(f"plugin {found.name!r} is no extractor of local features")
-        return extractor
-
-    def _map_features(self, image: str) -> Features:
-        return self._cache.get(image, lambda: self._load_map_features(image))
-
-    def _load_map_features(self, image: str) -> Features:
-        keypoints = self.map.keypoints_px(image)
-        descriptors = self._map_descriptors(image)
-        if len(keypoints) != len(descriptors):
-            raise DataError(
-                f"{image} has {len(keypoints)} keypoints and {len(descriptors)} descriptors",
-                path=self.map.folder.root,
-            )
-        camera = self.map.camera(image)
-        # only keypoints that observe a point can help a pose, but all take part in the mutual
-        # check: without its rivals a wrong match would look unrivalled
-        return Features.of(camera, keypoints, descriptors)
-
-    def _map_descriptors(self, image: str) -> NDArray[Any]:
-        if self._descriptors is not None:
-            return self._descriptors[image]
-        return self.map.descriptors(image)
-
 
 def _query_of(image: Path | str | NDArray[np.uint8], camera: Camera) -> Query:
     return Query(camera, image, str(image) if isinstance(image, str | Path) else "query")
-
-
-def _keep_all(a: Features, b: Features, matches: NDArray[np.int64]) -> NDArray[np.bool_]:
-    return np.ones(len(matches), dtype=bool)

@@ -1,76 +1,102 @@
-"""The most similar images of a map to one query, from global features of either side."""
+"""Which images of a map resemble a query most."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.features.vlad import Vocabulary, aggregate, train_vlad
+from megloc_kapture.io.weights import MissingWeightsError
+from megloc_kapture.io.weights_registry import registry
 from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.pipeline.global_choice import GlobalFeaturesChoice
 from megloc_kapture.pipeline.kapture_map import KaptureMap
+from megloc_kapture.pipeline.local_types import LocalType
 from megloc_kapture.pipeline.options import PipelineOptions
 from megloc_kapture.pipeline.queries import Query
-from megloc_kapture.pipeline.query_features import QueryFeatures
-from megloc_kapture.plugins import GlobalFeatureExtractor
+from megloc_kapture.pipeline.query_images import Preprocessor, QueryImage
+from megloc_kapture.plugins import GLOBAL_FEATURES, GlobalFeatureExtractor, plugin_names
 from megloc_kapture.stages.candidates import Candidates, Retrieval, vectors_of
-from megloc_kapture.stages.global_vlad import VladSettings, read_vocabulary
+from megloc_kapture.stages.global_vlad import VladSettings, read_vocabulary, vlad_type
 from megloc_kapture.stages.local_features import read_image_of
-from megloc_kapture.values import LocalFeatures
+from megloc_kapture.stages.matches import Features
 
-_VLAD_WORDS = "VLAD over the map's descriptors"
+# names of vectors in naver's kapture datasets; deep-image-retrieval's extract_kapture.py made them,
+# neither whitened nor of images made smaller
+_PUBLISHED = {
+    name: GlobalFeaturesChoice(
+        name="apgem", options={"weights": weights, "whitening": "", "max_size_px": None}
+    )
+    for name, weights in (
+        ("AP-GeM-LM18", "apgem-resnet101-lm18"),
+        ("Resnet101-AP-GeM-LM18", "apgem-resnet101-lm18"),
+        ("Resnet-101-AP-GeM", "apgem-resnet101"),
+    )
+}
+
+
+@dataclass(frozen=True)
+class _Compared:
+    """One type of vectors that a query is compared by.
+
+    Attributes
+    ----------
+    name : the map's kapture type; of vectors that it has not, the one they would have.
+    choice : what makes the query's; None where the query brings them.
+    stored : whether the map has them.
+    """
+
+    name: str
+    choice: GlobalFeaturesChoice | None
+    weight: float
+    stored: bool
 
 
 class MapRetrieval:
     """Ranks a map's images for queries.
 
-    Global features that map and query both bring are compared. Where they share none, those that
-    the options name: of VLAD the map's own vocabulary or one trained on its descriptors; of an
-    image network the vectors the map has, else its images are described once, in memory.
-
-    Parameters
-    ----------
-    descriptors : of a map image (N, D), by its name.
+    Compared are, first, global features that map and query both bring (of these, where there are
+    any, those that the options name); else those of the options that the map has vectors of, or,
+    of VLAD, descriptors to train it on; else those of the map that an extractor is known for; else
+    those of the options, for which the map's images are described once, in memory.
     """
 
     def __init__(
         self,
         kapture_map: KaptureMap,
         options: PipelineOptions,
-        query_features: QueryFeatures,
-        descriptors: Callable[[str], NDArray[Any]],
+        types: Sequence[LocalType],
+        preprocessor: Preprocessor,
     ) -> None:
-        self._map, self._options = kapture_map, options
-        self._query_features, self._descriptors = query_features, descriptors
+        self._map, self._options, self._types = kapture_map, options, types
+        self._preprocessor = preprocessor
         self._vectors: dict[str, NDArray[np.float32]] = {}
         self._extractors: dict[str, GlobalFeatureExtractor] = {}
+        self._vocabularies: dict[str, tuple[Vocabulary, VladSettings]] = {}
 
-    def rank(self, query: Query, local: LocalFeatures, permitted: Sequence[str]) -> list[str]:
+    def rank(
+        self, image: QueryImage, features: Sequence[Features], permitted: Sequence[str]
+    ) -> list[str]:
         """Names of the permitted map images most similar to a query, best first.
+
+        Parameters
+        ----------
+        features : local features of the query, of each type.
 
         Raises
         ------
         DataError : the map has neither descriptors nor images to compare the query with.
         PluginError, MissingWeightsError : an image network cannot be used.
         """
-        shared = self._shared(query.global_features)
-        if shared:
-            weight_of = {self._network_type(c): c.weight for c in self._networks()}
-            weights = [weight_of.get(name, 1.0) for name in shared]
-            vectors = [query.global_features[name] for name in shared]
-            databases = [self._stored(name) for name in shared]
-        else:
-            choices = self._options.global_features
-            weights = [chosen.weight for chosen in choices]
-            described = [self._described(chosen, query, local) for chosen in choices]
-            vectors = [vector for vector, _ in described]
-            databases = [database for _, database in described]
-        retrieval = Retrieval(tuple(shared), tuple(weights), self._options.fusion)
+        compared = self._compared(image.query.global_features)
+        databases = [self._of_map(one) for one in compared]
+        vectors = [self._of_query(one, image, features) for one in compared]
+        names, weights = zip(*((one.name, one.weight) for one in compared), strict=True)
         rows = [_unit(np.asarray(v, np.float32).reshape(1, -1)) for v in vectors]
         members = np.flatnonzero(np.isin(self._map.images, list(permitted)))
         candidates = Candidates(
@@ -79,90 +105,200 @@ class MapRetrieval:
                 database if len(positions) == len(database) else database[positions]
                 for database in databases
             ],
-            [self._map.poses[image] for image in self._map.images],
-            retrieval,
+            [self._map.poses[name] for name in self._map.images],
+            Retrieval(names, weights, self._options.fusion),
         )
         index, _ = candidates.of(rows, members, self._options.query_pairs)
         return [self._map.images[i] for i in index[0] if i >= 0]
 
+    def is_at_hand(self, query: Query) -> bool:
+        """Whether a query can be ranked without describing the map first, or lacking weights."""
+        compared = self._compared(query.global_features)
+        try:
+            for one in compared:
+                if one.choice is not None and not one.choice.is_vlad:
+                    self._extractor(one.choice)
+        except MissingWeightsError:
+            return False
+        return all(one.stored for one in compared)
+
+    def names_one_of(self, brought: Collection[str]) -> bool:
+        """Whether the options name one of the types that queries bring."""
+        return any(self._wanted(one).name in brought for one in self._options.global_features)
+
     def describe(self, global_types: Collection[str]) -> str:
         """How queries that bring these global features are compared, for people."""
-        shared = self._shared(global_types)
+        words = []
+        for one in self._compared(global_types):
+            if one.choice is not None and one.choice.is_vlad:
+                words.append("VLAD over the map's descriptors")
+            else:
+                words.append(f"global features {one.name}")
+        return ", ".join(words)
+
+    def _compared(self, brought: Collection[str]) -> list[_Compared]:
+        wanted = [self._wanted(choice) for choice in self._options.global_features]
+        shared = [name for name in self._map.global_types() if name in brought]
         if shared:
-            return f"global features {', '.join(shared)}"
-        names = [
-            _VLAD_WORDS if chosen.is_vlad else f"global features {chosen.name}"
-            for chosen in self._options.global_features
+            weight_of = {one.name: one.weight for one in wanted}
+            named = [name for name in shared if name in weight_of]
+            return [
+                _Compared(name, None, weight_of.get(name, 1.0), stored=True)
+                for name in named or shared
+            ]
+        usable = [one for one in wanted if one.stored or self._trains_vlad(one)]
+        if usable:
+            return usable
+        known = [
+            _Compared(name, choice, 1.0, stored=True)
+            for name in self._map.global_types()
+            if (choice := _choice_of(name)) is not None
         ]
-        return ", ".join(names)
+        return known or wanted
 
-    def _shared(self, global_types: Collection[str]) -> list[str]:
-        return [name for name in self._map.global_types() if name in global_types]
+    def _wanted(self, choice: GlobalFeaturesChoice) -> _Compared:
+        """One of the options' features, under the name that the map knows them by."""
+        if choice.is_vlad:
+            name = self._vlad_name(choice)
+            return _Compared(name, choice, choice.weight, name in self._stored_vocabularies)
+        there = self._map.global_types()
+        try:
+            name = self._extractor(choice).name
+        except MissingWeightsError:  # named when they are needed
+            name = next((name for name in there if name.startswith(choice.name)), choice.name)
+        if name in there:
+            return _Compared(name, choice, choice.weight, stored=True)
+        for other in there:
+            published = _PUBLISHED.get(other)
+            if published is not None and published.name == choice.name:
+                return _Compared(other, published, choice.weight, stored=True)
+        return _Compared(name, choice, choice.weight, stored=False)
 
-    def _networks(self) -> list[GlobalFeaturesChoice]:
-        return [chosen for chosen in self._options.global_features if not chosen.is_vlad]
+    def _vlad_name(self, choice: GlobalFeaturesChoice) -> str:
+        """The type of VLAD's vectors: those that the map has, where the options allow them."""
+        local_type = choice.vlad_options().local_type
+        asked = {key: value for key, value in choice.options.items() if key != "local_type"}
+        for name, (_, settings) in sorted(self._stored_vocabularies.items()):
+            same = settings.options.model_copy(update=asked) == settings.options
+            if same and local_type in (None, settings.local_type):
+                return name
+        # not the map's own, which were made with other options
+        name = vlad_type(local_type or base_type(self._types[0].name))
+        return name if name not in self._map.global_types() else f"{name}, trained anew"
 
-    def _network_type(self, chosen: GlobalFeaturesChoice) -> str:
-        return self._extractor(chosen).name
+    def _trains_vlad(self, one: _Compared) -> bool:
+        return one.choice is not None and one.choice.is_vlad
 
-    def _extractor(self, chosen: GlobalFeaturesChoice) -> GlobalFeatureExtractor:
-        if chosen.name not in self._extractors:
-            self._extractors[chosen.name] = chosen.make()
-        return self._extractors[chosen.name]
+    def _of_query(
+        self, one: _Compared, image: QueryImage, features: Sequence[Features]
+    ) -> NDArray[np.float32]:
+        if one.choice is None:
+            return np.asarray(image.query.global_features[one.name])
+        if not one.choice.is_vlad:
+            return image.describe(self._extractor(one.choice))
+        vocabulary, settings = self._vlad(one)
+        position = self._position(settings.local_type)
+        return aggregate(features[position].descriptors, vocabulary, settings.options)
 
-    def _described(
-        self, chosen: GlobalFeaturesChoice, query: Query, local: LocalFeatures
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """The query's vector, and the rows of the map's images."""
-        if chosen.is_vlad:
-            vocabulary, settings, database = self._vlad
-            return aggregate(local.descriptors, vocabulary, settings.options), database
-        extractor = self._extractor(chosen)
-        return self._query_features.describe(query, extractor), self._of_map(extractor)
+    def _of_map(self, one: _Compared) -> NDArray[np.float32]:
+        if one.name not in self._vectors:
+            self._vectors[one.name] = self._read_or_describe(one)
+        return self._vectors[one.name]
 
-    def _of_map(self, extractor: GlobalFeatureExtractor) -> NDArray[np.float32]:
-        if extractor.name in self._map.global_types():
-            return self._stored(extractor.name)
-        if extractor.name not in self._vectors:
-            if not self._map.has_images():
-                raise DataError(
-                    f"the map has no global features {extractor.name!r}, and no images to describe",
-                    path=self._map.folder.root,
-                )
-            self._vectors[extractor.name] = np.stack(
-                [self._describe(image, extractor) for image in self._map.images]
-            )
-        return self._vectors[extractor.name]
-
-    def _describe(self, image: str, extractor: GlobalFeatureExtractor) -> NDArray[np.float32]:
-        folder = self._map.folder
-        pixels = read_image_of(folder.image_path(image), folder.read().camera_of(image))
-        query = Query(self._map.camera(image), pixels, image)
-        return self._query_features.describe(query, extractor)
-
-    def _stored(self, global_type: str) -> NDArray[np.float32]:
-        if global_type not in self._vectors:
-            readers = [self._map.folder.global_features(global_type)]
+    def _read_or_describe(self, one: _Compared) -> NDArray[np.float32]:
+        if one.stored:
+            readers = [self._map.folder.global_features(one.name)]
             (source,) = vectors_of(readers, self._map.images)
-            self._vectors[global_type] = source.read(0, len(source))
-        return self._vectors[global_type]
+            return source.read(0, len(source))
+        if one.choice is None or one.choice.is_vlad:
+            vocabulary, settings = self._vlad(one)
+            local = self._types[self._position(settings.local_type)]
+            rows = [
+                aggregate(local.descriptors(image), vocabulary, settings.options)
+                for image in self._map.images
+            ]
+            return np.stack(rows)
+        if not self._map.has_images():
+            raise DataError(
+                f"the map has no global features {one.name!r}, and no images to describe",
+                path=self._map.folder.root,
+            )
+        extractor = self._extractor(one.choice)
+        return np.stack([self._map_image(name).describe(extractor) for name in self._map.images])
+
+    def _map_image(self, name: str) -> QueryImage:
+        """A map image, pre-processed as queries are."""
+        folder = self._map.folder
+        pixels = read_image_of(folder.image_path(name), folder.read().camera_of(name))
+        return self._preprocessor.of(Query(self._map.camera(name), pixels, name))
+
+    def _extractor(self, choice: GlobalFeaturesChoice) -> GlobalFeatureExtractor:
+        key = f"{choice.name} {sorted(choice.options.items())}"
+        if key not in self._extractors:
+            self._extractors[key] = choice.make()
+        return self._extractors[key]
+
+    def _vlad(self, one: _Compared) -> tuple[Vocabulary, VladSettings]:
+        """Vocabulary, and how it was made: the map's own where it has one."""
+        if one.name not in self._vocabularies:
+            stored = self._stored_vocabularies.get(one.name)
+            self._vocabularies[one.name] = stored or self._trained(one)
+        return self._vocabularies[one.name]
 
     @cached_property
-    def _vlad(self) -> tuple[Vocabulary, VladSettings, NDArray[np.float32]]:
-        """Vocabulary, how it was made, and the map's vectors: the map's own where it has them."""
+    def _stored_vocabularies(self) -> dict[str, tuple[Vocabulary, VladSettings]]:
+        """Those that lie beside the map's vectors, of local features that queries have."""
         folder = self._map.folder
+        known = {base_type(one.name) for one in self._types}
+        found: dict[str, tuple[Vocabulary, VladSettings]] = {}
         for name in self._map.global_types():
-            stored = read_vocabulary(folder.root / "reconstruction" / "global_features" / name)
-            if stored is not None and stored[1].local_type == base_type(self._map.local_type):
-                return *stored, self._stored(name)
-        chosen = next(one for one in self._options.global_features if one.is_vlad)
-        options, images = chosen.vlad_options().of_vlad(), self._map.images
+            places = [folder.root / "reconstruction" / "global_features" / name]
+            places += [
+                d / "global_features" / name / "global_features" for d in folder.features_dirs
+            ]
+            for place in places:
+                stored = read_vocabulary(place)
+                if stored is not None and stored[1].local_type in known:
+                    found.setdefault(name, stored)
+        return found
+
+    def _trained(self, one: _Compared) -> tuple[Vocabulary, VladSettings]:
+        if one.choice is None:
+            raise ValueError("vectors that a query brings need no vocabulary")
+        vlad = one.choice.vlad_options()
+        local = self._types[self._position(vlad.local_type or self._types[0].name)]
+        options, images = vlad.of_vlad(), [i for i in self._map.images if i in local.first]
         vocabulary = train_vlad(
-            images, lambda image: len(self._descriptors(image)), self._descriptors, options
+            images, lambda image: len(local.descriptors(image)), local.descriptors, options
         )
-        vectors = [aggregate(self._descriptors(image), vocabulary, options) for image in images]
-        settings = VladSettings(local_type=self._map.local_type, options=options)
-        return vocabulary, settings, np.stack(vectors)
+        return vocabulary, VladSettings(local_type=local.name, options=options)
+
+    def _position(self, local_type: str) -> int:
+        names = [base_type(one.name) for one in self._types]
+        if base_type(local_type) not in names:
+            raise DataError(
+                f"VLAD over {local_type} needs local features of this type; queries have "
+                f"{', '.join(names)}",
+                path=self._map.folder.root,
+            )
+        return names.index(base_type(local_type))
+
+
+def _choice_of(global_type: str) -> GlobalFeaturesChoice | None:
+    """The extractor of a type of vectors that a map has, where it can be made; else None."""
+    if global_type in _PUBLISHED:
+        return _PUBLISHED[global_type]
+    for plugin in plugin_names(GLOBAL_FEATURES):
+        weights = [name for name in registry() if global_type.startswith(name)]
+        if not global_type.startswith(plugin) or not weights:
+            continue
+        choice = GlobalFeaturesChoice(name=plugin, options={"weights": max(weights, key=len)})
+        try:
+            if choice.make().name == global_type:
+                return choice
+        except MissingWeightsError:
+            return None
+    return None
 
 
 def _unit(rows: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -91,6 +91,26 @@ class PipelineOptions(Options):
         """One choice stands for a list of one."""
         return (value,) if isinstance(value, str | dict) else value
 
+    def idle(self) -> dict[str, str]:
+        idle: dict[str, str] = {}
+        if len(self.global_features) == 1:
+            idle["fusion"] = "there is one type of global features (global_features)"
+        if not self.makes_points():
+            idle["local_features"] = f"map = {self.map}: the map's own features are used"
+        if not self.uses_given_map():
+            idle["given_features"] = f"map = {self.map} takes no given model"
+            if all(chosen.matching for chosen in self.local_features):
+                idle["matching"] = "each of local_features names its own matching"
+        if not self.triangulates():
+            of_pairs = ("mapping_pairs", "mapping_verification", "triangulation")
+            idle |= dict.fromkeys(of_pairs, f"map = {self.map}: map images are not matched")
+        if self.map != "lift":
+            idle["lifting"] = f"map = {self.map}: keypoints are not lifted"
+        if self.verification == "none":
+            verifications = ("mapping_verification", "query_verification")
+            idle |= dict.fromkeys(verifications, "verification is none")
+        return idle
+
     def make_extractors(self) -> list[LocalFeatureExtractor]:
         """The extractors of local features, in order; raises PluginError, MissingWeightsError."""
         return [

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 from pydantic import ValidationError
 
 from megloc_kapture.errors import OptionError
 from megloc_kapture.matching.guided_pyramid import GuidedPyramidOptions
+from megloc_kapture.pipeline.assignments import check_assigned
 from megloc_kapture.pipeline.global_choice import GlobalFeaturesChoice
 from megloc_kapture.pipeline.options import LocalFeaturesChoice, PipelineOptions
 from megloc_kapture.plugins import PluginChoice
@@ -69,27 +70,36 @@ def options_of_preset(
     *,
     changes: Sequence[dict[str, Any]] = (),
     assignments: Sequence[str] = (),
+    used: Collection[str] | None = None,
 ) -> PipelineOptions:
     """A preset's options with changes: nested tables in order, then ``key.key=value`` texts.
 
+    Parameters
+    ----------
+    used : the options that texts may change, by their first key; None: all.
+
     Raises
     ------
-    OptionError : unknown preset or option, or a value the option cannot have.
+    OptionError : unknown preset or option, a value the option cannot have, or a text that changes
+        an option which nothing acts on.
     """
     if preset not in PRESETS:
         raise OptionError(f"unknown preset {preset!r}; known: {', '.join(PRESETS)}")
     tree = PRESETS[preset].model_dump()
     for change in changes:
         _merge(tree, change)
-    _merge(tree, assigned(assignments))
+    typed = assigned(assignments)
+    _merge(tree, typed)
     try:
-        return PipelineOptions.model_validate(tree)
+        options = PipelineOptions.model_validate(tree)
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
             raise OptionError(f"unknown option {where}; known here: {_known(where)}") from error
         raise OptionError(f"option {where}: {first['msg']}") from error
+    check_assigned(options, typed, used=used)
+    return options
 
 
 def assigned(assignments: Sequence[str]) -> dict[str, Any]:

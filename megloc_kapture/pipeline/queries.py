@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +14,13 @@ from numpy.typing import NDArray
 from megloc_kapture.datasets.kapture_folders import check_image
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.kapture_store import FeatureReader, KaptureFolder
+from megloc_kapture.matching.guided_pyramid import base_type, pyramid_type
 from megloc_kapture.pipeline.kapture_map import KaptureMap, check_lengths
-from megloc_kapture.plugins import LOCAL_FEATURES, load_plugin
+from megloc_kapture.plugins import DepthView
 from megloc_kapture.stages.local_features import read_image_of, read_mask
-from megloc_kapture.values import Camera, LocalFeatures
+from megloc_kapture.stages.query_units import query_units
+from megloc_kapture.stages.ranking_scene import depth_of
+from megloc_kapture.values import Camera, LocalFeatures, RigidTransform
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,22 +33,24 @@ class Query:
     image : uint8 (H, W, 3) RGB or the path of an image file; may be absent where the features
         are given.
     name : what to call it.
-    features : local features of the map's type, keypoints in COLMAP's convention.
+    features : keypoints type of the map to local features, keypoints in COLMAP's convention.
+        Types that it does not bring are extracted.
     global_features : type name to vector, of the map's types.
     prior : names of the map images it may be matched with; None: all.
     candidates : names of the map images it is matched with, best first, instead of retrieval.
-    mask : bool (H, W), True = use, or the path of a mask image (0 = ignore), which may be absent;
-        for the extraction of features.
+    mask : bool (H, W), True = use, or the path of a mask image (0 = ignore), which may be absent.
+    depth : a depth map that was taken with the image, or what reads one; for ``icp``.
     """
 
     camera: Camera
     image: Path | str | NDArray[np.uint8] | None = None
     name: str = "query"
-    features: LocalFeatures | None = None
+    features: Mapping[str, LocalFeatures] = field(default_factory=dict)
     global_features: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     prior: tuple[str, ...] | None = None
     candidates: tuple[str, ...] | None = None
     mask: Path | NDArray[np.bool_] | None = None
+    depth: DepthView | Callable[[], DepthView | None] | None = None
 
     def read_mask(self) -> NDArray[np.bool_] | None:
         """The mask, bool (H, W), True = use; None where there is none. Raises DataError."""
@@ -61,11 +66,24 @@ class Query:
             )
         return mask
 
+    def read_depth(self) -> DepthView | None:
+        """The depth map that was taken with the image; None without. Raises DataError."""
+        if self.depth is None or isinstance(self.depth, DepthView):
+            return self.depth
+        return self.depth()
+
+    def has_image(self) -> bool:
+        """Whether there is an image to look at, or a file that should be one."""
+        if isinstance(self.image, str | Path):
+            return Path(self.image).is_file()
+        return self.image is not None
+
     def read_image(self) -> NDArray[np.uint8]:
         """The image as uint8 (H, W, 3) RGB; raises DataError when there is none or it is broken."""
         if self.image is None:
             raise DataError(
-                f"query {self.name} has neither features of the map's type nor an image"
+                f"query {self.name} has no image, and lacks features of the map's types or is to "
+                "be looked at"
             )
         if isinstance(self.image, str | Path):
             return read_image_of(Path(self.image), self.camera)
@@ -82,6 +100,10 @@ class Query:
         return image
 
 
+Unit = tuple[tuple[Query, RigidTransform], ...]
+"""Queries that are localized together, with the ``cam_from_rig`` of each."""
+
+
 class KaptureQueries:
     """The images of a kapture folder as queries, with the features it brings; read one by one.
 
@@ -96,17 +118,23 @@ class KaptureQueries:
         self._folder, self._map = folder, kapture_map
         self._data = folder.read()
         self.names = self._data.image_names()
-        local_type = kapture_map.local_type
-        self._keypoints: FeatureReader | None = None
-        self._descriptors: FeatureReader | None = None
-        if all(local_type in folder.types(kind) for kind in ("keypoints", "descriptors")):
-            self._keypoints = folder.keypoints(local_type)
-            self._descriptors = folder.descriptors(local_type)
+        self._local: dict[str, tuple[FeatureReader, FeatureReader]] = {
+            name: (folder.keypoints(name), folder.descriptors(name))
+            for name in _types_and_bases(kapture_map.stored_types())
+            if name in folder.types("keypoints") and name in folder.types("descriptors")
+        }
         self._globals = {
             name: folder.global_features(name)
             for name in kapture_map.global_types()
             if name in folder.types("global_features")
         }
+
+    def lacking(self, local_type: str) -> str | None:
+        """The first image without features of a type; None where all bring them."""
+        if local_type not in self._local:
+            return self.names[0] if self.names else None
+        keypoints, _ = self._local[local_type]
+        return next((name for name in self.names if name not in keypoints), None)
 
     def check(self) -> None:
         """Check all that can be checked without reading features or pixels.
@@ -114,30 +142,17 @@ class KaptureQueries:
         Raises
         ------
         DataError : there are no images; an image is needed and absent, broken or not of its
-            camera's size; features are truncated, of different length, or not as wide as the
-            map's; or they are absent and there is no extractor for their type, or not its weights.
-        PluginError : the extractor cannot be loaded.
+            camera's size; or features are truncated, of different length, or not as wide as the
+            map's.
         """
         if not self.names:
             raise DataError("there are no query images", path=self._folder.root)
         self._check_widths()
-        extractor = self._map.extractor()
-        loads = False
         for name in self.names:
-            if self._has_features(name):
-                if self._keypoints is not None and self._descriptors is not None:
-                    check_lengths(self._keypoints, self._descriptors, name)
-            elif extractor is None:
-                raise DataError(
-                    f"image {name!r} has no features of type {self._map.local_type!r}, and no "
-                    "extractor for them is installed; give them with --features-dir, or in the "
-                    "kapture folder",
-                    path=self._folder.root,
-                )
-            else:
-                if not loads:  # looking a plugin up is too slow to do it for every query
-                    load_plugin(LOCAL_FEATURES, extractor.name, extractor.options)
-                    loads = True
+            brought = [readers for readers in self._local.values() if name in readers[0]]
+            for keypoints, descriptors in brought:
+                check_lengths(keypoints, descriptors, name)
+            if not brought:
                 check_image(self._folder, name)
             for vectors in self._globals.values():
                 if name in vectors:
@@ -148,9 +163,9 @@ class KaptureQueries:
             (vectors, self._map.folder.global_features(name))
             for name, vectors in self._globals.items()
         ]
-        if self._descriptors is not None and self._map.has_descriptors():
-            local_type = self._map.local_type
-            pairs.append((self._descriptors, self._map.folder.descriptors(local_type)))
+        for name, (_, descriptors) in self._local.items():
+            if name in self._map.folder.types("descriptors"):
+                pairs.append((descriptors, self._map.folder.descriptors(name)))
         for ours, theirs in pairs:
             if ours.config.dsize != theirs.config.dsize:
                 raise DataError(
@@ -167,6 +182,21 @@ class KaptureQueries:
             if all(image in vectors for image in self.names)
         ]
 
+    def units(self, *, rigs: bool) -> list[tuple[str, ...]]:
+        """Names of the images that are localized together.
+
+        Parameters
+        ----------
+        rigs : whether cameras of one rig and one moment are; else every image by itself.
+        """
+        return [unit.images for unit in query_units(self._data, rigs=rigs)]
+
+    def read_units(self, *, rigs: bool) -> Iterator[Unit]:
+        """The queries of :meth:`units`, read one after another."""
+        for unit in query_units(self._data, rigs=rigs):
+            queries = map(self.query, unit.images)
+            yield tuple(zip(queries, unit.cams_from_rig, strict=True))
+
     def __iter__(self) -> Iterator[Query]:
         return map(self.query, self.names)
 
@@ -181,6 +211,7 @@ class KaptureQueries:
             global_features=vectors,
             prior=self._prior(name),
             mask=self._folder.root / "sensors" / "masks" / f"{name}.png",
+            depth=partial(depth_of, self._folder, name) if self._data.records_depth else None,
         )
 
     def _prior(self, name: str) -> tuple[str, ...] | None:
@@ -198,16 +229,26 @@ class KaptureQueries:
             found.update(dict.fromkeys((self.names[at] for at in positions), prior))
         return found
 
-    def _has_features(self, name: str) -> bool:
-        return self._keypoints is not None and name in self._keypoints
+    def _features(self, name: str) -> dict[str, LocalFeatures]:
+        found = {}
+        for local_type, (keypoints, descriptors) in self._local.items():
+            if name not in keypoints:
+                continue
+            check_lengths(keypoints, descriptors, name)
+            stored = keypoints.read(name)
+            found[local_type] = LocalFeatures(
+                self._to_colmap(local_type, stored),
+                np.zeros(len(stored), np.float32),
+                descriptors.read(name),
+            )
+        return found
 
-    def _features(self, name: str) -> LocalFeatures | None:
-        if self._keypoints is None or self._descriptors is None or name not in self._keypoints:
-            return None
-        check_lengths(self._keypoints, self._descriptors, name)
-        keypoints = self._keypoints.read(name)
-        return LocalFeatures(
-            self._map.keypoints_to_colmap(keypoints),
-            np.zeros(len(keypoints), np.float32),
-            self._descriptors.read(name),
-        )
+    def _to_colmap(self, local_type: str, keypoints: NDArray[Any]) -> NDArray[np.float32]:
+        stored = self._map.stored_types()
+        like = next(name for name in (local_type, pyramid_type(local_type)) if name in stored)
+        return self._map.keypoints_of(like).to_colmap(keypoints)
+
+
+def _types_and_bases(types: Sequence[str]) -> list[str]:
+    """With a guided pyramid's type the one it is made of: of this a query may have features."""
+    return sorted({*types, *map(base_type, types)})

@@ -57,6 +57,14 @@ FusionMethod = (
 )
 RANK_METHODS: frozenset[str] = frozenset({"round_robin", "reciprocal_rank", "borda"})
 
+# which operators have which option
+_OPTIONS_OF: dict[str, tuple[str, ...]] = {
+    "gamma": ("ghm", "mean_and_power", "mean_and_min"),
+    "alpha": ("min_and_max", "villena_roman"),
+    "rank_constant": ("reciprocal_rank",),
+    "list_length": ("reciprocal_rank", "borda"),
+}
+
 Similarities = NDArray[np.floating[Any]]
 
 
@@ -89,6 +97,13 @@ class FusionOptions(Options):
         description="reciprocal_rank, borda: images of each feature's ranking that count, at "
         "least as many as are asked for",
     )
+
+    def idle(self) -> dict[str, str]:
+        return {
+            name: f"{self.method} does not have it, {', '.join(methods)} do"
+            for name, methods in _OPTIONS_OF.items()
+            if self.method not in methods
+        }
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -32,6 +32,11 @@ class QueryPairsOptions(Options):
         default=None, description="few views of one place; none: as similar as they are"
     )
 
+    def idle(self) -> dict[str, str]:
+        if self.by == "retrieval":
+            return {}
+        return dict.fromkeys(self.all_but("by"), "all map images are taken (exhaustive)")
+
 
 @dataclass(frozen=True)
 class Retrieval:

@@ -93,7 +93,11 @@ def given_map(reference: KaptureFolder, mapping: KaptureFolder, output: Path) ->
     seen = reference.observations()[local_type]
     found_again = 1.0
     # what is the reference's own comes first
-    source = KaptureFolder(reference.root, features_dirs=mapping.features_dirs)
+    source = KaptureFolder(
+        reference.root,
+        features_dirs=mapping.features_dirs,
+        allow_links_below=reference.allow_links_below,
+    )
     if not has_descriptors(reference):
         moved = _moved(reference, mapping, seen)
         found_again = moved.num_found / len(seen)

@@ -79,7 +79,7 @@ def train_on_map(
     descriptors = mapping.descriptors(local_type)
     if not any(descriptors.length(image) for image in images):
         raise DataError(f"the map has no descriptors of type {local_type}", path=mapping.root)
-    read = _Descriptors(FolderSpec(mapping.root, mapping.features_dirs), local_type)
+    read = _Descriptors(FolderSpec(mapping), local_type)
     each = partial(ordered_map, executor=executor)
     return train_vlad(images, descriptors.length, read, options, each=each)
 
@@ -107,10 +107,10 @@ def extract_vlad(
     place = output / "global_features" / type_name
     write_vocabulary(place, vocabulary, local_type, options)
     config = FeatureConfig(type_name, np.dtype(np.float32), vocabulary.size, metric_type="L2")
-    run = FolderSpec(place).key
+    run = FolderSpec(KaptureFolder(place)).key
     jobs = []
     for folder in folders:
-        read = _Descriptors(FolderSpec(folder.root, folder.features_dirs), local_type)
+        read = _Descriptors(FolderSpec(folder), local_type)
         jobs += [_Job(read, image, place, run) for image in folder.read().image_names()]
     jobs.sort(key=lambda job: job.image)
     writer = FeatureWriter(output, "global_features", type_name, config, orphan=True)

@@ -58,7 +58,7 @@ def pyramid_mapping(
     DataError : features or matches are missing, or an image; or the extractor's features are not
         like those of ``local_type``.
     """
-    spec = FolderSpec(mapping.root, mapping.features_dirs)
+    spec = FolderSpec(mapping)
     how = HowToRetry(
         spec, spec, local_type, local_type, extractor, matcher, verification, options,
         mask_margin_px,
@@ -116,8 +116,8 @@ def pyramid_queries(
     larger = pyramid_type(local_type)
     there = all(larger in mapping.types(kind) for kind in ("keypoints", "descriptors"))
     how = HowToRetry(
-        FolderSpec(query.root, query.features_dirs),
-        FolderSpec(mapping.root, mapping.features_dirs),
+        FolderSpec(query),
+        FolderSpec(mapping),
         local_type,
         larger if there else local_type,
         extractor,

@@ -44,6 +44,9 @@ class MaskOptions(Options):
         default=None, description="folder of masks IMAGE.png, 0 where the image is ignored"
     )
 
+    def idle(self) -> dict[str, str]:
+        return {} if self.segmenter else {"dynamic": "no segmenter tells classes apart"}
+
 
 @dataclass(frozen=True)
 class MaskFiles:

@@ -46,6 +46,14 @@ class MappingPairsOptions(Options):
     covisibility: PairsByCovisibilityOptions = PairsByCovisibilityOptions()
     sequence: PairsBySequenceOptions = PairsBySequenceOptions()
 
+    def idle(self) -> dict[str, str]:
+        of_method = {"retrieval": "top_k"}
+        return {
+            of_method.get(method, method): f"{method} is not in mapping_pairs.by"
+            for method in ("retrieval", "poses", "covisibility", "sequence")
+            if method not in self.by
+        }
+
     def needs_points(self) -> bool:
         """Whether a method looks at points that are there already."""
         overlap = "poses" in self.by and self.poses.min_overlap is not None

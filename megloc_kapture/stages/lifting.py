@@ -74,7 +74,7 @@ def lift_map(
             "rig with camera and depth sensor)",
             path=mapping.root,
         )
-    spec = FolderSpec(mapping.root, mapping.features_dirs)
+    spec = FolderSpec(mapping)
     row_of = {image: row for row, image in enumerate(images)}
     points: list[NDArray[np.float64]] = []
     seen: dict[str, Observations] = {}

@@ -9,6 +9,11 @@ from megloc_kapture.io.cluster_table import CLUSTERS_FILE, write_clusters
 from megloc_kapture.io.csv_table import write_csv_table
 from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, write_sensors
 from megloc_kapture.io.links import link_images
+from megloc_kapture.io.refinement_table import (
+    REFINEMENT_FILE,
+    refinement_text,
+    write_refinement,
+)
 from megloc_kapture.io.status_table import STATUS_FILE, Fallback, QueryStatus, write_status
 from megloc_kapture.stages.rig_siblings import poses_through_rig
 from megloc_kapture.values import Failure, Pose, RigidTransform
@@ -24,6 +29,8 @@ def write_localized(
     timing: Path | None = None,
 ) -> dict[str, int]:
     """Write the localized queries as kapture, with ``status.csv`` and ``clusters.csv`` beside it.
+
+    Where pose refiners were at work, ``refinement.csv`` says what each made of a pose.
 
     Parameters
     ----------
@@ -68,6 +75,11 @@ def write_localized(
             for image, result in named
         ),
     )
+    refinements = [
+        row for _, result in named if isinstance(result, Pose) for row in result.refinements
+    ]
+    if refinements:
+        write_refinement(output / REFINEMENT_FILE, refinements)
     if timing is not None:
         rows = (
             (image, step, f"{seconds:.5f}")
@@ -92,6 +104,8 @@ def _status(image: str, result: Pose | Failure, fallback: Fallback) -> QueryStat
         num_matches=result.num_matches,
         num_inliers=result.num_inliers,
         cluster=result.cluster if isinstance(result, Pose) else None,
+        refinement=refinement_text(result.refinements) if isinstance(result, Pose) else "",
         fallback=fallback,
         candidates=result.candidates,
+        remarks="; ".join(result.remarks),
     )

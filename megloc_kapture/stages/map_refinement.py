@@ -377,7 +377,7 @@ def _verify_depth(
         return
     covariances = selection.covariances()
     observed, placed = selection.observed()
-    spec = FolderSpec(folder.root)
+    spec = FolderSpec(folder)
     rows_of = [(image, rows) for image, rows in observed.by_image() if image in with_depth]
 
     def job(image: int, rows: NDArray[np.int64]) -> _DepthJob:

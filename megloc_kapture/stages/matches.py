@@ -123,7 +123,7 @@ def match_pairs(
     -------
     Counts for the log: pairs, pairs with matches, matches.
     """
-    specs = [FolderSpec(f.root, f.features_dirs) for f in (first, second)]
+    specs = [FolderSpec(f) for f in (first, second)]
     jobs = []
     within_one = first.root == second.root
     ordered = sorted(

@@ -56,8 +56,8 @@ def ordered_map(
 class FolderSpec:
     """A kapture folder as work items name it: cheap to send, opened once per process and run."""
 
-    def __init__(self, root: Path, features_dirs: Iterable[Path] = ()) -> None:
-        self.key = (Path(root), tuple(Path(d) for d in features_dirs), next(_run_ids))
+    def __init__(self, folder: KaptureFolder) -> None:
+        self.key = (folder.root, folder.features_dirs, folder.allow_links_below, next(_run_ids))
 
     def open(self) -> KaptureFolder:
         """The folder; the same object for every item of this run in this process."""
@@ -65,5 +65,10 @@ class FolderSpec:
 
 
 @lru_cache(maxsize=8)
-def _open_folder(root: Path, features_dirs: tuple[Path, ...], run_id: int) -> KaptureFolder:
-    return KaptureFolder(root, features_dirs=features_dirs)
+def _open_folder(
+    root: Path,
+    features_dirs: tuple[Path, ...],
+    allow_links_below: tuple[Path, ...],
+    run_id: int,
+) -> KaptureFolder:
+    return KaptureFolder(root, features_dirs=features_dirs, allow_links_below=allow_links_below)

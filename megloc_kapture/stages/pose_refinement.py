@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.errors import PluginError
@@ -17,20 +19,25 @@ from megloc_kapture.io.cluster_table import CLUSTERS_FILE
 from megloc_kapture.io.csv_table import write_csv_table
 from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, write_sensors
 from megloc_kapture.io.links import link_images
-from megloc_kapture.io.refinement_table import REFINEMENT_FILE, RefinementRow, write_refinement
+from megloc_kapture.io.refinement_table import (
+    REFINEMENT_FILE,
+    refinement_text,
+    write_refinement,
+)
 from megloc_kapture.io.status_table import STATUS_FILE, QueryStatus, read_status, write_status
 from megloc_kapture.plugins import (
     POSE_REFINERS,
     PluginChoice,
     PoseRefinement,
     PoseRefiner,
+    RankingScene,
     load_plugin,
 )
 from megloc_kapture.refinement.references import ReferenceImages
 from megloc_kapture.stages.parallel import FolderSpec, Track, ordered_map, untracked
 from megloc_kapture.stages.ranking_scene import KaptureScene
 from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
-from megloc_kapture.values import Options, RigidTransform
+from megloc_kapture.values import Camera, Options, RefinementRow, RigidTransform
 
 
 class PoseRefinementOptions(Options):
@@ -44,6 +51,9 @@ class PoseRefinementOptions(Options):
         gt=0,
         description="map images a refiner may choose from: that look the query's way, the nearest",
     )
+
+    def idle(self) -> dict[str, str]:
+        return {} if self.refines() else {"max_references": "pose_refinement.by is empty"}
 
     def refines(self) -> bool:
         """Whether anything is done."""
@@ -64,11 +74,56 @@ class _Job:
     references: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class _Refined:
+@dataclass(frozen=True, eq=False)
+class RefinedPose:
+    """A query's pose after all refiners.
+
+    Attributes
+    ----------
+    covariance : float64 (6, 6) that the last refiner whose pose counts gave; None without.
+    rows : what each refiner made of it, in their order.
+    """
+
     cam_from_world: RigidTransform
+    covariance: NDArray[np.float64] | None
     rows: tuple[RefinementRow, ...]
     seconds: dict[str, float]
+
+
+class PoseReferences:
+    """Which map images a pose is refined against, by coordinate frame.
+
+    Parameters
+    ----------
+    poses : ``cam_from_world`` of the map's images.
+    """
+
+    def __init__(
+        self,
+        poses: Mapping[str, RigidTransform],
+        restrictions: Restrictions,
+        options: PoseRefinementOptions,
+    ) -> None:
+        images = sorted(poses)
+        self._restrictions, self._options = restrictions, options
+        self._by_frame = {
+            restrictions.frame(images[members[0]]): ReferenceImages(
+                {images[member]: poses[images[member]] for member in members}
+            )
+            for members in restrictions.frames(images)
+        }
+
+    def near(self, cam_from_world: RigidTransform, candidates: Sequence[str]) -> list[str]:
+        """Map images that may show what a query sees, best first.
+
+        Parameters
+        ----------
+        candidates : map images that its pose comes from.
+        """
+        frame = self._restrictions.frame(candidates[0]) if candidates else ""
+        return self._by_frame[frame].near(
+            cam_from_world, candidates, max_references=self._options.max_references
+        )
 
 
 def refine_poses(
@@ -108,23 +163,13 @@ def refine_poses(
     refiners = tuple(options.make_refiners())
     statuses = read_status(localized.root / STATUS_FILE)
     data = localized.read()
-    map_spec, query_spec = (FolderSpec(f.root, f.features_dirs) for f in (map_folder, query))
-    map_poses = map_folder.read().poses()
-    images = sorted(map_poses)
-    by_frame = {
-        restrictions.frame(images[members[0]]): ReferenceImages(
-            {images[member]: map_poses[images[member]] for member in members}
-        )
-        for members in restrictions.frames(images)
-    }
+    map_spec, query_spec = (FolderSpec(f) for f in (map_folder, query))
+    references = PoseReferences(map_folder.read().poses(), restrictions, options)
     jobs = []
     for image, status in statuses.items():
         pose = data.cam_from_world(image)
         if status.status == "localized" and pose is not None:
-            frame = restrictions.frame(status.candidates[0]) if status.candidates else ""
-            near = by_frame[frame].near(
-                pose, status.candidates, max_references=options.max_references
-            )
+            near = references.near(pose, status.candidates)
             jobs.append(_Job(map_spec, query_spec, refiners, image, pose, tuple(near)))
     results = track(ordered_map(_refine, jobs, executor), len(jobs), "refining")
     found = {job.image: refined for job, refined in zip(jobs, results, strict=True)}
@@ -152,7 +197,7 @@ def _write(
     data: KaptureData,
     localized: KaptureFolder,
     statuses: dict[str, QueryStatus],
-    found: dict[str, _Refined],
+    found: dict[str, RefinedPose],
 ) -> None:
     poses = dict(data.trajectories)
     for image, refined in found.items():
@@ -162,7 +207,7 @@ def _write(
     write_status(
         output / STATUS_FILE,
         (
-            status.model_copy(update={"refinement": _said(found[image].rows)})
+            status.model_copy(update={"refinement": refinement_text(found[image].rows)})
             if image in found
             else status
             for image, status in statuses.items()
@@ -176,23 +221,45 @@ def _write(
     )
 
 
-def _said(rows: Sequence[RefinementRow]) -> str:
-    return "; ".join(f"{row.method}: {'accepted' if row.accepted else row.reason}" for row in rows)
-
-
-def _refine(job: _Job) -> _Refined:
+def _refine(job: _Job) -> RefinedPose:
     mapping, query = job.map.open(), job.query.open()
-    scene = KaptureScene(mapping, query)
-    camera = query.read().camera_of(job.image)
-    pose, rows, seconds = job.cam_from_world, [], {}
-    for refiner in job.refiners:
+    return refine_pose(
+        job.image,
+        query.read().camera_of(job.image),
+        job.cam_from_world,
+        job.references,
+        job.refiners,
+        KaptureScene(mapping, query),
+    )
+
+
+def refine_pose(
+    image: str,
+    camera: Camera,
+    cam_from_world: RigidTransform,
+    references: Sequence[str],
+    refiners: Sequence[PoseRefiner],
+    scene: RankingScene,
+) -> RefinedPose:
+    """Refine the pose of one query by one refiner after another.
+
+    Parameters
+    ----------
+    references : map images, see :class:`PoseReferences`.
+
+    Raises
+    ------
+    PluginError : a refiner breaks its protocol.
+    """
+    pose, covariance, rows, seconds = cam_from_world, None, [], {}
+    for refiner in refiners:
         started = time.perf_counter()
-        refined = refiner.refine(job.image, camera, pose, job.references, scene)
-        rows.append(_row(refiner, job.image, pose, refined))
+        refined = refiner.refine(image, camera, pose, references, scene)
+        rows.append(_row(refiner, image, pose, refined))
         if refined.accepted:
-            pose = refined.cam_from_world
+            pose, covariance = refined.cam_from_world, refined.covariance
         seconds[refiner.name] = time.perf_counter() - started
-    return _Refined(pose, tuple(rows), seconds)
+    return RefinedPose(pose, covariance, tuple(rows), seconds)
 
 
 def _row(

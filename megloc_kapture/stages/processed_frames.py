@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.images import image_size, write_image
+from megloc_kapture.io.images import image_as_read_back, image_size, write_image
 from megloc_kapture.io.links import link_file
 from megloc_kapture.preprocessing.frame_plan import FramePlan
 from megloc_kapture.preprocessing.frames import processed_image, processed_mask, reached_region
@@ -99,6 +99,19 @@ def _masks(job: FrameJob, image: NDArray[np.uint8] | None) -> dict[str, Mask]:
     if reached is not None:
         masks["unseen"] = reached
     return masks
+
+
+def frame_as_stored(image: NDArray[np.uint8], plan: FramePlan, name: str) -> NDArray[np.uint8]:
+    """A processed image as it is read from the new kapture: a JPEG has lost a little.
+
+    Parameters
+    ----------
+    name : of the image, whose suffix says how it is stored.
+    """
+    if not plan.changes_pixels:
+        return image
+    read = image_as_read_back(_grey_if_grey(image), name, jpeg_quality=_JPEG_QUALITY)
+    return read if read.ndim == 3 else image
 
 
 def _grey_if_grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

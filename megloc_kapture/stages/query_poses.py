@@ -121,6 +121,33 @@ def localize_views(
     return replace(found, result=result)
 
 
+def localize_unit(
+    views: Sequence[QueryView],
+    candidates: Sequence[str],
+    frames: Sequence[str],
+    options: LocalizationOptions,
+    *,
+    centers: Mapping[str, NDArray[np.float64]],
+    ranker: PoseRanker,
+    scene: RankingScene,
+) -> list[Pose | Failure]:
+    """Localize one query, or the cameras of a rig together, and say so of each camera.
+
+    A rig that has no pose is tried camera by camera. Parameters as of :func:`localize_views`.
+    """
+
+    def localize(together: Sequence[QueryView]) -> ClusterLocalization:
+        return localize_views(
+            together, candidates, frames, options, centers=centers, ranker=ranker, scene=scene
+        )
+
+    if len(views) > 1:
+        found = localize(views)
+        if found.result:
+            return poses_of_cameras(views, found)
+    return [localize([QueryView(v.name, v.camera, v.matches)]).result for v in views]
+
+
 def _indices_of(views: Sequence[QueryView]) -> list[MapIndex]:
     by_identity = {id(typed.index): typed.index for view in views for typed in view.matches}
     return list(by_identity.values())
@@ -138,34 +165,19 @@ def _localize(job: _Job) -> list[tuple[str, Pose | Failure]]:
     }
     posed = [pair for pair in zip(job.candidates, job.frames, strict=True) if pair[0] in centers]
     candidates, frames = [image for image, _ in posed], [frame for _, frame in posed]
-    scene = KaptureScene(mapping, query)
-
-    def localize(together: Sequence[QueryView]) -> ClusterLocalization:
-        return localize_views(
-            together,
-            candidates,
-            frames,
-            job.options,
-            centers=centers,
-            ranker=job.ranker,
-            scene=scene,
-        )
-
-    results: list[Pose | Failure] = []
-    if len(views) > 1:
-        found = localize(views)
-        if found.result:
-            results = poses_of_cameras(views, found)
-    # a rig without a pose: perhaps one of its cameras has one
-    results = results or [localize([_alone(view)]).result for view in views]
+    results = localize_unit(
+        views,
+        candidates,
+        frames,
+        job.options,
+        centers=centers,
+        ranker=job.ranker,
+        scene=KaptureScene(mapping, query),
+    )
     return [
         (image, _for_writing(result, reading))
         for image, result in zip(job.unit.images, results, strict=True)
     ]
-
-
-def _alone(view: QueryView) -> QueryView:
-    return QueryView(view.name, view.camera, view.matches)
 
 
 def _for_writing(result: Pose | Failure, reading_s: float) -> Pose | Failure:
@@ -225,9 +237,7 @@ def localize_from_matches(
     PluginError : there is no such ranker, or it refuses its options.
     """
     ranker = options.make_ranker()
-    map_spec, query_spec, matches_spec = (
-        FolderSpec(f.root, f.features_dirs) for f in (map_folder, query, matches)
-    )
+    map_spec, query_spec, matches_spec = (FolderSpec(f) for f in (map_folder, query, matches))
     candidates = {name: tuple(images) for name, images in iterate_candidates(pairs)}
     units = query_units(query.read(), rigs=options.rigs)
     with shared_index(

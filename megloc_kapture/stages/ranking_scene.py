@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property, lru_cache
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,30 +77,50 @@ def _images_of(folder: KaptureFolder) -> _Images:
     return _Images(folder)
 
 
+class QueryScene(Protocol):
+    """Pixels, mask and depth of query images by their names; see :class:`KaptureScene`."""
+
+    def image(self, name: str) -> NDArray[np.uint8]:
+        """RGB pixels (H, W, 3); raises DataError."""
+        ...
+
+    def mask(self, name: str) -> NDArray[np.bool_] | None:
+        """Mask (H, W), True = use; None without one."""
+        ...
+
+    def depth(self, name: str) -> DepthView | None:
+        """Depth that was taken with the image; None without; raises DataError."""
+        ...
+
+
+def depth_of(folder: KaptureFolder, name: str) -> DepthView | None:
+    """Depth that was taken with an image of a folder; None without; raises DataError."""
+    return _images_of(folder).depth(name)
+
+
 class KaptureScene:
-    """A :class:`~megloc_kapture.plugins.RankingScene` of a map's folder and its queries'.
+    """A :class:`~megloc_kapture.plugins.RankingScene` of a map's folder and its queries.
 
     Parameters
     ----------
-    query : the folder of the queries; None where they are not in one.
-    read_query : pixels of a query image by its name, where they are not in the folder.
+    query : the folder of the queries, or what else knows them; None: nothing does.
+    map_camera : camera of a map image by its name; as stored unless given.
     """
 
     def __init__(
         self,
         mapping: KaptureFolder,
-        query: KaptureFolder | None = None,
+        query: KaptureFolder | QueryScene | None = None,
         *,
-        read_query: Callable[[str], NDArray[np.uint8]] | None = None,
+        map_camera: Callable[[str], Camera] | None = None,
     ) -> None:
         self._map = _images_of(mapping)
-        self._query = None if query is None else _images_of(query)
-        self._read_query = read_query
+        known = _images_of(query) if isinstance(query, KaptureFolder) else query
+        self._query: QueryScene | None = known
+        self._map_camera = map_camera or self._map.camera
 
     def query_image(self, name: str) -> NDArray[np.uint8]:
         """RGB pixels (H, W, 3) of a query image; raises DataError."""
-        if self._read_query is not None:
-            return self._read_query(name)
         if self._query is None:
             raise DataError(f"the pixels of query {name} are not known")
         return self._query.image(name)
@@ -129,8 +150,8 @@ class KaptureScene:
         return self._map.points(name)
 
     def map_camera(self, name: str) -> Camera:
-        """Camera of a map image, as stored."""
-        return self._map.camera(name)
+        """Camera of a map image."""
+        return self._map_camera(name)
 
     def map_pose(self, name: str) -> RigidTransform:
         """``cam_from_world`` of a map image; raises DataError when it has none."""

@@ -18,7 +18,7 @@ from pydantic import Field
 from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder
 from megloc_kapture.io.match_counts import read_match_counts
 from megloc_kapture.retrieval.coverage import most_covering
-from megloc_kapture.stages.matches import iterate_candidates
+from megloc_kapture.stages.matches import VerifiedMatches, iterate_candidates
 from megloc_kapture.values import Options
 
 Pair = tuple[str, str]
@@ -35,6 +35,9 @@ class RerankingOptions(Options):
         "features together",
     )
     keep: int = Field(default=20, gt=0, description="images that stay, N")
+
+    def idle(self) -> dict[str, str]:
+        return {} if self.reranks() else {"keep": "reranking.by is none"}
 
     def reranks(self) -> bool:
         """Whether anything is done."""
@@ -87,6 +90,36 @@ def reranked(
     if options.by == "coverage":
         return cover_pairs(pairs, matched_keypoints(query, local_types), options.keep)
     return rerank_pairs(pairs, correspondences(matches, local_types, options.by), options.keep)
+
+
+def kept_candidates(
+    of_types: Sequence[Sequence[VerifiedMatches]], options: RerankingOptions
+) -> list[int]:
+    """Positions of the candidates of one query that stay, best first, as :func:`reranked` has it.
+
+    Parameters
+    ----------
+    of_types : of each type of local features the matches with each candidate, best first.
+    """
+    count = len(of_types[0]) if of_types else 0
+    if options.by == "none":
+        return list(range(count))
+    if options.by == "coverage":
+        rows = [[np.unique(pair.matches[:, 0]) for pair in own] for own in of_types]
+        # keypoints are numbered through the types
+        sizes = [max((int(ids[-1]) + 1 for ids in own if len(ids)), default=0) for own in rows]
+        starts = np.cumsum([0, *sizes[:-1]])
+        keypoints = [
+            np.concatenate([start + own[at] for start, own in zip(starts, rows, strict=True)])
+            for at in range(count)
+        ]
+        return most_covering(keypoints, options.keep)[0]
+    by_matches = options.by == "matches"
+    counts = [
+        sum(own[at].num_found if by_matches else len(own[at].matches) for own in of_types)
+        for at in range(count)
+    ]
+    return sorted(range(count), key=lambda at: (-counts[at], at))[: options.keep]
 
 
 def cover_pairs(

@@ -20,8 +20,7 @@ from megloc_kapture.io.cluster_table import ClusterRow
 from megloc_kapture.io.depth_maps import write_depth_map
 from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, Sensor, write_sensors
-from megloc_kapture.io.refinement_table import RefinementRow
-from megloc_kapture.values import Camera, RigidTransform
+from megloc_kapture.values import Camera, RefinementRow, RigidTransform
 
 Displace = Callable[[RigidTransform, np.ndarray, float], RigidTransform]
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.refinement_table import RefinementRow, read_refinement, write_refinement
-from megloc_kapture.values import RigidTransform
+from megloc_kapture.io.refinement_table import read_refinement, write_refinement
+from megloc_kapture.values import RefinementRow, RigidTransform
 
 START = RigidTransform((0.6, 0.0, 0.8, 0.0), (1.0, -2.0, 0.1))
 ROWS = [

@@ -46,12 +46,13 @@ def shift_intrinsics(root: Path, shift_px: float) -> None:
 
 def test_our_own_map_is_as_colmap_has_it(workspace: Path) -> None:
     opened = KaptureMap.open(workspace / "map")
-    assert opened.local_type == "rootsift"
+    assert list(opened.keypoints) == ["rootsift"]
     assert (opened.pixel_origin.intrinsics, opened.pixel_origin.keypoints) == ("corner", "corner")
     assert opened.pixel_origin.error_px["corner"] < opened.pixel_origin.error_px["centre"]
     assert len(opened.images) == 7
-    assert opened.has_descriptors() and opened.has_images()
-    assert opened.extractor() == PluginChoice(name="rootsift")
+    keypoints = opened.keypoints["rootsift"]
+    assert keypoints.has_descriptors(opened.images) and opened.has_images()
+    assert keypoints.extractor() == PluginChoice(name="rootsift")
     assert opened.global_types() == ["vlad_rootsift"]
 
 
@@ -77,7 +78,9 @@ def test_a_half_pixel_between_keypoints_and_intrinsics_is_found_and_undone(
     assert found.error_px[found.intrinsics] == min(found.error_px.values())
     for image in original.images:
         np.testing.assert_allclose(
-            opened.keypoints_px(image), original.keypoints_px(image), atol=1e-3
+            opened.keypoints["rootsift"].keypoints_px(image),
+            original.keypoints["rootsift"].keypoints_px(image),
+            atol=1e-3,
         )
         np.testing.assert_allclose(
             opened.camera(image).params, original.camera(image).params, atol=1e-9
@@ -87,23 +90,25 @@ def test_a_half_pixel_between_keypoints_and_intrinsics_is_found_and_undone(
 def residuals_px(opened: KaptureMap, queries: KaptureFolder, truth: Path) -> list[float]:
     """Of each query, the median distance of its matches from where its true pose puts them."""
     poses, options, found = load_poses(truth), options_of_preset(), []
+    (local_type,) = opened.keypoints
+    stored = opened.keypoints[local_type]
     matcher, verify = (
-        options.make_matcher(opened.local_type),
+        options.make_matcher(local_type),
         two_view_verification(options.query_verification),
     )
 
     for query in KaptureQueries(queries, opened):
-        assert query.features is not None
-        keypoints = query.features.keypoints_px[:, :2]
-        ours = Features.of(query.camera, keypoints, query.features.descriptors)
+        features = query.features[local_type]
+        keypoints = features.keypoints_px[:, :2]
+        ours = Features.of(query.camera, keypoints, features.descriptors)
         matches = []
         for image in opened.images:
             theirs = Features.of(
-                opened.camera(image), opened.keypoints_px(image), opened.descriptors(image)
+                opened.camera(image), stored.keypoints_px(image), stored.descriptors(image)
             )
             matches.append((image, *match_and_verify(ours, [theirs], matcher, [verify])[0][:2]))
-        pairs = observed_matches(opened.index, matches).resolve()
-        seen = project(query.camera, poses[query.name], opened.index.xyz[pairs.point_ids])
+        pairs = observed_matches(stored.index, matches).resolve()
+        seen = project(query.camera, poses[query.name], stored.index.xyz[pairs.point_ids])
         distances = np.linalg.norm(seen - keypoints[pairs.keypoint_ids], axis=1)
         found.append(float(np.median(distances)))
     return found
@@ -173,16 +178,16 @@ def add_type(root: Path, name: str) -> None:
     observations.write_text("".join(rows))
 
 
-def test_of_several_types_one_is_chosen(map_copy: Path) -> None:
+def test_all_types_with_points_are_localized_with_unless_some_are_chosen(map_copy: Path) -> None:
     add_type(map_copy, "other")
-    with pytest.raises(OptionError, match="choose one with --keypoints-type: other, rootsift"):
-        KaptureMap.open(map_copy)
-    opened = KaptureMap.open(map_copy, keypoints_type="other")
-    assert opened.local_type == "other"
+    both = KaptureMap.open(map_copy)
+    assert list(both.keypoints) == ["other", "rootsift"]
+    opened = KaptureMap.open(map_copy, keypoints_types=["other"])
+    assert list(opened.keypoints) == ["other"]
     # the name inside its configuration tells who extracted it
-    assert opened.extractor() == PluginChoice(name="rootsift")
+    assert opened.keypoints["other"].extractor() == PluginChoice(name="rootsift")
     with pytest.raises(OptionError, match="'third'; there are: other, rootsift"):
-        KaptureMap.open(map_copy, keypoints_type="third")
+        KaptureMap.open(map_copy, keypoints_types=["third"])
 
 
 def test_what_cannot_be_opened(workspace: Path, map_copy: Path, tmp_path: Path) -> None:
@@ -201,9 +206,10 @@ def test_what_cannot_be_opened(workspace: Path, map_copy: Path, tmp_path: Path) 
 
 def test_features_may_lie_elsewhere(workspace: Path, map_copy: Path) -> None:
     shutil.rmtree(map_copy / "reconstruction" / "descriptors")
-    assert not KaptureMap.open(map_copy).has_descriptors()
+    bare = KaptureMap.open(map_copy)
+    assert not bare.keypoints["rootsift"].has_descriptors(bare.images)
     opened = KaptureMap.open(map_copy, features_dirs=[workspace])
-    assert opened.has_descriptors()
+    assert opened.keypoints["rootsift"].has_descriptors(opened.images)
     opened.check()
 
 

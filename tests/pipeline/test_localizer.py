@@ -44,9 +44,11 @@ def queries(workspace: Path, fountain: Path) -> list[Query]:
         Query(
             camera=data.camera_of(name),
             name=name,
-            features=LocalFeatures(
-                keypoints.read(name), np.zeros(800, np.float32), descriptors.read(name)
-            ),
+            features={
+                "rootsift": LocalFeatures(
+                    keypoints.read(name), np.zeros(800, np.float32), descriptors.read(name)
+                )
+            },
         )
         for name in data.image_names()
     ]
@@ -120,13 +122,12 @@ def test_a_black_image_fails_and_says_why(localizer: Localizer, truth: KaptureDa
 
 
 def test_too_few_matches_fail_and_are_counted(localizer: Localizer, queries: list[Query]) -> None:
-    features = queries[1].features
-    assert features is not None
+    features = queries[1].features["rootsift"]
     # of an empty map region: descriptors of another place
     noise = np.random.default_rng(0).random((20, 128), dtype=np.float32)
     noise /= np.linalg.norm(noise, axis=1, keepdims=True)
     few = LocalFeatures(features.keypoints_px[:20], features.scores[:20], noise)
-    found = localizer.localize_query(replace(queries[1], features=few))
+    found = localizer.localize_query(replace(queries[1], features={"rootsift": few}))
     assert isinstance(found, Failure) and found.reason
 
 
@@ -201,7 +202,7 @@ def test_retrieval_ranks_where_there_are_more_images_than_candidates(
             assert set(ranked) == neighbours[query.name]
         # within a prior, the best of those
         kept = replace(query, prior=("0000.jpg", "0002.jpg", "0009.jpg"))
-        assert set(narrow.candidates(kept, query.features)) < set(kept.prior or ())  # type: ignore[arg-type]
+        assert set(narrow.ranked(kept)) < set(kept.prior or ())
     assert narrow.describe_retrieval([]) == "VLAD over the map's descriptors"
     assert narrow.describe_retrieval(["vlad_rootsift"]) == "global features vlad_rootsift"
 
@@ -342,10 +343,13 @@ def test_a_map_without_descriptors_is_extracted_again(
     localizer: Localizer, map_copy: Path, queries: list[Query]
 ) -> None:
     shutil.rmtree(map_copy / "reconstruction" / "descriptors")
-    shutil.rmtree(map_copy / "reconstruction" / "global_features")
     again = Localizer(KaptureMap.open(map_copy), options=FEW)
     for query in queries:
         assert same(again.localize_query(query), localizer.localize_query(query))
+    # few as they are, its images are not ranked where nothing is at hand to rank them by
+    shutil.rmtree(map_copy / "reconstruction" / "global_features")
+    unranked = Localizer(KaptureMap.open(map_copy), options=FEW).localize_query(queries[0])
+    assert unranked and set(unranked.candidates) <= set(localizer.map.images)
     # with other options of the extractor most is found again, and that is enough
     usual = Localizer(KaptureMap.open(map_copy))
     assert all(usual.localize_many(queries))

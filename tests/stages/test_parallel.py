@@ -92,10 +92,10 @@ def test_no_items(two_processes: Executor) -> None:
 
 
 def test_a_folder_is_opened_once_per_run(world: Any) -> None:
-    spec = FolderSpec(world.mapping().root, [world.features_dir])
+    spec = FolderSpec(world.mapping())
     assert spec.open() is spec.open()
     # another run sees what was written since
-    other = FolderSpec(world.mapping().root, [world.features_dir])
+    other = FolderSpec(world.mapping())
     assert other.open() is not spec.open()
     assert other.open().root == world.mapping().root
     assert other.open().features_dirs == (world.features_dir,)

@@ -1,0 +1,317 @@
+"""The keypoints types that queries are localized with: how each is extracted and matched."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.weights import MissingWeightsError
+from megloc_kapture.localization.cluster_poses import ImageMatches
+from megloc_kapture.matching.guided_pyramid import base_type
+from megloc_kapture.pipeline.kapture_map import KaptureMap, MapKeypoints
+from megloc_kapture.pipeline.options import LocalFeaturesChoice, PipelineOptions
+from megloc_kapture.pipeline.query_images import QueryImage
+from megloc_kapture.plugins import (
+    LOCAL_FEATURES,
+    MATCHERS,
+    LocalFeatureExtractor,
+    Matcher,
+    PluginChoice,
+    load_plugin,
+)
+from megloc_kapture.stages.found_again import rows_found_again
+from megloc_kapture.stages.local_features import checked_features, read_image_of, read_mask
+from megloc_kapture.stages.matches import (
+    BATCH,
+    FeatureCache,
+    Features,
+    VerifiedMatches,
+    batched,
+    match_and_verify,
+    two_view_verification,
+)
+from megloc_kapture.stages.pyramid_query import retry_query
+from megloc_kapture.values import LocalFeatures
+
+_MIN_FOUND_AGAIN = 0.5
+_NO_MATCHES = VerifiedMatches(np.zeros((0, 2), np.int64), np.zeros(0, np.float32), 0)
+
+
+class LocalType:
+    """One keypoints type of a map, as queries are matched with it.
+
+    Networks and matchers are made when they are first needed.
+
+    Parameters
+    ----------
+    points : keypoints of the map that observe its points.
+    first : those that queries are matched with at first: of a guided pyramid's type, where pairs
+        with few matches are tried again, the type that it is made of.
+    choice : what the options say of this type of features; None where they do not name it.
+    cache : of the map's features, shared with other types.
+    """
+
+    def __init__(
+        self,
+        kapture_map: KaptureMap,
+        points: MapKeypoints,
+        first: MapKeypoints,
+        choice: LocalFeaturesChoice | None,
+        options: PipelineOptions,
+        cache: FeatureCache,
+    ) -> None:
+        self.points, self.first = points, first
+        self.choice = choice
+        self._map, self._options, self._cache = kapture_map, options, cache
+        self._again: dict[str, NDArray[Any]] | None = None
+        if not first.has_descriptors(kapture_map.images):
+            self._again = extract_again(kapture_map, first, self.extractor)
+
+    @property
+    def name(self) -> str:
+        """The kapture type name of the features that queries have."""
+        return self.first.name
+
+    @cached_property
+    def matcher(self) -> Matcher:
+        """The matcher; raises PluginError, MissingWeightsError."""
+        own = None if self.choice is None else self.choice.matching
+        chosen = own or self._options.matching
+        found: Matcher = load_plugin(MATCHERS, chosen.name, chosen.options)
+        return found
+
+    @cached_property
+    def extractor(self) -> LocalFeatureExtractor:
+        """The extractor of the type.
+
+        Raises
+        ------
+        DataError : none is installed, or the options' makes features of another type.
+        PluginError, MissingWeightsError : it cannot be made.
+        """
+        found = self._extractor_choice()
+        if found is None:
+            raise DataError(
+                f"features of type {self.name!r} are missing and no extractor for them is "
+                "installed; give them with --features-dir, or in the kapture folder",
+                path=self._map.folder.root,
+            )
+        extractor: LocalFeatureExtractor = load_plugin(LOCAL_FEATURES, found.name, found.options)
+        return extractor
+
+    def _extractor_choice(self) -> PluginChoice | None:
+        found = self.first.extractor()
+        if self.choice is None:
+            return found
+        known = {} if found is None else found.options
+        return PluginChoice(name=self.choice.name, options={**self.choice.options, **known})
+
+    def of_query(self, image: QueryImage) -> Features:
+        """The features of a query: those that it brings, else extracted ones.
+
+        Raises
+        ------
+        DataError : it has neither features nor an image, or they cannot be extracted.
+        """
+        brought = image.query.features
+        local = next((brought[n] for n in (self.name, base_type(self.name)) if n in brought), None)
+        if local is None:
+            local = image.extract(self.extractor)
+        return Features.of(image.camera, local.keypoints_px, local.descriptors)
+
+    def descriptors(self, image: str) -> NDArray[Any]:
+        """Descriptors (N, D) of a map image."""
+        return self.first.descriptors(image) if self._again is None else self._again[image]
+
+    def match(self, query: Features, images: Sequence[str]) -> list[VerifiedMatches]:
+        """Verified matches of a query with each of several map images."""
+        verification = two_view_verification(self._options.query_verification)
+        if self._options.verification == "none":
+            verification = _keep_all
+        found = dict.fromkeys(images, _NO_MATCHES)
+        for batch in batched((image for image in images if image in self.first), BATCH):
+            pairs = match_and_verify(
+                query,
+                [self._map_features(self.first, image) for image in batch],
+                self.matcher,
+                [verification] * len(batch),
+            )
+            found.update(zip(batch, pairs, strict=True))
+        return [found[image] for image in images]
+
+    def match_again(
+        self, query: Features, matches: Sequence[ImageMatches], image: QueryImage
+    ) -> tuple[NDArray[np.float32], list[ImageMatches], str]:
+        """Try map images with few matches again by guided pyramid matching, where it is on.
+
+        Parameters
+        ----------
+        matches : of each map image: its name, verified matches (K, 2), scores (K,).
+
+        Returns
+        -------
+        The query's keypoints, added ones last, the matches in their order, and why it was left
+        out although it is on; empty where it was not.
+        """
+        options = self._options.guided_pyramid
+        few = any(len(found) < options.min_matches for _, found, _ in matches)
+        if not self._options.matches_again() or not few:
+            return query.keypoints_px, list(matches), ""
+        reason = self.pyramid_obstacle or ("" if image.query.has_image() else "no image")
+        if reason:
+            return query.keypoints_px, list(matches), f"guided pyramid matching: {reason}"
+        known = [each for each in matches if each[0] in self.first]
+        keypoints, richer = retry_query(
+            query,
+            known,
+            lambda name: self._map_features(self.points, name),
+            self.extractor,
+            self.matcher,
+            image=lambda: image.pixels,
+            mask=lambda: image.feature_mask,
+            verification=self._options.query_verification,
+            options=options,
+            name=image.query.name,
+        )
+        return keypoints, richer, ""
+
+    @cached_property
+    def pyramid_obstacle(self) -> str:
+        """Why guided pyramid matching cannot extract features of this type; empty where it can."""
+        try:
+            _ = self.extractor
+        except MissingWeightsError:
+            return f"the weights that extract {self.name} are missing (megloc weights list)"
+        except DataError as error:
+            return error.message
+        return ""
+
+    def _map_features(self, keypoints: MapKeypoints, image: str) -> Features:
+        return self._cache.get((keypoints.name, image), lambda: self._load(keypoints, image))
+
+    def _load(self, keypoints: MapKeypoints, image: str) -> Features:
+        stored = keypoints.keypoints_px(image)
+        descriptors = (
+            self.descriptors(image) if keypoints is self.first else keypoints.descriptors(image)
+        )
+        if len(stored) != len(descriptors):
+            raise DataError(
+                f"{image} has {len(stored)} keypoints and {len(descriptors)} descriptors of type "
+                f"{keypoints.name!r}",
+                path=self._map.folder.root,
+            )
+        # only keypoints that observe a point can help a pose, but all take part in the mutual
+        # check: without its rivals a wrong match would look unrivalled
+        return Features.of(self._map.camera(image), stored, descriptors)
+
+
+def local_types_of(
+    kapture_map: KaptureMap, options: PipelineOptions, cache: FeatureCache
+) -> list[LocalType]:
+    """The types that queries are localized with, in the options' order, others behind by name.
+
+    These are the types of the map that have points, and those without any that the options name:
+    their matches have a say in which images are candidates, as in ``megloc eval``.
+
+    Raises
+    ------
+    DataError : a type has no descriptors, and they cannot be made again.
+    """
+    choices = _choices(options)
+    by_base = {base_type(name): keypoints for name, keypoints in kapture_map.keypoints.items()}
+    for stored in kapture_map.stored_types():
+        named = _rank(stored, choices) < len(choices)
+        if named and base_type(stored) not in by_base:
+            by_base[base_type(stored)] = kapture_map.keypoints_of(stored)
+    found = []
+    for base in sorted(by_base, key=lambda name: (_rank(name, choices), name)):
+        points = by_base[base]
+        first, rank = points, _rank(base, choices)
+        if options.matches_again() and base in kapture_map.stored_types():
+            first = kapture_map.keypoints_of(base)
+        choice = choices[rank] if rank < len(choices) else None
+        found.append(LocalType(kapture_map, points, first, choice, options, cache))
+    return found
+
+
+def _choices(options: PipelineOptions) -> list[LocalFeaturesChoice]:
+    """What the options say of types, ours first, then the given map's."""
+    own = list(options.local_features) if options.makes_points() else []
+    if options.uses_given_map():
+        given = options.given_features
+        own.append(LocalFeaturesChoice(name=given.name, options=given.options))
+    return own
+
+
+def _rank(local_type: str, choices: Sequence[LocalFeaturesChoice]) -> int:
+    """Which choice makes a type, by name alone: no network is loaded for that.
+
+    Types are called as their plugin, or their weights, which begin with its name.
+    """
+    base = base_type(local_type)
+    fitting = [rank for rank, one in enumerate(choices) if base.startswith(one.name)]
+    by_weights = [
+        rank
+        for rank in fitting
+        if str(choices[rank].options.get("weights", "")).removesuffix(".pth") == base
+    ]
+    exact = [rank for rank in fitting if choices[rank].name == base]
+    return next(iter((*by_weights, *exact, *fitting)), len(choices))
+
+
+def extract_again(
+    kapture_map: KaptureMap, keypoints: MapKeypoints, extractor: LocalFeatureExtractor
+) -> dict[str, NDArray[Any]]:
+    """Descriptors of every map image, one row per stored keypoint; zero where it is not found.
+
+    Raises
+    ------
+    DataError : an image is missing, or most observed keypoints are not found again: then the map
+        was made with another extractor or other options.
+    """
+    if not kapture_map.has_images():
+        raise DataError(
+            f"the map has no descriptors of type {keypoints.name!r}, and no images to extract "
+            "them from again",
+            path=kapture_map.folder.root,
+        )
+    found: dict[str, NDArray[Any]] = {}
+    again = observed = 0
+    for image in kapture_map.images:
+        if image not in keypoints:
+            continue
+        features = _features_of_map_image(kapture_map, extractor, image)
+        stored = keypoints.keypoints_px(image)
+        rows = rows_found_again(stored[:, :2], features.keypoints_px[:, :2])
+        descriptors = np.zeros((len(stored), features.descriptors.shape[1]), np.float32)
+        hit = rows >= 0
+        descriptors[hit] = features.descriptors[rows[hit]]
+        found[image] = descriptors
+        seen, _ = keypoints.index.observed(image)
+        again += int(hit[seen].sum())
+        observed += len(seen)
+    if again < _MIN_FOUND_AGAIN * observed:
+        raise DataError(
+            f"the map has no descriptors, and extracting {extractor.name} again finds only "
+            f"{again} of {observed} observed keypoints: it was made with other options",
+            path=kapture_map.folder.root,
+        )
+    return found
+
+
+def _features_of_map_image(
+    kapture_map: KaptureMap, extractor: LocalFeatureExtractor, image: str
+) -> LocalFeatures:
+    folder = kapture_map.folder
+    pixels = read_image_of(folder.image_path(image), folder.read().camera_of(image))
+    mask = read_mask(folder.root / "sensors" / "masks" / f"{image}.png", pixels.shape[:2])
+    return checked_features(extractor, extractor.extract(pixels, mask), image)
+
+
+def _keep_all(a: Features, b: Features, matches: NDArray[np.int64]) -> NDArray[np.bool_]:
+    return np.ones(len(matches), dtype=bool)
