@@ -66,10 +66,9 @@ COMMANDS: dict[str, type[Any]] = {
 
 
 def _parser() -> Any:
+    annotated: Any = Annotated  # of types that are values here, which mypy does not follow
     entries = [
-        Annotated.__class_getitem__(  # type: ignore[attr-defined]
-            (kind, tyro.conf.subcommand(name, description=kind.__doc__))
-        )
+        annotated[kind, tyro.conf.subcommand(name, description=kind.__doc__)]
         for name, kind in COMMANDS.items()
     ]
     return functools.reduce(operator.or_, entries)
