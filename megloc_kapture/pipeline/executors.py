@@ -7,13 +7,13 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import forkserver
 from multiprocessing.connection import wait
-from typing import Literal
+from typing import Any, Literal
 
 from megloc_kapture.errors import MeglocError, OptionError
 
@@ -25,87 +25,140 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-class _SharedLimit:
-    """Counts who needs a limit of the process; the first sets it, the last takes it back."""
+class _SingleThreads:
+    """One thread for BLAS, OpenMP and torch, while and wherever a block is open.
 
-    def __init__(self, limit: Callable[[], Callable[[], object]]) -> None:
-        """``limit`` sets it and returns what takes it back."""
-        self._limit = limit
+    Their numbers of threads have three scopes, so that no single call limits all of them:
+
+    - BLAS has one pool for the process: the first block that opens limits it, and the last that
+      closes gives it back, whichever threads these are. threadpoolctl ignores all threads but the
+      one that set OpenBLAS first, as long as that one lives; so its claim is cleared.
+    - OpenMP counts for each thread that calls it: every thread limits its own.
+    - torch keeps both, the process's number being that of threads it has not met yet, and it
+      overrides MKL and OpenMP; so every thread sets it last.
+
+    Libraries that are loaded while a block is open start with one thread by ``OMP_NUM_THREADS``.
+    """
+
+    def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._users = 0
-        self._restore: Callable[[], object] | None = None
+        self._threads = 0  # that have a block open
+        self._own = threading.local()  # depth: of this thread's blocks; openmp: its numbers before
+        self._blas: dict[str, int] = {}  # numbers of threads before, by library
+        self._torch = 0
+        self._variable: str | None = None
 
-    @contextmanager
-    def __call__(self) -> Iterator[None]:
+    def enter(self) -> None:
+        """Open a block in this thread; within another one of this thread it changes nothing."""
+        self._own.depth = getattr(self._own, "depth", 0) + 1
+        if self._own.depth > 1:
+            return
+        from threadpoolctl import ThreadpoolController
+
         with self._lock:
-            if self._users == 0:
-                self._restore = self._limit()
-            self._users += 1
-        try:
-            yield
-        finally:
-            with self._lock:
-                self._users -= 1
-                if self._users == 0 and self._restore is not None:
-                    self._restore()
+            libraries = ThreadpoolController()
+            if self._threads == 0:
+                self._variable = os.environ.get("OMP_NUM_THREADS")
+                os.environ["OMP_NUM_THREADS"] = "1"
+                blas = libraries.select(user_api="blas").lib_controllers
+                self._blas = {library.filepath: library.num_threads for library in blas}
+                torch = _loaded_torch()
+                self._torch = self._default() if torch is None else torch.get_num_threads()
+                _set_blas(blas, dict.fromkeys(self._blas, 1))
+            self._threads += 1
+            openmp = libraries.select(user_api="openmp").lib_controllers
+            self._own.openmp = {library.filepath: library.num_threads for library in openmp}
+            for library in openmp:
+                library.set_num_threads(1)
+            _set_torch(1, others=1)
+
+    def leave(self) -> None:
+        """Close the block that was opened last in this thread."""
+        self._own.depth -= 1
+        if self._own.depth:
+            return
+        from threadpoolctl import ThreadpoolController
+
+        with self._lock:
+            libraries = ThreadpoolController()
+            for library in libraries.select(user_api="openmp").lib_controllers:
+                number = self._own.openmp.get(library.filepath, self._default())
+                library.set_num_threads(number)
+            self._threads -= 1
+            _set_torch(self._torch, others=1 if self._threads else self._torch)
+            if self._threads == 0:
+                blas = libraries.select(user_api="blas").lib_controllers
+                before = {library.filepath: self._default() for library in blas} | self._blas
+                _set_blas(blas, before)
+                _clear_claim(blas)
+                os.environ.pop("OMP_NUM_THREADS")
+                if self._variable is not None:
+                    os.environ["OMP_NUM_THREADS"] = self._variable
+
+    def _default(self) -> int:
+        """Threads of a library that is loaded without a block."""
+        number = (self._variable or "").split(",")[0].strip()  # "4,2" is for nested regions
+        return int(number) if number.isdigit() and int(number) > 0 else available_cores()
 
 
-def _limit_blas() -> Callable[[], object]:
-    from threadpoolctl import threadpool_limits
-
-    restore: Callable[[], object] = threadpool_limits(
-        limits=1, user_api="blas"
-    ).restore_original_limits
-    return restore
+def _set_blas(libraries: Sequence[Any], numbers: Mapping[str, int]) -> None:
+    """Set the number of threads of each, by file path, in the whole process."""
+    _clear_claim(libraries)
+    for library in libraries:
+        library.set_num_threads(numbers[library.filepath])
 
 
-def _limit_torch() -> Callable[[], object]:
-    """One thread for torch, now, or from its import on: it sets its own, past BLAS's limits."""
-    wanted = os.environ.get("OMP_NUM_THREADS")
-    os.environ["OMP_NUM_THREADS"] = "1"
-    imported = sys.modules.get("torch")
-    before: int = int(wanted or available_cores())
-    if imported is not None:
-        before = imported.get_num_threads()
-        imported.set_num_threads(1)
-
-    def restore() -> None:
-        os.environ.pop("OMP_NUM_THREADS")
-        if wanted is not None:
-            os.environ["OMP_NUM_THREADS"] = wanted
-        torch = sys.modules.get("torch")
-        if torch is not None:
-            torch.set_num_threads(before)
-
-    return restore
+def _clear_claim(libraries: Sequence[Any]) -> None:
+    """Let any thread set OpenBLAS's number again; versions before 3.8 know no such claim."""
+    for library in libraries:
+        clear = getattr(library, "clear_controlling_thread", None)
+        if clear is not None:
+            clear(force=True)
 
 
-_blas_limit, _torch_limit = _SharedLimit(_limit_blas), _SharedLimit(_limit_torch)
+def _loaded_torch() -> Any:
+    """The module; None while it is not imported, or another thread is still at it."""
+    torch = sys.modules.get("torch")
+    return torch if hasattr(torch, "set_num_threads") else None
+
+
+def _set_torch(number: int, others: int) -> None:
+    """Set torch's number in this thread, and that of threads it has not met yet."""
+    torch = _loaded_torch()
+    if torch is None:
+        return
+    torch.get_num_threads()  # or this thread would take the others' number at its first product
+    torch.set_num_threads(number)
+    if others != number:
+        thread = threading.Thread(target=torch.set_num_threads, args=(others,))
+        thread.start()
+        thread.join()
+
+
+_single_threads = _SingleThreads()
 
 
 @contextmanager
 def single_threaded() -> Iterator[None]:
-    """One thread per matrix product while the block runs; blocks may overlap in several threads.
+    """One thread per matrix product while the block runs, in the thread that runs it.
 
     A product's last bits may depend on how it is split among threads; parallelism comes from
-    the executor, so that results are the same bytes whatever the number of workers.
+    the executor, so that results are the same bytes whatever the number of workers. Blocks may be
+    nested, and may overlap in several threads; after the last one all numbers are as before.
     """
-    from threadpoolctl import threadpool_limits
-
-    # OpenMP's limit is of the calling thread alone, and taking it back sets every library to what
-    # it had before: so BLAS is limited around it, and torch, which sets OpenMP's threads, in it
-    with _blas_limit(), threadpool_limits(limits=1, user_api="openmp"), _torch_limit():
+    _single_threads.enter()
+    try:
         yield
+    finally:
+        _single_threads.leave()
 
 
 def _start_worker() -> None:
     import cv2
     import numpy  # noqa: F401  its thread pool must be there to be limited
-    from threadpoolctl import threadpool_limits
 
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    threadpool_limits(limits=1)
-    _limit_torch()
+    _single_threads.enter()  # for good
     cv2.setNumThreads(1)
 
 

@@ -7,9 +7,12 @@ import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 
+import numpy as np
 import pytest
-from threadpoolctl import threadpool_info
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from megloc_kapture.errors import MeglocError, OptionError
 from megloc_kapture.pipeline.executors import available_cores, open_executor, single_threaded
@@ -75,6 +78,32 @@ def test_torch_imported_within_a_block_has_one_thread_there_and_all_afterwards()
     subprocess.run([sys.executable, "-c", script], check=True, env=environment)
 
 
+def test_torch_imported_by_one_of_two_threads_in_blocks_has_one_thread_in_both() -> None:
+    script = """if True:
+        import threading
+        from megloc_kapture.pipeline.executors import single_threaded
+        inside, left = threading.Event(), threading.Event()
+        def other():
+            with single_threaded():
+                inside.set()
+                left.wait(30)
+                seen.append(torch.get_num_threads())
+            seen.append(torch.get_num_threads())
+        seen = []
+        thread = threading.Thread(target=other)
+        with single_threaded():
+            thread.start()
+            assert inside.wait(30)
+            import torch
+        assert torch.get_num_threads() == 2, torch.get_num_threads()
+        left.set()
+        thread.join()
+        assert seen == [1, 2], seen
+    """
+    environment = {**os.environ, "OMP_NUM_THREADS": "2"}
+    subprocess.run([sys.executable, "-c", script], check=True, env=environment)
+
+
 def test_a_worker_that_dies_is_told_in_one_line() -> None:
     with pytest.raises(MeglocError, match="a worker process died.*--workers"):  # noqa: SIM117
         with open_executor("processes", 2) as executor:
@@ -92,27 +121,132 @@ def test_an_error_in_a_worker_keeps_its_kind() -> None:
             executor.submit(int, "x").result()
 
 
-def test_one_thread_while_any_block_is_open() -> None:
-    before = threads()
-    inside, leave = threading.Event(), threading.Event()
+# ------------------------------------------------------------------ one thread in every thread
+
+
+@pytest.fixture
+def two_threads() -> Iterator[None]:
+    """Two threads for every library, set by this thread, however many cores there are."""
+    import torch
+
+    before = torch.get_num_threads()
+    with threadpool_limits(limits=2):
+        torch.set_num_threads(2)
+        yield
+        torch.set_num_threads(before)
+
+
+def everywhere() -> set[int]:
+    """Numbers of threads that a calculation of this thread gets, in BLAS, OpenMP and torch."""
+    return threads() | {_torch_threads()}
+
+
+def within_a_block() -> set[int]:
+    with single_threaded():
+        return everywhere()
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_a_block_limits_the_thread_it_runs_in_after_another_thread_had_one() -> None:
+    with ThreadPoolExecutor(1) as first, ThreadPoolExecutor(1) as second:
+        for pool in (None, first, second, first):
+            seen = within_a_block() if pool is None else pool.submit(within_a_block).result()
+            assert seen == {1}
+            assert everywhere() == {2}
+            assert first.submit(everywhere).result() == {2}
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_a_block_limits_although_this_thread_set_its_own_number() -> None:
+    with threadpool_limits(limits=2):
+        assert ThreadPoolExecutor(1).submit(within_a_block).result() == {1}
+    with ThreadPoolExecutor(1) as pool, pool.submit(threadpool_limits, 2).result():
+        assert within_a_block() == {1}
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_blocks_may_be_nested() -> None:
+    with single_threaded():
+        with single_threaded():
+            assert everywhere() == {1}
+        assert everywhere() == {1}
+    assert everywhere() == {2}
+    with pytest.raises(KeyError), single_threaded(), single_threaded():
+        raise KeyError
+    assert everywhere() == {2}
+
+
+@pytest.mark.usefixtures("two_threads")
+@pytest.mark.parametrize("main_leaves_first", [True, False])
+def test_one_thread_while_any_block_is_open(main_leaves_first: bool) -> None:
+    inside, leave, left, end = (threading.Event() for _ in range(4))
     seen: list[set[int]] = []
 
     def other() -> None:
         with single_threaded():
             inside.set()
             leave.wait(30)
-            seen.append(threads())
+            seen.append(everywhere())
+        left.set()
+        end.wait(30)  # a thread that lives on claims nothing
+        seen.append(everywhere())
 
     thread = threading.Thread(target=other)
     with single_threaded():
         thread.start()
         assert inside.wait(30)
-        assert threads() == {1}
-    # the other block still wants it
+        assert everywhere() == {1}
+        if not main_leaves_first:
+            leave.set()
+            assert left.wait(30)
+            assert everywhere() == {1}
     leave.set()
+    assert left.wait(30)
+    assert everywhere() == {2}
+    end.set()
     thread.join()
-    assert seen == [{1}]
-    assert threads() == before
+    assert seen == [{1}, {2}]
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_threads_that_come_and_go_at_once_leave_the_numbers_as_they_were() -> None:
+    with ThreadPoolExecutor(4) as pool:
+        assert all(seen == {1} for seen in pool.map(lambda _: within_a_block(), range(200)))
+        assert all(seen == {2} for seen in pool.map(lambda _: everywhere(), range(8)))
+    assert everywhere() == {2}
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_a_product_has_the_same_bytes_in_any_thread() -> None:
+    """The size is one whose last bits depend on how OpenBLAS divides it."""
+    a, b = np.random.default_rng(0).normal(size=(2, 500, 500))
+
+    def product() -> bytes:
+        with single_threaded():
+            return (a @ b).tobytes()
+
+    here = product()
+    with ThreadPoolExecutor(2) as pool:
+        assert {future.result() for future in [pool.submit(product) for _ in range(8)]} == {here}
+
+
+def test_libraries_loaded_within_a_block_have_one_thread_there_and_all_afterwards() -> None:
+    script = """if True:
+        import numpy
+        from threadpoolctl import threadpool_info
+        from megloc_kapture.pipeline.executors import single_threaded
+        def numbers():
+            return {library["num_threads"] for library in threadpool_info()}
+        loaded, before = len(threadpool_info()), numbers()
+        with single_threaded():
+            import scipy.linalg
+            assert len(threadpool_info()) > loaded
+            assert numbers() == {1}, numbers()
+        assert numbers() == before, numbers()
+    """
+    for number in ("2", "2,1"):
+        environment = {**os.environ, "OMP_NUM_THREADS": number}
+        subprocess.run([sys.executable, "-c", script], check=True, env=environment)
 
 
 def test_there_is_a_core_at_least() -> None:
