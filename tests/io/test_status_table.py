@@ -12,7 +12,9 @@ from pydantic import ValidationError
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.status_table import QueryStatus, read_status, write_status
 
-HEADER = "image,status,reason,num_matches,num_inliers,cluster,fallback,candidates,refinement\n"
+HEADER = (
+    "image,status,reason,num_matches,num_inliers,cluster,fallback,candidates,refinement,remarks\n"
+)
 LOCALIZED = QueryStatus(
     image="q/b.jpg",
     status="localized",
@@ -39,6 +41,7 @@ statuses = st.one_of(
         cluster=st.none() | st.integers(0, 50),
         candidates=st.lists(names, max_size=4).map(tuple),
         refinement=st.sampled_from(["", "icp: accepted", "icp: it, then, moved 1 m"]),
+        remarks=st.sampled_from(["", "guided pyramid matching: no image"]),
     ),
     st.builds(
         QueryStatus,
@@ -63,15 +66,15 @@ def test_rows_are_sorted_whatever_the_order(tmp_path: Path) -> None:
     write_status(second, [FAILED, LOCALIZED])
     assert first.read_bytes() == second.read_bytes()
     assert first.read_text() == (
-        f'{HEADER}q/a.jpg,failed,"7 inliers, 12 needed",0,0,,retrieval,,\n'
-        'q/b.jpg,localized,,310,120,0,none,"map/2; left.jpg,map/1.jpg",icp: accepted\n'
+        f'{HEADER}q/a.jpg,failed,"7 inliers, 12 needed",0,0,,retrieval,,,\n'
+        'q/b.jpg,localized,,310,120,0,none,"map/2; left.jpg,map/1.jpg",icp: accepted,\n'
     )
 
 
 def test_two_rows_for_one_query(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="two statuses"):
         write_status(tmp_path / "status.csv", [FAILED, FAILED])
-    (tmp_path / "status.csv").write_text(HEADER + 2 * "a.jpg,localized,,9,9,,none,,\n")
+    (tmp_path / "status.csv").write_text(HEADER + 2 * "a.jpg,localized,,9,9,,none,,,\n")
     with pytest.raises(DataError, match="named twice") as caught:
         read_status(tmp_path / "status.csv")
     assert caught.value.line == 3
@@ -95,7 +98,7 @@ def test_two_rows_for_one_query(tmp_path: Path) -> None:
 )
 def test_broken_rows_name_line_and_field(tmp_path: Path, row: str, words: str) -> None:
     path = tmp_path / "status.csv"
-    path.write_text(f"{HEADER}{row},\n")
+    path.write_text(f"{HEADER}{row},,\n")
     with pytest.raises(DataError, match=words) as caught:
         read_status(path)
     assert caught.value.line == 2
