@@ -4,7 +4,7 @@
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .SUFFIXES:
-.PHONY: help venv eval test lint bench kloc-env clean
+.PHONY: help venv eval test test-slow test-all lint bench kloc-env clean
 
 # make eval
 DATASET ?= synthetic-aachen
@@ -12,6 +12,8 @@ ROOT ?=
 PRESET ?=
 WORKSPACE ?=
 ARGS ?=
+# make test-slow: no test begins after so many seconds
+BUDGET_S ?=
 # make bench
 SCENE ?= ../shared/data/scenes/redkitchen_rgbd
 KLOC_PYTHON ?=
@@ -19,7 +21,7 @@ KLOC_PYTHON ?=
 PYTHON ?=
 TORCH_INDEX ?=
 
-VENV := .venv
+VENV ?= .venv
 BIN := $(VENV)/bin
 # named by content, not by date: a checkout alone installs nothing again
 STAMP := $(VENV)/.installed-$(shell cat pyproject.toml constraints.txt | cksum | cut -d ' ' -f 1)
@@ -28,12 +30,14 @@ INSTALL := $(BIN)/python -m pip install -qq --disable-pip-version-check
 help:
 	@echo 'make eval       localize a data set: import, map, localize, pose file, recall table'
 	@echo '                DATASET=$(DATASET) ROOT=folder PRESET=name WORKSPACE=folder ARGS="more options"'
-	@echo 'make test       run the tests'
+	@echo 'make test       run the quick tests: minutes; ARGS="files or options of pytest"'
+	@echo 'make test-slow  run those that it leaves out: whole runs; BUDGET_S=seconds to begin none later'
+	@echo 'make test-all   run all tests, the property tests with many new examples'
 	@echo 'make lint       check style, types and the import contracts'
 	@echo 'make bench      measure speed; SCENE=folder, KLOC_PYTHON=.venv-kloc/bin/python to compare'
 	@echo 'make kloc-env   build .venv-kloc: kapture-localization with its old packages, and COLMAP'
 	@echo 'make clean      remove caches; leaves .venv, runs/ and submissions/ alone'
-	@echo 'Set-up happens once, by itself, in .venv: PYTHON=interpreter (3.11 or newer),'
+	@echo 'Set-up happens once, by itself, in .venv (VENV=folder): PYTHON=interpreter (3.11 or newer),'
 	@echo 'TORCH_INDEX=URL to take torch from another package index (the CPU wheels are smaller).'
 
 venv: $(STAMP)
@@ -42,8 +46,18 @@ eval: $(STAMP)
 	@$(BIN)/megloc eval '$(DATASET)' $(if $(ROOT),--root '$(ROOT)') $(if $(PRESET),--preset '$(PRESET)') \
 		$(if $(WORKSPACE),--workspace '$(WORKSPACE)') $(ARGS)
 
+# a file's tests share their fixtures, so they stay together
+PYTEST = $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile
+
 test: $(STAMP)
-	@$(BIN)/python -m pytest $(ARGS)
+	@$(PYTEST) -m 'not slow and not fuzz' $(ARGS)
+
+test-slow: $(STAMP)
+	@$(PYTEST) -m 'slow or fuzz' --no-loadscope-reorder --hypothesis-profile thorough \
+		$(if $(BUDGET_S),--time-budget-s '$(BUDGET_S)') $(ARGS)
+
+test-all: $(STAMP)
+	@$(PYTEST) --hypothesis-profile thorough $(ARGS)
 
 lint: $(STAMP)
 	@$(BIN)/ruff check .

@@ -22,6 +22,8 @@ from megloc_kapture.errors import DataError, PluginError
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.plugins import SEGMENTERS, load_plugin, plugin_names, weights_of
 
+pytestmark = pytest.mark.slow
+
 SOURCE = Path(__file__).parent / "outside_segmenter"
 WEIGHTS = "weights/espnetv2_cityscapes/espnetv2_s_1.0_city_1024x512.pth"
 PHOTOGRAPHS = {

@@ -5,15 +5,12 @@ from __future__ import annotations
 import re
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import pytest
 
 from megloc_kapture.cli.main import main
-from megloc_kapture.io.images import read_image_rgb, write_image
-from megloc_kapture.io.kapture_store import KaptureFolder, Sensor, write_sensors
 
 # enough to localize all queries of the small scene
 SMALL = ("--set", "local_features.options.max_keypoints=800")
@@ -55,32 +52,6 @@ def megloc(capsys: pytest.CaptureFixture[str]) -> Command:
         return Done(end.value.code, out, err)
 
     return run
-
-
-@pytest.fixture(scope="session")
-def scene(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """fountain_p11 at half its size: mapping/, query/ and query_gt/; not to be written into."""
-    root = tmp_path_factory.mktemp("scene")
-    for part in ("mapping", "query", "query_gt"):
-        folder = KaptureFolder(shared_data / "scenes" / "fountain_p11" / part)
-        data = folder.read()
-        halved = {}
-        for name, sensor in data.sensors.items():
-            camera = sensor.camera()
-            fx, fy, cx, cy = camera.params
-            half = replace(
-                camera,
-                width=camera.width // 2,
-                height=camera.height // 2,
-                params=(fx / 2, fy / 2, cx / 2, cy / 2),
-            )
-            halved[name] = Sensor.from_camera(half)
-        write_sensors(root / part, replace(data, sensors=halved))
-        for image in () if part == "query_gt" else data.image_names():
-            pixels = read_image_rgb(folder.image_path(image))
-            small = cv2.resize(pixels, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-            write_image(root / part / "sensors" / "records_data" / image, small)
-    return root
 
 
 @pytest.fixture(scope="session")

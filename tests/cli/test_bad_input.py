@@ -285,7 +285,7 @@ DATASETS: dict[str, tuple[Spoil, str]] = {
         r"mapping/sensors/records_data/0005\.jpg: ",
     ),
     "not an image": (not_an_image, r"records_data/0004\.jpg: not an image"),
-    "other size": (other_size, r"records_data/0004\.jpg: .*200x100.*768x512"),
+    "other size": (other_size, r"records_data/0004\.jpg: .*200x100.*400x300"),
     "pose column": (line(f"mapping/{TIMES}", 4, NO_COLUMN), r"mapping/.*trajectories\.txt:4: "),
     "true pose column": (line(f"query_gt/{TIMES}", 4, NO_COLUMN), r"query_gt/.*txt:4: "),
     "pose of nan": (line(f"mapping/{TIMES}", 3, NAN), r"mapping/.*trajectories\.txt:3: .*nan"),

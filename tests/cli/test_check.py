@@ -22,18 +22,17 @@ def command(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def poses(shared_data: Path) -> dict[str, RigidTransform]:
-    return KaptureFolder(shared_data / "scenes" / "herzjesu_p25" / "query_gt").read().poses()
+def poses(scene: Path) -> dict[str, RigidTransform]:
+    return KaptureFolder(scene / "query_gt").read().poses()
 
 
 @pytest.fixture
-def imported(shared_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def imported(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The one workspace of dataset aachen below runs/, with the scene's map."""
     monkeypatch.chdir(tmp_path)
     root = tmp_path / "runs" / "aachen-classic"
     for part in ("mapping", "query"):
-        data = KaptureFolder(shared_data / "scenes" / "herzjesu_p25" / part).read()
-        write_sensors(root / part, data)
+        write_sensors(root / part, KaptureFolder(scene / part).read())
     write_protocol(root / "megloc", Protocol(dataset="aachen", pose_file_names="basename"))
     return root
 
@@ -44,7 +43,7 @@ def test_a_right_file(
     place = tmp_path / "poses.txt"
     write_pose_file(place, poses)
     done = megloc("check", "aachen", place)
-    assert (done.status, done.out) == (0, "8 poses of 8 queries: no problem found\n")
+    assert (done.status, done.out) == (0, "4 poses of 4 queries: no problem found\n")
     assert done.err == "compared with runs/aachen-classic\n"
     assert megloc("check", "aachen", place, "-q").err == ""
     assert megloc("check", "synthetic-aachen", place, "--data", imported).status == 0
@@ -62,10 +61,10 @@ def test_a_wrong_file(
     first, *others, outcome = done.out.splitlines()
     assert "0001.png should be 0001.jpg" in others[0]
     assert first.startswith("error: poses.txt: the poses are inverted: they are world_from_cam")
-    assert any("poses.txt:9: 4 columns instead of 8" in line for line in others)
+    assert any("poses.txt:5: 4 columns instead of 8" in line for line in others)
     assert any("stranger.jpg is no name of the list" in line for line in others)
     assert "quaternion of length 1.41421, not 1" in done.out
-    assert outcome.startswith("9 poses of 8 queries: ") and "problems found" in outcome
+    assert outcome.startswith("5 poses of 4 queries: ") and "problems found" in outcome
     done = megloc("check", "aachen", place, "--json")
     content = json.loads(done.out)
     assert done.status == 2 and content["ok"] is False
@@ -81,7 +80,7 @@ def test_without_data_the_file_alone_is_checked(
     assert done.status == 2 and "not ending in .JPG" in done.out
     assert "the poses are not checked" in done.out
     done = megloc("check", "kapture", place)
-    assert done.status == 0 and done.out.endswith("8 poses: no problem found\n")
+    assert done.status == 0 and done.out.endswith("4 poses: no problem found\n")
     # a twin's run is none of the rendered world
     write_sensors(
         tmp_path / "runs" / "synthetic-aachen-classic" / "mapping",

@@ -376,7 +376,7 @@ def test_recall_that_is_high_enough(
 def blacken(dataset: Path, names: Sequence[str]) -> None:
     for name in names:
         place = dataset / "query/sensors/records_data" / name
-        write_image(place, np.zeros((512, 768, 3), np.uint8))
+        write_image(place, np.zeros((300, 400, 3), np.uint8))
 
 
 def test_low_recall_fails_when_asked_for(evaluate: Any, dataset: Path, finished: Path) -> None:

@@ -15,7 +15,6 @@ import pytest
 
 Contents = Callable[[Path], dict[str, bytes]]
 
-KILLS = 5
 # the dates of these tell nothing about poses
 DATED = ("stages/", "timing.csv")
 
@@ -96,14 +95,15 @@ def test_a_run_ended_at_the_keyboard_says_how_to_go_on(scene: Path, tmp_path: Pa
     assert list((tmp_path / "run" / ".partial").iterdir()) == []
 
 
+@pytest.mark.parametrize("kills", [1, pytest.param(5, marks=pytest.mark.slow)])
 def test_runs_killed_at_random_moments_end_in_the_same_bytes(
-    scene: Path, finished: Path, tmp_path: Path, contents: Contents
+    scene: Path, finished: Path, tmp_path: Path, contents: Contents, kills: int
 ) -> None:
     # seeded: which stages, and how long after they have begun
     draw = random.Random(20)
     stages = [path.stem for path in finished.glob("stages/[a-z]*.json")]
     order = {stage: (finished / "stages" / f"{stage}.json").stat().st_mtime_ns for stage in stages}
-    unlucky = sorted(draw.sample(sorted(stages), KILLS), key=order.__getitem__)
+    unlucky = sorted(draw.sample(sorted(stages), kills), key=order.__getitem__)
     workspace = tmp_path / "run"
     ends = []
     for stage in unlucky:
@@ -113,7 +113,7 @@ def test_runs_killed_at_random_moments_end_in_the_same_bytes(
         os.killpg(run.pid, signal.SIGKILL)
         ends.append(run.wait())
     # the last stage may have been faster
-    assert ends.count(-signal.SIGKILL) >= KILLS - 1
+    assert ends.count(-signal.SIGKILL) >= kills - 1
     last = start(scene, workspace)
     _, told = last.communicate()
     assert last.returncode == 0, told

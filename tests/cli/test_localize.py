@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from kapture.io.csv import kapture_from_dir
 
 from megloc_kapture.evaluation.folders import evaluate_folders
 from megloc_kapture.io.images import write_image
-from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder, write_pairs
+from megloc_kapture.io.kapture_store import FeatureWriter, ImagePair, KaptureFolder, write_pairs
 from megloc_kapture.io.status_table import read_status
 
 IMAGES = "training/gallery_light1_loop1/frames/rgb/camera_0/rgb_00"
@@ -37,6 +38,40 @@ def state(root: Path) -> dict[str, tuple[str, int]]:
         for path in sorted(root.rglob("*"))
         if path.is_file()
     }
+
+
+@pytest.fixture
+def foreign(finished: Path, scene: Path, tmp_path: Path) -> Path:
+    """A map and queries that bring features of a type that we know nothing about."""
+    root = tmp_path / "foreign"
+    shutil.copytree(finished / "map", root / "map", symlinks=True)
+    shutil.copytree(scene / "query", root / "query")
+    for part in ("map", "query"):
+        folder = KaptureFolder(finished / part, features_dirs=[finished])
+        ours = {"keypoints": folder.keypoints("rootsift")}
+        ours |= {"descriptors": folder.descriptors("rootsift")}
+        for kind, reader in ours.items():
+            shutil.rmtree(root / part / "reconstruction" / kind, ignore_errors=True)
+            owner = "orb_800" if kind == "descriptors" else None
+            config = replace(reader.config, name="ORB", keypoints_type=owner)
+            with FeatureWriter(root / part, kind, "orb_800", config) as writer:
+                for image in folder.read().image_names():
+                    writer.write(image, reader.read(image))
+    seen = root / "map" / "reconstruction" / "observations.txt"
+    seen.write_text(seen.read_text().replace("rootsift", "orb_800"))
+    shutil.rmtree(root / "map" / "reconstruction" / "global_features")
+    return root
+
+
+def test_a_map_of_another_tool_stays_as_it_is(megloc: Any, foreign: Path, scene: Path) -> None:
+    before = state(foreign)
+    result = foreign.parent / "localized"
+    done = megloc("localize", "-i", foreign / "map", "--query", foreign / "query", "-o", result)
+    assert done.out.startswith("4 of 4 queries localized in "), done
+    share, median_m, median_deg = medians(result, scene / "query_gt")
+    assert share == 1.0 and median_m < 0.01 and median_deg < 0.05
+    assert state(foreign) == before
+    assert "no extractor for orb_800" in megloc("info", foreign / "map").out
 
 
 def test_the_foreign_map(megloc: Any, shared_data: Path, tmp_path: Path) -> None:
@@ -162,7 +197,7 @@ def test_no_query_localized_is_no_error_and_a_fallback_is_marked(
     megloc: Any, finished: Path, dataset: Path, tmp_path: Path
 ) -> None:
     for place in (dataset / "query/sensors/records_data").iterdir():
-        write_image(place, np.zeros((512, 768, 3), np.uint8))
+        write_image(place, np.zeros((300, 400, 3), np.uint8))
     places = ["-i", finished / "map", "--query", dataset / "query", "-o", tmp_path / "localized"]
     done = megloc("localize", *places)
     assert done.status == 0

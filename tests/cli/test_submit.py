@@ -17,9 +17,9 @@ from megloc_kapture.io.status_table import QueryStatus, write_status
 
 
 @pytest.fixture
-def imported(shared_data: Path, tmp_path: Path) -> Path:
+def imported(scene: Path, tmp_path: Path) -> Path:
     """An imported scene and a result in it: the true poses of all but one query."""
-    scene, root = shared_data / "scenes" / "fountain_p11", tmp_path / "imported"
+    root = tmp_path / "imported"
     for part in ("mapping", "query"):
         write_sensors(root / part, KaptureFolder(scene / part).read())
     truth = KaptureFolder(scene / "query_gt").read()

@@ -40,6 +40,7 @@ def test_the_projection_is_the_eigenvectors_over_powers_of_the_deviations(
         np.testing.assert_allclose(row, expected, atol=5e-4)
 
 
+@pytest.mark.slow
 def test_many_vectors_are_white_afterwards() -> None:
     data = vectors_of(np.random.default_rng(4), 4000, 6)
     whitening = learn_whitening(data.copy(), 6)

@@ -6,10 +6,13 @@ import math
 from pathlib import Path
 
 import numpy as np
+import pytest
 from kapture.io.csv import kapture_from_dir
 from kloc import kapture_tool
 
 from megloc_kapture.io.kapture_store import KaptureFolder
+
+pytestmark = pytest.mark.slow
 
 
 def read_pose_file(path: Path) -> dict[str, np.ndarray]:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 from kloc import kloc, merged, needs_kapture_localization, pose_errors
+
+pytestmark = pytest.mark.slow
 
 
 @needs_kapture_localization

@@ -14,7 +14,7 @@ from megloc_kapture.stages.localized_folder import write_localized
 from megloc_kapture.stages.query_poses import LocalizationOptions, localize_from_matches
 from megloc_kapture.stages.triangulation import triangulate_map
 
-pytestmark = needs_kapture_localization
+pytestmark = [needs_kapture_localization, pytest.mark.slow]
 
 LOCAL, GLOBAL = "rootsift", "vlad_rootsift"
 

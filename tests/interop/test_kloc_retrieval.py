@@ -13,6 +13,8 @@ from megloc_kapture.retrieval.search import rank_by_similarity
 from megloc_kapture.stages.candidates import QueryPairsOptions, Retrieval
 from megloc_kapture.stages.image_pairs import pair_queries
 
+pytestmark = pytest.mark.slow
+
 TYPE = "AP-GeM-LM18"
 
 

@@ -85,6 +85,7 @@ def folder_bytes(root: Path) -> dict[str, bytes]:
     return {path.relative_to(root).as_posix(): path.read_bytes() for path in files}
 
 
+@pytest.mark.slow
 def test_a_variant_runs_only_what_differs_and_leaves_the_first_run_alone(first: Run) -> None:
     before = folder_bytes(first.workspace.root)
     variant = next(v for v in variants(first.options) if v.name == "pose ranking")
@@ -103,6 +104,7 @@ def test_a_variant_runs_only_what_differs_and_leaves_the_first_run_alone(first: 
     assert workspace.path(place).samefile(first.workspace.path(place))
 
 
+@pytest.mark.slow
 def test_refinement_is_turned_on_and_off_in_one_workspace(first: Run) -> None:
     workspace = fresh_copy(first.workspace, "with_rendering")
     plain = folder_bytes(first.workspace.path("localized"))
@@ -126,6 +128,7 @@ def test_refinement_is_turned_on_and_off_in_one_workspace(first: Run) -> None:
             assert not workspace.path("localized_unrefined").exists()
 
 
+@pytest.mark.slow
 def test_the_table_has_recall_medians_and_seconds(first: Run) -> None:
     stages = plan_evaluation(first)
     found = outcome("all steps", first.workspace, stages)

@@ -14,6 +14,8 @@ from megloc_kapture.io.kapture_store import KaptureFolder
 from megloc_kapture.pipeline.queries import KaptureQueries
 from megloc_kapture.values import RigidTransform
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def gallery(shared_data: Path) -> Path:

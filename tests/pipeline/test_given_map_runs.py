@@ -19,6 +19,8 @@ from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.run import Run
 from megloc_kapture.pipeline.workspace import Workspace
 
+pytestmark = pytest.mark.slow
+
 SMALL = {
     "num_places": 1,
     "stations_per_place": 6,

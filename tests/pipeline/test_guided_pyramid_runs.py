@@ -24,6 +24,8 @@ from megloc_kapture.pipeline.run import Run
 from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.values import RigidTransform
 
+pytestmark = pytest.mark.slow
+
 TURNED_FROM_UPRIGHT = RigidTransform.from_matrix(
     np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3)
 )

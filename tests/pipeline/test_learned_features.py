@@ -20,6 +20,8 @@ from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.run import Run
 from megloc_kapture.pipeline.workspace import Workspace
 
+pytestmark = pytest.mark.slow
+
 SMALL = [
     "local_features.aliked.options.max_keypoints=600",
     "preprocessing.max_size_px=640",

@@ -29,6 +29,8 @@ from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.run import Run
 from megloc_kapture.pipeline.workspace import Workspace
 
+pytestmark = pytest.mark.slow
+
 SMALL = {"num_locations": 2, "size_px": 360, "moments_per_condition": 2}
 OPTIONS = RobotCarTwinOptions(**SMALL)  # type: ignore[arg-type]
 SEED = OPTIONS.world().seed

@@ -24,6 +24,8 @@ from megloc_kapture.pipeline.queries import KaptureQueries, Query
 from megloc_kapture.pipeline.run import Run
 from megloc_kapture.pipeline.workspace import Workspace
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def options(tmp_path_factory: pytest.TempPathFactory) -> PipelineOptions:

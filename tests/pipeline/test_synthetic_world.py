@@ -15,6 +15,8 @@ from megloc_kapture.io.images import image_size
 from megloc_kapture.io.kapture_store import KaptureFolder, read_pairs
 from megloc_kapture.io.side_tables import read_groups
 
+pytestmark = pytest.mark.slow
+
 MIDDLE = 1  # of the thresholds: 0.25 m, 2 deg
 
 

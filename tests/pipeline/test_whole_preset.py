@@ -32,6 +32,8 @@ from whole_preset_artefacts import artefacts, read_features  # noqa: E402
 from whole_preset_scene import RANDOM_SCENE, Scene  # noqa: E402
 from whole_preset_weights import Sizes, write_random_weights  # noqa: E402
 
+pytestmark = pytest.mark.slow
+
 KEYS = Path(__file__).parents[1] / "nets" / "keys"
 SLIM = Path(__file__).parents[1] / "nets" / "data" / "delg" / "slim.txt"
 SCENE = Scene(

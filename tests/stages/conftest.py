@@ -7,11 +7,10 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
+from corner import WALLS, pose_at, write_kapture
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
 from megloc_kapture.features.vlad import VladOptions
@@ -33,52 +32,8 @@ from megloc_kapture.stages.matches import match_pairs
 from megloc_kapture.stages.triangulation import triangulate_map
 from megloc_kapture.values import Camera, RigidTransform
 
-CAMERA = Camera("PINHOLE", 400, 300, (300.0, 302.0, 200.0, 150.0))
-TEXTURE_PX_PER_M = 50
-# origin, unit vector of the texture's columns, width and height in metres; rows go down (+y)
-WALLS = (
-    (np.array([-6.0, -4.0, 6.0]), np.array([1.0, 0.0, 0.0]), 8, 8),
-    (np.array([2.0, -4.0, 6.0]), np.array([0.6, 0.0, -0.8]), 4, 8),
-)
 EXTRACTOR = RootSift(RootSiftOptions(max_keypoints=800))
 VLAD = VladOptions(num_clusters=8, training_descriptors=2000)
-
-
-def _texture(width: int, height: int, seed: int) -> NDArray[np.uint8]:
-    rng = np.random.default_rng(seed)
-    image = np.zeros((height, width, 3))
-    for sigma in (1.5, 4.0, 12.0):
-        layer = cv2.GaussianBlur(rng.normal(size=(height, width, 3)), (0, 0), sigma)
-        image += layer / layer.std()
-    return np.clip(128 + 30 * image, 0, 255).astype(np.uint8)
-
-
-def render(cam_from_world: RigidTransform) -> NDArray[np.uint8]:
-    """The image (H, W, 3) that the camera sees; exact but for bilinear sampling."""
-    fx, fy, cx, cy = CAMERA.params
-    # OpenCV's warp has pixel centres at integers, in the texture and in the image
-    calibration = np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]])
-    centre = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
-    size = (CAMERA.width, CAMERA.height)
-    image = np.full((CAMERA.height, CAMERA.width, 3), 128, dtype=np.uint8)
-    for seed, (origin, along, width, height) in enumerate(WALLS):
-        texture = _texture(width * TEXTURE_PX_PER_M, height * TEXTURE_PX_PER_M, seed)
-        world_from_texture = np.column_stack(
-            [along / TEXTURE_PX_PER_M, [0, 1 / TEXTURE_PX_PER_M, 0], origin]
-        )
-        in_cam = cam_from_world.rotation_matrix() @ world_from_texture
-        in_cam[:, 2] += cam_from_world.translation
-        homography = calibration @ in_cam @ centre
-        seen = cv2.warpPerspective(texture, homography, size, flags=cv2.INTER_LINEAR)
-        inside = cv2.warpPerspective(np.full_like(texture, 255), homography, size) == 255
-        image = np.where(inside.all(axis=2, keepdims=True), seen, image)
-    return image
-
-
-def pose_at(center: tuple[float, float, float], yaw_deg: float, pitch_deg: float) -> RigidTransform:
-    rotation = Rotation.from_euler("xy", [pitch_deg, yaw_deg], degrees=True).as_matrix()
-    return RigidTransform.from_matrix(rotation, -rotation @ np.array(center))
-
 
 MAP_POSES = {
     "left/0.png": pose_at((-1.5, 0.0, 0.0), -4, 1),
@@ -91,19 +46,6 @@ QUERY_POSES = {
     "query/a.png": pose_at((-0.4, 0.05, 0.2), -1, 1),
     "query/b.png": pose_at((0.5, -0.1, 0.6), 2, -1),
 }
-
-
-def write_kapture(root: Path, poses: dict[str, RigidTransform], *, with_poses: bool) -> None:
-    """Write rendered images as a kapture."""
-    data = KaptureData(sensors={"cam": Sensor.from_camera(CAMERA)})
-    for timestamp, (image, pose) in enumerate(poses.items()):
-        data.records_camera[timestamp, "cam"] = image
-        if with_poses:
-            data.trajectories[timestamp, "cam"] = pose
-        path = root / "sensors" / "records_data" / image
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_image(path, render(pose))
-    write_sensors(root, data)
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,8 @@ from megloc_kapture.datasets.grammars.fourseasons_times import read_times
 from megloc_kapture.datasets.grammars.fourseasons_transformations import read_transformations
 from megloc_kapture.errors import DataError
 
+pytestmark = pytest.mark.fuzz
+
 TIME = 1602074877390449152
 POSE = "-0.06,0.05,-0.15,0,0.6,0,0.8"
 READERS: dict[Callable[[Path], Any], str] = {

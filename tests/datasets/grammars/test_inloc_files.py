@@ -160,6 +160,7 @@ def test_what_is_no_text_is_refused(path: Path) -> None:
         read_transformation(path.parent)
 
 
+@pytest.mark.fuzz
 @given(st.binary(max_size=40), st.integers(0, 200), st.integers(0, 60))
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=300)
 def test_mutations_are_read_or_refused(path: Path, new: bytes, start: int, length: int) -> None:

@@ -168,6 +168,7 @@ def test_what_cannot_be_written_is_refused(path: Path) -> None:
     assert not path.exists()
 
 
+@pytest.mark.fuzz
 @given(st.booleans(), st.integers(0, 1200), st.integers(0, 20), st.binary(max_size=20))
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=400)
 def test_mutations_are_read_or_refused(

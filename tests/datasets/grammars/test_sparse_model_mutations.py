@@ -31,6 +31,8 @@ from megloc_kapture.datasets.grammars.sparse_points import SparsePoints
 from megloc_kapture.errors import DataError
 from megloc_kapture.values import Camera, RigidTransform
 
+pytestmark = pytest.mark.fuzz
+
 PLAIN, COMPILED = 1 << 62, 0
 MANY = settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
