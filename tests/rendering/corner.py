@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from megloc_kapture.io.depth_maps import write_depth_map
 from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture_store import KaptureData, Sensor, write_sensors
 from megloc_kapture.values import Camera, RigidTransform
@@ -56,6 +57,27 @@ def render(cam_from_world: RigidTransform) -> NDArray[np.uint8]:
     return image
 
 
+def depth_m(cam_from_world: RigidTransform) -> NDArray[np.float32]:
+    """The depth (H, W) along the optical axis that the camera sees, metres; 0 beyond the walls."""
+    fx, fy, cx, cy = CAMERA.params
+    x = (np.arange(CAMERA.width) + 0.5 - cx) / fx
+    y = (np.arange(CAMERA.height) + 0.5 - cy) / fy
+    rays = np.stack([*np.meshgrid(x, y), np.ones((CAMERA.height, CAMERA.width))], axis=-1)
+    nearest = np.full(rays.shape[:2], np.inf)
+    down = np.array([0.0, 1.0, 0.0])
+    for origin, along, width, height in WALLS:
+        rotation = cam_from_world.rotation_matrix()
+        corner = rotation @ origin + np.array(cam_from_world.translation)
+        normal = rotation @ np.cross(along, down)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            depth = (normal @ corner) / (rays @ normal)
+        hit = rays * depth[..., None] - corner
+        column, row = hit @ (rotation @ along), hit @ (rotation @ down)
+        on_wall = (column >= 0) & (column <= width) & (row >= 0) & (row <= height) & (depth > 0)
+        nearest = np.where(on_wall & (depth < nearest), depth, nearest)
+    return np.where(np.isfinite(nearest), nearest, 0.0).astype(np.float32)
+
+
 def pose_at(center: tuple[float, float, float], yaw_deg: float, pitch_deg: float) -> RigidTransform:
     rotation = Rotation.from_euler("xy", [pitch_deg, yaw_deg], degrees=True).as_matrix()
     return RigidTransform.from_matrix(rotation, -rotation @ np.array(center))
@@ -67,11 +89,15 @@ def write_kapture(
     *,
     with_poses: bool,
     with_images: bool = True,
+    with_depth: bool = False,
     first_timestamp: int = 0,
     world_from_room: RigidTransform = IDENTITY,
 ) -> None:
-    """Write rendered images as a kapture."""
+    """Write rendered images as a kapture, with the depth of each where it is asked for."""
     data = KaptureData(sensors={"cam": Sensor.from_camera(CAMERA)})
+    if with_depth:
+        data.sensors["depth"] = Sensor.from_camera(CAMERA, sensor_type="depth")
+        data.rigs["both"] = {"cam": IDENTITY, "depth": IDENTITY}
     for timestamp, (image, pose) in enumerate(poses.items(), start=first_timestamp):
         data.records_camera[timestamp, "cam"] = image
         if with_poses:
@@ -80,10 +106,13 @@ def write_kapture(
             path = root / "sensors" / "records_data" / image
             path.parent.mkdir(parents=True, exist_ok=True)
             write_image(path, render(pose @ world_from_room))
+            if with_depth:
+                data.records_depth[timestamp, "depth"] = f"{image}.depth"
+                write_depth_map(f"{path}.depth", depth_m(pose @ world_from_room))
     write_sensors(root, data)
 
 
-def write_scene(root: Path) -> None:
+def write_scene(root: Path, *, with_depth: bool = False) -> None:
     """Write ``mapping/`` of seven images, ``query/`` of four and their poses, ``query_gt/``.
 
     The camera walks along the wall; the images are numbered in its order, 0000.jpg to 0010.jpg.
@@ -100,6 +129,6 @@ def write_scene(root: Path) -> None:
     }
     queries = {name: walk.pop(name) for name in ("0001.jpg", "0004.jpg", "0007.jpg", "0010.jpg")}
     write = partial(write_kapture, world_from_room=world_from_room)
-    write(root / "mapping", walk, with_poses=True)
-    write(root / "query", queries, with_poses=False, first_timestamp=7)
+    write(root / "mapping", walk, with_poses=True, with_depth=with_depth)
+    write(root / "query", queries, with_poses=False, with_depth=with_depth, first_timestamp=7)
     write(root / "query_gt", queries, with_poses=True, with_images=False, first_timestamp=7)
