@@ -122,12 +122,8 @@ class AslFeat:
             scores = candidates.scores[kept]
             height, width = maps.features.shape[1:]
             x, y = (xy / STRIDE).unbind(1)
-            read = read_bilinear(
-                pixel_table(maps.features),
-                y.clamp(max=height - 1),
-                x.clamp(max=width - 1),
-                (height, width),
-            )
+            # the border keeps all of them inside the features
+            read = read_bilinear(pixel_table(maps.features), y, x, (height, width))
             descriptors = functional.normalize(read, dim=1)
         # the network puts the centre of the first pixel at (0, 0), COLMAP at (0.5, 0.5), where
         # the pixels of a resized image are those of the whole one times a factor

@@ -1,4 +1,4 @@
-"""ASLFeat keypoints: hand-made score maps, and random weights under TensorFlow's names."""
+"""ASLFeat keypoints: hand-made score maps, random weights, and TensorFlow's keypoints."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ from megloc_kapture.nets.aslfeat import AslFeatMaps
 from megloc_kapture.values import LocalFeatures
 
 Image = NDArray[np.uint8]
-VARIABLES = Path(__file__).parent.parent / "nets" / "keys" / "aslfeat.txt"
+NETS = Path(__file__).parent.parent / "nets"
+VARIABLES = NETS / "keys" / "aslfeat.txt"
+TENSORFLOW = NETS / "data" / "aslfeat"  # what make_reference.py of it has written
 
 
 @pytest.fixture(scope="module")
@@ -192,6 +194,22 @@ def test_several_scales_add_keypoints(checkpoint: Path) -> None:
     assert {tuple(row) for row in one.keypoints_px.tolist()} <= known
     assert (np.diff(several.scores) <= 0).all()
     assert several.keypoints_px[:, 0].max() < 400 and several.keypoints_px[:, 1].max() < 300
+
+
+@pytest.mark.parametrize("image", ["even", "odd"])
+def test_keypoints_are_tensorflows(image: str) -> None:
+    outputs = np.load(TENSORFLOW / "reference.npz")
+    gray = outputs[f"{image}/image"]
+    found = with_options(TENSORFLOW / "aslfeat.tar.gz").extract(np.repeat(gray[..., None], 3, 2))
+    assert len(found.scores) > 40
+    # the published network puts the first pixel's centre at (0, 0)
+    np.testing.assert_allclose(
+        found.keypoints_px[:, :2] - 0.5, outputs[f"{image}/keypoints"], rtol=0, atol=1e-4
+    )
+    np.testing.assert_allclose(found.scores, outputs[f"{image}/scores"], rtol=0, atol=1e-5)
+    np.testing.assert_allclose(
+        found.descriptors, outputs[f"{image}/descriptors"], rtol=0, atol=1e-5
+    )
 
 
 # 0.3 of the size, and of the longer side 128 pixels, is the smallest; each level is 1/sqrt(2)

@@ -1,26 +1,30 @@
-"""DeepLabV3+: keys, sizes, the head's parts, and a checkpoint that does not fit."""
+"""DeepLabV3+: logits of the published network, keys, sizes, a checkpoint that does not fit."""
 
 from __future__ import annotations
 
+import runpy
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
-from torch import nn
 from torch.nn import functional as F
+from transformers import MobileViTConfig
+from transformers.models.mobilevit.modeling_mobilevit import MobileViTASPP
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.nets.deeplabv3plus import (
     AtrousPyramid,
     Backbone,
     DeepLabV3Plus,
-    Head,
     backbone_of,
     most_likely,
 )
 from megloc_kapture.nets.loading import load_strictly
 
 KEYS = Path(__file__).parent / "keys"
+PUBLISHED = Path(__file__).parent / "data" / "deeplabv3plus"
+random_state = runpy.run_path(str(PUBLISHED / "make_reference.py"))["random_state"]
 
 
 def frozen_keys(backbone: Backbone) -> dict[str, tuple[int, ...]]:
@@ -28,10 +32,6 @@ def frozen_keys(backbone: Backbone) -> dict[str, tuple[int, ...]]:
     rows = (KEYS / f"deeplabv3plus-{backbone}.txt").read_text().splitlines()
     pairs = (row.split() for row in rows)
     return {key: () if s == "scalar" else tuple(map(int, s.split("x"))) for key, s in pairs}
-
-
-def after_first(layers: nn.Sequential) -> nn.Sequential:
-    return nn.Sequential(*list(layers)[1:])
 
 
 @pytest.mark.parametrize(
@@ -70,6 +70,49 @@ def test_a_checkpoint_goes_in_whole_or_not_at_all() -> None:
         backbone_of(["conv1a.weight"], "w.pth")
 
 
+@pytest.mark.parametrize("backbone", ["resnet101", "mobilenet"])
+def test_logits_and_classes_are_the_authors(backbone: Backbone) -> None:
+    outputs = np.load(PUBLISHED / "reference.npz")
+    with torch.device("meta"):
+        network = DeepLabV3Plus(backbone, num_classes=19)
+    network.load_state_dict(random_state(frozen_keys(backbone)), strict=True, assign=True)
+    image = torch.from_numpy(outputs["image"]).permute(2, 0, 1)
+    with torch.inference_mode():
+        logits = network.eval()(image[None] / 255)[0]
+    expected = torch.from_numpy(outputs[f"{backbone}/logits"])
+    scatter = float(expected.std(dim=(1, 2)).mean())  # among the pixels of a class
+    assert scatter > 0.05
+    torch.testing.assert_close(logits, expected, rtol=0, atol=1e-4 * scatter)
+    classes = most_likely(logits, *image.shape[1:]).numpy()
+    assert len(np.unique(classes)) > 5
+    assert (classes != outputs[f"{backbone}/classes"]).mean() < 1e-3  # but for ties
+
+
+@pytest.mark.parametrize("size", [(23, 40), (1, 1)])
+def test_the_pyramid_is_transformers_pyramid(size: tuple[int, int]) -> None:
+    config = MobileViTConfig(
+        neck_hidden_sizes=[8, 16, 8], aspp_out_channels=256, atrous_rates=[6, 12, 18]
+    )
+    theirs = MobileViTASPP(config).eval()
+    ours = AtrousPyramid(16).eval()
+    shapes = {key: tuple(value.shape) for key, value in ours.state_dict().items()}
+    state = random_state(shapes)
+    load_strictly(ours, state, "random")
+    kinds = {"0": "convolution", "1": "normalization"}
+    renamed = {}
+    for key, value in state.items():
+        *branch, layer, word = key.split(".")
+        if branch == ["convs", "4"]:  # behind the pooling, which is layer 0
+            branch, layer = [*branch, "conv_1x1"], str(int(layer) - 1)
+        renamed[".".join([*branch, kinds[layer], word])] = value
+    theirs.load_state_dict(renamed, strict=True)
+    x = torch.randn(2, 16, *size, generator=torch.Generator().manual_seed(0))
+    with torch.inference_mode():
+        found, expected = ours(x), theirs(x)
+    assert expected.std() > 0.1
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
+
+
 @pytest.mark.parametrize("size", [(64, 96), (65, 97), (33, 131)])
 @pytest.mark.parametrize("backbone", ["resnet101", "mobilenet"])
 def test_logits_stand_at_a_quarter_of_any_size(backbone: Backbone, size: tuple[int, int]) -> None:
@@ -81,50 +124,6 @@ def test_logits_stand_at_a_quarter_of_any_size(backbone: Backbone, size: tuple[i
     expected = [(length - lost + 3) // 4 for length in size]
     assert logits.shape == (1, 19, *expected)
     assert torch.isfinite(logits).all()
-
-
-def test_the_pyramid_works_where_there_is_one_place() -> None:
-    torch.manual_seed(0)
-    pyramid = AtrousPyramid(8).eval()
-    x = torch.randn(1, 8, 1, 1)
-    with torch.inference_mode():
-        found = pyramid(x)
-        # one place: a dilated kernel sees it with its middle alone, and it is its own mean
-        middles = [
-            after_first(branch)(F.conv2d(x, branch[0].weight[:, :, 1:2, 1:2]))
-            for branch in pyramid.convs[1:4]
-        ]
-        pooled = after_first(pyramid.convs[4])(x)
-        everything = torch.cat([pyramid.convs[0](x), *middles, pooled], dim=1)
-        torch.testing.assert_close(found, pyramid.project(everything))
-    assert found.shape == (1, 256, 1, 1)
-
-
-def test_the_pyramids_pooling_is_the_mean_everywhere() -> None:
-    torch.manual_seed(0)
-    pooling = AtrousPyramid(8).eval().convs[4]
-    x = torch.randn(1, 8, 5, 7)
-    with torch.inference_mode():
-        found = pooling(x)
-        value = after_first(pooling)(x.mean(dim=(2, 3), keepdim=True))
-        # the published network scales the one value bilinearly
-        scaled = F.interpolate(value, size=(5, 7), mode="bilinear", align_corners=False)
-    torch.testing.assert_close(found, scaled)
-
-
-def test_the_heads_low_level_features_come_first() -> None:
-    torch.manual_seed(0)
-    head = Head(8, 6, 3).eval()
-    first: nn.Conv2d = head.classifier[0]
-    with torch.no_grad():
-        first.weight[:, 48:] = 0.0  # blind to the pyramid
-    low_level = torch.randn(1, 6, 9, 11)
-    with torch.inference_mode():
-        one = head(low_level, torch.randn(1, 8, 3, 3))
-        other = head(low_level, torch.randn(1, 8, 3, 3))
-        elsewhere = head(torch.randn(1, 6, 9, 11), torch.randn(1, 8, 3, 3))
-    torch.testing.assert_close(one, other)
-    assert not torch.allclose(one, elsewhere)
 
 
 @pytest.mark.parametrize("size", [(40, 60), (37, 53), (9, 200)])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import pickle
+import runpy
 from pathlib import Path
 
 import cv2
@@ -14,6 +15,9 @@ import torch
 from megloc_kapture.errors import DataError
 from megloc_kapture.nets.deeplabv3plus import Backbone, DeepLabV3Plus
 from megloc_kapture.preprocessing.deeplab import DeepLab, DeepLabOptions
+
+# what make_reference.py of it has written
+PUBLISHED = Path(__file__).parent.parent / "nets" / "data" / "deeplabv3plus"
 
 
 def smooth_noise() -> np.ndarray:
@@ -50,19 +54,17 @@ def deeplab(weights: Path, **options: object) -> DeepLab:
     return DeepLab(DeepLabOptions(weights=str(weights), device="cpu", **options))
 
 
-def test_labels_are_the_networks_at_the_images_size(weights: Path, photograph: np.ndarray) -> None:
-    labels = deeplab(weights).segment(photograph)
-    assert labels.shape == (123, 171) and labels.dtype == np.uint8
+def test_labels_are_the_published_networks_at_the_images_size(tmp_path: Path) -> None:
+    with torch.device("meta"):
+        network = DeepLabV3Plus("mobilenet", num_classes=19)
+    shapes = {key: tuple(value.shape) for key, value in network.state_dict().items()}
+    state = runpy.run_path(str(PUBLISHED / "make_reference.py"))["random_state"](shapes)
+    torch.save({"model_state": state, "best_score": 0.7}, tmp_path / "published.pth")
+    reference = np.load(PUBLISHED / "reference.npz")
+    labels = deeplab(tmp_path / "published.pth").segment(reference["image"])
+    assert labels.shape == reference["image"].shape[:2] and labels.dtype == np.uint8
     assert len(np.unique(labels)) > 3
-    # the same by the steps that the publication describes
-    network = DeepLabV3Plus("mobilenet", num_classes=19).eval()
-    network.load_state_dict(torch.load(weights, weights_only=True)["model_state"])
-    with torch.inference_mode():
-        small = network(torch.from_numpy(photograph).permute(2, 0, 1)[None].float() / 255)
-        large = torch.nn.functional.interpolate(
-            small, size=(123, 171), mode="bilinear", align_corners=False
-        )
-    assert np.array_equal(labels, large[0].argmax(0).numpy())
+    assert (labels != reference["mobilenet/classes"]).mean() < 1e-3  # but for ties
 
 
 def test_the_backbone_is_read_from_the_checkpoint(tmp_path: Path, photograph: np.ndarray) -> None:
