@@ -102,6 +102,73 @@ def test_the_foreign_map(megloc: Any, shared_data: Path, tmp_path: Path) -> None
     assert all(s.status == "localized" and s.num_inliers > 50 for s in statuses.values())
 
 
+@pytest.mark.parametrize("preset", ["modern", "megloc"])
+def test_the_foreign_map_needs_no_weights_of_ours(
+    megloc: Any, shared_data: Path, tmp_path: Path, preset: str
+) -> None:
+    """It brings its own R2D2 and AP-GeM, and so do its queries."""
+    place = shared_data / "foreign_maps" / "virtual_gallery"
+    result = tmp_path / "localized"
+    places = ("-i", place / "map", "--query", place / "query", "-o", result)
+    done = megloc("localize", *places, "--preset", preset)
+    assert done.out.startswith("4 of 4 queries localized in ")
+    assert "localizing with r2d2_500" in done.err
+    _, median_m, median_deg = medians(result, place / "query_gt")
+    assert median_m <= 0.010 and median_deg <= 0.16
+    # what could not be done is said: pairs with few matches would be extracted again
+    remarks = {status.remarks for status in read_status(result / "status.csv").values()}
+    if preset == "megloc":
+        assert remarks == {
+            "guided pyramid matching: the weights that extract r2d2_500 are missing "
+            "(megloc weights list)"
+        }
+        assert "left out of 4 queries: guided pyramid matching" in done.err
+    else:
+        assert remarks == {""}
+    # who asks for it by name is refused instead
+    refused = megloc("localize", *places, "-f", "--set", "guided_pyramid.mode=all")
+    refused.refused("--set guided_pyramid changes nothing: the weights that extract r2d2_500")
+
+
+def test_proxy_folders_of_kapture_localization(
+    megloc: Any, shared_data: Path, tmp_path: Path
+) -> None:
+    """Its normal intermediate: a kapture folder whose parts are links."""
+    symlink = pytest.importorskip("kapture_localization.utils.symlink")
+    place = shared_data / "foreign_maps" / "virtual_gallery"
+    for part in ("map", "query"):
+        data = place / part / "reconstruction"
+        symlink.create_kapture_proxy(
+            str(tmp_path / part),
+            str(place / part),
+            [str(data / "keypoints" / "r2d2_500")],
+            [str(data / "descriptors" / "r2d2_500")],
+            [str(data / "global_features" / "AP-GeM-LM18")],
+            None,
+            ["r2d2_500"],
+            ["r2d2_500"],
+            ["AP-GeM-LM18"],
+            force=True,
+        )
+    for points in ("points3d.txt", "observations.txt"):
+        link = tmp_path / "map" / "reconstruction" / points
+        link.symlink_to((place / "map" / "reconstruction" / points).resolve())
+    places = ("-i", tmp_path / "map", "--query", tmp_path / "query", "-o", tmp_path / "localized")
+    # links lead only where the user lets them
+    megloc("localize", *places).refused("lies behind a link that leaves .*--allow-links-below")
+    elsewhere = ("--allow-links-below", tmp_path)
+    megloc("localize", *places, *elsewhere).refused("lies behind a link that leaves")
+    allowed = ("--allow-links-below", place)
+    done = megloc("localize", *places, *allowed)
+    assert done.out.startswith("4 of 4"), done
+    as_it_is = ("-i", place / "map", "--query", place / "query", "-o", tmp_path / "expected")
+    assert megloc("localize", *as_it_is).status == 0
+    for name in ("status.csv", "sensors/trajectories.txt"):
+        expected = (tmp_path / "expected" / name).read_bytes()
+        assert (tmp_path / "localized" / name).read_bytes() == expected
+    assert described(megloc("info", tmp_path / "map", *allowed).out)["points"] == "630"
+
+
 def test_without_output_it_goes_to_localized(
     megloc: Any, shared_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -131,8 +198,10 @@ def test_given_pairs_take_the_place_of_retrieval(megloc: Any, gallery: Path) -> 
     ]
     write_pairs(gallery / "pairs.txt", pairs)
     places = ["-i", gallery / "map", "--query", gallery / "query", "-o", gallery / "localized"]
-    # of a longer list than retrieval would give nothing may be cut off
-    options = ["--pairs", gallery / "pairs.txt", "--set", "query_pairs.top_k=1"]
+    options = ["--pairs", gallery / "pairs.txt"]
+    megloc("localize", *places, *options, "--set", "query_pairs.top_k=1").refused(
+        "--set query_pairs changes nothing: --pairs gives the candidates"
+    )
     assert megloc("localize", *places, *options).status == 0
     statuses = read_status(gallery / "localized" / "status.csv")
     assert statuses[names[0]].reason == "no map image is a candidate"
