@@ -44,7 +44,7 @@ venv: $(STAMP)
 
 eval: $(STAMP)
 	@$(BIN)/megloc eval '$(DATASET)' $(if $(ROOT),--root '$(ROOT)') $(if $(PRESET),--preset '$(PRESET)') \
-		$(if $(WORKSPACE),--workspace '$(WORKSPACE)') $(ARGS)
+		$(if $(WORKSPACE),--workspace '$(WORKSPACE)') --submissions submissions $(ARGS)
 
 # a file's tests share their fixtures, so they stay together
 PYTEST = $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile

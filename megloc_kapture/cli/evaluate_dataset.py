@@ -31,6 +31,7 @@ from megloc_kapture.pipeline.executors import available_cores, open_executor, si
 from megloc_kapture.pipeline.plan import Stage, StageReport, all_kept, run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.run import EVALUATION, LOCALIZED, Run
+from megloc_kapture.pipeline.submissions_folder import FOLDER, keep_submission
 from megloc_kapture.pipeline.workspace import Workspace
 
 BELOW_RECALL = 3
@@ -49,6 +50,9 @@ class Eval(Choosing, Working, Common):
     """Go on with what is there of a partial download."""
     workspace: Annotated[Path | None, tyro.conf.arg(aliases=["-w"])] = None
     """Where everything is kept; runs/DATASET-PRESET unless given."""
+    submissions: Path | None = None
+    """Folder that gets a copy of the pose file and its provenance, and overwrites none of another
+    result; submissions/ unless --workspace is given."""
     config: Path | None = None
     """A benchmark file (TOML) with this dataset's options, instead of the one that we bring."""
     thresholds: tuple[str, ...] = ()
@@ -99,6 +103,7 @@ class Eval(Choosing, Working, Common):
         self._check_judging(choice)
         self._check_ablation(choice)
         place = self.workspace or Path("runs") / f"{self.dataset}-{preset}"
+        submissions = self.submissions or (None if self.workspace else Path(FOLDER))
         workspace = Workspace(place, force=self.force)
         with (
             workspace.lock(),
@@ -131,9 +136,14 @@ class Eval(Choosing, Working, Common):
             return 0
         if all_kept(reports):
             console.say("nothing to do: every stage is up to date")
-        if not any(report.name == "evaluation" for report in reports):
-            return 0
-        return self._conclude(console, workspace, run.submission_below(workspace.root), benchmark)
+        done = {report.name for report in reports}
+        status = self._conclude(console, workspace, benchmark) if "evaluation" in done else 0
+        if "submission" in done:
+            self._hand_in(console, run.submission_below(workspace.root), submissions)
+        report = workspace.path(EVALUATION) / REPORT_HTML
+        if "evaluation" in done and report.is_file():
+            console.result(f"report     {shown(report)}")
+        return status
 
     def _ablate(self, console: Console, run: Run, stages: Sequence[Stage]) -> None:
         outcomes = [outcome("all steps", run.workspace, stages)]
@@ -172,9 +182,18 @@ class Eval(Choosing, Working, Common):
         if not choice.has_truth():
             raise OptionError(f"--fail-below needs true poses: {choice.root}/query_gt is missing")
 
-    def _conclude(
-        self, console: Console, workspace: Workspace, pose_file: Path, benchmark: BenchmarkFile
-    ) -> int:
+    def _hand_in(self, console: Console, pose_file: Path, submissions: Path | None) -> None:
+        """Say where the pose file is, and put it among the others where that is wanted."""
+        if submissions is not None:
+            kept = keep_submission(pose_file, submissions)
+            if kept.name != pose_file.name:
+                console.say(
+                    f"{shown(submissions / pose_file.name)} is of another result and stays as it is"
+                )
+            pose_file = kept
+        console.result(f"pose file  {shown(pose_file)}")
+
+    def _conclude(self, console: Console, workspace: Workspace, benchmark: BenchmarkFile) -> int:
         evaluation = workspace.path(EVALUATION)
         statuses = read_status(workspace.path(LOCALIZED) / STATUS_FILE)
         if statuses and all(status.status == "failed" for status in statuses.values()):
@@ -185,9 +204,6 @@ class Eval(Choosing, Working, Common):
             console.result((evaluation / AGREEMENT_TEXT).read_text(encoding="utf-8"))
         for text in published_results(benchmark):
             console.result(text)
-        console.result(f"pose file  {shown(pose_file)}")
-        if (evaluation / REPORT_HTML).is_file():
-            console.result(f"report     {shown(evaluation / REPORT_HTML)}")
         if self.fail_below is not None:
             return self._judge(console, evaluation)
         return 0

@@ -18,6 +18,7 @@ from megloc_kapture.datasets.aachen_layout import (
     NUM_DAY,
     NUM_NIGHT,
     NUM_SEQUENCES,
+    POSE_FILE_STEMS,
     SEQUENCES_FOLDER,
     Layout,
     Version,
@@ -147,7 +148,9 @@ class Aachen:
             links=links,
             groups={query.name: ImageGroup(condition=query.condition) for query in queries},
             names=_pose_file_names(queries, layout),
-            protocol=protocol_of(self.name),
+            protocol=protocol_of(self.name).model_copy(
+                update={"pose_file_stem": POSE_FILE_STEMS[version]}
+            ),
             summary=_summary(version, mapping, queries),
             remarks=self._remarks(layout, version, mapping, left_out),
             missing=missing,

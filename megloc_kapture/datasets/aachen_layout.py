@@ -18,6 +18,8 @@ NUM_DAY = 824
 NUM_NIGHT = {"1.0": 98, "1.1": 191}
 # of v1.1's map images and night queries together
 NUM_CAMERAS = 5234
+# the names by which visuallocalization.net tells the versions' pose files apart
+POSE_FILE_STEMS = {"1.0": "Aachen", "1.1": "Aachen_v1_1"}
 
 DATABASE_FOLDER, SEQUENCES_FOLDER, QUERY_FOLDER = "db", "sequences", "query"
 # v1.1's night list stands in the place of v1.0's and has these beside the old ones

@@ -21,6 +21,7 @@ _PROTOCOLS = {
     for protocol in (
         Protocol(
             dataset="aachen",
+            pose_file_stem="Aachen_v1_1",
             thresholds=_LTVL_THRESHOLDS,
             pose_file_names="basename",
             truth=f"{_KEPT_BY_LTVL}.",
@@ -28,6 +29,7 @@ _PROTOCOLS = {
         ),
         Protocol(
             dataset="robotcar",
+            pose_file_stem="RobotCar",
             thresholds=_LTVL_THRESHOLDS,
             truth=f"{_KEPT_BY_LTVL}. RobotCar Seasons v2 publishes those of its training images.",
             conditions=(*_DAY, *_NIGHT),
@@ -35,6 +37,7 @@ _PROTOCOLS = {
         ),
         Protocol(
             dataset="4seasons",
+            pose_file_stem="4Seasons",
             thresholds=((0.1, None), (0.2, None), (0.5, None)),
             pose_file="mlad",
             truth=(
@@ -45,6 +48,7 @@ _PROTOCOLS = {
         ),
         Protocol(
             dataset="inloc",
+            pose_file_stem="InLoc",
             thresholds=((0.25, 10.0), (0.5, 10.0), (1.0, 10.0)),
             pose_file_names="basename",
             truth=f"{_KEPT_BY_LTVL}.",

@@ -128,6 +128,8 @@ class Protocol(Options):
         file per relocalization file with poses relative to reference keyframes.
     pose_file_names : how an image is called in the pose file: its whole path, or its last part;
         ``names.csv`` overrules it.
+    pose_file_stem : what the pose file's own name begins with by the server's convention,
+        ``STEM_eval_METHOD.txt``; empty where there is none, and ``dataset`` stands there.
     truth : who knows the true poses of the queries, where they are not published.
     conditions : in the order they are reported; conditions not listed follow, sorted.
     pools : name -> conditions that are pooled under it, as "day" pools dawn and noon.
@@ -142,6 +144,7 @@ class Protocol(Options):
     )
     pose_file: PoseFileFormat = "ltvl"
     pose_file_names: PoseFileNames = "full"
+    pose_file_stem: str = Field(default="", pattern=r"^([A-Za-z0-9][A-Za-z0-9_.-]*)?$")
     truth: str = ""
     conditions: tuple[str, ...] = ()
     pools: dict[str, tuple[str, ...]] = Field(default_factory=dict)

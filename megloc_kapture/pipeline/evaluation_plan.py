@@ -101,7 +101,7 @@ def plan_evaluation(run: Run) -> list[Stage]:
         *(_refinement_stages(run, dump) if options.pose_refinement.refines() else ()),
         Stage(
             "submission",
-            2,
+            3,
             {"dataset": run.dataset, "preset": run.preset, "options": dump},
             ("import", last),
             (SUBMISSIONS,),

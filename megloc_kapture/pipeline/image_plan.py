@@ -69,7 +69,7 @@ def _dataset_stages(run: Run, hashes: FileHashes) -> list[Stage]:
             Stage("render", 1, source.render_options(), (), ("world",), render),
             Stage(
                 "import",
-                2,
+                3,
                 settings,
                 ("render",),
                 outputs,
@@ -85,7 +85,7 @@ def _dataset_stages(run: Run, hashes: FileHashes) -> list[Stage]:
     return [
         Stage(
             "import",
-            2,
+            3,
             settings,
             (),
             outputs,

@@ -10,7 +10,7 @@ from megloc_kapture.datasets.kapture_folders import MAPPING, QUERY, QUERY_GT
 from megloc_kapture.datasets.official import REFERENCE
 from megloc_kapture.io.side_tables import SIDE_TABLES, read_protocol
 from megloc_kapture.pipeline.benchmarks import BenchmarkFile
-from megloc_kapture.pipeline.datasets import DatasetChoice
+from megloc_kapture.pipeline.datasets import TWIN_PREFIX, DatasetChoice
 from megloc_kapture.pipeline.options import PipelineOptions
 from megloc_kapture.pipeline.submission import place_of
 from megloc_kapture.pipeline.workspace import Workspace
@@ -110,10 +110,16 @@ class Run:
         return self.source.name
 
     def submission_below(self, folder: Path) -> Path:
-        """Where, below ``folder``, the pose file stands; a folder where it is several files."""
+        """Where, below ``folder``, the pose file stands; a folder where it is several files.
+
+        Its name is the server's, ``Aachen_v1_1_eval_METHOD.txt``. That of a rendered twin begins
+        with ``synthetic-``: there is no server for it.
+        """
         protocol = read_protocol(self.workspace.path(SIDE_TABLES))
-        stem = f"{self.dataset}_eval_megloc-{self.preset}"
-        return place_of(folder / SUBMISSIONS, stem, protocol)
+        stem = self.dataset
+        if protocol.pose_file_stem and not stem.startswith(TWIN_PREFIX):
+            stem = protocol.pose_file_stem
+        return place_of(folder / SUBMISSIONS, f"{stem}_eval_megloc-{self.preset}", protocol)
 
     def restrictions(self) -> Restrictions:
         """What the dataset's side tables permit."""

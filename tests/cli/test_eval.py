@@ -85,6 +85,43 @@ def lasting(found: dict[str, bytes], *but: str) -> dict[str, bytes]:
 # ------------------------------------------------------------------ what is there at the end
 
 
+def test_the_pose_file_of_each_result_is_among_the_submissions(
+    megloc: Any, scene: Path, workspace: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (workspace.parent / "runs").mkdir()
+    run = workspace.rename(workspace.parent / "runs" / "kapture-classic")
+    monkeypatch.chdir(workspace.parent)
+    command = ("eval", "kapture", "--root", scene, "--executor", "inline")
+    same = ("--set", "local_features.options.max_keypoints=800")
+    other = (*same, "--set", "localization.pose.max_error_px=6")
+    first, second = Path(POSES), Path(POSES.replace(".txt", "-2.txt"))
+    done = megloc(*command, *same)
+    assert "nothing to do" in done.err and f"pose file  {first}\n" in done.out
+    poses = first.read_bytes()
+    assert poses == (run / POSES).read_bytes()
+    assert Path(f"{POSES}.json").read_bytes() == (run / f"{POSES}.json").read_bytes()
+    done = megloc(*command, *other)
+    assert f"{first} is of another result and stays as it is" in done.err
+    assert f"pose file  {second}\n" in done.out
+    assert first.read_bytes() == poses != second.read_bytes() == (run / POSES).read_bytes()
+    # back again, and into a folder of one's own
+    assert f"pose file  {first}\n" in megloc(*command, *same).out
+    assert len(list(Path("submissions").iterdir())) == 4
+    done = megloc(*command, *same, "--workspace", run, "--submissions", "mine")
+    assert done.out.splitlines()[-2] == f"pose file  {Path('mine') / first.name}"
+    (run / POSES).unlink()
+    assert megloc(*command, *same, "--workspace", run).status == 0  # nobody asked for a copy
+
+
+def test_until_the_submission_the_pose_file_is_said(
+    evaluate: Any, scene: Path, workspace: Path
+) -> None:
+    folder = workspace.parent / "kept"
+    done = evaluate(scene, workspace, "--until", "submission", "--submissions", folder)
+    assert done.out == f"pose file  {folder / Path(POSES).name}\n"
+    assert not done.err.count("evaluation")
+
+
 def test_the_workspace_has_what_is_promised(finished: Path) -> None:
     for place in (
         *("mapping", "query", "query_gt", "megloc/protocol.json", "map", "localized"),

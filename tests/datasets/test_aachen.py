@@ -221,6 +221,9 @@ def test_side_tables(root11: Path, tmp_path: Path) -> None:
     assert protocol.conditions == ("day", "night")
     assert (protocol.pose_file, protocol.pose_file_names) == ("ltvl", "basename")
     assert "visuallocalization.net" in protocol.truth
+    # both models are there: the version that is read is the version that is handed in
+    assert protocol.pose_file_stem == "Aachen_v1_1"
+    assert read(root11, version="1.0").protocol.pose_file_stem == "Aachen"
     assert not (tables / "priors.csv").exists()
 
 

@@ -12,11 +12,13 @@ from typing import Any
 import kapture
 import numpy as np
 import pytest
+from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.evaluation.mlad_file import read_mlad_file
 from megloc_kapture.evaluation.pose_file import read_pose_file
+from megloc_kapture.evaluation.protocols import protocol_of
 from megloc_kapture.io.challenge_tables import (
     RelocalizationPair,
     write_names,
@@ -34,7 +36,10 @@ from megloc_kapture.io.side_tables import (
     write_world,
 )
 from megloc_kapture.io.status_table import QueryStatus, write_status
+from megloc_kapture.pipeline.datasets import DatasetChoice
 from megloc_kapture.pipeline.manifests import Manifest
+from megloc_kapture.pipeline.options import PipelineOptions
+from megloc_kapture.pipeline.run import Run
 from megloc_kapture.pipeline.submission import (
     check_dataset,
     place_of,
@@ -42,6 +47,7 @@ from megloc_kapture.pipeline.submission import (
     workspace_provenance,
     write_submission,
 )
+from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.values import Camera, RigidTransform
 
 CAMERA = Sensor.from_camera(Camera("PINHOLE", 640, 480, (500, 500, 320, 240)))
@@ -447,6 +453,36 @@ def test_rules_that_are_nowhere() -> None:
 def test_places(tmp_path: Path) -> None:
     assert place_of(tmp_path, "x_1.1", Protocol()) == tmp_path / "x_1.1.txt"
     assert place_of(tmp_path, "x_1.1", Protocol(pose_file="mlad")) == tmp_path / "x_1.1"
+
+
+@pytest.mark.parametrize(
+    ("name", "stem"),
+    [
+        ("aachen", "Aachen_v1_1"),
+        ("robotcar", "RobotCar"),
+        ("inloc", "InLoc"),
+        ("4seasons", "4Seasons"),
+        ("kapture", "kapture"),
+        # what no server takes says so
+        ("synthetic", "synthetic"),
+        ("synthetic-aachen", "synthetic-aachen"),
+        ("synthetic-4seasons", "synthetic-4seasons"),
+    ],
+)
+def test_a_run_calls_its_pose_file_as_the_server_does(name: str, stem: str, tmp_path: Path) -> None:
+    workspace = Workspace(tmp_path / "workspace")
+    rules = protocol_of(name.removeprefix("synthetic-") if name != "synthetic" else name)
+    write_protocol(workspace.path("megloc"), rules)
+    run = Run(DatasetChoice(name, None), "classic", PipelineOptions(), workspace)
+    end = "" if rules.pose_file == "mlad" else ".txt"
+    expected = tmp_path / "submissions" / f"{stem}_eval_megloc-classic{end}"
+    assert run.submission_below(tmp_path) == expected
+
+
+@pytest.mark.parametrize("stem", ["../x", "a/b", ".x", "a b", "a\n"])
+def test_a_pose_file_lies_nowhere_else(stem: str) -> None:
+    with pytest.raises(ValidationError, match="pose_file_stem"):
+        Protocol(pose_file_stem=stem)
 
 
 def test_ltvl_poses_are_kaptures_own(dataset: Dataset, tmp_path: Path) -> None:

@@ -1,0 +1,116 @@
+"""Pose files of several runs in one folder: none is overwritten, the same is not kept twice."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.evaluation.provenance import write_provenance
+from megloc_kapture.pipeline.submissions_folder import keep_submission
+
+NAME = "Aachen_v1_1_eval_megloc-classic"
+
+
+def pose_file(run: Path, text: str, **provenance: str) -> Path:
+    place = run / "submissions" / f"{NAME}.txt"
+    place.parent.mkdir(parents=True, exist_ok=True)
+    place.write_text(text)
+    write_provenance(place, provenance, counts={})
+    return place
+
+
+def pose_files(run: Path, texts: dict[str, str]) -> Path:
+    place = run / "submissions" / "4Seasons_eval_megloc-1.5"
+    place.mkdir(parents=True)
+    for name, text in texts.items():
+        (place / name).write_text(text)
+    write_provenance(place, {}, counts={}, files=list(texts))
+    return place
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def test_a_pose_file_and_its_provenance_are_copied(tmp_path: Path) -> None:
+    place = pose_file(tmp_path / "run", "a 1 0 0 0 0 0 0\n")
+    kept = keep_submission(place, tmp_path / "kept")
+    assert kept == tmp_path / "kept" / f"{NAME}.txt"
+    assert contents(kept.parent) == contents(place.parent)
+
+
+def test_other_poses_of_the_name_stand_beside_the_old_ones(tmp_path: Path) -> None:
+    folder = tmp_path / "kept"
+    for number, text in enumerate(("first\n", "second\n", "third\n"), start=1):
+        keep_submission(pose_file(tmp_path / str(number), text, preset=text), folder)
+    names = (f"{NAME}.txt", f"{NAME}-2.txt", f"{NAME}-3.txt")
+    assert [(folder / name).read_text() for name in names] == ["first\n", "second\n", "third\n"]
+    for name, text in zip(names, ("first\n", "second\n", "third\n"), strict=True):
+        told = json.loads((folder / f"{name}.json").read_text())
+        assert list(told["files"]) == [name] and told["preset"] == text
+
+
+def test_the_same_poses_are_found_again_under_whatever_name(tmp_path: Path) -> None:
+    folder = tmp_path / "kept"
+    places = [pose_file(tmp_path / text, text) for text in ("first", "second")]
+    kept = [keep_submission(place, folder) for place in places]
+    before = contents(folder)
+    assert [keep_submission(place, folder) for place in reversed(places)] == kept[::-1]
+    # their provenance is that of the run that made them first
+    again = pose_file(tmp_path / "again", "second", preset="another")
+    assert keep_submission(again, folder) == kept[1]
+    assert contents(folder) == before
+
+
+def test_a_challenge_of_several_files_is_a_folder(tmp_path: Path) -> None:
+    folder = tmp_path / "kept"
+    first = pose_files(tmp_path / "1", {"a.txt": "1 2\n", "b.txt": "3 4\n"})
+    other = pose_files(tmp_path / "2", {"a.txt": "1 2\n", "b.txt": "5 6\n"})
+    fewer = pose_files(tmp_path / "3", {"a.txt": "1 2\n"})
+    names = [keep_submission(place, folder).name for place in (first, other, fewer, first)]
+    assert names == [f"4Seasons_eval_megloc-1.5{end}" for end in ("", "-2", "-3", "")]
+    for place, name in zip((first, other, fewer), names, strict=False):
+        assert contents(folder / name) == contents(place)
+        assert (folder / f"{name}.json").read_bytes() == Path(f"{place}.json").read_bytes()
+
+
+def test_what_a_killed_run_left_is_completed(tmp_path: Path) -> None:
+    place = pose_files(tmp_path / "run", {"a.txt": "1 2\n", "b.txt": "3 4\n"})
+    kept = tmp_path / "kept" / place.name
+    kept.mkdir(parents=True)
+    (kept / "a.txt").write_text("1 2\n")
+    assert keep_submission(place, kept.parent) == kept
+    assert contents(kept.parent) == contents(place.parent)
+
+
+def test_what_is_no_pose_file_is_left_alone(tmp_path: Path) -> None:
+    folder = tmp_path / "kept"
+    (folder / f"{NAME}.txt" / "deep").mkdir(parents=True)
+    (folder / f"{NAME}-2.txt").symlink_to(tmp_path / "nowhere")
+    kept = keep_submission(pose_file(tmp_path / "run", "a\n"), folder)
+    assert kept.name == f"{NAME}-3.txt"
+    assert not (tmp_path / "nowhere").exists()
+
+
+def test_a_provenance_without_its_poses_is_replaced(tmp_path: Path) -> None:
+    folder = tmp_path / "kept"
+    keep_submission(pose_file(tmp_path / "old", "old\n"), folder).unlink()
+    place = pose_file(tmp_path / "new", "new\n")
+    keep_submission(place, folder)
+    assert contents(folder) == contents(place.parent)
+
+
+@pytest.mark.parametrize("gone", [f"{NAME}.txt", f"{NAME}.txt.json"])
+def test_a_lost_pose_file_is_said_to_be_lost(tmp_path: Path, gone: str) -> None:
+    place = pose_file(tmp_path / "run", "a\n")
+    (place.parent / gone).unlink()
+    with pytest.raises(DataError, match="--from submission"):
+        keep_submission(place, tmp_path / "kept")
+    assert not (tmp_path / "kept").exists()
