@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import Field, field_validator
 
+from megloc_kapture.datasets.aachen_kapture import KaptureLayout, map_images, query_images
 from megloc_kapture.datasets.aachen_layout import (
     ADDITIONAL_NIGHT,
     DATABASE_FOLDER,
+    DAY,
+    NIGHT,
     NUM_CAMERAS,
     NUM_DATABASE,
     NUM_DAY,
@@ -23,8 +26,14 @@ from megloc_kapture.datasets.aachen_layout import (
     Layout,
     Version,
 )
-from megloc_kapture.datasets.aachen_model import MapImage, read_map_images, read_points
+from megloc_kapture.datasets.aachen_model import (
+    MapImage,
+    QueryImage,
+    read_map_images,
+    read_points,
+)
 from megloc_kapture.datasets.grammars.query_list import read_query_list
+from megloc_kapture.datasets.kapture_form import image_files
 from megloc_kapture.datasets.official import (
     REFERENCE,
     Count,
@@ -36,13 +45,12 @@ from megloc_kapture.datasets.official import (
     read_ground_truth,
 )
 from megloc_kapture.datasets.reference_map import write_reference_map
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.evaluation.protocols import protocol_of
 from megloc_kapture.io.kapture_store import KaptureData, Sensor
 from megloc_kapture.io.side_tables import ImageGroup, World
-from megloc_kapture.values import Camera, Options
+from megloc_kapture.values import Options
 
-DAY, NIGHT = "day", "night"
 # the first timestamp of each list; map images count from 0
 _FIRST_TIMESTAMP = {DAY: 100_000, NIGHT: 200_000}
 _WRONG_IMAGE = "db/1228.jpg"
@@ -65,16 +73,6 @@ class AachenOptions(Options):
         return str(version) if isinstance(version, float) else version
 
 
-@dataclass(frozen=True, slots=True)
-class _Query:
-    """An image of a list, and its line's number among the list's images."""
-
-    name: str
-    condition: str
-    position: int
-    camera: Camera
-
-
 class Aachen:
     """Adapter of Aachen Day-Night.
 
@@ -93,17 +91,24 @@ class Aachen:
         layout="images_upright/{db,query[,sequences]}/ (archives extracted in place), "
         "queries/{day,night}_time_queries_with_intrinsics.txt and 3D-models/ with "
         "aachen_cvpr2018_db.nvm and database_intrinsics.txt (v1.0) or "
-        "aachen_v_1_1/{cameras,images,points3D}.bin (v1.1)",
+        "aachen_v_1_1/{cameras,images,points3D}.bin (v1.1); or as kapture's downloader leaves it, "
+        "mapping/ and query/ (or query_day/ and query_night/)",
     )
 
     def __init__(self, options: AachenOptions | None = None) -> None:
         self.options = options or AachenOptions()
 
     def check(self, root: Path) -> None:
-        """Raise DataError, quickly, when ``root`` cannot be Aachen Day-Night."""
+        """Raise MeglocError, quickly, when ``root`` cannot be what is wanted of Aachen."""
+        if _kapture_of(root) is not None:
+            if self.options.reference_model:
+                raise OptionError(
+                    f"the reference model is read from the official layout, and {root} has "
+                    "kapture folders; in a kapture map megloc localize localizes"
+                )
+            return
         layout = Layout(Path(root))
-        wanted = (layout.images, layout.query_list(DAY).parent, layout.nvm.parent)
-        absent = [folder.name for folder in wanted if not folder.is_dir()]
+        absent = _absent(layout)
         if absent:
             raise DataError(
                 f"not {self.card.title}, no folder {' and '.join(absent)}; it has to lie as "
@@ -114,6 +119,11 @@ class Aachen:
 
     def input_files(self, root: Path) -> Iterator[Path]:
         """Every file an import may depend on, images included."""
+        kapture = _kapture_of(root)
+        if kapture is not None:
+            yield from kapture.input_files()
+            yield from ground_truth_files(Path(root))
+            return
         layout = Layout(Path(root))
         reference = self.options.reference_model
         version = layout.version(self.options.version)
@@ -131,44 +141,71 @@ class Aachen:
         Raises
         ------
         DataError : something is broken, or ``root`` is not the dataset; names file and line.
+        OptionError : an option that kapture folders cannot fulfil.
         """
         self.check(root)
+        kapture = _kapture_of(root)
+        if kapture is not None:
+            return self._read_kapture(kapture, Missing(Path(root)))
         layout = Layout(Path(root))
         version = layout.version(self.options.version)
         missing = Missing(layout.root)
         images = read_map_images(layout, version, missing)
         queries, left_out = _read_queries(layout, version, missing)
-        mapping, query = _mapping_data(images), _query_data(queries)
-        truth, _ = read_ground_truth(layout.root, query, World())  # the lists tell conditions
         links = {"": layout.images}
+        dataset = self._dataset(version, images, queries, layout.query_list, missing)
+        return replace(
+            dataset,
+            links=links,
+            remarks=self._remarks(layout, version, dataset.mapping, left_out),
+            write_more=partial(_write_reference, layout, version, dataset.mapping, links)
+            if self.options.reference_model
+            else None,
+        )
+
+    def _read_kapture(self, layout: KaptureLayout, missing: Missing) -> OfficialDataset:
+        version, mapping, query = layout.read(self.options.version, missing)
+        queries = query_images(query, layout.root)
+        images = map_images(mapping)
+        dataset = self._dataset(version, images, queries, lambda _: layout.root, missing)
+        return replace(
+            dataset,
+            image_files=image_files([*mapping, *query]),
+            remarks=[
+                *_about_wrong_image(dataset.mapping),
+                f"Read from kapture folders, as v{version}.",
+            ],
+        )
+
+    def _dataset(
+        self,
+        version: Version,
+        images: Mapping[int, MapImage],
+        queries: Sequence[QueryImage],
+        lists: Callable[[str], Path],
+        missing: Missing,
+    ) -> OfficialDataset:
+        """What does not depend on how the images lie."""
+        mapping, query = _mapping_data(images), _query_data(queries)
+        truth, _ = read_ground_truth(missing.root, query, World())  # the names tell conditions
         return OfficialDataset(
             mapping=mapping,
             query=query,
             query_gt=truth,
-            links=links,
             groups={query.name: ImageGroup(condition=query.condition) for query in queries},
-            names=_pose_file_names(queries, layout),
+            names=_pose_file_names(queries, lists),
             protocol=protocol_of(self.name).model_copy(
                 update={"pose_file_stem": POSE_FILE_STEMS[version]}
             ),
             summary=_summary(version, mapping, queries),
-            remarks=self._remarks(layout, version, mapping, left_out),
             missing=missing,
-            write_more=partial(_write_reference, layout, version, mapping, links)
-            if self.options.reference_model
-            else None,
         )
 
     def _remarks(
         self, layout: Layout, version: Version, mapping: KaptureData, left_out: int
     ) -> list[str]:
         """What a user should know about this import."""
-        remarks = []
-        if _WRONG_IMAGE in mapping.records_camera.values():
-            remarks.append(
-                f"{_WRONG_IMAGE} has a wrong pose in the published model; its maintainer says that "
-                "it may be dropped. It is imported as published."
-            )
+        remarks = _about_wrong_image(mapping)
         if version == "1.0" and not layout.database_intrinsics.is_file():
             remarks.append(
                 f"Without {layout.database_intrinsics.name} the map images' principal points are "
@@ -191,10 +228,32 @@ class Aachen:
         return remarks
 
 
-def _read_queries(layout: Layout, version: Version, missing: Missing) -> tuple[list[_Query], int]:
+def _kapture_of(root: Path) -> KaptureLayout | None:
+    """The kapture folders that lie in the place of the official files; None where these do."""
+    return KaptureLayout.find(root) if _absent(Layout(Path(root))) else None
+
+
+def _absent(layout: Layout) -> list[str]:
+    """Names of the official layout's folders that are not there."""
+    wanted = (layout.images, layout.query_list(DAY).parent, layout.nvm.parent)
+    return [folder.name for folder in wanted if not folder.is_dir()]
+
+
+def _about_wrong_image(mapping: KaptureData) -> list[str]:
+    if _WRONG_IMAGE not in mapping.records_camera.values():
+        return []
+    return [
+        f"{_WRONG_IMAGE} has a wrong pose in the published model; its maintainer says that it may "
+        "be dropped. It is imported as published."
+    ]
+
+
+def _read_queries(
+    layout: Layout, version: Version, missing: Missing
+) -> tuple[list[QueryImage], int]:
     """The listed queries whose images are there, day first, in the order of the lists; and how
     many of v1.1's a v1.0 leaves out."""
-    queries: list[_Query] = []
+    queries: list[QueryImage] = []
     listed: dict[str, Path] = {}
     left_out = 0
     for condition in (DAY, NIGHT):
@@ -210,7 +269,7 @@ def _read_queries(layout: Layout, version: Version, missing: Missing) -> tuple[l
             if version == "1.0" and name.startswith(ADDITIONAL_NIGHT):
                 left_out += 1
             elif missing.require(layout.images / name):
-                queries.append(_Query(name, condition, position, camera))
+                queries.append(QueryImage(name, condition, position, camera))
     return queries, left_out
 
 
@@ -224,7 +283,7 @@ def _mapping_data(images: Mapping[int, MapImage]) -> KaptureData:
     return data
 
 
-def _query_data(queries: Sequence[_Query]) -> KaptureData:
+def _query_data(queries: Sequence[QueryImage]) -> KaptureData:
     data = KaptureData()
     for query in queries:
         sensor_id = f"{query.condition}_{query.position:05d}"
@@ -234,7 +293,7 @@ def _query_data(queries: Sequence[_Query]) -> KaptureData:
     return data
 
 
-def _pose_file_names(queries: Sequence[_Query], layout: Layout) -> dict[str, str]:
+def _pose_file_names(queries: Sequence[QueryImage], lists: Callable[[str], Path]) -> dict[str, str]:
     """Last parts of the names, in the order of the lists."""
     names: dict[str, str] = {}
     taken: dict[str, str] = {}
@@ -244,12 +303,12 @@ def _pose_file_names(queries: Sequence[_Query], layout: Layout) -> dict[str, str
         if other != query.name:
             raise DataError(
                 f"{query.name} and {other} would both be {name} in the pose file",
-                path=layout.query_list(query.condition),
+                path=lists(query.condition),
             )
     return names
 
 
-def _summary(version: Version, mapping: KaptureData, queries: Sequence[_Query]) -> list[Count]:
+def _summary(version: Version, mapping: KaptureData, queries: Sequence[QueryImage]) -> list[Count]:
     folders = [name.split("/")[0] for name in mapping.records_camera.values()]
     conditions = [query.condition for query in queries]
     counts = [Count("database images", folders.count(DATABASE_FOLDER), NUM_DATABASE)]

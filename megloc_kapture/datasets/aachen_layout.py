@@ -12,6 +12,7 @@ from megloc_kapture.errors import DataError
 
 Version = Literal["1.0", "1.1"]
 
+DAY, NIGHT = "day", "night"
 NUM_DATABASE = 4328
 NUM_SEQUENCES = 2369
 NUM_DAY = 824

@@ -30,6 +30,16 @@ class MapImage:
     cam_from_world: RigidTransform
 
 
+@dataclass(frozen=True, slots=True)
+class QueryImage:
+    """A query, and its number among those of its condition, in the order of the official list."""
+
+    name: str
+    condition: str
+    position: int
+    camera: Camera
+
+
 def read_map_images(layout: Layout, version: Version, missing: Missing) -> dict[int, MapImage]:
     """The images of a version's model that are on disk, by their positions in the model.
 

@@ -125,6 +125,7 @@ class OfficialDataset:
     query_gt : the queries' true poses where they are known, in the local frame; else None.
     links : folder below ``records_data`` -> folder of the dataset it is a link to; ``""`` makes
         ``records_data`` itself the link.
+    image_files : image -> its file, for images that lie in no such folder; linked one by one.
     groups : of all images, the queries' and the map's.
     priors : query -> map images or groups (``location`` of map images) it may be matched with.
     names : scored query -> its name in the pose file, in the order of the challenge's list; empty
@@ -139,8 +140,9 @@ class OfficialDataset:
 
     mapping: KaptureData
     query: KaptureData
-    links: Mapping[str, Path]
     protocol: Protocol
+    links: Mapping[str, Path] = field(default_factory=dict)
+    image_files: Mapping[str, Path] = field(default_factory=dict)
     query_gt: KaptureData | None = None
     groups: Mapping[str, ImageGroup] = field(default_factory=dict)
     priors: Mapping[str, Sequence[str]] = field(default_factory=dict)
@@ -175,6 +177,8 @@ def write_official(dataset: OfficialDataset, output: Path, *, allow_missing: boo
     for part, data in ((MAPPING, dataset.mapping), (QUERY, dataset.query)):
         write_sensors(output / part, data)
         link_records(output / part, dataset.links)
+        own = set(data.image_names()) if dataset.image_files else set()
+        link_records(output / part, {n: f for n, f in dataset.image_files.items() if n in own})
     if dataset.query_gt is not None and dataset.query_gt.trajectories:
         write_sensors(output / QUERY_GT, dataset.query_gt)
     tables = output / SIDE_TABLES

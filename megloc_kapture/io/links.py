@@ -32,22 +32,23 @@ def link_images(source_root: Path, output_root: Path) -> None:
 
 
 def link_records(output_root: Path, links: Mapping[str, Path]) -> None:
-    """Make folders below ``output_root/sensors/records_data`` links to folders of a dataset.
+    """Make folders or images below ``output_root/sensors/records_data`` links to a dataset's.
 
     Parameters
     ----------
-    links : path below ``records_data`` -> the folder it shows; ``""`` is ``records_data`` itself.
+    links : path below ``records_data`` -> the folder or file it shows; ``""`` is ``records_data``
+        itself.
 
     Raises
     ------
     OutputError : a link cannot be made.
     """
     records = Path(output_root) / "sensors" / "records_data"
-    for name, folder in links.items():
+    for name, target in links.items():
         place = records / name if name else records
         try:
             place.parent.mkdir(parents=True, exist_ok=True)
-            place.symlink_to(Path(folder).resolve(), target_is_directory=True)
+            place.symlink_to(Path(target).resolve(), target_is_directory=True)
         except OSError as error:
             raise output_error(place, error) from error
 

@@ -1,0 +1,59 @@
+"""A challenge dataset in its official layout and in kapture folders: one and the same result."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+from kapture_forms import aachen_with_kapture
+
+from megloc_kapture.datasets.synthetic.aachen_twin import AachenTwinOptions, write_aachen_twin
+
+NAME = "submissions/Aachen_v1_1_eval_megloc-classic.txt"
+SMALL = AachenTwinOptions(
+    num_places=1,
+    stations_per_place=7,
+    sequence_images=2,
+    day_queries=4,
+    night_queries=1,
+    additional_night_queries=1,
+    width=480,
+    height=360,
+)
+
+
+@pytest.mark.slow
+def test_aachen_in_both_forms_gives_the_same_pose_file(
+    megloc: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    official = tmp_path / "official"
+    write_aachen_twin(official, SMALL)
+    downloaded = aachen_with_kapture(official, tmp_path / "downloaded")
+    shutil.copytree(official / "ground_truth", downloaded / "ground_truth")
+    monkeypatch.chdir(tmp_path)
+    for root in (official, downloaded):
+        done = megloc(
+            *("eval", "aachen", "--root", root, "--workspace", tmp_path / f"{root.name}-run"),
+            *("--set", "local_features.options.max_keypoints=1500", "--executor", "inline"),
+            *("--set", "global_features.options.num_clusters=16", "--submissions", "submissions"),
+        )
+        assert done.status == 0, done.err
+        assert f"pose file  {NAME}\n" in done.out
+    runs = [tmp_path / f"{root.name}-run" for root in (official, downloaded)]
+    # the second was the same, and was left as it was
+    assert [path.name for path in sorted((tmp_path / "submissions").iterdir())] == [
+        Path(NAME).name,
+        f"{Path(NAME).name}.json",
+    ]
+    assert (runs[0] / NAME).read_bytes() == (runs[1] / NAME).read_bytes()
+    rows = (tmp_path / NAME).read_text().splitlines()
+    assert len(rows) >= 3 and all("/" not in row.split()[0] for row in rows)
+    tables = ("names.csv", "groups.csv", "protocol.json", "world.json")
+    for table in tables:
+        one, other = ((run / "megloc" / table).read_bytes() for run in runs)
+        assert one == other, table
+    recall = json.loads((runs[1] / "evaluation/recall.json").read_text())
+    assert [row["name"] for row in recall["rows"]] == ["day", "night", "all"]
