@@ -50,8 +50,12 @@ def kapture_parent(root: Path, part: str = MAPPING) -> Path | None:
     ----------
     part : path of a kapture folder below it.
     """
-    parents = (Path(root) / name for name in _PARENTS)
-    return next((parent for parent in parents if is_kapture(parent / part)), None)
+    return next((parent for parent in parents(root) if is_kapture(parent / part)), None)
+
+
+def parents(root: Path) -> tuple[Path, ...]:
+    """The folders in which the parts of a dataset may lie, the root first."""
+    return tuple(Path(root) / name for name in _PARENTS)
 
 
 def is_kapture(folder: Path) -> bool:

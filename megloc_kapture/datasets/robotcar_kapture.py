@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from megloc_kapture.datasets.grammars.robotcar_files import (
     ImageKey,
@@ -11,7 +11,8 @@ from megloc_kapture.datasets.grammars.robotcar_files import (
     read_intrinsics,
 )
 from megloc_kapture.datasets.official import Missing, with_poses
-from megloc_kapture.datasets.robotcar_layout import CAMERAS
+from megloc_kapture.datasets.robotcar_layout import CAMERAS, Layout
+from megloc_kapture.datasets.robotcar_reference import Reference
 from megloc_kapture.datasets.robotcar_rig import rig_of_model
 from megloc_kapture.datasets.robotcar_selection import Selection
 from megloc_kapture.errors import DataError
@@ -32,17 +33,13 @@ class Car:
     members: Mapping[str, RigidTransform]
 
 
-def read_car(selection: Selection, missing: Missing) -> Car:
+def read_car(layout: Layout, selection: Selection, missing: Missing) -> Car:
     """Read intrinsics and extrinsics; an image of each camera tells its size.
-
-    The rig is the one that the model's poses show; the published extrinsics stand in where the
-    model has too few moments of all cameras.
 
     Raises
     ------
     DataError : a broken file; names file and line.
     """
-    layout = selection.layout
     example = {image.camera: path for image, path in reversed(selection.images().items())}
     sensors = {}
     members = {}
@@ -60,10 +57,16 @@ def read_car(selection: Selection, missing: Missing) -> Car:
         path = layout.extrinsics(camera)
         if missing.require(path) and camera in sensors:
             members[camera] = read_extrinsics(path).inverse()
-    of_model = rig_of_model(selection.reference.poses)
-    if of_model and set(of_model) <= set(sensors):
-        members = of_model
     return Car(sensors, members)
+
+
+def with_rig_of_model(car: Car, reference: Reference) -> Car:
+    """The car with the rig that the model's poses show.
+
+    The published extrinsics stay where the model has too few moments of all cameras.
+    """
+    of_model = rig_of_model(reference.poses)
+    return replace(car, members=of_model) if of_model and set(of_model) <= set(car.sensors) else car
 
 
 def mapping_data(selection: Selection, car: Car) -> KaptureData:

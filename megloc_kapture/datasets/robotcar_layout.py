@@ -102,6 +102,11 @@ class Layout:
         """Lists of queries that are there, by location, sorted."""
         return _numbered(self.query_list("").parent, _QUERY_LIST)
 
+    def num_reference_images(self) -> int:
+        """How many images of the reference traversal are there."""
+        files = self.image_files()
+        return sum(path.parent.parent.name == REFERENCE_CONDITION for path in files)
+
     def image_files(self) -> Iterator[Path]:
         """Every image that is there, sorted folder by folder."""
         for condition in _sorted_names(self.images):

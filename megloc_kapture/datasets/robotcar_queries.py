@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from megloc_kapture.datasets.grammars.robotcar_files import (
     ImageKey,
-    ListedImage,
     read_query_location,
     read_test_list,
     read_train_poses,
@@ -53,7 +52,7 @@ def read_queries(layout: Layout, version: int, missing: Missing, *, allow_missin
     at_time: dict[tuple[str, int], ImageKey] = {}
     for location, path in lists.items():
         for entry in read_query_location(path):
-            _check_query(entry, at_time, path)
+            note_query(entry.image, at_time, path, entry.line)
             others = locations.get(entry.image, ())
             if location not in others:
                 locations[entry.image] = (*others, location)
@@ -68,18 +67,44 @@ def read_queries(layout: Layout, version: int, missing: Missing, *, allow_missin
             if known is not None:
                 train[known] = pose.cam_from_world
     if version == 2 and missing.require(layout.test_list):
-        for entry in read_test_list(layout.test_list):
-            known = _scored_query(entry.image, at_time, layout.test_list, entry.line, allow_missing)
-            unlisted += known is None
-            if known in train:
-                raise DataError(
-                    f"{entry.text!r} is in {layout.train_list.name} too",
-                    path=layout.test_list,
-                    line=entry.line,
-                )
-            if known is not None:
-                test[known] = entry.text
+        test, more = read_test_names(layout.test_list, at_time, train, allow_missing=allow_missing)
+        unlisted += more
     return Queries(locations, train, test, unlisted)
+
+
+def read_test_names(
+    path: Path,
+    at_time: Mapping[tuple[str, int], ImageKey],
+    train: Collection[ImageKey],
+    *,
+    allow_missing: bool,
+) -> tuple[dict[ImageKey, str], int]:
+    """Read version 2's list of test images.
+
+    Parameters
+    ----------
+    at_time : (camera, time) -> query; the list leaves conditions out.
+    train : queries whose poses are public, which are in another list.
+
+    Returns
+    -------
+    Query -> its text in the list, in its order, and how many of the list are no queries.
+
+    Raises
+    ------
+    DataError : a broken list, a training image in it, or one that is no query, unless missing
+        data is allowed; names the line.
+    """
+    test: dict[ImageKey, str] = {}
+    unlisted = 0
+    for entry in read_test_list(path):
+        known = _scored_query(entry.image, at_time, path, entry.line, allow_missing)
+        unlisted += known is None
+        if known in train:
+            raise DataError(f"{entry.text!r} is a training image too", path=path, line=entry.line)
+        if known is not None:
+            test[known] = entry.text
+    return test, unlisted
 
 
 def _wanted(path: Path, version: int, missing: Missing) -> bool:
@@ -87,19 +112,25 @@ def _wanted(path: Path, version: int, missing: Missing) -> bool:
     return missing.require(path) if version == 2 else path.is_file()
 
 
-def _check_query(entry: ListedImage, at_time: dict[tuple[str, int], ImageKey], path: Path) -> None:
-    if entry.image.camera not in CAMERAS:
+def note_query(
+    image: ImageKey, at_time: dict[tuple[str, int], ImageKey], path: Path, line: int | None = None
+) -> None:
+    """Note the camera and time of a query in ``at_time``.
+
+    Raises
+    ------
+    DataError : an unknown camera, or another image has its camera and time; names ``path``.
+    """
+    if image.camera not in CAMERAS:
         raise DataError(
-            f"{entry.text!r} is of camera {entry.image.camera!r}; known: {', '.join(CAMERAS)}",
+            f"{image.path} is of camera {image.camera!r}; known: {', '.join(CAMERAS)}",
             path=path,
-            line=entry.line,
+            line=line,
         )
-    other = at_time.setdefault((entry.image.camera, entry.image.timestamp), entry.image)
-    if other != entry.image:
+    other = at_time.setdefault((image.camera, image.timestamp), image)
+    if other != image:
         raise DataError(
-            f"{entry.image.path} and {other.path} are of one camera and time",
-            path=path,
-            line=entry.line,
+            f"{image.path} and {other.path} are of one camera and time", path=path, line=line
         )
 
 

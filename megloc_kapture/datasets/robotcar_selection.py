@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
 from pydantic import Field, model_validator
 
 from megloc_kapture.datasets.grammars.robotcar_files import ImageKey
-from megloc_kapture.datasets.official import Missing
-from megloc_kapture.datasets.robotcar_layout import CAMERAS, SCORED_CAMERA, ImageFiles, Layout
+from megloc_kapture.datasets.robotcar_layout import SCORED_CAMERA
 from megloc_kapture.datasets.robotcar_queries import Queries
 from megloc_kapture.datasets.robotcar_reference import ModelChoice, Reference
 from megloc_kapture.values import Options
@@ -34,6 +33,11 @@ class RobotCarOptions(Options):
     reference_model: bool = Field(
         default=False, description="import the model's points as a kapture map of SIFT features"
     )
+    location_prior: bool = Field(
+        default=True,
+        description="a query is matched with map images of its location and camera only, which "
+        "the benchmark permits to know; false: with all",
+    )
 
     @model_validator(mode="after")
     def _usable(self) -> RobotCarOptions:
@@ -55,7 +59,6 @@ class Selection:
         They keep the order of the models and lists.
     """
 
-    layout: Layout
     version: int
     reference: Reference
     queries: Queries
@@ -75,14 +78,20 @@ class Selection:
 
 
 def select(
-    layout: Layout,
     options: RobotCarOptions,
     version: int,
     reference: Reference,
     queries: Queries,
-    missing: Missing,
+    *,
+    cameras: Collection[str],
+    find: Callable[[ImageKey], str | None],
 ) -> Selection:
-    """Choose the images and find them; those that are not there are noted in ``missing``."""
+    """Choose the images of these cameras.
+
+    Parameters
+    ----------
+    find : path of an image below ``images/``; None where it is not there.
+    """
     wanted: Iterable[ImageKey] = queries.locations
     if options.queries != "all":
         listed = queries.train if options.queries == "train" else queries.test
@@ -93,15 +102,12 @@ def select(
         # neither are the other cameras of these moments queries: the map knows where they were
         taken = set(_of_moments(queries.locations, train))
         wanted = [image for image in wanted if image not in taken]
-    files = ImageFiles(layout, missing)
-    cameras = {camera for camera in CAMERAS if missing.require(layout.intrinsics(camera))}
 
     def found(images: Iterable[ImageKey]) -> dict[ImageKey, str]:
-        paths = ((image, files.find(image)) for image in images if image.camera in cameras)
+        paths = ((image, find(image)) for image in images if image.camera in cameras)
         return {image: path for image, path in paths if path is not None}
 
     return Selection(
-        layout,
         version,
         reference,
         queries,

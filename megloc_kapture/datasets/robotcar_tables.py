@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
+from pathlib import Path
 
 from megloc_kapture.datasets.official import Count
 from megloc_kapture.datasets.robotcar_layout import (
@@ -15,8 +16,8 @@ from megloc_kapture.datasets.robotcar_layout import (
     NUM_TEST,
     NUM_TRAIN,
     QUERIES_PER_CAMERA,
-    REFERENCE_CONDITION,
     SCORED_CAMERA,
+    Layout,
 )
 from megloc_kapture.datasets.robotcar_selection import Selection
 from megloc_kapture.evaluation.protocols import protocol_of
@@ -82,13 +83,18 @@ def protocol(dataset: str, version: int) -> Protocol:
     )
 
 
-def summary(selection: Selection) -> list[Count]:
-    """What models and lists say, beside what is published, and what of it is imported."""
-    layout, queries, reference = selection.layout, selection.queries, selection.reference
-    on_disk = sum(path.parent.parent.name == REFERENCE_CONDITION for path in layout.image_files())
+def summary(selection: Selection, *, reference_images: int) -> list[Count]:
+    """What models and lists say, beside what is published, and what of it is imported.
+
+    Parameters
+    ----------
+    reference_images : how many are on disk, with a pose or without.
+    """
+    queries, reference = selection.queries, selection.reference
+    locations = {location for listed in queries.locations.values() for location in listed}
     counts = [
-        Count("locations with queries", len(layout.query_lists()), NUM_LOCATIONS),
-        Count("reference images", on_disk, NUM_REFERENCE_IMAGES),
+        Count("locations with queries", len(locations), NUM_LOCATIONS),
+        Count("reference images", reference_images, NUM_REFERENCE_IMAGES),
         Count("reference images with a pose", len(reference.poses), NUM_REGISTERED),
         Count("query images", len(queries.locations), NUM_QUERIES),
     ]
@@ -109,7 +115,6 @@ def summary(selection: Selection) -> list[Count]:
 
 def remarks(selection: Selection) -> list[str]:
     """What a user should know about this import."""
-    layout = selection.layout
     said = [
         "The rig is the one that the reference model's poses show, as extrinsics/ does not agree "
         "well with them; where the model has fewer than ten moments of all cameras, it is that of "
@@ -117,7 +122,7 @@ def remarks(selection: Selection) -> list[str]:
     ]
     unknown = sum(image not in selection.reference.locations for image in selection.map_images)
     if unknown:
-        folder = layout.individual_model("NNN").relative_to(layout.root)
+        folder = Layout(Path()).individual_model("NNN")
         said.append(
             f"The location of {unknown} map images is not known: only the individual models tell "
             f"it ({folder}, extracted). All queries of their camera may be matched with them."
