@@ -34,11 +34,6 @@ from megloc_kapture.datasets.fourseasons_recordings import (
 )
 from megloc_kapture.datasets.fourseasons_report import image_groups, protocol, remarks, summary
 from megloc_kapture.datasets.fourseasons_selection import Selection, select
-from megloc_kapture.datasets.grammars.fourseasons_calibration import (
-    CAMERA_FILES,
-    STEREO_FILE,
-    read_calibration,
-)
 from megloc_kapture.datasets.official import (
     DatasetCard,
     Missing,
@@ -103,7 +98,8 @@ class FourSeasons:
         folders=("4Seasons",),
         layout="ROOT/calibration/ and ROOT/<recording>/{undistorted_images/,GNSSPoses.txt,"
         "Transformations.txt,times.txt} of two recordings or more; relocalization files of a "
-        "challenge in ROOT or the reference recording's folder",
+        "challenge in ROOT or the reference recording's folder; or the recordings as "
+        "kapture_import_4seasons converts them, in ROOT/records/",
     )
 
     def __init__(self, options: FourSeasonsOptions | None = None) -> None:
@@ -113,7 +109,7 @@ class FourSeasons:
         """Raise DataError, quickly, when ``root`` has not the recordings or no calibration."""
         chosen = self._select(root, Missing(root))
         for recording in (*chosen.references, *chosen.queries):
-            recording.calibration_folder(root)
+            recording.calibration(root)
 
     def input_files(self, root: Path) -> Iterator[Path]:
         """Every file an import depends on: text files, images, point clouds where asked for."""
@@ -121,15 +117,14 @@ class FourSeasons:
         chosen = self._select(root, Missing(root))
         yield from (file.path for file in chosen.files)
         recordings = (*chosen.references, *chosen.queries)
-        calibrations = dict.fromkeys(recording.calibration_folder(root) for recording in recordings)
-        for folder in calibrations:
-            yield from (folder / name for name in (*CAMERA_FILES, STEREO_FILE))
+        yield from dict.fromkeys(f for r in recordings for f in r.calibration_files(root))
         for recording in recordings:
             for name in (GNSS_POSES, TRANSFORMATIONS, POSES, ACCURACY, TIMES):
                 if (recording.folder / name).is_file():
                     yield recording.folder / name
         for data in (dataset.mapping, dataset.query):
-            yield from (root / image for image in data.image_names())
+            for image in data.image_names():
+                yield chosen.recordings[image.partition("/")[0]].file_of(image)
         if self.options.depth:
             taken = {timestamp for timestamp, _ in dataset.mapping.records_depth}
             for recording in chosen.references:
@@ -160,7 +155,7 @@ class FourSeasons:
         for recording in chosen.queries:
             known = self._query_poses(recording, frame, missing)
             times = self._query_times(recording, known, tasks, missing)
-            calibration = read_calibration(recording.calibration_folder(root))
+            calibration = recording.calibration(root)
             cars[recording.name] = query.add(recording, calibration, times)
             truth |= {(time, cars[recording.name]): pose for time, pose in known.items()}
         tables = challenge_tables(tasks, chosen.recordings, local, mapping.data, query.data)
@@ -225,7 +220,7 @@ class FourSeasons:
         times: Iterable[int] = sorted(cams_from_local)
         if self.options.frames == "all":
             times = recording.times_on_disk(CAMERAS[0])
-        calibration = read_calibration(recording.calibration_folder(root))
+        calibration = recording.calibration(root)
         car = mapping.add(recording, calibration, times)
         taken = {timestamp for timestamp, _ in mapping.data.records_camera}
         for timestamp, pose in cams_from_local.items():

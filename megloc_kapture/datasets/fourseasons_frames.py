@@ -16,17 +16,23 @@ from dataclasses import dataclass
 import numpy as np
 
 from megloc_kapture.datasets.fourseasons_recordings import (
+    CAMERAS,
     GNSS_POSES,
     POSES,
     TRANSFORMATIONS,
     Recording,
 )
+from megloc_kapture.datasets.geodesy import earth_from_enu, geodetic
 from megloc_kapture.datasets.grammars.fourseasons_poses import read_gnss_poses, read_poses
 from megloc_kapture.datasets.grammars.fourseasons_transformations import read_transformations
 from megloc_kapture.datasets.official import Missing
 from megloc_kapture.errors import DataError
+from megloc_kapture.io.kapture_store import KaptureFolder
 from megloc_kapture.io.side_tables import SimilarityTransform, World
 from megloc_kapture.values import RigidTransform
+
+# from the centre of the earth, of places where cars drive
+_LEAST_RADIUS_M, _GREATEST_RADIUS_M = 6.3e6, 6.4e6
 
 
 @dataclass(frozen=True)
@@ -115,6 +121,8 @@ def read_keyframe_poses(
     DataError : a broken file, a row without scale where nothing else tells it, or no row that is
         good enough.
     """
+    if recording.kapture is not None:
+        return None if on_earth is False else _kapture_poses(recording.kapture)
     plain = recording.folder / POSES
     if on_earth is not True and plain.is_file():
         poses = read_poses(plain)
@@ -155,6 +163,33 @@ def _gnss_poses(recording: Recording, min_fusion_quality: int) -> KeyframePoses:
             path=path,
         )
     return KeyframePoses(poses, transformations.e_from_gpsw, scales, dropped)
+
+
+def _kapture_poses(folder: KaptureFolder) -> KeyframePoses | None:
+    """The poses that kapture's importer writes, on earth and of the car, whose frame is cam0's.
+
+    It keeps all keyframes, whatever their fusion. The scene is made anew, east, north and up
+    amid them.
+    """
+    data = folder.read()
+    poses: dict[int, RigidTransform] = {}
+    for timestamp in sorted({timestamp for timestamp, _ in data.trajectories}):
+        cam_from_earth = data.device_from_world(timestamp, CAMERAS[0])
+        if cam_from_earth is not None:
+            poses[timestamp] = cam_from_earth.inverse()
+    if not poses:
+        return None
+    middle = np.median([pose.translation for pose in poses.values()], axis=0)
+    if not _LEAST_RADIUS_M < float(np.linalg.norm(middle)) < _GREATEST_RADIUS_M:
+        raise DataError(
+            "the poses are not on earth; kapture's importer writes ECEF where it finds "
+            f"{TRANSFORMATIONS}",
+            path=folder.root / "sensors" / "trajectories.txt",
+        )
+    earth_from_scene = earth_from_enu(*geodetic(middle))
+    scene_from_earth = earth_from_scene.inverse()
+    scene = {timestamp: scene_from_earth @ pose for timestamp, pose in poses.items()}
+    return KeyframePoses(scene, earth_from_scene, {})
 
 
 def _scales_beside(recording: Recording) -> dict[int, float]:

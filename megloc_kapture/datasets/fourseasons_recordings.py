@@ -7,13 +7,21 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from megloc_kapture.datasets.grammars.fourseasons_calibration import (
+    CAMERA_FILES,
+    STEREO_FILE,
+    StereoCalibration,
+    read_calibration,
+)
 from megloc_kapture.datasets.grammars.fourseasons_lines import timestamp_of_name
 from megloc_kapture.datasets.grammars.fourseasons_relocalization import (
     RelocalizationRow,
     parse_relocalization_name,
     read_relocalization,
 )
+from megloc_kapture.datasets.kapture_form import is_kapture
 from megloc_kapture.errors import DataError
+from megloc_kapture.io.kapture_store import KaptureFolder
 
 CAMERAS = ("cam0", "cam1")
 CALIBRATION_FOLDERS = ("calibration", "Calibration")
@@ -21,6 +29,7 @@ GNSS_POSES, POSES, ACCURACY = "GNSSPoses.txt", "poses.txt", "keyframe_accuracy.t
 TRANSFORMATIONS, TIMES, KEYFRAMES = "Transformations.txt", "times.txt", "KeyFrameData"
 
 _IMAGES = "undistorted_images"
+_KAPTURE_RECORDS = "records"
 _MARKS = (_IMAGES, GNSS_POSES, POSES, TIMES)
 _RELOCALIZATION_PLACES = ("", "RelocalizationFiles*", "*", "*/RelocalizationFiles*")
 
@@ -32,20 +41,33 @@ class Recording:
     Parameters
     ----------
     name : of its folder, which is also what relocalization files call it.
-    folder : where it lies.
+    folder : where its files lie; of a kapture folder its ``records_data``.
+    kapture : has cameras and poses, where the recording was converted by kapture's importer.
     """
 
     name: str
     folder: Path
+    kapture: KaptureFolder | None = None
 
     @property
     def has_poses(self) -> bool:
-        """Whether poses of its keyframes are published and here."""
+        """Whether poses of its keyframes are published and here.
+
+        Raises
+        ------
+        DataError : a broken kapture folder.
+        """
+        if self.kapture is not None:
+            return bool(self.kapture.read().trajectories)
         return (self.folder / GNSS_POSES).is_file() or (self.folder / POSES).is_file()
 
     def image(self, timestamp: int, camera: str) -> str:
         """Name of an image below the dataset's root."""
         return f"{self.name}/{_IMAGES}/{camera}/{timestamp}.png"
+
+    def file_of(self, image: str) -> Path:
+        """Where an image of this recording lies, by its name."""
+        return self.folder / image.removeprefix(f"{self.name}/")
 
     def image_file(self, timestamp: int, camera: str) -> Path:
         """Where an image lies, if it is there."""
@@ -70,8 +92,39 @@ class Recording:
         times = (timestamp_of_name(n.removesuffix(".png")) for n in names if n.endswith(".png"))
         return sorted(time for time in times if time is not None)
 
+    def calibration(self, root: Path) -> StereoCalibration:
+        """The cameras of its undistorted images.
+
+        Raises
+        ------
+        DataError : broken, or there is none; names the file.
+        """
+        if self.kapture is None:
+            return read_calibration(self.calibration_folder(root))
+        data = self.kapture.read()
+        path = self.kapture.root / "sensors"
+        try:
+            cam0, cam1 = (data.sensors[name].camera() for name in CAMERAS)
+            car = next(members for members in data.rigs.values() if set(CAMERAS) <= set(members))
+        except (KeyError, StopIteration):
+            raise DataError(
+                f"no cameras {' and '.join(CAMERAS)} on one rig, as kapture's importer of "
+                "4Seasons writes them",
+                path=path,
+            ) from None
+        except DataError as error:
+            raise DataError(error.message, path=path) from error
+        return StereoCalibration(cam0, cam1, car[CAMERAS[1]] @ car[CAMERAS[0]].inverse())
+
+    def calibration_files(self, root: Path) -> list[Path]:
+        """The files of :meth:`calibration`; raises what it raises where there are none."""
+        if self.kapture is not None:
+            return sorted((self.kapture.root / "sensors").glob("*.txt"))
+        folder = self.calibration_folder(root)
+        return [folder / name for name in (*CAMERA_FILES, STEREO_FILE)]
+
     def calibration_folder(self, root: Path) -> Path:
-        """The calibration of its undistorted images: its own, or the dataset's.
+        """The folder of a calibration: its own, or the dataset's.
 
         Raises
         ------
@@ -119,22 +172,37 @@ def find_recordings(root: Path) -> dict[str, Recording]:
     ------
     DataError : the root cannot be read, or has no recording.
     """
-    if not root.is_dir():
-        raise DataError("no such folder", path=root)
-    found = {}
-    try:
-        folders = sorted(root.iterdir())
-    except OSError as error:
-        raise DataError(f"cannot read: {error.strerror}", path=root) from error
-    for folder in folders:
-        if folder.is_dir() and any((folder / mark).exists() for mark in _MARKS):
-            found[folder.name] = Recording(folder.name, folder)
+    found = {
+        folder.name: Recording(folder.name, folder)
+        for folder in _folders(root)
+        if any((folder / mark).exists() for mark in _MARKS)
+    } or _kapture_recordings(root)
     if not found:
         raise DataError(
             f"no recording here, a folder with {_IMAGES}/ and {GNSS_POSES} or {TIMES} in it",
             path=root,
         )
     return found
+
+
+def _kapture_recordings(root: Path) -> dict[str, Recording]:
+    """The recordings that kapture's importer has converted, below ``records/`` or the root."""
+    records = root / _KAPTURE_RECORDS
+    found = {}
+    for folder in _folders(records if records.is_dir() else root):
+        images = folder / "sensors" / "records_data"
+        if is_kapture(folder) and (images / _IMAGES).is_dir():
+            found[folder.name] = Recording(folder.name, images, KaptureFolder(folder))
+    return found
+
+
+def _folders(root: Path) -> list[Path]:
+    if not root.is_dir():
+        raise DataError("no such folder", path=root)
+    try:
+        return sorted(path for path in root.iterdir() if path.is_dir())
+    except OSError as error:
+        raise DataError(f"cannot read: {error.strerror}", path=root) from error
 
 
 def find_relocalization_files(root: Path, recordings: Iterable[str]) -> list[RelocalizationFile]:

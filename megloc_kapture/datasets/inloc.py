@@ -12,7 +12,7 @@ from pathlib import Path
 
 from pydantic import Field
 
-from megloc_kapture.datasets.grammars.inloc_files import Cutout, read_transformation
+from megloc_kapture.datasets.grammars.inloc_files import Cutout
 from megloc_kapture.datasets.inloc_depth import DepthJob, depth_camera, write_depth_maps
 from megloc_kapture.datasets.inloc_layout import (
     DISTRACTOR_FLOORS,
@@ -219,19 +219,19 @@ class _Map:
     depth_jobs: list[DepthJob] = field(default_factory=list)
 
     def add(self, scan: Scan, missing: Missing) -> None:
-        """A scan's cutouts with their poses; nothing where its transformation is missing."""
+        """A scan's cutouts with their poses; nothing of those whose place is not known."""
         without = [c.image for c in scan.cutouts if c.image not in scan.with_points]
         if self.options.depth:
             missing.files += [scan.folder / f"{image}{POINTS_SUFFIX}" for image in without]
-        if not scan.transformation.exists():
-            return
-        scan_from_floor = read_transformation(scan.transformation).inverse()
+        poses = scan.poses()
         for cutout in scan.cutouts:
+            if cutout.image not in poses:
+                continue
+            pose = poses[cutout.image]
             image = f"{CUTOUTS}/{scan.location}/{cutout.image}"
             camera = cutout_camera(*image_size(scan.folder / cutout.image))
             timestamp = _timestamp(scan, cutout)
             self.groups[image] = ImageGroup(frame=scan.floor, location=scan.location)
-            pose = cutout.cam_from_scan() @ scan_from_floor
             sensor = self._sensor(camera)
             self.data.records_camera[timestamp, sensor] = image
             if not self.options.depth:

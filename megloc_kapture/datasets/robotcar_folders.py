@@ -46,10 +46,9 @@ class LocationFolders:
     def find(cls, root: Path) -> LocationFolders | None:
         """The folders below ``root``; None where there are none."""
         for parent in parents(root):
-            places = sorted(parent.iterdir()) if parent.is_dir() else []
             found = {
                 f"{int(place.name):03d}": place
-                for place in places
+                for place in sorted(parent.glob("[0-9][0-9]*"))
                 if _LOCATION.fullmatch(place.name) and is_kapture(place / MAPPING)
             }
             if found:

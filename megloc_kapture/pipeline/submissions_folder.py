@@ -61,9 +61,13 @@ def _places(place: Path, folder: Path) -> Iterator[Path]:
 
 def _content(place: Path) -> dict[str, bytes]:
     """Bytes by name below ``place``; the name is "" where it is a file itself."""
-    if place.is_dir():
-        return {path.name: _read(path) for path in sorted(place.iterdir())}
-    return {"": _read(place)}
+    if not place.is_dir():
+        return {"": _read(place)}
+    try:
+        files = sorted(place.iterdir())
+    except OSError as error:
+        raise DataError(f"cannot read: {error.strerror or error}", path=place) from error
+    return {file.name: _read(file) for file in files}
 
 
 def _is_free(place: Path, content: dict[str, bytes]) -> bool:
@@ -80,14 +84,12 @@ def _is_free(place: Path, content: dict[str, bytes]) -> bool:
 
 
 def _read(path: Path) -> bytes:
+    if not path.is_file():
+        raise DataError("no such file; --from submission writes it again", path=path)
     try:
         return path.read_bytes()
     except OSError as error:
-        raise DataError(
-            f"cannot read the submission: {error.strerror or error}; --from submission writes it "
-            "again",
-            path=path,
-        ) from error
+        raise DataError(f"cannot read: {error.strerror or error}", path=path) from error
 
 
 def _write_provenance(place: Path, beside: bytes, kept: Path) -> None:

@@ -55,5 +55,11 @@ def test_aachen_in_both_forms_gives_the_same_pose_file(
     for table in tables:
         one, other = ((run / "megloc" / table).read_bytes() for run in runs)
         assert one == other, table
+    # and the commands for one result know it by its name
+    done = megloc("submit", "aachen", "-i", runs[1] / "localized", "-o", tmp_path / "mine.txt")
+    assert (done.status, done.err) == (0, ""), done
+    assert (tmp_path / "mine.txt").read_bytes() == (tmp_path / NAME).read_bytes()
+    done = megloc("check", "aachen", NAME, "--data", runs[1])
+    assert done.status == 0, done.out
     recall = json.loads((runs[1] / "evaluation/recall.json").read_text())
     assert [row["name"] for row in recall["rows"]] == ["day", "night", "all"]
