@@ -111,6 +111,13 @@ def test_the_same_dataset_in_both_forms(official: Path, downloaded: Path) -> Non
     assert_same(read(downloaded), expected)
 
 
+def test_rows_of_tables_have_no_order(official: Path, root: Path) -> None:
+    for table in root.glob("*/sensors/*.txt"):
+        lines = table.read_text().splitlines()
+        table.write_text("\n".join([*lines[:2], *reversed(lines[2:])]) + "\n")
+    assert_same(read(root), read(official))
+
+
 def test_queries_that_kapture_merged(official: Path, downloaded: Path, root: Path) -> None:
     parts = [downloaded / part for part in PARTS]
     images = ["--image_transfer", "link_absolute"]
@@ -148,7 +155,7 @@ def test_what_is_written(downloaded: Path, official: Path, tmp_path: Path) -> No
     assert found.trajectories is None
 
 
-def test_the_pose_file_of_v1_0(root: Path) -> None:
+def test_the_pose_file_of_v1_0(downloaded: Path, root: Path) -> None:
     for part, gone in (("mapping", "sequences/"), ("query_night", "_additional_night/")):
         data = kapture_from_dir(str(root / part))
         for time, sensor, name in list(kapture.flatten(data.records_camera)):
@@ -157,6 +164,11 @@ def test_the_pose_file_of_v1_0(root: Path) -> None:
         shutil.rmtree(root / part / "sensors" / "records_data" / gone, ignore_errors=True)
         kapture_to_dir(str(root / part), data)
     assert read(root).protocol.pose_file_stem == "Aachen"
+    # the added queries alone are v1.1's, and so is the folder's name
+    shutil.rmtree(root / "query_night")
+    shutil.copytree(downloaded / "query_night", root / "query_night", symlinks=True)
+    assert read(root).protocol.pose_file_stem == "Aachen_v1_1"
+    shutil.rmtree(root / "query_night")
     assert read(root, version="1.1").protocol.pose_file_stem == "Aachen_v1_1"
     named = root.rename(root.with_name("Aachen-Day-Night-v1.1"))
     assert read(named).protocol.pose_file_stem == "Aachen_v1_1"
