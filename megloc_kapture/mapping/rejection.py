@@ -19,6 +19,8 @@ from megloc_kapture.values import Camera, Options, RigidTransform
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+_SIGMA_OF_MAD = 1.4826  # of normally distributed values: 1 / (quantile of 3/4)
+
 
 class ConsistencyOptions(Options):
     """What images and points must agree in; none: not asked for."""
@@ -51,6 +53,12 @@ class UncertaintyOptions(Options):
     )
     keep_quantile: float | None = Field(
         default=None, gt=0, le=1, description="share of the points that stays, the surest ones"
+    )
+    max_robust_sigmas: float | None = Field(
+        default=None,
+        gt=0,
+        description="how far the logarithm of a point's share of its depth may lie above the "
+        "map's median, in standard deviations estimated from the median absolute deviation",
     )
 
     def needs_deviations(self) -> bool:
@@ -179,7 +187,23 @@ def too_uncertain(deviations: Floats, depths: Floats, options: UncertaintyOption
             if len(known):
                 kept = max(1, round(options.keep_quantile * len(known)))
                 rejected |= deviations > known[kept - 1]
+        if options.max_robust_sigmas is not None:
+            relative = deviations / depths
+            usual = relative[np.isfinite(relative) & (relative > 0)]
+            if len(usual):
+                limit = robust_limit(np.log(usual), options.max_robust_sigmas)
+                rejected |= relative > np.exp(limit)
     return rejected
+
+
+def robust_limit(values: Floats, num_sigmas: float) -> float:
+    """The median of ``values`` (N,), N > 0, and so many of their standard deviations more.
+
+    The deviation is 1.4826 times the median absolute deviation: that of a normal distribution,
+    which up to half of the values cannot spoil (Rousseeuw and Croux, JASA 1993).
+    """
+    median = float(np.median(values))
+    return median + num_sigmas * _SIGMA_OF_MAD * float(np.median(np.abs(values - median)))
 
 
 def left_with_too_few(

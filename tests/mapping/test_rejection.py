@@ -6,7 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from scipy.stats import median_abs_deviation
 
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.mapping.rejection import (
@@ -172,6 +175,52 @@ def test_uncertain_points(limits: dict[str, Any], expected: list[int]) -> None:
     options = UncertaintyOptions.model_validate(limits)
     assert options.needs_deviations() == bool(limits)
     assert too_uncertain(deviations, depths, options).tolist() == [bool(e) for e in expected]
+
+
+@pytest.mark.parametrize(
+    ("limits", "expected"),
+    [
+        # each limit by itself: above it goes, at it stays, below it stays
+        ({"max_deviation": 2.0}, [0, 0, 1]),
+        ({"max_relative_deviation": 0.2}, [0, 0, 1]),
+        ({"keep_quantile": 2 / 3}, [0, 0, 1]),
+        ({"max_robust_sigmas": 0.5}, [0, 0, 1]),
+    ],
+)
+def test_the_uncertain_go_and_the_sure_stay(limits: dict[str, Any], expected: list[int]) -> None:
+    deviations = np.array([1.0, 2.0, 3.0])
+    found = too_uncertain(deviations, np.full(3, 10.0), UncertaintyOptions.model_validate(limits))
+    assert found.tolist() == [bool(e) for e in expected]
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(1e-3, 1e3), st.floats(0.5, 4.0))
+def test_a_limit_of_the_scenes_own_follows_its_scale(
+    seed: int, scale: float, num_sigmas: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    depths = rng.uniform(1.0, 50.0, 200)
+    relative = np.exp(rng.normal(-6.0, 0.7, 200))
+    relative[::10] = np.nan
+    options = UncertaintyOptions(max_robust_sigmas=num_sigmas)
+    found = too_uncertain(relative * depths, depths, options)
+    logarithms = np.log(relative[~np.isnan(relative)])
+    spread = median_abs_deviation(logarithms, scale="normal")
+    expected = np.log(relative) > np.median(logarithms) + num_sigmas * spread
+    near = np.abs(np.log(relative) - np.median(logarithms) - num_sigmas * spread) < 1e-5
+    np.testing.assert_array_equal(found[~near], expected[~near])
+    # images ten times as noisy, or a world in another unit, change nothing
+    for deviations, other in ((relative * depths * scale, depths), (relative * depths, depths)):
+        again = too_uncertain(deviations * scale, other * scale, options)
+        np.testing.assert_array_equal(again[~near], found[~near])
+
+
+def test_a_limit_of_the_scenes_own_bears_what_is_unknown() -> None:
+    options = UncertaintyOptions(max_robust_sigmas=2.0)
+    unknown = np.array([np.nan, np.nan])
+    assert not too_uncertain(unknown, np.ones(2), options).any()
+    assert not too_uncertain(np.full(5, 0.1), np.ones(5), options).any()  # all alike
+    infinite = np.array([0.1, 0.11, 0.12, np.inf])
+    assert too_uncertain(infinite, np.ones(4), options).tolist() == [False, False, False, True]
 
 
 def test_who_loses_nothing_stays() -> None:
