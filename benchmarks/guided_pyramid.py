@@ -6,7 +6,8 @@
 A scene is a folder with mapping/, query/ and query_gt/ in kapture; cameras are pinholes. Its
 queries are taken as they are, and changed: turned; turned and at a third of the size; turned, and
 the middle third enlarged three times. Cameras and true poses change along. The map is triangulated
-once; every query is matched with all map images, without the pyramid (off), and with it (all, max).
+once; every query is matched with all map images, without the pyramid (off), and with it (all, max;
+all pairs: all variants tried on every pair, none left out by the probed ones).
 
 ``--choose`` compares sets of scales and of turns on the same queries by mode ``all`` instead.
 """
@@ -58,6 +59,12 @@ sys.path.append(str(Path(__file__).resolve().parent / "speed"))
 from timing import table  # noqa: E402
 
 THRESHOLDS = ((0.05, 5.0), (0.25, 2.0))
+WAYS: dict[str, GuidedPyramidOptions] = {
+    "off": GuidedPyramidOptions(),
+    "all": GuidedPyramidOptions(mode="all"),
+    "max": GuidedPyramidOptions(mode="max"),
+    "all pairs": GuidedPyramidOptions(mode="all", probed_pairs=1_000_000),
+}
 SETS: dict[str, GuidedPyramidOptions] = {
     "1/3 1/2 1 2 3, four turns": GuidedPyramidOptions(mode="all"),
     "1/2 1 2, four turns": GuidedPyramidOptions(mode="all", scales=(0.5, 1.0, 2.0)),
@@ -129,12 +136,14 @@ def _scaled(change: Change, width: int, height: int) -> tuple[int, int]:
     return round(width * change.scale), round(height * change.scale)
 
 
-def write_queries(scene: Path, change: Change, root: Path) -> dict[str, RigidTransform]:
-    """Write the changed queries as kapture; their true poses by name."""
+def write_queries(
+    scene: Path, change: Change, root: Path, num_queries: int | None
+) -> dict[str, RigidTransform]:
+    """Write the first of the changed queries as kapture; their true poses by name."""
     source = KaptureFolder(scene / "query")
     truth = KaptureFolder(scene / "query_gt").read().poses()
     data, poses = KaptureData(), {}
-    for timestamp, image in enumerate(source.read().image_names()):
+    for timestamp, image in enumerate(source.read().image_names()[:num_queries]):
         name = f"changed_{Path(image).with_suffix('.png')}"
         camera, changed_from_camera = changed_camera(change, source.read().camera_of(image))
         data.sensors[f"cam{timestamp}"] = Sensor.from_camera(camera)
@@ -156,6 +165,7 @@ class Bench:
     matcher: Matcher
     jobs: int
     map_options: GuidedPyramidOptions
+    num_queries: int | None = None
 
     def mapping(self) -> KaptureFolder:
         return KaptureFolder(
@@ -190,7 +200,7 @@ class Bench:
         """A row for each way to match the changed queries."""
         local_type = self.extractor.name
         root = self.root / change.name.replace(" ", "_").replace(",", "")
-        truth = write_queries(self.scene, change, root / "query")
+        truth = write_queries(self.scene, change, root / "query", self.num_queries)
         features = root / "features"
         query = KaptureFolder(root / "query", features_dirs=[features])
         pairs = [
@@ -291,21 +301,27 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--map-mode", choices=("off", "all", "max"), default="off")
     parser.add_argument("--choose", action="store_true")
+    parser.add_argument("--change", choices=[c.name for c in CHANGES], action="append")
+    parser.add_argument("--mode", choices=WAYS, action="append")
+    parser.add_argument("--queries", type=int, help="the first so many only")
     parser.add_argument("--workspace", type=Path, help="keep what is made here")
     options = parser.parse_args()
     ways = (
         {"off": GuidedPyramidOptions(), **SETS}
         if options.choose
-        else {mode: GuidedPyramidOptions(mode=mode) for mode in ("off", "all", "max")}
+        else {name: way for name, way in WAYS.items() if name in (options.mode or WAYS)}
     )
-    changes = CHOSEN_BY if options.choose else CHANGES
+    changes: Sequence[Change] = CHOSEN_BY if options.choose else CHANGES
+    changes = [c for c in changes if options.change is None or c.name in options.change]
     extractor = load_plugin(LOCAL_FEATURES, options.features)
     matcher = load_plugin(MATCHERS, options.matcher)
     with tempfile.TemporaryDirectory(prefix="megloc-pyramid-") as temporary, single_threaded():
         for scene in options.scene:
             root = (options.workspace or Path(temporary)) / f"{scene.name}-{options.features}"
             map_options = GuidedPyramidOptions(mode=options.map_mode)
-            bench = Bench(scene, root, extractor, matcher, options.jobs, map_options)
+            bench = Bench(
+                scene, root, extractor, matcher, options.jobs, map_options, options.queries
+            )
             bench.make_map()
             rows = [row for change in changes for row in bench.measure(change, ways)]
             print(f"{os.linesep}{scene.name}, {extractor.name}{os.linesep}{table([HEADER, *rows])}")

@@ -8,11 +8,52 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from megloc_kapture.geometry.cameras import bearing_rays, px_from_cam
 from megloc_kapture.mapping.chunks import in_chunks
 from megloc_kapture.mapping.pairs import each_once
 from megloc_kapture.values import Camera, RigidTransform
 
 _CHUNK = 1024  # pairs; each is worked out by itself, so that chunks change nothing
+
+
+# pixels looked at, across and down; depths, in distances of the two centres
+_GRID = (9, 7)
+_DEPTHS = 2.0 ** np.arange(-2, 8, 0.5)
+
+
+def views_can_overlap(
+    first: Camera,
+    first_from_world: RigidTransform,
+    second: Camera,
+    second_from_world: RigidTransform,
+) -> bool:
+    """Whether some place in the view of one camera is in that of the other, whatever stands there.
+
+    Looked for along the rays of a grid of pixels, from a quarter of the distance between the
+    cameras to infinity.
+    """
+    between = second_from_world @ first_from_world.inverse()
+    return _reaches(first, second, between) or _reaches(second, first, between.inverse())
+
+
+def _reaches(first: Camera, second: Camera, second_from_first: RigidTransform) -> bool:
+    x, y = np.meshgrid(
+        *(np.linspace(0, size, n) for size, n in zip(_size(first), _GRID, strict=True))
+    )
+    rays = bearing_rays(first, np.stack([x.ravel(), y.ravel()], axis=1))
+    turned = rays @ second_from_first.rotation_matrix().T
+    offset = np.asarray(second_from_first.translation)
+    depths = _DEPTHS * np.linalg.norm(offset)
+    # without a distance between them, and at infinity, only the turn counts
+    points = [turned, *(turned * depth + offset for depth in depths[depths > 0])]
+    with np.errstate(invalid="ignore"):
+        seen = px_from_cam(second, np.concatenate(points))
+        inside = ((seen >= 0) & (seen <= _size(second))).all(axis=1)
+    return bool(inside.any())
+
+
+def _size(camera: Camera) -> tuple[int, int]:
+    return camera.width, camera.height
 
 
 def frustum_overlap(

@@ -2,6 +2,8 @@
 
 MegLoc, section "Guided pyramid matching". Where a pair has fewer than 100 verified matches,
 features are extracted from the image scaled and turned, and matched with the other image as it is.
+An image's variants are probed on a few of its pairs, and those that match nothing there are not
+tried on the rest: what has nothing in common with the image costs no more than that.
 What is verified is either all put together (``all``) or the richest is kept (``max``).
 
 Each variant is verified by itself: most of them are turned the wrong way and have matches by chance
@@ -54,6 +56,15 @@ class GuidedPyramidOptions(Options):
         default=1600,
         gt=0,
         description="an image is not enlarged beyond this; memory grows with the pixels",
+    )
+    probed_pairs: int = Field(
+        default=5,
+        gt=0,
+        description="pairs of an image that all variants are tried on: those with most matches; "
+        "on the rest only the variants that matched one of them",
+    )
+    probe_matches: int = Field(
+        default=30, gt=0, description="verified matches with which a variant matched a probed pair"
     )
 
     def idle(self) -> dict[str, str]:
@@ -271,3 +282,33 @@ def match_variants(
                     )
                 )
     return [judgement.agree(matches) for judgement, matches in zip(judgements, found, strict=True)]
+
+
+def match_probed(
+    variants: Sequence[VariantFeatures],
+    num_others: int,
+    match: Callable[[Sequence[VariantFeatures], range], Sequence[list[VariantMatches]]],
+    options: GuidedPyramidOptions,
+) -> tuple[list[list[VariantMatches]], int]:
+    """Match an image's variants with the first few of several images, what matched with the rest.
+
+    Parameters
+    ----------
+    num_others : images to match with, the most promising first.
+    match : of some of the variants with some of the images, as :func:`match_variants`.
+
+    Returns
+    -------
+    matches : for each of the images the variants that match it.
+    num_left : variants that were tried on the images behind the probed ones.
+    """
+    first = min(options.probed_pairs, num_others)
+    found = list(match(variants, range(first)))
+    matched = {
+        one.variant for of_pair in found for one in of_pair if len(one) >= options.probe_matches
+    }
+    left = [variant for variant in variants if variant.variant in matched]
+    if left and first < num_others:
+        found += match(left, range(first, num_others))
+    found += [[] for _ in range(num_others - len(found))]
+    return found, len(left)

@@ -6,7 +6,7 @@ keypoints of T first, unchanged, then those that were added, and the matches of 
 index into T is one into T-pyramid, and what reads kapture reads it.
 
 An image is extracted again once, however many pairs it is in: the work goes by images, not by
-pairs.
+pairs. Map images whose poses leave them no view in common are not tried.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from itertools import groupby
 from pathlib import Path
 
 from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder
+from megloc_kapture.mapping.frustum_overlap import views_can_overlap
 from megloc_kapture.matching.guided_pyramid import GuidedPyramidOptions, pyramid_type
 from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
 from megloc_kapture.plugins import LocalFeatureExtractor, Matcher
@@ -63,11 +63,19 @@ def pyramid_mapping(
         spec, spec, local_type, local_type, extractor, matcher, verification, options,
         mask_margin_px,
     )  # fmt: skip
-    poses = mapping.read().poses()
+    data, poses = mapping.read(), mapping.read().poses()
+
+    def can_gain(first: str, second: str) -> bool:
+        if not (first in poses and second in poses):
+            return False  # poses are what verifies
+        return views_can_overlap(
+            data.camera_of(first), poses[first], data.camera_of(second), poses[second]
+        )
+
     # kept in one file, so (a, b) and (b, a) are one pair
     named = sorted({(min(p.query, p.map), max(p.query, p.map)) for p in pairs})
     run = PyramidPairs(mapping, mapping, how, mapping.matches(local_type), named)
-    run.find_hard(posed=set(poses))
+    run.find_hard(can_gain)
     jobs = []
     others: dict[str, tuple[list[str], list[str]]] = defaultdict(lambda: ([], []))
     for a, b in run.hard:
@@ -126,11 +134,11 @@ def pyramid_queries(
         options,
         mask_margin_px,
     )
-    named = sorted({(pair.query, pair.map) for pair in pairs})
+    named = list(dict.fromkeys((pair.query, pair.map) for pair in pairs))
     run = PyramidPairs(query, mapping, how, query.matches(local_type), named)
     run.find_hard()
-    jobs = [
-        Retry(how, image, tuple(other for _, other in group))
-        for image, group in groupby(run.hard, key=lambda pair: pair[0])
-    ]
+    others: dict[str, list[str]] = defaultdict(list)
+    for image, other in run.hard:
+        others[image].append(other)
+    jobs = [Retry(how, image, tuple(others[image])) for image in sorted(others)]
     return run.write(jobs, output, executor, track)

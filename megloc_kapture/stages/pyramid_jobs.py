@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -20,6 +20,7 @@ from megloc_kapture.matching.guided_pyramid import (
     VariantFeatures,
     VariantMatches,
     extract_variants,
+    match_probed,
     match_variants,
 )
 from megloc_kapture.matching.variant_verification import (
@@ -68,8 +69,8 @@ class Retry:
 
     Attributes
     ----------
-    others : matched with all variants.
-    only_scaled : matched with those of another scale only.
+    others : matched with all variants; those with most matches first, as they are probed first.
+    only_scaled : matched with those of another scale only; in the same order.
     """
 
     how: HowToRetry
@@ -85,11 +86,11 @@ class Retried:
     Attributes
     ----------
     found : for each of ``others``, then of ``only_scaled``, the variants that match.
-    num_variants : that were tried with each of both, the skipped ones among them.
+    num_variants : that were tried with each of these, the skipped ones among them.
     """
 
     found: list[list[VariantMatches]]
-    num_variants: tuple[int, int]
+    num_variants: list[int]
     skipped: list[SkippedVariant]
     seconds: float
 
@@ -117,18 +118,24 @@ def retry(job: Retry) -> Retried:
         like=itself.for_matcher(),
     )
     scaled_only = [one for one in variants if one.variant.scale != 1.0]
-    found = [
-        matches
-        for names, used in ((job.others, variants), (job.only_scaled, scaled_only))
-        for matches in match_in_batches(
+    found: list[list[VariantMatches]] = []
+    counts: list[int] = []
+    for names, used, num_tried in (
+        (job.others, variants, len(every)),
+        (job.only_scaled, scaled_only, len(scaled)),
+    ):
+        matches, num_left = match_in_batches(
             used,
             names,
             lambda name: cached_features(how.second, second, how.second_type, name),
             how.matcher,
             lambda name, other: _judgement(job, itself, name, other),
+            how.options,
         )
-    ]
-    return Retried(found, (len(every), len(scaled)), skipped, seconds=time.perf_counter() - started)
+        probed = min(len(names), how.options.probed_pairs)
+        found += matches
+        counts += [num_tried] * probed + [num_left] * (len(names) - probed)
+    return Retried(found, counts, skipped, seconds=time.perf_counter() - started)
 
 
 def match_in_batches(
@@ -137,22 +144,34 @@ def match_in_batches(
     load: Callable[[str], Features],
     matcher: Matcher,
     judge: Callable[[str, Features], Judgement],
-) -> Iterator[list[VariantMatches]]:
+    options: GuidedPyramidOptions,
+) -> tuple[list[list[VariantMatches]], int]:
     """The variants that match each of several images, whose features are not all loaded at once.
 
     Parameters
     ----------
+    names : of the images, the most promising first.
     load : features of an image.
     judge : of the matches with an image, by its name and features.
+
+    Returns
+    -------
+    See :func:`megloc_kapture.matching.guided_pyramid.match_probed`.
     """
-    for batch in batched(names, BATCH):
-        others = [load(name) for name in batch]
-        yield from match_variants(
-            variants,
-            [other.for_matcher() for other in others],
-            partial(match_all, matcher),
-            [judge(name, other) for name, other in zip(batch, others, strict=True)],
-        )
+
+    def match(some: Sequence[VariantFeatures], which: range) -> list[list[VariantMatches]]:
+        found = []
+        for batch in batched(names[which.start : which.stop], BATCH):
+            others = [load(name) for name in batch]
+            found += match_variants(
+                some,
+                [other.for_matcher() for other in others],
+                partial(match_all, matcher),
+                [judge(name, other) for name, other in zip(batch, others, strict=True)],
+            )
+        return found
+
+    return match_probed(variants, len(names), match, options)
 
 
 def extraction(extractor: LocalFeatureExtractor, name: str) -> Extract:

@@ -7,7 +7,7 @@ order, so that the rows of added keypoints do not depend on the workers.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -73,15 +73,23 @@ class PyramidPairs:
         self._descriptors = first.descriptors(how.first_type)
         self.hard: list[_Pair] = []
 
-    def find_hard(self, posed: set[str] | None = None) -> None:
-        """Find the pairs with few matches; those without poses gain none where poses verify."""
+    def find_hard(self, can_gain: Callable[[str, str], bool] = lambda first, second: True) -> None:
+        """Find the pairs with few matches, the ones with most of them first.
+
+        Parameters
+        ----------
+        can_gain : of two images, whether they may have matches at all.
+        """
         options = self._how.options
         if options.mode == "off":
             return
+        found = []
         for pair in self._pairs:
-            can_gain = posed is None or posed.issuperset(pair)
-            if can_gain and len(self._matches.read(*pair)[0]) < options.min_matches:
-                self.hard.append(pair)
+            count = len(self._matches.read(*pair)[0])
+            if count < options.min_matches and can_gain(*pair):
+                found.append((-count, pair))
+        # of equal counts in the order of the pairs
+        self.hard = [pair for _, pair in sorted(found, key=lambda each: each[0])]
 
     def write(
         self, jobs: Sequence[Retry], output: Path, executor: Executor | None, track: Track
@@ -245,10 +253,8 @@ def _retried(
     for job, result in zip(jobs, results, strict=True):
         done.seconds += result.seconds
         done.skipped[job.image] = described(result.skipped)
-        counts = [result.num_variants[0]] * len(job.others)
-        counts += [result.num_variants[1]] * len(job.only_scaled)
         for other, found, count in zip(
-            (*job.others, *job.only_scaled), result.found, counts, strict=True
+            (*job.others, *job.only_scaled), result.found, result.num_variants, strict=True
         ):
             done.found[job.image, other] = [spool.put(matches) for matches in found]
             done.num_variants[job.image, other] = count

@@ -40,7 +40,7 @@ def retry_query(
 
     Parameters
     ----------
-    matches : of each candidate: its name, verified matches (K, 2), scores (K,).
+    matches : of each candidate, best first: its name, verified matches (K, 2), scores (K,).
     load : features of a candidate.
     image, mask : of the query; called only where a candidate has few matches.
     name : of the query, for messages.
@@ -54,7 +54,8 @@ def retry_query(
     ------
     DataError : the image cannot be read, or its features are of another size than the query's.
     """
-    few = [other for other, found, _ in matches if len(found) < options.min_matches]
+    hard = [(len(found), other) for other, found, _ in matches if len(found) < options.min_matches]
+    few = [other for _, other in sorted(hard, key=lambda each: -each[0])]
     if options.mode == "off" or not few:
         return query.keypoints_px, list(matches)
     camera = query.camera
@@ -74,7 +75,8 @@ def retry_query(
             verification,
         )  # fmt: skip
 
-    found = dict(zip(few, match_in_batches(variants, few, load, matcher, judge), strict=True))
+    by_other, _ = match_in_batches(variants, few, load, matcher, judge, options)
+    found = dict(zip(few, by_other, strict=True))
     keypoints = KeypointUnion(query.keypoints_px)
     richer: list[NamedMatches] = []
     for other, pairs, scores in matches:

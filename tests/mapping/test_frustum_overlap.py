@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.geometry.cameras import project
+from megloc_kapture.geometry.cameras import bearing_rays, project
 from megloc_kapture.mapping import frustum_overlap as module
-from megloc_kapture.mapping.frustum_overlap import frustum_overlap
+from megloc_kapture.mapping.frustum_overlap import frustum_overlap, views_can_overlap
 from megloc_kapture.mapping.pairs import exhaustive_pairs
 from megloc_kapture.values import Camera, RigidTransform
 
@@ -100,3 +100,38 @@ def test_where_the_distortion_turns_back_nothing_is_seen() -> None:
         np.array([[0, 1]]), [strong] * 2, [level] * 2, xyz, np.array([0, 1]), np.array([0, 0])
     )
     assert found.tolist() == [0.5]
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_views_with_a_place_in_the_middle_of_both_overlap(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    first, second = (CAMERAS[at] for at in rng.integers(0, len(CAMERAS), 2))
+    poses = []
+    for camera in (first, second):
+        turn = Rotation.random(random_state=rng.integers(2**31)).as_matrix()
+        # the world's origin is in front, in the middle half
+        px = rng.uniform(0.25, 0.75, (1, 2)) * (camera.width, camera.height)
+        ray = bearing_rays(camera, px)[0] * 10.0 ** rng.uniform(-1, 2)
+        poses.append(RigidTransform.from_matrix(turn, ray))
+    assert views_can_overlap(first, poses[0], second, poses[1])
+    assert views_can_overlap(second, poses[1], first, poses[0])
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=lambda camera: camera.model)
+@pytest.mark.parametrize("apart_m", [0.0, 0.3, 40.0])
+def test_views_back_to_back_do_not_overlap(camera: Camera, apart_m: float) -> None:
+    here = RigidTransform.identity()
+    turn = Rotation.from_euler("y", 180, degrees=True).as_matrix()
+    # the other one stands behind, and looks away
+    there = RigidTransform.from_matrix(turn, -turn @ [0.0, 0.0, -apart_m])
+    assert not views_can_overlap(camera, here, camera, there)
+    assert not views_can_overlap(camera, there, camera, here)
+
+
+def test_views_that_turn_by_more_than_they_are_wide_do_not_overlap() -> None:
+    camera = CAMERAS[0]
+    wide_deg = 2 * np.degrees(np.arctan(320 / 500))
+    for angle_deg, expected in ((wide_deg - 9.0, True), (wide_deg + 1.0, False)):
+        turn = Rotation.from_euler("y", angle_deg, degrees=True).as_matrix()
+        turned = RigidTransform.from_matrix(turn, np.zeros(3))
+        assert views_can_overlap(camera, RigidTransform.identity(), camera, turned) == expected

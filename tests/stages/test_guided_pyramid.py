@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -518,3 +519,35 @@ def test_one_query_whose_pairs_are_easy_is_never_read(scene: Scene) -> None:
         )  # fmt: skip
         np.testing.assert_array_equal(keypoints, own.keypoints_px)
         assert [(other, len(matches)) for other, matches, _ in found] == [("left/1.png", 100)]
+
+
+@pytest.mark.parametrize("kind", ["mapping", "queries"])
+@pytest.mark.parametrize(("more", "tried"), [(0, False), (1, True)])
+def test_a_pair_with_as_many_matches_as_asked_for_is_left(
+    scene: Scene, tmp_path: Path, kind: str, more: int, tried: bool
+) -> None:
+    """Fewer than so many, MegLoc says: with exactly so many nothing is tried again."""
+    folder, pairs = scene.mapping(), scene.mapping_pairs()
+    if kind != "mapping":
+        folder, pairs = scene.query("easy"), scene.query_pairs("easy")
+    matches = folder.matches("upright")
+    counts = {(p.query, p.map): len(matches.read(p.query, p.map)[0]) for p in pairs}
+    least = min(counts.values())
+    options = ALL.model_copy(update={"min_matches": least + more})
+    retry = scene.retry_mapping if kind == "mapping" else partial(scene.retry_queries, "easy")
+    assert bool(retry(tmp_path / "out", options=options)["pairs_tried"]) == tried
+
+
+def test_images_that_look_away_from_each_other_are_not_tried(scene: Scene, tmp_path: Path) -> None:
+    data = scene.mapping().read()
+    away = data.record_of("right/3.png")
+    behind = RigidTransform.from_matrix(np.diag([-1.0, 1.0, -1.0]), np.zeros(3))
+    data.trajectories[away] = behind @ data.trajectories[away]
+    write_sensors(tmp_path / "mapping", data)
+    turned = Scene(scene.root, scene.world)
+    turned.mapping = lambda *more: KaptureFolder(  # type: ignore[method-assign]
+        tmp_path / "mapping", features_dirs=scene.mapping(*more).features_dirs
+    )
+    counts = turned.retry_mapping(tmp_path / "out")
+    assert counts["pairs_tried"] == counts["images_extracted_again"] == 0
+    assert scene.retry_mapping(tmp_path / "again")["pairs_tried"] == 2
