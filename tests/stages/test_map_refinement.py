@@ -226,6 +226,30 @@ def test_covariances_are_those_of_the_new_map(wall: Wall, tmp_path: Path) -> Non
     assert uncertainty.points == 23
 
 
+def test_a_point_is_as_uncertain_as_in_its_worst_direction(wall: Wall, tmp_path: Path) -> None:
+    # seen in a row from afar: depth is far less sure than the two directions across
+    unchecked = {"max_sigmas": None}
+    refined(wall, tmp_path / "all", depth=unchecked)
+    stored = read_point_covariances(tmp_path / "all", len(wall.points))
+    assert stored is not None
+    deviations = np.full((len(stored), 3), np.nan)  # of lifted points
+    for row in np.flatnonzero(np.isfinite(stored[:, 0])):
+        deviations[row] = np.sqrt(np.linalg.eigvalsh(_square(stored[row])))
+    limit = float(np.nanmedian(deviations[:, 2]))
+    folder, _ = refined(
+        wall, tmp_path / "out", depth=unchecked, uncertainty={"max_deviation": limit * (1 + 1e-9)}
+    )
+    sure = ~(deviations[:, 2] > limit * (1 + 1e-9))
+    np.testing.assert_array_equal(folder.points3d(), wall.points[sure])
+    for direction in (0, 1):
+        assert (~(deviations[:, direction] > limit)).sum() > sure.sum() + 10
+
+
+def _square(covariance: np.ndarray) -> np.ndarray:
+    xx, xy, xz, yy, yz, zz = covariance
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
 def test_tracks_of_several_types_count_together(wall: Wall, tmp_path: Path) -> None:
     _, report = refined(
         wall,

@@ -194,6 +194,26 @@ def test_pictures_are_compared_where_both_rooms_show_something(scene: Scene) -> 
     assert abs(together[0] - together[1]) < 0.3 * (alone[0] - alone[1])
 
 
+def test_rooms_that_show_nothing_in_common_are_told_by_their_own_distances(scene: Scene) -> None:
+    # of the wrong room the poster is known, of the right one the wall beside it
+    original = scene.map_depth
+
+    def depth(name: str) -> DepthView | None:
+        view = original(name)
+        if view is not None:
+            unknown = slice(70, None) if name.startswith(f"{RIGHT}_") else slice(90)
+            view.depth_m[:, unknown] = 0
+        return view
+
+    scene.map_depth = depth  # type: ignore[method-assign]
+    for order in (1, -1):
+        pair = [hypothesis(0, 300), hypothesis(RIGHT, 120)][::order]
+        for hypotheses in (pair, [PoseHypothesis(h.images[:1], h.views, 4.0) for h in pair]):
+            scores = ranker(min_valid=0.05).score(hypotheses, scene)[::order]
+            assert scores[1] > scores[0] + 0.05
+            assert scores.sum() == pytest.approx(0.0)
+
+
 def test_hopeless_clusters_are_not_looked_at(scene: Scene) -> None:
     scores = ranker(min_inlier_share=0.5).score(HYPOTHESES, scene)
     assert np.argmin(scores) == 2  # 120 of 300

@@ -5,24 +5,28 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import Executor
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import PluginError
+from megloc_kapture.geometry.cameras import project
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder
 from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions
-from megloc_kapture.plugins import PluginChoice
+from megloc_kapture.localization.cluster_poses import QueryView, TypedMatches
+from megloc_kapture.localization.map_index import MapIndex
+from megloc_kapture.plugins import POSE_RANKERS, PluginChoice, RankingScene, load_plugin
 from megloc_kapture.stages.candidates import QueryPairsOptions, Retrieval
 from megloc_kapture.stages.image_pairs import pair_queries
 from megloc_kapture.stages.query_poses import (
     LocalizationOptions,
     localize_from_matches,
+    localize_views,
 )
-from megloc_kapture.values import Failure, Pose
+from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
 Results = list[tuple[str, Pose | Failure]]
 
@@ -209,3 +213,37 @@ def test_real_photographs_are_localized_within_a_centimetre(
     errors = fountain()
     assert len(errors) == 4
     assert max(errors.values()) < 0.01
+
+
+@pytest.mark.parametrize("first", ["wrong", "right"])
+def test_every_cluster_gives_a_pose_whichever_retrieval_ranks_first(first: str) -> None:
+    """Two places that look alike; the query matches more of one, which may be retrieved last."""
+    rng = np.random.default_rng(0)
+    camera = Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))
+    place = rng.uniform((-2, -2, 4), (2, 2, 8), (100, 3))
+    names, rows = ("right/1", "right/2", "wrong/1", "wrong/2"), np.arange(100)
+    index = MapIndex.build(
+        np.concatenate([place, place + [50.0, 0.0, 0.0]]),
+        names,
+        np.repeat(np.arange(4), 100),
+        np.tile(rows, 4),
+        np.concatenate([rows, rows, rows + 100, rows + 100]),
+    )
+    truth = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.2, -0.1, 0.4))
+    matches = [
+        (name, np.stack([rows[:count]] * 2, axis=1), np.full(count, 0.9))
+        for name, count in zip(names, (80, 90, 60, 50), strict=True)
+    ]
+    seen = project(camera, truth, place).astype(np.float32)
+    found = localize_views(
+        [QueryView("q", camera, (TypedMatches(index, seen, matches),))],
+        sorted(names, key=lambda name: not name.startswith(first)),
+        [""] * 4,
+        LocalizationOptions(),
+        centers={},
+        ranker=load_plugin(POSE_RANKERS, "inliers"),
+        scene=cast(RankingScene, None),  # that ranker asks for no picture
+    ).result
+    assert isinstance(found, Pose)
+    assert len(found.clusters) == 2
+    np.testing.assert_allclose(found.cam_from_world.center(), truth.center(), atol=1e-5)
