@@ -25,9 +25,20 @@ from megloc_kapture.pipeline.ablation import (
     write_outcomes,
 )
 from megloc_kapture.pipeline.benchmarks import BenchmarkFile, find_benchmark, read_benchmark
-from megloc_kapture.pipeline.datasets import TWIN_PREFIX, DatasetChoice, choose_dataset
+from megloc_kapture.pipeline.datasets import (
+    TWIN_PREFIX,
+    DatasetChoice,
+    choose_dataset,
+    has_model,
+)
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
 from megloc_kapture.pipeline.executors import available_cores, open_executor, single_threaded
+from megloc_kapture.pipeline.paper_steps import (
+    DatasetFacts,
+    LayeredOptions,
+    paper_steps,
+    steps_text,
+)
 from megloc_kapture.pipeline.plan import Stage, StageReport, all_kept, run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.run import EVALUATION, LOCALIZED, Run
@@ -65,6 +76,8 @@ class Eval(Choosing, Working, Common):
     """Stop behind this stage."""
     dry_run: bool = False
     """Say which stages would run, and why."""
+    explain: bool = False
+    """List the steps of the paper, which of them this run does and why; nothing is run."""
     ablate: bool = False
     """Run again without each of the steps in turn, in ablation/, and print what each adds."""
     fail_below: float | None = None
@@ -82,20 +95,29 @@ class Eval(Choosing, Working, Common):
                 raise OptionError(
                     f"{self.config} is for dataset {benchmark.dataset}, not {self.dataset}"
                 )
+        preset = self.preset or benchmark.preset
         choice = choose_dataset(
             self.dataset,
             self.root,
-            import_options=benchmark.import_options,
+            import_options=benchmark.import_options_of(preset),
             query_prefix=self.query_prefix,
             allow_missing=self.allow_missing,
+            find_root=not self.explain,
         )
-        return self._run(console, choice, benchmark)
+        return self._run(console, choice, benchmark, preset)
 
-    def _run(self, console: Console, choice: DatasetChoice, benchmark: BenchmarkFile) -> int:
-        preset = self.preset or benchmark.preset
+    def _run(
+        self, console: Console, choice: DatasetChoice, benchmark: BenchmarkFile, preset: str
+    ) -> int:
         choice.check()
-        changes = benchmark.changes(query_depth=choice.has_query_depth())
+        changes = benchmark.changes(preset, query_depth=choice.has_query_depth())
         options = options_of_preset(preset, changes=changes, assignments=self.set)
+        layers = LayeredOptions(
+            preset, options_of_preset(preset), options_of_preset(preset, changes=changes), options
+        )
+        if self.explain:
+            console.result(steps_text(paper_steps(layers, facts_of(choice))))
+            return 0
         if self.thresholds:
             parsed = [Threshold.parse(text) for text in self.thresholds]
             pairs = tuple((t.position_m, t.angle_deg) for t in parsed)
@@ -119,6 +141,7 @@ class Eval(Choosing, Working, Common):
                 executor=executor,
                 track=console.track,
                 num_threads=self.workers or available_cores(),
+                steps=tuple(paper_steps(layers, facts_of(choice))),
             )
             stages = plan_evaluation(run)
             reports = run_plan(
@@ -131,7 +154,7 @@ class Eval(Choosing, Working, Common):
                 on_report=lambda report: console.say(describe(report)),
             )
             if self.ablate and not self.dry_run:
-                self._ablate(console, run, stages)
+                self._ablate(console, run, stages, layers)
         if self.dry_run:
             return 0
         if all_kept(reports):
@@ -145,12 +168,15 @@ class Eval(Choosing, Working, Common):
             console.result(f"report     {shown(report)}")
         return status
 
-    def _ablate(self, console: Console, run: Run, stages: Sequence[Stage]) -> None:
+    def _ablate(
+        self, console: Console, run: Run, stages: Sequence[Stage], layers: LayeredOptions
+    ) -> None:
         outcomes = [outcome("all steps", run.workspace, stages)]
         for variant in variants(run.options):
             console.say(f"ablation: without {variant.name}")
             workspace = fresh_copy(run.workspace, variant.slug)
-            changed = replace(run, options=variant.options, workspace=workspace)
+            steps = paper_steps(replace(layers, chosen=variant.options), facts_of(run.source))
+            changed = replace(run, options=variant.options, workspace=workspace, steps=tuple(steps))
             with workspace.lock():
                 planned = plan_evaluation(changed)
                 run_plan(
@@ -215,6 +241,11 @@ class Eval(Choosing, Working, Common):
             console.say(f"recall {recall:.3f} is below {self.fail_below:.3f}")
             return BELOW_RECALL
         return 0
+
+
+def facts_of(choice: DatasetChoice) -> DatasetFacts:
+    """What of a dataset decides which steps of the paper it permits."""
+    return DatasetFacts(choice.has_map_depth(), choice.has_query_depth(), has_model(choice))
 
 
 def published_results(benchmark: BenchmarkFile) -> list[str]:

@@ -19,7 +19,8 @@ def render_page(template: str, *, provenance: Mapping[str, Any] | None, **conten
     Parameters
     ----------
     template : its file name.
-    provenance : plain JSON data, shown at the end with the versions.
+    provenance : plain JSON data, shown at the end with the versions; its ``steps``, each with
+        ``name``, ``on`` and ``why``, stand first.
     content : what the template shows.
     """
     environment = Environment(
@@ -30,6 +31,8 @@ def render_page(template: str, *, provenance: Mapping[str, Any] | None, **conten
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
+    told = dict(provenance or {})
+    steps = told.pop("steps", [])
     return environment.get_template(template).render(
         **content,
         format=tables,
@@ -38,5 +41,6 @@ def render_page(template: str, *, provenance: Mapping[str, Any] | None, **conten
         unknown=without_truth_text,
         infinity=math.inf,
         versions=package_versions(),
-        provenance=json.dumps(dict(provenance), indent=2, ensure_ascii=False) if provenance else "",
+        steps=steps,
+        provenance=json.dumps(told, indent=2, ensure_ascii=False) if told else "",
     )

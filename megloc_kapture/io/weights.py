@@ -9,7 +9,7 @@ from __future__ import annotations
 import glob
 import hashlib
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -89,6 +89,25 @@ def find_weights(name: str) -> WeightsFile:
             f"{name!r} is neither a file nor a name in the registry (megloc weights list)"
         )
     return describe(path.name, path.absolute())
+
+
+def find_all_weights(names: Sequence[str]) -> list[WeightsFile]:
+    """The checkpoints of a network that needs several, in order.
+
+    Raises
+    ------
+    MissingWeightsError : says of all that are not there how to get them, a line each.
+    DataError : see :func:`find_weights`.
+    """
+    found, missing = [], []
+    for name in names:
+        try:
+            found.append(find_weights(name))
+        except MissingWeightsError as error:
+            missing.append(str(error))
+    if missing:
+        raise MissingWeightsError("\n".join(missing))
+    return found
 
 
 def places(weights: Weights) -> Iterator[Path]:

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.io.weights import WeightsFile, find_weights, read_weights, sha256_of
+from megloc_kapture.io.weights import WeightsFile, find_all_weights, read_weights, sha256_of
 from megloc_kapture.nets.lpips import SMALLEST_PX, Lpips, Trunk, lpips_from
 from megloc_kapture.nets.runtime import NetworkOptions, image_tensor, inference, pick_device
 
@@ -46,8 +46,9 @@ class LpipsDistance:
     def __init__(self, options: LpipsOptions | None = None) -> None:
         self.options = options or LpipsOptions()
         net = self.options.net
-        self._trunk = find_weights(self.options.trunk or f"lpips-trunk-{net}")
-        self._heads = find_weights(self.options.heads or f"lpips-{net}")
+        self._trunk, self._heads = find_all_weights(
+            [self.options.trunk or f"lpips-trunk-{net}", self.options.heads or f"lpips-{net}"]
+        )
         own = self.options.trunk or self.options.heads
         self.name = f"lpips-like-{net}" if own else f"lpips-{net}"
 

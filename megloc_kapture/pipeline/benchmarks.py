@@ -6,11 +6,11 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, field_validator
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.side_tables import Protocol
-from megloc_kapture.pipeline.presets import DEFAULT_PRESET
+from megloc_kapture.pipeline.presets import DEFAULT_PRESET, PRESETS
 from megloc_kapture.values import Options
 
 _PACKAGE = Path(__file__).resolve().parent.parent
@@ -32,13 +32,27 @@ class PublishedResult(Options):
     recall: dict[str, str]
 
 
+class PresetOptions(Options):
+    """What a dataset wants different of one preset alone, after what it wants of all of them.
+
+    Parameters
+    ----------
+    import_options : the adapter's.
+    options : changes to the preset.
+    """
+
+    import_options: dict[str, Any] = Field(default_factory=dict)
+    options: dict[str, Any] = Field(default_factory=dict)
+
+
 class BenchmarkFile(Options):
     """``benchmarks/<dataset>.toml``: how one dataset is run.
 
     Parameters
     ----------
     import_options : the adapter's.
-    options : changes to the preset.
+    options : changes to every preset.
+    presets : further ones to the preset of a name.
     options_with_query_depth : further ones, where the queries come with depth maps of their own.
     thresholds, conditions, pools : instead of the dataset's own (see the side tables' Protocol).
     published : what others have reached.
@@ -51,12 +65,26 @@ class BenchmarkFile(Options):
     pools: dict[str, tuple[str, ...]] | None = None
     import_options: dict[str, Any] = Field(default_factory=dict)
     options: dict[str, Any] = Field(default_factory=dict)
+    presets: dict[str, PresetOptions] = Field(default_factory=dict)
     options_with_query_depth: dict[str, Any] = Field(default_factory=dict)
     published: tuple[PublishedResult, ...] = ()
 
-    def changes(self, *, query_depth: bool) -> list[dict[str, Any]]:
-        """Changes to the preset, in order, for data whose queries have depth or not."""
-        return [self.options, *([self.options_with_query_depth] if query_depth else [])]
+    @field_validator("presets")
+    @classmethod
+    def _known_presets(cls, presets: dict[str, PresetOptions]) -> dict[str, PresetOptions]:
+        unknown = sorted(set(presets) - set(PRESETS))
+        if unknown:
+            raise ValueError(f"unknown preset {unknown[0]!r}; known: {', '.join(PRESETS)}")
+        return presets
+
+    def changes(self, preset: str, *, query_depth: bool) -> list[dict[str, Any]]:
+        """Changes to a preset, in order, for data whose queries have depth or not."""
+        own = self.presets.get(preset, PresetOptions()).options
+        return [self.options, own, *([self.options_with_query_depth] if query_depth else [])]
+
+    def import_options_of(self, preset: str) -> dict[str, Any]:
+        """The adapter's options, where this preset is run."""
+        return self.import_options | self.presets.get(preset, PresetOptions()).import_options
 
     def change(self, protocol: Protocol) -> Protocol:
         """A dataset's protocol with what this file wants different."""

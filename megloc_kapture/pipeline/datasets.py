@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from megloc_kapture.datasets.kapture_folders import (
+    MAPPING,
     QUERY,
     QUERY_GT,
     check_root,
@@ -92,6 +93,19 @@ class DatasetChoice:
         if self.root is None or self.adapter is not None:
             return False
         return bool(KaptureFolder(self.root / QUERY).read().records_depth)
+
+    def has_map_depth(self) -> bool:
+        """Whether the map's images come with depth maps, as far as options and folders tell.
+
+        Raises
+        ------
+        DataError : the map's folder is broken.
+        """
+        if self.adapter is not None:
+            return bool(getattr(getattr(self.adapter, "options", None), "depth", False))
+        if self.root is None:
+            return bool(getattr(self.twin and self.twin.options, "depth", False))
+        return bool(KaptureFolder(self.root / MAPPING).read().records_depth)
 
     def settings(self) -> dict[str, Any]:
         """What, beside the files, determines an import."""
@@ -176,8 +190,13 @@ def choose_dataset(
     import_options: Mapping[str, Any] | None = None,
     query_prefix: str = "",
     allow_missing: bool = False,
+    find_root: bool = True,
 ) -> DatasetChoice:
     """The dataset of a name; without ``root`` it is looked for below MEGLOC_DATA.
+
+    Parameters
+    ----------
+    find_root : false: an official dataset may be without a root; it cannot be imported then.
 
     Raises
     ------
@@ -199,33 +218,48 @@ def choose_dataset(
     )
     if root is None and (name == SYNTHETIC or name.startswith(TWIN_PREFIX)):
         return replace(choice, twin=twin_of(layout))
-    if root is None:
+    if root is None and (find_root or adapter is None):
         choice = replace(choice, root=_root_in_environment(name, adapter))
     return choice
 
 
-def with_model(choice: DatasetChoice) -> DatasetChoice:
+def with_model(choice: DatasetChoice, *, features: bool) -> DatasetChoice:
     """The dataset, imported with the model that it comes with.
+
+    Parameters
+    ----------
+    features : of a twin, draw the model's features too, which localizing in it needs.
 
     Raises
     ------
     OptionError : it comes with none.
     """
-    if choice.adapter is None:
-        raise OptionError(
-            f"map = given takes the model that a dataset comes with; dataset {choice.name} has "
-            "none (megloc localize takes any kapture map)"
-        )
+    adapter = None if choice.adapter is None else _adapter_with_model(choice)
+    if adapter is None:
+        raise OptionError(f"dataset {choice.name} comes with no model")
+    twin = choice.twin
+    if twin is not None and features:
+        layout = choice.name.removeprefix(TWIN_PREFIX)
+        twin = twin_of(layout, **{**twin.options.model_dump(), "model_features": True})
     options = {**choice.import_options, "reference_model": True}
-    layout = choice.name.removeprefix(TWIN_PREFIX)
-    try:
-        adapter: DatasetAdapter = load_plugin(DATASETS, layout, options)
-    except PluginError as error:
-        raise OptionError(f"map = given: dataset {layout} comes with no model") from error
-    twin = None
-    if choice.twin is not None:
-        twin = twin_of(layout, **{**choice.twin.options.model_dump(), "model_features": True})
     return replace(choice, adapter=adapter, import_options=options, twin=twin)
+
+
+def has_model(choice: DatasetChoice) -> bool:
+    """Whether the dataset comes with a model of points."""
+    return choice.adapter is not None and _adapter_with_model(choice) is not None
+
+
+def _adapter_with_model(choice: DatasetChoice) -> DatasetAdapter | None:
+    """The adapter that imports the dataset's model too; None where it knows of none."""
+    options = {**choice.import_options, "reference_model": True}
+    try:
+        adapter: DatasetAdapter = load_plugin(
+            DATASETS, choice.name.removeprefix(TWIN_PREFIX), options
+        )
+    except PluginError:
+        return None
+    return adapter
 
 
 def _root_in_environment(name: str, adapter: DatasetAdapter | None) -> Path:

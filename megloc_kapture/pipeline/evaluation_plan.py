@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from megloc_kapture.evaluation.surroundings import surroundings_of
 from megloc_kapture.evaluation.without_truth_outputs import write_without_truth
 from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder, read_pairs
 from megloc_kapture.io.side_tables import SIDE_TABLES
-from megloc_kapture.pipeline.datasets import with_model
+from megloc_kapture.pipeline.datasets import DatasetChoice, with_model
 from megloc_kapture.pipeline.image_plan import plan_images
 from megloc_kapture.pipeline.map_plan import matched_images, plan_map
 from megloc_kapture.pipeline.missing_weights import check_weights
@@ -69,8 +69,8 @@ def plan_evaluation(run: Run) -> list[Stage]:
         raise OptionError(
             "guided pyramid matching counts verified matches; verification = none has none"
         )
-    if given:
-        run = replace(run, source=with_model(run.source))
+    if given or options.pairs_by_points():
+        run = replace(run, source=_with_model(run, given))
     dump = options.model_dump(mode="json")
     last = "refine_poses" if options.pose_refinement.refines() else "localization"
     stages = [
@@ -109,14 +109,33 @@ def plan_evaluation(run: Run) -> list[Stage]:
         ),
         Stage(
             "evaluation",
-            2,
-            {"dataset": run.dataset, "preset": run.preset, "options": dump},
+            3,
+            {
+                "dataset": run.dataset,
+                "preset": run.preset,
+                "options": dump,
+                "steps": [asdict(step) for step in run.steps],
+            },
             ("import", last),
             (EVALUATION,),
             lambda out: _evaluation(run, out),
         ),
     ]
     return stages
+
+
+def _with_model(run: Run, given: bool) -> DatasetChoice:
+    try:
+        return with_model(run.source, features=given)
+    except OptionError as error:
+        wanted = (
+            f"map = {run.options.map} localizes in that model (megloc localize takes any kapture "
+            "map)"
+            if given
+            else "mapping_pairs by covisibility or overlap need its points; "
+            '--set \'mapping_pairs.by=["poses", "retrieval"]\' does without them'
+        )
+        raise OptionError(f"{error}: {wanted}") from error
 
 
 def _pyramid_stages(run: Run, dump: Mapping[str, Any]) -> list[Stage]:
@@ -251,7 +270,10 @@ def _evaluation(run: Run, out: Path) -> dict[str, float]:
     tables = run.workspace.path(SIDE_TABLES)
     label = f"{run.dataset}, {run.preset}"
     map_poses = run.workspace.folder(MAPPING).read().poses()
-    provenance = _provenance(run) | {"versions": package_versions()}
+    provenance = _provenance(run) | {
+        "steps": [asdict(step) for step in run.steps],
+        "versions": package_versions(),
+    }
     around = surroundings_of(localized)
     if not truth.is_dir():
         found = results_without_truth(

@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import DataError
 from megloc_kapture.io.kapture_store import KaptureFolder, read_pairs, write_pairs
 from megloc_kapture.pipeline.plan import Stage
 from megloc_kapture.pipeline.run import (
@@ -122,11 +122,6 @@ def _is_given(run: Run, local_type: str) -> bool:
 
 
 def _matching_stages(run: Run, dump: Mapping[str, Any]) -> list[Stage]:
-    if run.options.mapping_pairs.needs_points() and not run.options.uses_given_map():
-        raise OptionError(
-            "mapping_pairs by covisibility or overlap need points before there are any; "
-            "map = given+triangulate takes those of the dataset's own model"
-        )
     return [
         Stage(
             "mapping_pairs",
@@ -196,7 +191,7 @@ def _mapping_pairs(run: Run, out: Path) -> dict[str, int]:
         options,
         retrieval=run.options.retrieval(),
         restrictions=run.restrictions(),
-        covisible=run.workspace.folder(REFERENCE) if run.options.uses_given_map() else None,
+        covisible=run.workspace.folder(REFERENCE) if run.options.pairs_by_points() else None,
     )
     write_pairs(out / MAPPING_PAIRS, pairs)
     return {"pairs": len(pairs)}

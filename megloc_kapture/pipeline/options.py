@@ -150,6 +150,10 @@ class PipelineOptions(Options):
         """Whether map images are matched with each other."""
         return self.map in ("triangulate", "given+triangulate")
 
+    def pairs_by_points(self) -> bool:
+        """Whether map images are paired by the points of the model that the dataset comes with."""
+        return self.triangulates() and self.mapping_pairs.needs_points()
+
     def point_types(self) -> list[str]:
         """Keypoints types of our own in the map: the pyramids' where map images were retried."""
         types = self.own_types()

@@ -9,18 +9,24 @@ from typing import Any
 from pydantic import ValidationError
 
 from megloc_kapture.errors import OptionError
+from megloc_kapture.mapping.rejection import UncertaintyOptions
 from megloc_kapture.matching.guided_pyramid import GuidedPyramidOptions
 from megloc_kapture.pipeline.assignments import check_assigned
 from megloc_kapture.pipeline.global_choice import GlobalFeaturesChoice
 from megloc_kapture.pipeline.options import LocalFeaturesChoice, PipelineOptions
 from megloc_kapture.plugins import PluginChoice
+from megloc_kapture.stages.candidates import QueryPairsOptions
+from megloc_kapture.stages.image_pairs import MappingPairsOptions
+from megloc_kapture.stages.map_refinement import MapRefinementOptions
 from megloc_kapture.stages.preprocessing import PreprocessingOptions
 from megloc_kapture.stages.reranking import RerankingOptions
 from megloc_kapture.values import Options
 
-# the paper's features, matching and retrieval
+# every step of the paper that needs nothing of the dataset; what hangs on it (masks, co-visibility,
+# sequences, weights for rooms) stands in benchmarks/*.toml, and docs/paper.md has all of them
 _MEGLOC = PipelineOptions(
-    preprocessing=PreprocessingOptions(max_size_px=1600),
+    # cameras without distortion stay as they are; enlarging is measured in docs/choices.md
+    preprocessing=PreprocessingOptions(max_size_px=1600, upscale=True, undistort=True),
     local_features=(
         LocalFeaturesChoice(name="superpoint", matching=PluginChoice(name="superglue")),
         LocalFeaturesChoice(
@@ -32,8 +38,11 @@ _MEGLOC = PipelineOptions(
     global_features=tuple(
         GlobalFeaturesChoice(name=name) for name in ("netvlad", "delg", "apgem", "openibl")
     ),
+    mapping_pairs=MappingPairsOptions(by=("poses", "retrieval")),
+    query_pairs=QueryPairsOptions(top_k=50),
     reranking=RerankingOptions(by="coverage"),
     guided_pyramid=GuidedPyramidOptions(mode="all"),
+    refinement=MapRefinementOptions(uncertainty=UncertaintyOptions(max_robust_sigmas=2.5)),
 )
 # chosen by benchmarks/features.py among weights that are free for any use: docs/choices.md
 _MODERN = PipelineOptions(

@@ -12,6 +12,7 @@ from megloc_kapture.io.side_tables import SIDE_TABLES, read_protocol
 from megloc_kapture.pipeline.benchmarks import BenchmarkFile
 from megloc_kapture.pipeline.datasets import TWIN_PREFIX, DatasetChoice
 from megloc_kapture.pipeline.options import PipelineOptions
+from megloc_kapture.pipeline.paper_steps import PaperStep
 from megloc_kapture.pipeline.submission import place_of
 from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.stages.parallel import Track, untracked
@@ -59,6 +60,7 @@ class Run:
     Attributes
     ----------
     benchmark : what it wants different in the dataset's protocol.
+    steps : of the paper, for the report.
     """
 
     source: DatasetChoice
@@ -69,6 +71,7 @@ class Run:
     executor: Executor | None = None
     track: Track = untracked
     num_threads: int = 1
+    steps: tuple[PaperStep, ...] = ()
 
     @property
     def images_stage(self) -> str:

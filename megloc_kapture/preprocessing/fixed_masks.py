@@ -35,6 +35,10 @@ class FixedMask(Options):
     bottom_share: float | None = Field(
         default=None, gt=0, lt=1, description="share of the height, from the bottom"
     )
+    fallback: bool = Field(
+        default=False,
+        description="only for cameras whose unchanging region was not looked for or not found",
+    )
 
     @model_validator(mode="after")
     def _exactly_one(self) -> FixedMask:

@@ -129,8 +129,9 @@ class StandingMasks:
         DataError : a drawn mask is absent, no image, or not of the camera's size.
         """
         width, height = camera.width, camera.height
-        mine = tuple(one for one in self._fixed if one.is_for(sensor_id, image))
         region = self._regions.get(sensor_id)
+        fitting = [one for one in self._fixed if one.is_for(sensor_id, image)]
+        mine = tuple(one for one in fitting if not (one.fallback and region))
         key = (mine, region, width, height)
         if key not in self._combined:
             masks = {}
@@ -141,7 +142,7 @@ class StandingMasks:
             if region:
                 masks["unchanging"] = region.mask(width, height)
             self._combined[key] = masks
-        self._used.update(mine)
+        self._used.update(fitting)
         return self._combined[key]
 
     def unused(self) -> list[FixedMask]:

@@ -92,7 +92,7 @@ def preprocess_images(
     regions: dict[str, UnchangingRegion] = {}
     if options.masks.unchanging:
         regions = find_unchanging_regions(folder, sequences, executor=executor, track=track)
-    remarks = _remarks(regions)
+    remarks = _remarks(regions, any(one.fallback for one in options.masks.fixed))
     standing = StandingMasks(options.masks.fixed, regions, root)
 
     _unlink_folders(output)
@@ -168,10 +168,13 @@ def _plans(data: KaptureData, options: FrameOptions) -> dict[str, FramePlan]:
     return plans
 
 
-def _remarks(regions: Mapping[str, UnchangingRegion]) -> list[str]:
-    """Of cameras without an unchanging region; refuses when none has the images to find one."""
+def _remarks(regions: Mapping[str, UnchangingRegion], have_fallback: bool) -> list[str]:
+    """Of cameras without an unchanging region.
+
+    Refuses when none has the images to find one, unless a fixed mask stands in.
+    """
     remarks = [f"camera {name}: {r.reason}" for name, r in sorted(regions.items()) if not r]
-    if regions and not any(region.frontier for region in regions.values()):
+    if regions and not (have_fallback or any(region.frontier for region in regions.values())):
         raise OptionError(f"no unchanging region can be found: {remarks[0]}")
     return remarks
 

@@ -66,6 +66,20 @@ def test_names_are_escaped(world: Any, page_of: Any) -> None:
     assert f"why {evil}" in text
 
 
+def test_the_steps_of_the_paper_come_first(world: Any, page_of: Any) -> None:
+    steps = [
+        {"name": "ASLFeat", "on": True, "why": "preset megloc"},
+        {"name": "poses refined by ICP", "on": False, "why": "<no> depth"},
+    ]
+    html = render_report(evaluation_of(world), provenance={"preset": "megloc", "steps": steps})
+    text = page_of(html).text
+    assert "Steps of the paper: 1 of 2 are on" in text
+    assert text.index("ASLFeat") < text.index("poses refined by ICP") < text.index("Recall")
+    assert "<no> depth" in text and "<no>" not in html
+    assert "steps" not in html.partition("<pre>")[2]  # not once more at the end
+    assert "Steps of the paper" not in render_report(evaluation_of(world))
+
+
 def test_same_bytes_each_time_and_no_date(world: Any) -> None:
     evaluation = evaluation_of(world)
     options = {"preset": "classic"}

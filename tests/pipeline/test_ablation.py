@@ -15,8 +15,10 @@ from megloc_kapture.pipeline.ablation import (
     variants,
     write_outcomes,
 )
-from megloc_kapture.pipeline.datasets import choose_dataset
+from megloc_kapture.pipeline.benchmarks import find_benchmark
+from megloc_kapture.pipeline.datasets import TWIN_PREFIX, choose_dataset
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
+from megloc_kapture.pipeline.options import PipelineOptions
 from megloc_kapture.pipeline.plan import run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.run import Run
@@ -27,11 +29,18 @@ def names(*assignments: str, preset: str = "classic") -> list[str]:
     return [v.name for v in variants(options_of_preset(preset, assignments=assignments))]
 
 
+def megloc_on_aachen() -> PipelineOptions:
+    """The paper's options with what its steps need of a dataset."""
+    changes = find_benchmark("aachen", TWIN_PREFIX).changes("megloc", query_depth=False)
+    return options_of_preset("megloc", changes=changes)
+
+
 def test_only_steps_that_are_there_are_left_out() -> None:
     assert names() == ["map refinement", "clusters", "pose ranking"]
     plain = ("localization.rank.name=inliers", "localization.clusters.by=none")
     assert names(*plain) == ["map refinement"]
-    assert names(preset="megloc") == [
+    assert [v.name for v in variants(megloc_on_aachen())] == [
+        "masks",
         "second local features",
         "fusion",
         "map refinement",
@@ -44,7 +53,7 @@ def test_only_steps_that_are_there_are_left_out() -> None:
 
 
 def test_a_variant_lacks_its_step_and_nothing_else() -> None:
-    options = options_of_preset("megloc")
+    options = megloc_on_aachen()
     for variant in variants(options):
         changed = {
             name
@@ -52,6 +61,7 @@ def test_a_variant_lacks_its_step_and_nothing_else() -> None:
             if value != options.model_dump()[name]
         }
         expected = {
+            "masks": {"preprocessing"},
             "second local features": {"local_features"},
             "fusion": {"global_features"},
             "map refinement": {"refinement"},

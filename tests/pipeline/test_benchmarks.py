@@ -10,7 +10,7 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.io.side_tables import Protocol
 from megloc_kapture.pipeline.benchmarks import BenchmarkFile, find_benchmark, read_benchmark
 from megloc_kapture.pipeline.datasets import TWIN_PREFIX, choose_dataset, dataset_names
-from megloc_kapture.pipeline.presets import options_of_preset
+from megloc_kapture.pipeline.presets import PRESETS, options_of_preset
 
 FILES = sorted(Path(__file__).parents[2].glob("benchmarks/*.toml"))
 
@@ -25,7 +25,7 @@ def test_a_benchmark_file(tmp_path: Path) -> None:
     benchmark = read_benchmark(path)
     assert benchmark.thresholds == ((0.25, 2.0), (0.5, 5.0))
     for query_depth, refiners in ((False, []), (True, ["icp"])):
-        changes = benchmark.changes(query_depth=query_depth)
+        changes = benchmark.changes(benchmark.preset, query_depth=query_depth)
         options = options_of_preset(benchmark.preset, changes=changes)
         assert options.query_pairs.top_k == 9
         assert [one.name for one in options.pose_refinement.by] == refiners
@@ -35,7 +35,8 @@ def test_a_benchmark_file(tmp_path: Path) -> None:
 def test_our_own_benchmark_files_are_good(path: Path) -> None:
     benchmark = read_benchmark(path)
     assert benchmark.dataset == path.stem
-    options_of_preset(benchmark.preset, changes=benchmark.changes(query_depth=True))
+    for preset in PRESETS:
+        options_of_preset(preset, changes=benchmark.changes(preset, query_depth=True))
     benchmark.change(Protocol())
     if benchmark.import_options:
         choose_dataset(benchmark.dataset, Path(), import_options=benchmark.import_options)
@@ -65,7 +66,9 @@ def test_a_benchmark_changes_what_it_names_of_a_protocol() -> None:
         (b"dataset = ", "b.toml: not TOML: "),
         (b"\xff\xfe", "b.toml: not TOML: "),
         (b"", "b.toml: dataset: "),
-        (b'dataset = "x"\npresets = "y"\n', "b.toml: presets: "),
+        (b'dataset = "x"\npreset_of = "y"\n', "b.toml: preset_of: "),
+        (b'dataset = "x"\n[presets.best]\n', "b.toml: presets: .*unknown preset 'best'; known: "),
+        (b'dataset = "x"\n[presets.megloc]\nset = 1\n', "b.toml: presets.megloc.set: "),
     ],
 )
 def test_a_broken_benchmark_file_is_named(

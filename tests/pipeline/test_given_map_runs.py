@@ -76,14 +76,19 @@ def test_the_model_and_points_of_our_own(run: Callable[..., Workspace]) -> None:
     given, own = (set(observations[name].point_ids.tolist()) for name in ("sift", "rootsift"))
     assert given and own and not given & own  # every point is of one type
     assert len(given | own) == len(found.points3d())
-    # pairs come from the model's co-visibility: every pair sees points of it in common
+    assert covisible_pairs(workspace)
+
+
+def covisible_pairs(workspace: Workspace) -> int:
+    """How many pairs there are; every pair sees points of the model in common."""
     seen = KaptureFolder(workspace.path("reference")).observations()["sift"]
     points = {
         name: set(seen.point_ids[seen.image_ids == row].tolist())
         for row, name in enumerate(seen.image_names)
     }
     pairs = read_pairs(workspace.path("pairs/mapping.txt"))
-    assert pairs and all(points[pair.query] & points[pair.map] for pair in pairs)
+    assert all(points[pair.query] & points[pair.map] for pair in pairs)
+    return len(pairs)
 
 
 def test_a_dataset_without_a_model_is_refused(tmp_path: Path) -> None:
@@ -111,13 +116,30 @@ def test_both_need_features_of_two_types(tmp_path: Path) -> None:
         plan_evaluation(run)
 
 
-def test_covisibility_needs_points(tmp_path: Path) -> None:
-    options = options_of_preset(assignments=['mapping_pairs.by=["covisibility"]'])
-    run = Run(
-        choose_dataset("synthetic-aachen", None),
-        "classic",
-        options,
-        Workspace(tmp_path / "workspace"),
+@pytest.mark.slow
+def test_covisibility_is_that_of_the_model_the_dataset_comes_with(tmp_path: Path) -> None:
+    workspace = Workspace(tmp_path / "workspace")
+    options = options_of_preset(
+        assignments=[*CHEAP, 'mapping_pairs.by=["covisibility"]', "preprocessing.max_size_px=320"]
     )
-    with pytest.raises(OptionError, match="given\\+triangulate"):
-        plan_evaluation(run)
+    source = choose_dataset("synthetic-aachen", None)
+    source = replace(source, twin=twin_of("aachen", **SMALL))
+    with workspace.lock(), single_threaded():
+        planned = plan_evaluation(Run(source, "classic", options, workspace))
+        run_plan(planned, workspace, last="mapping_pairs")
+    # its points are needed, its features are not
+    assert not list(workspace.path("world").rglob("*.db"))
+    assert covisible_pairs(workspace)
+
+
+def test_without_a_model_there_is_no_covisibility(tmp_path: Path) -> None:
+    for name in ("synthetic", "synthetic-4seasons"):
+        options = options_of_preset(assignments=['mapping_pairs.by=["covisibility"]'])
+        run = Run(choose_dataset(name, None), "classic", options, Workspace(tmp_path / name))
+        with pytest.raises(OptionError, match=f"{name} comes with no model: .*by covisibility"):
+            plan_evaluation(run)
+    # points that are lifted need no pairs
+    options = options_of_preset(assignments=['mapping_pairs.by=["covisibility"]', "map=lift"])
+    plan_evaluation(
+        Run(choose_dataset("synthetic-inloc", None), "classic", options, Workspace(tmp_path / "i"))
+    )

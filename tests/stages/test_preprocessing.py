@@ -426,6 +426,18 @@ def test_a_bonnet_is_found_with_the_maps_images(tmp_path: Path) -> None:
     assert mask is not None and not mask[150:].any() and mask[:140].all()
     assert report.remarks == ()
     assert report.masked["unchanging"] == pytest.approx(1 - mask.mean())
+    # a strip that stands in where no region is found
+    strip = {"unchanging": True, "fixed": ({"camera": "*", "bottom_share": 0.5, "fallback": True},)}
+    new, report = run(query, tmp_path / "strip", strip)
+    mask = mask_of(new, "1.png")
+    assert mask is not None and not mask[90:].any() and mask[:90].all()
+    assert report.remarks == (
+        "camera cam: it has 2 images, and at least 10 of a sequence are needed",
+    )
+    new, report = run(query, tmp_path / "found", strip, sequences=[mapping])
+    mask = mask_of(new, "1.png")
+    assert mask is not None and not mask[150:].any() and mask[:140].all()
+    assert report.remarks == ()
 
 
 def test_a_camera_without_bonnet_is_remarked(

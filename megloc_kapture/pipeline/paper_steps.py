@@ -1,0 +1,268 @@
+"""The steps of the paper, each on or off in a run, and why.
+
+Peng et al., MegLoc, arXiv 2111.13063; docs/paper.md has the same steps with their deviations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from megloc_kapture.pipeline.options import PipelineOptions
+from megloc_kapture.stages.image_pairs import PairingMethod
+
+RETRIEVAL = frozenset({"netvlad", "delg", "apgem", "openibl"})
+
+_NOT_YET = "not implemented yet"
+_LIFTED = "the points are lifted from the map's depth: map images are not matched with each other"
+
+
+@dataclass(frozen=True)
+class PaperStep:
+    """A step of the paper in a run.
+
+    Attributes
+    ----------
+    why : who turned it on or off, or what it needs that is not there.
+    """
+
+    name: str
+    on: bool
+    why: str
+
+
+@dataclass(frozen=True)
+class DatasetFacts:
+    """What of a dataset decides which steps it permits.
+
+    Attributes
+    ----------
+    map_depth, query_depth : whether map images and queries come with depth maps.
+    model : whether it comes with points of its own.
+    """
+
+    map_depth: bool
+    query_depth: bool
+    model: bool
+
+
+@dataclass(frozen=True)
+class LayeredOptions:
+    """A run's options as they came about.
+
+    Attributes
+    ----------
+    preset : the name, and ``of_preset`` the options of it alone.
+    of_dataset : with what the dataset's file changes.
+    chosen : with what the user typed: those of the run.
+    """
+
+    preset: str
+    of_preset: PipelineOptions
+    of_dataset: PipelineOptions
+    chosen: PipelineOptions
+
+
+@dataclass(frozen=True)
+class _Step:
+    """A step: its option, when it is on, why data may not permit it, and its figures."""
+
+    name: str
+    option: str
+    is_on: Callable[[PipelineOptions], bool]
+    obstacle: Callable[[PipelineOptions, DatasetFacts], str] = lambda options, facts: ""
+    figures: Callable[[PipelineOptions], str] = lambda options: ""
+
+
+def paper_steps(options: LayeredOptions, facts: DatasetFacts) -> list[PaperStep]:
+    """The steps of the paper in its order, and whether a run does them; nothing is loaded."""
+    found = [_explained(step, options, facts) for step in _STEPS]
+    return found + [PaperStep(name, on=False, why=_NOT_YET) for name in _MISSING]
+
+
+def steps_text(steps: Sequence[PaperStep]) -> str:
+    """The steps as lines of text."""
+    width = max(len(step.name) for step in steps)
+    return "\n".join(
+        f"{step.name:{width}s}  {'on' if step.on else 'off':3s}  {step.why}" for step in steps
+    )
+
+
+def _explained(step: _Step, options: LayeredOptions, facts: DatasetFacts) -> PaperStep:
+    chosen = step.is_on(options.chosen)
+    by_file = step.is_on(options.of_dataset)
+    by_preset = step.is_on(options.of_preset)
+    if chosen != by_file:
+        why = f"an option of this run ({step.option})"
+    elif by_file != by_preset:
+        why = f"the dataset's file ({step.option})"
+    elif chosen:
+        why = f"preset {options.preset}"
+    else:
+        why = f"neither preset {options.preset} nor the dataset's file asks for it ({step.option})"
+    obstacle = step.obstacle(options.chosen, facts)
+    # what nobody could turn on is said before who did not
+    if obstacle and (chosen or chosen == by_file):
+        return PaperStep(step.name, on=False, why=obstacle)
+    figures = step.figures(options.chosen) if chosen else ""
+    return PaperStep(step.name, on=chosen, why=f"{why}; {figures}" if figures else why)
+
+
+def _uses(extractor: str, matcher: str | None = None) -> Callable[[PipelineOptions], bool]:
+    def uses(options: PipelineOptions) -> bool:
+        return options.makes_points() and any(
+            one.name == extractor
+            and (matcher is None or (one.matching or options.matching).name == matcher)
+            for one in options.local_features
+        )
+
+    return uses
+
+
+def _superglue(options: PipelineOptions) -> str:
+    (first,) = (one for one in options.local_features if one.name == "superpoint")
+    matching = first.matching or options.matching
+    radius = first.options.get("nms_radius", 4)
+    weights = matching.options.get("weights", "superglue_outdoor")
+    return f"non-maximum suppression within {radius} px, {weights}"
+
+
+def _pairs_by(method: PairingMethod) -> Callable[[PipelineOptions], bool]:
+    return lambda options: method in options.mapping_pairs.by
+
+
+def _not_matched(options: PipelineOptions, facts: DatasetFacts) -> str:
+    if options.map == "lift":
+        return _LIFTED
+    return "" if options.triangulates() else "the map is given: its images are not matched"
+
+
+def _no_model(options: PipelineOptions, facts: DatasetFacts) -> str:
+    if not facts.model and options.triangulates():
+        return "the dataset comes with no model whose points images could see in common"
+    return _not_matched(options, facts)
+
+
+def _no_uncertainty(options: PipelineOptions, facts: DatasetFacts) -> str:
+    if options.map == "lift":
+        return "a lifted point is seen by one image, which says nothing of its uncertainty"
+    return ""
+
+
+def _not_triangulated(options: PipelineOptions, facts: DatasetFacts) -> str:
+    return "" if options.triangulates() else f"map = {options.map}"
+
+
+def _no_lpips_depth(options: PipelineOptions, facts: DatasetFacts) -> str:
+    if facts.map_depth:
+        return ""
+    return "the paper's indoor strategy; the map images have no depth to make views of"
+
+
+def _ranks_by_lpips(options: PipelineOptions) -> bool:
+    rank = options.localization.rank
+    distance = rank.options.get("distance", {})
+    return rank.name == "perceptual" and distance.get("name") == "lpips"
+
+
+def _masks_car(options: PipelineOptions) -> bool:
+    return options.preprocessing.masks.unchanging or bool(options.preprocessing.masks.fixed)
+
+
+def _refines_by(name: str) -> Callable[[PipelineOptions], bool]:
+    return lambda options: any(one.name == name for one in options.pose_refinement.by)
+
+
+_STEPS = (
+    _Step(
+        "larger side of 1600 px, sides multiples of 8",
+        "preprocessing.max_size_px",
+        lambda o: o.preprocessing.max_size_px == 1600,
+        figures=lambda o: "" if o.preprocessing.upscale else "smaller images are not enlarged",
+    ),
+    _Step(
+        "lens distortion removed",
+        "preprocessing.undistort",
+        lambda o: o.preprocessing.undistort,
+        figures=lambda o: "cameras without distortion stay as they are",
+    ),
+    _Step(
+        "people and vehicles masked",
+        "preprocessing.masks.segmenter",
+        lambda o: o.preprocessing.masks.segmenter is not None,
+        figures=lambda o: str(getattr(o.preprocessing.masks.segmenter, "name", "")),
+    ),
+    _Step("the own car masked", "preprocessing.masks.unchanging", _masks_car),
+    _Step(
+        "SuperPoint matched by SuperGlue",
+        "local_features",
+        _uses("superpoint", "superglue"),
+        figures=_superglue,
+    ),
+    _Step("ASLFeat", "local_features", _uses("aslfeat")),
+    _Step(
+        "four global features fused",
+        "global_features",
+        lambda o: {one.name for one in o.global_features} >= RETRIEVAL,
+    ),
+    _Step("map pairs by poses", "mapping_pairs.by", _pairs_by("poses"), _not_matched),
+    _Step("map pairs by co-visibility", "mapping_pairs.by", _pairs_by("covisibility"), _no_model),
+    _Step("map pairs by retrieval", "mapping_pairs.by", _pairs_by("retrieval"), _not_matched),
+    _Step("map pairs by sequence", "mapping_pairs.by", _pairs_by("sequence"), _not_matched),
+    _Step(
+        "points triangulated with known poses", "map", lambda o: o.triangulates(), _not_triangulated
+    ),
+    _Step(
+        "points verified by depth",
+        "refinement.depth.max_sigmas",
+        lambda o: o.refinement.depth.max_sigmas is not None,
+        lambda o, facts: "" if facts.map_depth else "the map images have no depth",
+    ),
+    _Step(
+        "uncertain points rejected",
+        "refinement.uncertainty",
+        lambda o: o.refinement.uncertainty.needs_deviations(),
+        _no_uncertainty,
+    ),
+    _Step(
+        "M images retrieved, N kept by local matches",
+        "reranking.by",
+        lambda o: o.reranking.reranks(),
+        figures=lambda o: f"M = {o.query_pairs.top_k}, N = {o.reranking.keep}",
+    ),
+    _Step(
+        "guided pyramid matching",
+        "guided_pyramid.mode",
+        lambda o: o.matches_again(),
+        figures=lambda o: f"pairs with fewer than {o.guided_pyramid.min_matches} verified matches",
+    ),
+    _Step(
+        "one pose per cluster of candidates",
+        "localization.clusters.by",
+        lambda o: o.localization.clusters.by != "none",
+        figures=lambda o: f"by {o.localization.clusters.by}",
+    ),
+    _Step(
+        "clusters ranked by LPIPS of aligned views",
+        "localization.rank",
+        _ranks_by_lpips,
+        _no_lpips_depth,
+    ),
+    _Step(
+        "poses refined by ICP",
+        "pose_refinement.by",
+        _refines_by("icp"),
+        lambda o, facts: "" if facts.query_depth else "the queries have no depth",
+    ),
+    _Step(
+        "poses refined by rendering",
+        "pose_refinement.by",
+        _refines_by("rendering"),
+        lambda o, facts: "" if facts.map_depth else "the map images have no depth",
+    ),
+)
+_MISSING = (
+    "depth of map images by multi-view stereo",
+    "rendering by a neural field (NeRF-W)",
+    "descriptors and matcher trained anew",
+)

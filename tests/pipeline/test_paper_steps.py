@@ -1,0 +1,179 @@
+"""The steps of the paper: what each dataset's file turns on, and what is said of the rest."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from megloc_kapture.cli.main import main
+from megloc_kapture.io.weights import MissingWeightsError
+from megloc_kapture.pipeline.benchmarks import find_benchmark
+from megloc_kapture.pipeline.datasets import TWIN_PREFIX
+from megloc_kapture.pipeline.missing_weights import check_weights
+from megloc_kapture.pipeline.paper_steps import (
+    DatasetFacts,
+    LayeredOptions,
+    PaperStep,
+    paper_steps,
+    steps_text,
+)
+from megloc_kapture.pipeline.presets import options_of_preset
+
+FACTS = {
+    "aachen": DatasetFacts(map_depth=False, query_depth=False, model=True),
+    "robotcar": DatasetFacts(map_depth=False, query_depth=False, model=True),
+    "4seasons": DatasetFacts(map_depth=False, query_depth=False, model=False),
+    "inloc": DatasetFacts(map_depth=True, query_depth=False, model=False),
+    "kapture": DatasetFacts(map_depth=True, query_depth=True, model=False),
+}
+NOT_YET = {
+    "depth of map images by multi-view stereo",
+    "rendering by a neural field (NeRF-W)",
+    "descriptors and matcher trained anew",
+}
+WITHOUT_DEPTH = {
+    "points verified by depth",
+    "clusters ranked by LPIPS of aligned views",
+    "poses refined by ICP",
+    "poses refined by rendering",
+}
+SEQUENCE, COVISIBLE = "map pairs by sequence", "map pairs by co-visibility"
+OFF = {
+    "aachen": {*WITHOUT_DEPTH, "the own car masked", SEQUENCE},
+    "robotcar": {*WITHOUT_DEPTH, SEQUENCE},
+    "4seasons": {*WITHOUT_DEPTH, COVISIBLE},
+    "inloc": {
+        "people and vehicles masked",
+        "the own car masked",
+        "map pairs by poses",
+        COVISIBLE,
+        "map pairs by retrieval",
+        SEQUENCE,
+        "points triangulated with known poses",
+        "uncertain points rejected",
+        "poses refined by ICP",
+    },
+    # nobody knows what is in a user's folders
+    "kapture": {
+        "people and vehicles masked",
+        "the own car masked",
+        COVISIBLE,
+        SEQUENCE,
+        "clusters ranked by LPIPS of aligned views",
+        "poses refined by rendering",
+    },
+}
+
+
+def layers(dataset: str, preset: str, *assignments: str) -> LayeredOptions:
+    changes = find_benchmark(dataset, TWIN_PREFIX).changes(
+        preset, query_depth=FACTS[dataset].query_depth
+    )
+    return LayeredOptions(
+        preset,
+        options_of_preset(preset),
+        options_of_preset(preset, changes=changes),
+        options_of_preset(preset, changes=changes, assignments=assignments),
+    )
+
+
+def steps_of(dataset: str, preset: str, *assignments: str) -> dict[str, PaperStep]:
+    found = paper_steps(layers(dataset, preset, *assignments), FACTS[dataset])
+    return {step.name: step for step in found}
+
+
+@pytest.mark.parametrize("dataset", FACTS)
+def test_the_preset_does_every_step_that_a_dataset_permits(dataset: str) -> None:
+    steps = steps_of(dataset, "megloc")
+    assert {name for name, step in steps.items() if not step.on} == OFF[dataset] | NOT_YET
+    assert all(step.why for step in steps.values())
+    # with its own options each dataset needs no download
+    check_weights(layers(dataset, "classic").chosen)
+
+
+def test_outdoors_and_indoors_differ_as_the_networks_do() -> None:
+    said = {
+        dataset: steps_of(dataset, "megloc")["SuperPoint matched by SuperGlue"].why
+        for dataset in FACTS
+    }
+    for dataset in ("aachen", "robotcar", "4seasons"):
+        assert "within 3 px, superglue_outdoor" in said[dataset]
+    assert "within 4 px, superglue_indoor" in said["inloc"]
+
+
+@pytest.mark.parametrize(
+    ("assignment", "name"),
+    [
+        ("preprocessing.undistort=false", "lens distortion removed"),
+        ("preprocessing.masks.segmenter=null", "people and vehicles masked"),
+        ('mapping_pairs.by=["poses", "retrieval"]', COVISIBLE),
+        ("guided_pyramid.mode=off", "guided pyramid matching"),
+        ("localization.clusters.by=none", "one pose per cluster of candidates"),
+        ('local_features=["superpoint"]', "ASLFeat"),
+        ("refinement.uncertainty.max_robust_sigmas=null", "uncertain points rejected"),
+        ("reranking.by=none", "M images retrieved, N kept by local matches"),
+    ],
+)
+def test_who_turned_a_step_off_is_said(assignment: str, name: str) -> None:
+    before, after = steps_of("aachen", "megloc"), steps_of("aachen", "megloc", assignment)
+    assert before[name].on and not after[name].on
+    assert after[name].why.startswith("an option of this run (")
+    others = {other for other in before if other != name}
+    changed = {other for other in others if before[other].on != after[other].on}
+    assert changed <= {"SuperPoint matched by SuperGlue"}  # a list typed anew has other matchers
+    assert steps_of("aachen", "classic")["ASLFeat"].why.startswith("neither preset classic nor")
+
+
+def test_who_turned_a_step_on_is_said() -> None:
+    steps = steps_of("robotcar", "megloc", "mapping_pairs.by=['sequence']")
+    assert steps[SEQUENCE] == PaperStep(SEQUENCE, True, "an option of this run (mapping_pairs.by)")
+    assert steps["ASLFeat"].why == "preset megloc"
+    masked = steps["people and vehicles masked"]
+    assert masked.why == "the dataset's file (preprocessing.masks.segmenter); deeplabv3plus"
+
+
+def test_a_step_without_its_data_is_off_whoever_asks_for_it() -> None:
+    icp = "poses refined by ICP"
+    asked = steps_of("aachen", "classic", 'pose_refinement.by=["icp"]')
+    assert asked[icp] == PaperStep(icp, False, "the queries have no depth")
+    assert steps_of("kapture", "classic")[icp].on
+
+
+@pytest.mark.parametrize("dataset", ["aachen", "robotcar", "4seasons", "inloc"])
+def test_all_weights_that_the_steps_need_are_named_at_once(
+    dataset: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("MEGLOC_WEIGHTS", str(tmp_path))
+    with pytest.raises(MissingWeightsError) as told:
+        check_weights(layers(dataset, "megloc").chosen)
+    needed = ["superpoint_v1", "aslfeat", "netvlad-pitts30k", "delg-r101-gldv2clean", "openibl"]
+    needed += ["apgem-resnet101-lm18"]
+    if dataset == "inloc":
+        needed += ["superglue_indoor", "lpips-trunk-alex", "lpips-alex"]
+    else:
+        needed += ["superglue_outdoor", "deeplabv3plus-resnet101"]
+    lines = str(told.value).splitlines()
+    assert sorted(line.split()[2] for line in lines) == sorted(needed)
+    assert all("megloc weights " in line for line in lines)
+
+
+def test_the_page_about_the_paper_has_every_step() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "paper.md").read_text(encoding="utf-8")
+    for name in steps_of("aachen", "megloc"):
+        assert f"| {name} |" in page
+
+
+def test_explaining_runs_nothing_and_needs_no_data(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("MEGLOC_WEIGHTS", str(tmp_path / "weights"))
+    monkeypatch.delenv("MEGLOC_DATA", raising=False)
+    monkeypatch.chdir(tmp_path)
+    for dataset in ("inloc", "synthetic-inloc"):
+        with pytest.raises(SystemExit) as end:
+            main(["eval", dataset, "--preset", "megloc", "--explain"])
+        assert end.value.code == 0
+        expected = paper_steps(layers("inloc", "megloc"), FACTS["inloc"])
+        assert capsys.readouterr().out.rstrip("\n") == steps_text(expected)
+    assert list(tmp_path.iterdir()) == []
