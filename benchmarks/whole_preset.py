@@ -4,9 +4,14 @@
     .venv/bin/python benchmarks/whole_preset.py --wiring free --executor inline
 
 ``random``: seeded random weights in every official container, added by ``megloc weights add
---unverified``, and the preset with all of its options on a small rendered scene. Such networks
-localize little or nothing; what counts is that each stage runs, says why it found nothing, and
-leaves files that kapture reads. The refiners run on the true poses as well, moved by 5 cm.
+--unverified``, and the preset on a small rendered scene whose queries have depth; the options are
+sizes, and what depends on the scene. Such networks localize little or nothing; what counts is that
+each stage runs, says why it found nothing, and leaves files that kapture reads. The refiners run on
+the true poses as well, moved by 5 cm. The twins of the datasets run with the datasets' own files
+and nothing else::
+
+    .venv/bin/python benchmarks/whole_preset_weights.py DIR
+    MEGLOC_WEIGHTS=DIR make eval DATASET=synthetic-aachen PRESET=megloc    # and the others
 
 ``free``: the same wiring with free weights in each slot, and recall that must reach the bars: 90 %
 of the queries within 0.25 m and 2 deg, 95 % within 0.5 m and 5 deg. Exits with 1 below them. The
@@ -55,12 +60,13 @@ voxels_m = [0.4, 0.2, 0.1], max_distances_m = [1.2, 0.6, 0.3] } },
     { name = "rendering" },
 ]"""
 
-# all that the paper does, in small; the options of both wirings
+# sizes for a small scene, and what depends on it; all else is the preset's. Both wirings
 _COMMON = f"""\
 dataset = "kapture"
 preset = "megloc"
 thresholds = [[0.05, 5.0], [0.25, 2.0], [0.5, 5.0], [5.0, 10.0]]
 
+# the map's cameras go round
 [options.mapping_pairs]
 by = ["poses", "retrieval", "sequence"]
 top_k = 4
@@ -71,21 +77,12 @@ sequence = {{ window = 1 }}
 top_k = 8
 
 [options.reranking]
-by = "coverage"
 keep = 5
 
 [options.guided_pyramid]
-mode = "all"
 min_matches = 30
 scales = [0.5, 1.0]
 rotations_deg = [0, 90]
-
-[options.refinement]
-min_observations = 2
-uncertainty = {{ keep_quantile = 0.95 }}
-
-[options.localization]
-clusters = {{ by = "covisibility" }}
 
 [options.pose_refinement]
 by = {REFINERS}
@@ -93,10 +90,7 @@ by = {REFINERS}
 _RANDOM = """
 [options.preprocessing]
 max_size_px = 304
-undistort = true
-
-[options.preprocessing.masks]
-segmenter = { name = "deeplabv3plus", options = { weights = "deeplabv3plus-mobilenet" } }
+masks = { segmenter = { name = "deeplabv3plus" } }
 
 [options.local_features]
 superpoint = { options = { max_keypoints = 400 } }
@@ -112,12 +106,11 @@ min_inliers = 6
 
 [options.localization.rank]
 name = "perceptual"
-options = { distance = { name = "lpips", options = { net = "squeeze" } } }
+options = { distance = { name = "lpips" } }
 """
 _FREE = """
 [options.preprocessing]
 max_size_px = 384
-undistort = true
 
 [[options.local_features]]
 name = "aliked"

@@ -1,5 +1,8 @@
 """Random weights for the preset ``megloc`` in the containers that its networks are published in.
 
+    .venv/bin/python benchmarks/whole_preset_weights.py DIR
+    MEGLOC_WEIGHTS=DIR make eval DATASET=synthetic-aachen PRESET=megloc
+
 Every file has the official name, container, keys and shapes; the numbers are drawn from a seed.
 Where torch's own way to begin a network would let nothing through (a score map that is flat, a
 graph that drowns the descriptors), the numbers are scaled so that features still answer to texture
@@ -8,6 +11,7 @@ and matches to descriptors: then every stage after them has something to do.
 
 from __future__ import annotations
 
+import argparse
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -24,6 +28,7 @@ from scipy.io import savemat
 from tensorflow_checkpoints import write_saved_model, write_tensorflow_checkpoint
 from torch import nn
 
+from megloc_kapture.io.weights import UNVERIFIED
 from megloc_kapture.io.weights_registry import registry
 from megloc_kapture.nets.apgem import ApGemNet
 from megloc_kapture.nets.aslfeat import AslFeatNet
@@ -60,10 +65,12 @@ class Sizes:
     Attributes
     ----------
     clusters, whitened : of NetVLAD and OpenIBL, whose whitenings are half a gigabyte each.
+    hidden : units of AlexNet's classifier, which is most of its file and which nobody reads.
     """
 
     clusters: int = 64
     whitened: int = 4096
+    hidden: int = 4096
 
 
 OFFICIAL = Sizes()
@@ -242,13 +249,14 @@ def _pca_class() -> Iterator[type]:
                 sys.modules[name] = module
 
 
-def _lpips_trunk(path: Path, _: Sizes) -> None:
-    features = _lpips_state(lambda key: key.startswith("features."))
-    classifier = {
-        "classifier.1.weight": torch.randn(1000, 512, 1, 1),
-        "classifier.1.bias": torch.zeros(1000),
-    }
-    torch.save(features | classifier, path)
+def _lpips_trunk(path: Path, sizes: Sizes) -> None:
+    state = _lpips_state(lambda key: key.startswith("features."))
+    inputs = 256 * 6 * 6
+    for layer, outputs in ((1, sizes.hidden), (4, sizes.hidden), (6, 1000)):
+        state[f"classifier.{layer}.weight"] = torch.randn(outputs, inputs)
+        state[f"classifier.{layer}.bias"] = torch.zeros(outputs)
+        inputs = outputs
+    torch.save(state, path)
 
 
 def _lpips_heads(path: Path, _: Sizes) -> None:
@@ -257,14 +265,15 @@ def _lpips_heads(path: Path, _: Sizes) -> None:
 
 
 def _lpips_state(wanted: Callable[[str], bool]) -> dict[str, torch.Tensor]:
-    state = _spread(Lpips("squeeze")).state_dict()
+    state = _spread(Lpips("alex")).state_dict()
     return {key: value for key, value in state.items() if wanted(key)}
 
 
 def _deeplab(path: Path, _: Sizes) -> None:
-    net = _spread(DeepLabV3Plus("mobilenet", num_classes=19))
-    # of random labels most stand still, so that the masks leave something of the images
-    net.get_parameter("classifier.classifier.3.bias")[:_STANDING_CLASSES].add_(2.0)
+    net = _spread(DeepLabV3Plus("resnet101", num_classes=19))
+    # random labels stand still, so that masks leave something of the images
+    logits = net.eval()(torch.rand(1, 3, 129, 161))
+    net.get_parameter("classifier.classifier.3.bias")[:_STANDING_CLASSES].add_(2.0 * logits.std())
     state = {"model_state": net.state_dict(), "cur_itrs": 30_000, "best_score": np.float64(0.7)}
     torch.save(state, path)
 
@@ -272,14 +281,15 @@ def _deeplab(path: Path, _: Sizes) -> None:
 _WRITERS: dict[str, Callable[[Path, Sizes], None]] = {
     "superpoint_v1": _superpoint,
     "superglue_outdoor": _superglue,
+    "superglue_indoor": _superglue,
     "aslfeat": _aslfeat,
     "netvlad-pitts30k": _netvlad,
     "openibl": _openibl,
     "delg-r101-gldv2clean": _delg,
     "apgem-resnet101-lm18": _apgem,
-    "lpips-trunk-squeeze": _lpips_trunk,
-    "lpips-squeeze": _lpips_heads,
-    "deeplabv3plus-mobilenet": _deeplab,
+    "lpips-trunk-alex": _lpips_trunk,
+    "lpips-alex": _lpips_heads,
+    "deeplabv3plus-resnet101": _deeplab,
 }
 
 
@@ -298,3 +308,21 @@ def _tensorflow_layout(value: torch.Tensor) -> NDArray[np.float32]:
     if value.ndim == 4:
         value = value.permute(2, 3, 1, 0)
     return np.ascontiguousarray(value.numpy(), np.float32).reshape(value.shape)
+
+
+def main() -> None:
+    """Write all of them where ``megloc`` finds what is not the published file."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path, help="of weights, for MEGLOC_WEIGHTS; 2.5 GB")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--small", action="store_true", help="smaller whitenings and classifiers")
+    options = parser.parse_args()
+    sizes = Sizes(clusters=4, whitened=32, hidden=8) if options.small else OFFICIAL
+    for name, path in write_random_weights(
+        options.folder / UNVERIFIED, options.seed, sizes
+    ).items():
+        print(f"{name:24s}  {path}")
+
+
+if __name__ == "__main__":
+    main()

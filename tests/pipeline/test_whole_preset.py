@@ -45,7 +45,7 @@ SCENE = Scene(
 )
 MAP_IMAGES, QUERIES = 18, 2
 # whitenings of full size are a gigabyte
-SMALL = Sizes(clusters=4, whitened=32)
+SMALL = Sizes(clusters=4, whitened=32, hidden=8)
 CHANGES = (
     "preprocessing.max_size_px=160",
     "local_features.superpoint.options.max_keypoints=150",
@@ -114,11 +114,11 @@ def test_every_container_has_the_published_name_and_keys(
         assert path.name in {Path(file.name).name for file in registry()[name].files}
         assert find_weights(name).path.is_relative_to(added / "unverified")
     assert found["superpoint_v1"] == keys("superpoint.txt")
-    assert found["superglue_outdoor"] == keys("superglue.txt")
+    assert found["superglue_outdoor"] == found["superglue_indoor"] == keys("superglue.txt")
     assert found["aslfeat"] == keys("aslfeat.txt")
     assert found["openibl"] == keys("openibl.txt")
     assert found["netvlad-pitts30k"] == keys("openibl.txt") | {"average_image"}
-    assert found["deeplabv3plus-mobilenet"] == keys("deeplabv3plus-mobilenet.txt")
+    assert found["deeplabv3plus-resnet101"] == keys("deeplabv3plus-resnet101.txt")
     whitening = {key for key in found["apgem-resnet101-lm18"] if key.startswith("pca.")}
     assert "pca.Landmarks_clean.components" in whitening and len(whitening) == 4
     assert keys("apgem-resnet101.txt") <= found["apgem-resnet101-lm18"]
