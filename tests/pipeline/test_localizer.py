@@ -339,6 +339,7 @@ def test_its_queries_cannot_be_extracted_without_the_networks_weights(
         localizer.localize(np.zeros((1024, 1536, 3), np.uint8), camera)
 
 
+@pytest.mark.slow
 def test_a_map_without_descriptors_is_extracted_again(
     localizer: Localizer, map_copy: Path, queries: list[Query]
 ) -> None:

@@ -62,6 +62,7 @@ def test_without_images_there_is_nothing_to_extract_from(stripped: Path) -> None
         again(opened, RootSift())
 
 
+@pytest.mark.slow
 def test_masks_are_used_as_they_were(stripped: Path) -> None:
     mask = np.zeros((1024, 1536), np.uint8)
     for image in KaptureMap.open(stripped).images:

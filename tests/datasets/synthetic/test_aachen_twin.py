@@ -234,6 +234,7 @@ def test_version_10_alone(tmp_path: Path) -> None:
     assert dataset.remarks == []
 
 
+@pytest.mark.slow
 def test_processes_write_the_same_bytes(root: Path, tmp_path: Path) -> None:
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as executor:
         write_aachen_twin(tmp_path, SMALL, executor)

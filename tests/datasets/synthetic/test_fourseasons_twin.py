@@ -338,6 +338,7 @@ def hashes(root: Path) -> dict[str, str]:
     }
 
 
+@pytest.mark.slow
 def test_processes_write_the_same_bytes(tmp_path: Path) -> None:
     tiny = SMALL.model_copy(
         update={"num_places": 1, "map_keyframes": 3, "winter_keyframes": 1, "dusk_keyframes": 1}

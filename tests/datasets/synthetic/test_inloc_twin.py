@@ -172,6 +172,7 @@ def test_the_default_twin_is_real_work() -> None:
     assert all(count >= 4 for count in kinds.values())  # each kind two times on each floor
 
 
+@pytest.mark.slow
 def test_processes_write_the_same_bytes(root: Path, tmp_path: Path) -> None:
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as executor:
         write_inloc_twin(tmp_path, SMALL, executor)
