@@ -281,6 +281,7 @@ def test_names_are_the_test_list(root: Path, imported: Path) -> None:
     assert all("/rear/" in name for name in scored)
 
 
+@pytest.mark.slow
 def test_the_same_options_give_the_same_bytes(tmp_path: Path) -> None:
     options = SMALL.model_copy(update={"num_locations": 1, "size_px": 64})
     write_robotcar_twin(tmp_path / "once", options)

@@ -33,6 +33,8 @@ from megloc_kapture.stages.matches import match_pairs
 
 import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
 
+pytestmark = pytest.mark.slow
+
 OPTIONS = AachenTwinOptions(
     num_places=1,
     stations_per_place=7,

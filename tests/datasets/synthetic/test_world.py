@@ -14,6 +14,7 @@ def world() -> SyntheticWorld:
     return build_world()
 
 
+@pytest.mark.slow
 def test_the_default_world_is_real_work(world: SyntheticWorld) -> None:
     assert len(world.mapping) >= 80
     assert len(world.queries) >= 40
