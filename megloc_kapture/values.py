@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -158,35 +159,38 @@ class RigidTransform:
     def inverse(self) -> RigidTransform:
         """``b_from_a`` of an ``a_from_b``."""
         w, x, y, z = self.quat_wxyz
-        t = -self.rotation_matrix().T @ np.array(self.translation)
-        return RigidTransform((w, -x, -y, -z), (float(t[0]), float(t[1]), float(t[2])))
+        turned = RigidTransform((w, -x, -y, -z), (0.0, 0.0, 0.0))
+        tx, ty, tz = turned._applied(self.translation)
+        return RigidTransform(turned.quat_wxyz, (-tx, -ty, -tz))
 
     def __matmul__(self, other: RigidTransform) -> RigidTransform:
         """``a_from_b @ b_from_c`` is ``a_from_c``."""
         w1, x1, y1, z1 = self.quat_wxyz
         w2, x2, y2, z2 = other.quat_wxyz
-        quat = np.array(
-            [
-                w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
-                w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
-                w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
-                w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
-            ]
-        )
-        quat /= np.linalg.norm(quat)
-        t = self.rotation_matrix() @ np.array(other.translation) + np.array(self.translation)
-        return RigidTransform(
-            (float(quat[0]), float(quat[1]), float(quat[2]), float(quat[3])),
-            (float(t[0]), float(t[1]), float(t[2])),
-        )
+        w = w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2
+        x = w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2
+        y = w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2
+        z = w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2
+        norm = math.sqrt(w * w + x * x + y * y + z * z)
+        translation = self._applied(other.translation)
+        return RigidTransform((w / norm, x / norm, y / norm, z / norm), translation)
+
+    def _applied(self, point: tuple[float, float, float]) -> tuple[float, float, float]:
+        """Transform one point, with the same bits on every processor (BLAS's differ)."""
+        px, py, pz = point
+        (tx, ty, tz), rotation = self.translation, self.rotation_matrix().tolist()
+        x, y, z = (row[0] * px + row[1] * py + row[2] * pz for row in rotation)
+        return x + tx, y + ty, z + tz
 
     def apply(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Transform points of shape (N, 3)."""
-        return points @ self.rotation_matrix().T + np.array(self.translation)
+        # not by BLAS, whose last bits depend on the processor
+        turned = np.einsum("...j,ij->...i", points, self.rotation_matrix())
+        return turned + np.array(self.translation)
 
     def center(self) -> NDArray[np.float64]:
         """For a ``cam_from_world``: the camera centre in the world, (3,) float64."""
-        return -self.rotation_matrix().T @ np.array(self.translation)
+        return np.array(self.inverse().translation)
 
 
 @dataclass(frozen=True, slots=True)

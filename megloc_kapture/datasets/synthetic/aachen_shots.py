@@ -19,12 +19,13 @@ from megloc_kapture.datasets.synthetic.looks import Condition, day_look
 from megloc_kapture.datasets.synthetic.movers import place_movers
 from megloc_kapture.datasets.synthetic.options import SyntheticWorldOptions, stream
 from megloc_kapture.datasets.synthetic.places import Place, build_place
+from megloc_kapture.datasets.synthetic.portable import settled_pose
 from megloc_kapture.datasets.synthetic.query_shots import query_shots
 from megloc_kapture.datasets.synthetic.shots import Shot, noise_seed
-from megloc_kapture.values import Camera, Options, RigidTransform
+from megloc_kapture.values import Camera, Options
 
 # the published model lies some hundred metres from its origin, with y down
-OFFICIAL_FROM_WORLD = RigidTransform.from_matrix(
+OFFICIAL_FROM_WORLD = settled_pose(
     np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]), np.array([738.5, -6.25, -41.75])
 )
 NUM_UNLISTED = 2  # query images on disk that no list names

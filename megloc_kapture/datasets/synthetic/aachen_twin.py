@@ -36,7 +36,7 @@ from megloc_kapture.stages.parallel import Track, untracked
 __all__ = ["AACHEN_TWIN_VERSION", "AachenTwinOptions", "write_aachen_twin"]
 
 # raise when the same options give other files than before
-AACHEN_TWIN_VERSION = 1
+AACHEN_TWIN_VERSION = 2
 _IMAGES = "images_upright"
 _MODELS = "3D-models"
 

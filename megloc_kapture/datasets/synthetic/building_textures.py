@@ -17,6 +17,7 @@ from megloc_kapture.datasets.synthetic.drawing import (
 from megloc_kapture.datasets.synthetic.materials import TILE, tiled
 from megloc_kapture.datasets.synthetic.noise import smooth_noise
 from megloc_kapture.datasets.synthetic.options import stream
+from megloc_kapture.datasets.synthetic.portable import resized, sin
 
 
 def paint_wall(
@@ -35,11 +36,8 @@ def paint_wall(
     coarse = smooth_noise(rng, height, width, cell=160, octaves=3)
     fine = smooth_noise(rng, height, width, cell=32, octaves=2)
     patches = np.clip(smooth_noise(rng, height, width, cell=90, octaves=5) - 1.2, 0, 0.25) * 4
-    streaks = cv2.resize(
-        smooth_noise(rng, max(2, height // 40), width, cell=12, octaves=3),
-        (width, height),
-        interpolation=cv2.INTER_CUBIC,
-    )
+    streaks = smooth_noise(rng, max(2, height // 40), width, cell=12, octaves=3)
+    streaks = resized(streaks, width, height, cubic=True)
     tone = 1 + dirt * (0.06 * coarse + 0.055 * fine + 0.04 * streaks)
     wall = shade(wall, np.clip(tone, 0.3, 1.6))
     patch = random_colour(rng, 90, 190, chroma=0.3)[None, None]
@@ -137,7 +135,7 @@ def paint_window(rng: np.random.Generator, height: int, width: int) -> Rgb:
     image = to_rgb(shade(np.broadcast_to(glass, (height, width, 3)), ramp * cloud))
     if rng.random() < 0.6:  # curtains with folds
         part = int(width * rng.uniform(0.15, 0.35))
-        folds = 1 + 0.25 * np.sin(np.arange(part) * rng.uniform(0.3, 0.7))
+        folds = 1 + 0.25 * sin(np.arange(part) * rng.uniform(0.3, 0.7))
         cloth = (
             (random_colour(rng, 110, 220, chroma=0.4) * folds[:, None])
             .clip(0, 255)
@@ -173,9 +171,8 @@ def paint_door(rng: np.random.Generator, height: int, width: int) -> Rgb:
     x = np.arange(width)
     column = tone[np.minimum(x * planks // width, planks - 1)]
     seam = np.where((x * planks % width) < planks * 2, 0.5, 1.0)
-    grain = cv2.resize(
-        smooth_noise(rng, max(2, height // 16), width, cell=6, octaves=2), (width, height)
-    )
+    grain = smooth_noise(rng, max(2, height // 16), width, cell=6, octaves=2)
+    grain = resized(grain, width, height)
     image = to_rgb(
         shade(
             base * np.ones((height, width, 3), np.float32),
@@ -200,7 +197,7 @@ def paint_door(rng: np.random.Generator, height: int, width: int) -> Rgb:
 def paint_shutter(rng: np.random.Generator, height: int, width: int) -> Rgb:
     """A rolling shutter: horizontal slats, with a graffito."""
     base = random_colour(rng, 110, 200, chroma=0.3)
-    slats = 1 + 0.18 * np.sin(np.arange(height, dtype=np.float32) * (2 * np.pi / 11))
+    slats = 1 + 0.18 * sin(np.arange(height) * (2 * np.pi / 11))
     dirt = 1 + 0.09 * smooth_noise(rng, height, width, cell=40, octaves=4)
     image = to_rgb(shade(np.broadcast_to(base, (height, width, 3)), slats[:, None] * dirt))
     box = (int(0.08 * width), int(0.3 * height), int(0.95 * width), int(0.85 * height))

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.datasets.synthetic.options import SyntheticWorldOptions
+from megloc_kapture.datasets.synthetic.portable import product, settled_pose
 from megloc_kapture.values import Camera, RigidTransform
 
 BONNET_CAMERA = "front"
@@ -24,7 +25,7 @@ def looking_at(
     down = np.cross(forward, right)
     cos, sin = np.cos(roll), np.sin(roll)
     rotation = np.stack([cos * right + sin * down, cos * down - sin * right, forward])
-    return RigidTransform.from_matrix(rotation, -rotation @ position)
+    return settled_pose(rotation, -product(rotation, position))
 
 
 def rig_cameras(options: SyntheticWorldOptions) -> dict[str, Camera]:
@@ -63,8 +64,8 @@ def rig_geometry() -> dict[str, RigidTransform]:
         about_x = np.array(
             [[1, 0, 0], [0, np.cos(pitch), np.sin(pitch)], [0, -np.sin(pitch), np.cos(pitch)]]
         )
-        rotation = about_x @ about_y
-        result[name] = RigidTransform.from_matrix(rotation, -rotation @ np.array(offset))
+        rotation = product(about_x, about_y)
+        result[name] = settled_pose(rotation, -product(rotation, np.array(offset)))
     return result
 
 

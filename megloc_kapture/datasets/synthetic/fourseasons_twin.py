@@ -52,14 +52,14 @@ from megloc_kapture.stages.parallel import Track, untracked
 from megloc_kapture.values import Options, RigidTransform
 
 # raise when the same options draw other pixels or other files than before
-FOURSEASONS_TWIN_VERSION = 1
+FOURSEASONS_TWIN_VERSION = 2
 
 REFERENCE = "recording_2020-06-18_10-12-33"
 WINTER = "recording_2021-01-15_13-04-17"
 DUSK = "recording_2021-03-22_18-41-05"
 
 _EXPOSURE_MS = {REFERENCE: 0.2457180023, WINTER: 1.9, DUSK: 10.0}
-_GREY = np.array([0.299, 0.587, 0.114], np.float32)
+_GREY = np.array([299, 587, 114])  # thousandths
 
 Drawn = tuple[NDArray[np.uint8], NDArray[np.float32]] | None
 
@@ -195,7 +195,7 @@ def _write_recording(
 
 def _write_files(root: Path, shot: Shot, view: View) -> Drawn:
     """Write the image, grey as the camera's; returned where it has depth, with that."""
-    grey = np.round(view.image @ _GREY).astype(np.uint8)
+    grey = ((view.image @ _GREY + 500) // 1000).astype(np.uint8)
     write_image(root / shot.name, grey)
     return None if view.depth_m is None else (grey, view.depth_m)
 

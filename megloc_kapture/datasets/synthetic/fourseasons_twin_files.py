@@ -19,6 +19,7 @@ from megloc_kapture.datasets.geodesy import earth_from_enu, geodetic
 from megloc_kapture.datasets.grammars.sparse_points import SparsePoints
 from megloc_kapture.datasets.synthetic.fourseasons_drive import CAM1_FROM_CAM0, Frame
 from megloc_kapture.datasets.synthetic.options import stream
+from megloc_kapture.datasets.synthetic.portable import settled
 from megloc_kapture.values import Camera, RigidTransform
 
 # the world's origin: near Munich, its axes east, north and up
@@ -114,9 +115,8 @@ def times_text(frames: Iterable[Frame], exposure_ms: float) -> str:
 def result_text(frames: SlamFrames, all_frames: Iterable[Frame]) -> str:
     """``result.txt``: the odometry's poses of all frames, level, of the unrectified camera."""
     half = np.radians(_RECTIFICATION_DEG) / 2
-    rectification = RigidTransform(
-        (float(np.cos(half)), 0.0, float(np.sin(half)), 0.0), (0.0, 0.0, 0.0)
-    )
+    w, y = settled((np.cos(half), np.sin(half))).tolist()
+    rectification = RigidTransform((w, 0.0, y, 0.0), (0.0, 0.0, 0.0))
     lines = []
     for frame in all_frames:
         pose = frames.s_from_as @ _odometry_pose(frames, frame) @ rectification
@@ -244,10 +244,12 @@ def _random_transform(
 ) -> RigidTransform:
     """A turn about z by up to ``yaw`` and about x and y by up to ``tilt`` radians, and a shift."""
     ax, ay, az = (float(a) / 2 for a in rng.uniform(-1, 1, 3) * (tilt, tilt, yaw))
+    cos_x, cos_y, cos_z = settled(np.cos((ax, ay, az))).tolist()
+    sin_x, sin_y, sin_z = settled(np.sin((ax, ay, az))).tolist()
     turns = (
-        RigidTransform((float(np.cos(az)), 0.0, 0.0, float(np.sin(az))), (0.0, 0.0, 0.0)),
-        RigidTransform((float(np.cos(ay)), 0.0, float(np.sin(ay)), 0.0), (0.0, 0.0, 0.0)),
-        RigidTransform((float(np.cos(ax)), float(np.sin(ax)), 0.0, 0.0), (0.0, 0.0, 0.0)),
+        RigidTransform((cos_z, 0.0, 0.0, sin_z), (0.0, 0.0, 0.0)),
+        RigidTransform((cos_y, 0.0, sin_y, 0.0), (0.0, 0.0, 0.0)),
+        RigidTransform((cos_x, sin_x, 0.0, 0.0), (0.0, 0.0, 0.0)),
     )
     x, y, z = (float(v) for v in rng.uniform(-1, 1, 3) * reach_m)
     shift = RigidTransform((1.0, 0.0, 0.0, 0.0), (x, y, z))
@@ -257,7 +259,7 @@ def _random_transform(
 def _as_written(transform: RigidTransform) -> RigidTransform:
     """The transform that six decimals stand for."""
     quat = np.round(transform.quat_wxyz, 6)
-    w, x, y, z = (quat / np.linalg.norm(quat)).tolist()
+    w, x, y, z = (quat / np.sqrt((quat * quat).sum())).tolist()
     tx, ty, tz = np.round(transform.translation, 6).tolist()
     return RigidTransform((w, x, y, z), (tx, ty, tz))
 

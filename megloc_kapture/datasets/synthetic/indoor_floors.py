@@ -26,6 +26,7 @@ from megloc_kapture.datasets.synthetic.indoor_rooms import (
 from megloc_kapture.datasets.synthetic.movers import mover_recipes
 from megloc_kapture.datasets.synthetic.options import SyntheticWorldOptions, stream
 from megloc_kapture.datasets.synthetic.places import Place
+from megloc_kapture.datasets.synthetic.portable import product, settled_pose
 from megloc_kapture.datasets.synthetic.surfaces import Surfaces
 from megloc_kapture.values import RigidTransform
 
@@ -155,14 +156,14 @@ def _beside_corridor(turned: bool) -> RigidTransform:
 
 def _placed(x: float, y: float, *, turned: bool) -> RigidTransform:
     sign = -1.0 if turned else 1.0
-    return RigidTransform.from_matrix(np.diag([sign, sign, 1.0]), np.array([x, y, 0.0]))
+    return settled_pose(np.diag([sign, sign, 1.0]), np.array([x, y, 0.0]))
 
 
 def _official_frame(seed: int, index: int) -> RigidTransform:
     """world_from_place: every floor has its own, and their coordinates overlap."""
     rng = stream(seed, "indoor", "frame", index)
     translation = np.array([*rng.uniform(-6, 6, 2), rng.uniform(-0.5, 0.5)])
-    return RigidTransform.from_matrix(_about_z(rng.uniform(-np.pi, np.pi)), translation)
+    return settled_pose(_about_z(rng.uniform(-np.pi, np.pi)), translation)
 
 
 def _zone(
@@ -190,8 +191,8 @@ def _zone(
     lean_x, lean_y = (
         RigidTransform(_small_turn(axis, rng.normal(0, _SCAN_TILT)), (0, 0, 0)) for axis in (1, 2)
     )
-    rotation = (lean_x @ lean_y).rotation_matrix() @ turn
-    return Zone(*names, plan, place_from_part, RigidTransform.from_matrix(rotation, spot).inverse())
+    rotation = product((lean_x @ lean_y).rotation_matrix(), turn)
+    return Zone(*names, plan, place_from_part, settled_pose(rotation, spot).inverse())
 
 
 def _small_turn(axis: int, angle: float) -> tuple[float, float, float, float]:

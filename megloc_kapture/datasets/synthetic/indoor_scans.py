@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.datasets.synthetic.indoor_floors import Floor
+from megloc_kapture.datasets.synthetic.portable import product
 from megloc_kapture.datasets.synthetic.render import NO_SURFACE, sample_grid, visible_surfaces
 from megloc_kapture.values import Camera, RigidTransform
 
@@ -42,12 +43,12 @@ def scanned_points(
     hit = (seen.surface != NO_SURFACE) & (inverse > 0)
     points = rays / np.where(hit, inverse, np.nan)[..., None]
     distance = np.linalg.norm(points, axis=-1)
-    normals = floor.place.surfaces.normals() @ cam_from_place.rotation_matrix().T
+    normals = product(floor.place.surfaces.normals(), cam_from_place.rotation_matrix().T)
     cosine = -np.einsum("hwk,hwk->hw", normals[surface], points) / distance
     back = hit & ~floor.glass[surface] & (distance < _RANGE_M) & (cosine > _MIN_COSINE)
     back &= image.mean(axis=2) >= _DARK
     back &= rng.random(back.shape) >= _DROPOUTS
     noise = 1 + _RANGE_NOISE_M * rng.standard_normal(back.shape) / distance
-    in_scan = (points * noise[..., None]) @ cam_from_scan.rotation_matrix()
+    in_scan = product(points * noise[..., None], cam_from_scan.rotation_matrix())
     in_scan[~back] = np.nan
     return in_scan.astype(np.float32).astype(np.float64)

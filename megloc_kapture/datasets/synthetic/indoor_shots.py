@@ -6,6 +6,7 @@ import numpy as np
 
 from megloc_kapture.datasets.synthetic.cameras import looking_at
 from megloc_kapture.datasets.synthetic.looks import Look
+from megloc_kapture.datasets.synthetic.portable import exp
 from megloc_kapture.values import Camera, RigidTransform
 
 YAWS_DEG = tuple(range(0, 360, 30))
@@ -33,7 +34,7 @@ def lamp_light(
     rng: np.random.Generator, *, noise: float, noise_seed: int, spread: float = 0.0
 ) -> Look:
     """Light of ceiling lamps; ``spread`` is how much light and colour vary between images."""
-    light = float(np.exp(rng.normal(0, spread)))
+    light = float(exp(rng.normal(0, spread)))
     cast = np.exp(rng.normal(0, 0.35 * spread, 3))
     return Look(
         condition="day",
@@ -44,7 +45,7 @@ def lamp_light(
         glow=(3.0, 2.9, 2.7),
         sky_colour=(0.0, 0.0, 0.0),
         cloud_shift=0.0,
-        exposure=float(np.exp(rng.normal(0, spread))),
+        exposure=float(exp(rng.normal(0, spread))),
         white_balance=(float(cast[0]), float(cast[1]), float(cast[2])),
         shot_noise=4e-5 * noise,
         read_noise=0.002 * noise,

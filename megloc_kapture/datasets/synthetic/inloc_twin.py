@@ -25,6 +25,7 @@ from megloc_kapture.datasets.synthetic.indoor_shots import (
     lamp_light,
 )
 from megloc_kapture.datasets.synthetic.options import SyntheticWorldOptions, stream
+from megloc_kapture.datasets.synthetic.portable import settled
 from megloc_kapture.datasets.synthetic.shots import Shot, noise_seed
 from megloc_kapture.datasets.synthetic.studio import draw_shots
 from megloc_kapture.datasets.synthetic.views import View
@@ -35,7 +36,7 @@ from megloc_kapture.stages.parallel import Track, untracked
 from megloc_kapture.values import Options, RigidTransform
 
 # raise when the same options draw other pixels or other files than before
-INLOC_TWIN_VERSION = 1
+INLOC_TWIN_VERSION = 2
 
 _FLOORS = ("DUC1", "DUC2")
 _BUILDING = "DUC"
@@ -209,7 +210,8 @@ def _queries(options: InLocTwinOptions) -> list[Shot]:
 def _displaced(pose: RigidTransform, rng: np.random.Generator) -> RigidTransform:
     """Where a scan was thought to stand before its refinement: beside its place, turned a bit."""
     half = 0.5 * float(rng.normal(0, 0.02))
-    turn = RigidTransform((float(np.cos(half)), 0.0, 0.0, float(np.sin(half))), (0.0, 0.0, 0.0))
+    w, z = settled((np.cos(half), np.sin(half))).tolist()
+    turn = RigidTransform((w, 0.0, 0.0, z), (0.0, 0.0, 0.0))
     x, y, z = (float(v) for v in rng.normal(0, 0.08, 3))
     return RigidTransform((1.0, 0.0, 0.0, 0.0), (x, y, z)) @ pose @ turn
 

@@ -8,6 +8,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from megloc_kapture.datasets.synthetic.portable import exp, settled
+
 Triple = tuple[float, float, float]
 Condition = Literal["day", "night"]
 
@@ -58,7 +60,7 @@ def as_array(values: Triple) -> NDArray[np.float32]:
 
 
 def _triple(values: NDArray[np.float64]) -> Triple:
-    r, g, b = (float(v) for v in values)
+    r, g, b = settled(values).tolist()
     return r, g, b
 
 
@@ -86,7 +88,7 @@ def day_look(
         glow=(0.0, 0.0, 0.0),
         sky_colour=_triple(sky_colour),
         cloud_shift=float(rng.uniform(0, 2 * np.pi)),
-        exposure=float(0.85 * np.exp(rng.normal(0, 0.12))),
+        exposure=float(0.85 * exp(rng.normal(0, 0.12))),
         white_balance=_triple(np.exp(rng.normal(0, 0.03, 3))),
         shot_noise=4e-5,
         read_noise=0.002,
@@ -108,7 +110,7 @@ def night_look(rng: np.random.Generator, *, exposure: float, noise_seed: int) ->
         glow=_triple(np.array([1.0, 0.85, 0.6])),
         sky_colour=(0.006, 0.008, 0.016),
         cloud_shift=float(rng.uniform(0, 2 * np.pi)),
-        exposure=float(exposure * 0.65 * np.exp(rng.normal(0, 0.25))),
+        exposure=float(exposure * 0.65 * exp(rng.normal(0, 0.25))),
         white_balance=_triple(np.array([1.0, 0.92, 0.86]) * np.exp(rng.normal(0, 0.05, 3))),
         shot_noise=2.2e-3,
         read_noise=0.006,

@@ -15,6 +15,7 @@ from megloc_kapture.datasets.synthetic.drawing import (
     to_rgb,
 )
 from megloc_kapture.datasets.synthetic.noise import smooth_noise
+from megloc_kapture.datasets.synthetic.portable import resized
 
 
 def paint_poster(rng: np.random.Generator, height: int, width: int) -> Rgb:
@@ -66,9 +67,8 @@ def paint_wood(rng: np.random.Generator, height: int, width: int) -> Rgb:
         np.minimum(y * boards // height, boards - 1)
     ]
     seam = np.where((y * boards % height) < boards * 2, 0.4, 1.0)
-    grain = cv2.resize(
-        smooth_noise(rng, height, max(2, width // 12), cell=8, octaves=3), (width, height)
-    )
+    grain = smooth_noise(rng, height, max(2, width // 12), cell=8, octaves=3)
+    grain = resized(grain, width, height)
     field = (tone * seam)[:, None] * (1 + 0.12 * grain)
     image = to_rgb(shade(np.broadcast_to(base, (height, width, 3)), field))
     for x in (0.04, 0.9):

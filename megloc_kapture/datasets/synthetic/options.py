@@ -11,7 +11,7 @@ from pydantic import Field
 from megloc_kapture.values import Options
 
 # raise when the same options draw other pixels or other files than before
-SYNTHETIC_VERSION = 1
+SYNTHETIC_VERSION = 2
 
 
 class SyntheticWorldOptions(Options):

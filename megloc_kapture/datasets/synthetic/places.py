@@ -17,6 +17,7 @@ from megloc_kapture.datasets.synthetic.floor_plans import FloorPlan, Obstacle, d
 from megloc_kapture.datasets.synthetic.furniture import RADIUS_M, SHARE, build_furniture
 from megloc_kapture.datasets.synthetic.movers import mover_recipes
 from megloc_kapture.datasets.synthetic.options import SyntheticWorldOptions, stream
+from megloc_kapture.datasets.synthetic.portable import settled_pose
 from megloc_kapture.datasets.synthetic.surfaces import SurfaceBuilder, Surfaces
 from megloc_kapture.datasets.synthetic.textures import TextureRecipe
 from megloc_kapture.values import RigidTransform
@@ -149,7 +150,7 @@ def _place_from_world(rng: np.random.Generator, index: int, num_places: int) -> 
     yaw = rng.uniform(-np.pi, np.pi)
     cos, sin = np.cos(yaw), np.sin(yaw)
     rotation = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-    return RigidTransform.from_matrix(rotation, middle).inverse()
+    return settled_pose(rotation, middle).inverse()
 
 
 def _wall(

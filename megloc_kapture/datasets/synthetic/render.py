@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.datasets.synthetic.atlas import NUM_LEVELS, Atlas
+from megloc_kapture.datasets.synthetic.portable import log2
 from megloc_kapture.datasets.synthetic.surfaces import Surfaces
 from megloc_kapture.errors import DataError
 from megloc_kapture.values import Camera, RigidTransform
@@ -118,8 +118,8 @@ def visible_surfaces(
 ) -> Visibility:
     """Find the nearest surface along each sample's ray."""
     rotation = cam_from_world.rotation_matrix()
-    origin = cam_from_world.apply(surfaces.origin)
-    edge_u, edge_v = surfaces.edge_u @ rotation.T, surfaces.edge_v @ rotation.T
+    seen_from = surfaces.moved(rotation, np.array(cam_from_world.translation))
+    origin, edge_u, edge_v = seen_from.origin, seen_from.edge_u, seen_from.edge_v
     planes, facing = _planes(origin, edge_u, edge_v)
     boxes = _bounding_boxes(origin, edge_u, edge_v, grid)
     rows, columns = grid.shape
@@ -272,9 +272,10 @@ def _level(
     part = np.abs(surfaces.uv[:, 2:] - surfaces.uv[:, :2])
     texels = (size * part).prod(1)
     # the Jacobian of a projective map is its determinant over the cube of the denominator
-    scale = np.abs(np.linalg.det(seen.planes)) * texels / (fx * fy * seen.grid.supersampling**2)
-    constant = (0.5 * np.log2(np.maximum(scale, 1e-30))).astype(np.float32)
-    level = np.take(constant, index) - np.float32(1.5) * np.log2(inverse)
+    determinant = (seen.planes[:, 0] * np.cross(seen.planes[:, 1], seen.planes[:, 2])).sum(1)
+    scale = np.abs(determinant) * texels / (fx * fy * seen.grid.supersampling**2)
+    constant = np.float32(0.5) * log2(np.maximum(scale, 1e-30))
+    level = np.take(constant, index) - np.float32(1.5) * log2(inverse)
     return np.clip(level, 0, NUM_LEVELS - 1 - 1e-3)
 
 
@@ -291,8 +292,10 @@ def _lookup_table(surfaces: Surfaces, atlas: Atlas) -> Float32:
 def _lookup(
     atlas: Atlas, table: Float32, row: NDArray[np.int32], u: Float32, v: Float32
 ) -> Float32:
+    from megloc_kapture.datasets.synthetic.texture_kernels import bilinear
+
     affine = np.take(table, row, axis=0)
     x = affine[..., 0] + affine[..., 1] * u
     y = affine[..., 2] + affine[..., 3] * v
-    texels = cv2.remap(atlas.image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(texels, np.float32)
+    texels: Float32 = bilinear(atlas.image, x, y)
+    return texels

@@ -23,6 +23,7 @@ from megloc_kapture.datasets.synthetic.covisibility import (
 from megloc_kapture.datasets.synthetic.movers import place_movers
 from megloc_kapture.datasets.synthetic.options import SyntheticWorldOptions, stream
 from megloc_kapture.datasets.synthetic.places import Place, build_place
+from megloc_kapture.datasets.synthetic.portable import product, settled_pose
 from megloc_kapture.datasets.synthetic.road_looks import road_look
 from megloc_kapture.datasets.synthetic.shots import Shot, noise_seed
 from megloc_kapture.values import Camera, Options, RigidTransform
@@ -34,7 +35,7 @@ CAMERAS = ("left", "rear", "right")
 SCORED_CAMERA = "rear"  # it sees the car's boot too
 
 # the published world is metric with z up; this one lies elsewhere than the rendered one
-OFFICIAL_FROM_WORLD = RigidTransform.from_matrix(
+OFFICIAL_FROM_WORLD = settled_pose(
     np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
     np.array([-412.25, 1381.5, 62.75]),
 )
@@ -191,8 +192,8 @@ def cam_from_car() -> dict[str, RigidTransform]:
             [[np.cos(right), 0, -np.sin(right)], [0, 1, 0], [np.sin(right), 0, np.cos(right)]]
         )
         about_x = np.array([[1, 0, 0], [0, np.cos(up), np.sin(up)], [0, -np.sin(up), np.cos(up)]])
-        rotation = about_x @ about_y
-        result[name] = RigidTransform.from_matrix(rotation, -rotation @ np.array(position))
+        rotation = product(about_x, about_y)
+        result[name] = settled_pose(rotation, -product(rotation, np.array(position)))
     return result
 
 

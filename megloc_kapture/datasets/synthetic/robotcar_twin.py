@@ -43,7 +43,7 @@ from megloc_kapture.values import Camera, RigidTransform
 __all__ = ["ROBOTCAR_TWIN_VERSION", "RobotCarTwinOptions", "write_robotcar_twin"]
 
 # raise when the same options give other files than before
-ROBOTCAR_TWIN_VERSION = 1
+ROBOTCAR_TWIN_VERSION = 2
 # moments of these traversals, the last of each, are in neither list of version 2
 _UNLISTED_CONDITIONS = ("rain", "night-rain")
 

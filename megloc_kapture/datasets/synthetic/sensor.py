@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.datasets.synthetic.looks import Look, as_array
 from megloc_kapture.datasets.synthetic.options import stream
+from megloc_kapture.datasets.synthetic.portable import averaged, blurred, exp, resized
 
 Float32 = NDArray[np.float32]
 
@@ -23,7 +24,7 @@ def develop(
     """
     height, width = light.shape[0] // supersampling, light.shape[1] // supersampling
     if supersampling > 1:
-        light = np.asarray(cv2.resize(light, (width, height), interpolation=cv2.INTER_AREA))
+        light = averaged(light, supersampling)
     if bonnet_seed is not None:
         cover, paint = bonnet(width, height, bonnet_seed)
         lit = as_array(look.sky) + np.float32(0.4) * as_array(look.sun)
@@ -32,18 +33,15 @@ def develop(
     signal = light * (as_array(look.white_balance) * np.float32(look.exposure))
     signal *= (1 - np.float32(look.vignetting) * _corner_distance(width, height))[..., None]
     if look.condition == "night":  # light that strays around lamps
-        small = cv2.resize(
-            np.minimum(signal, 4.0), (width // 8, height // 8), interpolation=cv2.INTER_AREA
-        )
-        haze = cv2.resize(cv2.GaussianBlur(small, (0, 0), 3.0), (width, height))
+        haze = resized(blurred(averaged(np.minimum(signal, 4.0), 8), 3.0), width, height)
         signal = signal + np.float32(0.06) * haze
-    signal = cv2.GaussianBlur(signal, (0, 0), look.blur_px)
+    signal = blurred(signal, look.blur_px)
     rng = np.random.default_rng(look.noise_seed)
     deviation = np.sqrt(look.shot_noise * signal + look.read_noise**2)
     signal = signal + deviation * rng.standard_normal(signal.shape, dtype=np.float32)
     # a shoulder instead of a hard limit, then gamma 2
     signal = np.clip(signal, 0, None)
-    signal = np.where(signal > 0.7, 1 - 0.3 * np.exp(-(signal - 0.7) / 0.3), signal)
+    signal = np.where(signal > 0.7, 1 - 0.3 * exp(-(signal - 0.7) / 0.3), signal)
     return np.clip(np.sqrt(signal) * 255 + 0.5, 0, 255).astype(np.uint8)
 
 
@@ -68,7 +66,7 @@ def bonnet(width: int, height: int, seed: int) -> tuple[Float32, Float32]:
     cover = np.clip(below * height + 0.5, 0, 1).astype(np.float32)
     rng = stream(seed, "bonnet")
     colour = rng.uniform(0.05, 0.35, 3).astype(np.float32)
-    gloss = np.exp(-(((below - 0.035) / 0.02) ** 2)) * 0.5 + 0.6 + 1.5 * np.clip(below, 0, None)
+    gloss = exp(-(((below - 0.035) / 0.02) ** 2)) * 0.5 + 0.6 + 1.5 * np.clip(below, 0, None)
     canvas = np.clip(colour * gloss[..., None], 0, 1).astype(np.float32)
     for side in (-0.42, 0.42):
         start = (int((0.5 + side * 0.6) * width), int(0.86 * height))

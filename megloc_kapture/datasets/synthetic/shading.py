@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.datasets.synthetic.looks import Look, as_array
 from megloc_kapture.datasets.synthetic.noise import periodic_noise
 from megloc_kapture.datasets.synthetic.options import stream
+from megloc_kapture.datasets.synthetic.portable import arctan2, exp, product
 from megloc_kapture.datasets.synthetic.render import NO_SURFACE, Visibility
 from megloc_kapture.datasets.synthetic.shadow import ShadowMap
 from megloc_kapture.datasets.synthetic.surfaces import Surfaces
@@ -56,7 +56,7 @@ def radiance(
     if has_sun or has_lamps:
         x, y, z = _positions(seen, cam_from_place)
     if has_sun:
-        facing = np.clip(normals @ np.array(look.sun_direction), 0, None).astype(np.float32)
+        facing = np.clip(product(normals, np.array(look.sun_direction)), 0, None).astype(np.float32)
         sun = np.take(facing, index)
         if shadows is not None:
             sun = sun * shadows.lit(x, y, z)
@@ -105,31 +105,18 @@ def _sky(
     cam_from_place: RigidTransform,
     clouds: Float32,
 ) -> Float32:
+    from megloc_kapture.datasets.synthetic.texture_kernels import bilinear
+
     rotation = cam_from_place.rotation_matrix().astype(np.float32)
     gx = np.broadcast_to(seen.grid.x, where.shape)[where].astype(np.float32)
     gy = np.broadcast_to(seen.grid.y, where.shape)[where].astype(np.float32)
     rays = gx[:, None] * rotation[0] + gy[:, None] * rotation[1] + rotation[2]
-    azimuth = np.arctan2(rays[:, 1], rays[:, 0]) + np.float32(look.cloud_shift)
-    rise = rays[:, 2] / np.hypot(rays[:, 0], rays[:, 1])
+    azimuth = arctan2(rays[:, 1], rays[:, 0]) + np.float32(look.cloud_shift)
+    rise = rays[:, 2] / np.sqrt(rays[:, 0] * rays[:, 0] + rays[:, 1] * rays[:, 1])
     u = np.mod(azimuth * np.float32(_CLOUD_SIZE / (2 * np.pi)), _CLOUD_SIZE)
     v = np.clip(rise, 0, 3) * np.float32(_CLOUD_SIZE / 3.2)
-    shape = (1, -1)
-    cover = _lookup_wrapped(clouds, u.reshape(shape), v.reshape(shape)).reshape(-1, 1)
+    seamless = np.concatenate([clouds, clouds[:, :1]], axis=1)[..., None]
+    cover = bilinear(seamless, u[None], v[None])[0]
     base = as_array(look.sky_colour)
-    haze = np.exp(-3 * np.clip(rise, 0, None))[:, None] * base.mean() * np.float32(0.5)
+    haze = exp(-3 * np.clip(rise, 0, None))[:, None] * base.mean() * np.float32(0.5)
     return base * (1 - 0.5 * cover) + cover * base.mean() * np.float32(1.1) + haze
-
-
-def _lookup_wrapped(image: Float32, u: Float32, v: Float32) -> Float32:
-    """Bilinear lookup, in rows of at most 32,000 (OpenCV's limit on a map's side)."""
-    parts = [
-        cv2.remap(
-            image,
-            np.ascontiguousarray(u[:, i : i + 32000]),
-            np.ascontiguousarray(v[:, i : i + 32000]),
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_WRAP,
-        )
-        for i in range(0, u.shape[1], 32000)
-    ]
-    return np.concatenate(parts, axis=1)

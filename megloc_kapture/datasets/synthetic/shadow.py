@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from megloc_kapture.datasets.synthetic.portable import product
 from megloc_kapture.datasets.synthetic.surfaces import Surfaces
 
 _SIZE = 1024
@@ -54,9 +55,9 @@ def cast_shadows(surfaces: Surfaces, sun_direction: tuple[float, float, float]) 
     """The shadow map of the surfaces (both sides cast shadows)."""
     sun = np.array(sun_direction)
     side = np.cross([0.0, 0.0, 1.0] if abs(sun[2]) < 0.99 else [1.0, 0.0, 0.0], sun)
-    side /= np.linalg.norm(side)
+    side /= np.sqrt((side * side).sum())
     axes = np.stack([side, np.cross(sun, side), sun])
-    flat = (surfaces.corners() @ axes.T)[..., :2]
+    flat = product(surfaces.corners(), axes.T)[..., :2]
     low, high = flat.min((0, 1)) - 0.1, flat.max((0, 1)) + 0.1
     step = float((high - low).max() / _SIZE)
     nothing = ShadowMap(axes, low, step, np.full((_SIZE, _SIZE), _NOTHING, np.float32))
@@ -67,11 +68,11 @@ def add_shadows(shadows: ShadowMap, surfaces: Surfaces) -> ShadowMap:
     """The map with the shadows of more surfaces, where they lie on its grid."""
     axes, low, step = shadows.axes, shadows.low, shadows.step
     height = shadows.height.copy()
-    outline = ((surfaces.corners() @ axes.T)[..., :2] - low) / step
+    outline = (product(surfaces.corners(), axes.T)[..., :2] - low) / step
     first = np.clip(np.floor(outline.min(1)) - 1, 0, _SIZE).astype(int)
     last = np.clip(np.ceil(outline.max(1)) + 1, 0, _SIZE).astype(int)
-    origin = surfaces.origin @ axes.T
-    edge_u, edge_v = surfaces.edge_u @ axes.T, surfaces.edge_v @ axes.T
+    along = surfaces.moved(axes, np.zeros(3))
+    origin, edge_u, edge_v = along.origin, along.edge_u, along.edge_v
     across = edge_u[:, 0] * edge_v[:, 1] - edge_u[:, 1] * edge_v[:, 0]
     for index in np.flatnonzero((np.abs(across) > 1e-6) & (first < last).all(1)):
         (left, top), (right, bottom) = first[index], last[index]

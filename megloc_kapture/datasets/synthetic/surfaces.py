@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from megloc_kapture.datasets.synthetic.portable import product, settled
+
 Vector = NDArray[np.float64]
 
 
@@ -49,9 +51,9 @@ class Surfaces:
     def moved(self, rotation: Vector, translation: Vector) -> Surfaces:
         """The surfaces after ``x -> rotation x + translation``."""
         return Surfaces(
-            self.origin @ rotation.T + translation,
-            self.edge_u @ rotation.T,
-            self.edge_v @ rotation.T,
+            product(self.origin, rotation.T) + translation,
+            product(self.edge_u, rotation.T),
+            product(self.edge_v, rotation.T),
             self.texture,
             self.uv,
             self.glow,
@@ -132,10 +134,10 @@ class SurfaceBuilder:
         """All that was added, in order."""
         count = len(self._rows)
         return Surfaces(
-            np.array([r[0] for r in self._rows], np.float64).reshape(count, 3),
-            np.array([r[1] for r in self._rows], np.float64).reshape(count, 3),
-            np.array([r[2] for r in self._rows], np.float64).reshape(count, 3),
+            settled([r[0] for r in self._rows]).reshape(count, 3),
+            settled([r[1] for r in self._rows]).reshape(count, 3),
+            settled([r[2] for r in self._rows]).reshape(count, 3),
             np.array([r[3] for r in self._rows], np.int32),
-            np.array([r[4] for r in self._rows], np.float64).reshape(count, 4),
+            settled([r[4] for r in self._rows]).reshape(count, 4),
             np.array([r[5] for r in self._rows], np.float32),
         )

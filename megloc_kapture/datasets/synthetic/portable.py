@@ -1,0 +1,126 @@
+"""Arithmetic that gives the same bits on every processor.
+
+Sums, products, quotients and square roots are exact to the last bit (IEEE 754). Matrix products of
+BLAS, filters of OpenCV and elementary functions are not: they take what instructions the processor
+has, fused ones among them, and a grey level that lies between two may fall to either. So products
+are sums written out here, filters are too, and elementary functions are computed in float64 and
+rounded where their last bits are gone.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from megloc_kapture.values import RigidTransform
+
+_DECIMALS = 9  # a nanometre; errors of the functions that were used are a millionth of it
+_CUBIC = -0.75  # the slope at distance 1, as OpenCV has it
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+
+def settled(values: ArrayLike) -> Float64:
+    """Metres, radians or parts of a unit vector without their last bits, float64."""
+    rounded = np.round(np.asarray(values, np.float64), _DECIMALS)
+    return np.asarray(rounded + 0.0, np.float64)  # of -0 and 0, 0
+
+
+def settled_pose(rotation: Float64, translation: Float64) -> RigidTransform:
+    """The transform of a rotation matrix (3, 3) and a translation (3,), without the last bits."""
+    quat = settled(RigidTransform.from_matrix(rotation, translation).quat_wxyz)
+    # half a turn has w = 0, give or take a last bit, by which either sign may come out
+    quat = quat * np.sign(quat[np.flatnonzero(quat)[0]])
+    w, x, y, z = (quat + 0.0).tolist()
+    tx, ty, tz = settled(translation).tolist()
+    return RigidTransform((w, x, y, z), (tx, ty, tz))
+
+
+def exp(values: ArrayLike) -> Float32:
+    """Exponential function, float32."""
+    return np.exp(np.asarray(values, np.float64)).astype(np.float32)
+
+
+def sin(angles: ArrayLike) -> Float32:
+    """Sine of angles in radians, float32."""
+    return np.sin(np.asarray(angles, np.float64)).astype(np.float32)
+
+
+def log2(values: ArrayLike) -> Float32:
+    """Binary logarithm, float32."""
+    return np.log2(np.asarray(values, np.float64)).astype(np.float32)
+
+
+def arctan2(y: ArrayLike, x: ArrayLike) -> Float32:
+    """Angle of (x, y) in radians, float32."""
+    angles = np.arctan2(np.asarray(y, np.float64), np.asarray(x, np.float64))
+    return np.asarray(angles, np.float32)
+
+
+def product(left: Float64, right: Float64) -> Float64:
+    """``left @ right``, (..., K) by (K,) or (K, M), K >= 1; for a K of few."""
+    terms = (left[..., k, None] * right[k] for k in range(len(right)))
+    total = next(terms)
+    for term in terms:
+        total = total + term
+    return total[..., 0] if right.ndim == 1 else total
+
+
+def resized(image: Float32, width: int, height: int, *, cubic: bool = False) -> Float32:
+    """An image (h, w, ...) enlarged to (height, width, ...), linearly or by Keys' cubic.
+
+    Half a pixel lies around the outermost centres, which are repeated beyond the edge.
+    """
+    across = _interpolated(np.moveaxis(image, 1, 0), width, cubic)
+    return _interpolated(np.moveaxis(across, 0, 1), height, cubic)
+
+
+def _interpolated(rows: Float32, count: int, cubic: bool) -> Float32:
+    """``count`` rows at equal distances between those of an array (N, ...)."""
+    at = (np.arange(count) + 0.5) * (len(rows) / count) - 0.5
+    first = np.floor(at).astype(np.int64)
+    part = at - first
+    weights = {0: 1 - part, 1: part}
+    if cubic:
+        weights = {tap: _keys(np.abs(part - tap)) for tap in (-1, 0, 1, 2)}
+    shape = (count,) + (1,) * (rows.ndim - 1)
+    total = np.zeros((count, *rows.shape[1:]), np.float32)
+    for tap, weight in weights.items():
+        taken = rows[np.clip(first + tap, 0, len(rows) - 1)]
+        total += taken * weight.astype(np.float32).reshape(shape)
+    return total
+
+
+def _keys(distance: Float64) -> Float64:
+    """Weights of samples at distances of 0 to 2 (Keys 1981, equation 4, the slope at 1 free)."""
+    d = distance
+    near = ((_CUBIC + 2) * d - (_CUBIC + 3)) * d * d + 1
+    return np.where(d <= 1, near, _CUBIC * (((d - 5) * d + 8) * d - 4))
+
+
+def averaged(image: Float32, factor: int) -> Float32:
+    """Means of squares of ``factor`` by ``factor`` pixels, (h // factor, w // factor, ...)."""
+    height, width = image.shape[0] // factor, image.shape[1] // factor
+    image = image[: height * factor, : width * factor]
+    down = sum(image[k::factor] for k in range(factor))
+    across = sum(np.asarray(down)[:, k::factor] for k in range(factor))
+    return np.asarray(across, np.float32) * np.float32(1 / factor**2)
+
+
+def blurred(image: Float32, deviation_px: float) -> Float32:
+    """A Gaussian blur of an image (h, w, ...), out to four deviations, mirrored at the edges."""
+    radius = int(round(4 * deviation_px))
+    weights = np.asarray(exp(-0.5 * (np.arange(radius + 1) / deviation_px) ** 2), np.float64)
+    weights = (weights / (weights[0] + 2 * np.sum(weights[1:]))).astype(np.float32)
+    for axis in (0, 1):
+        size = image.shape[axis]
+        padding = [(0, 0)] * image.ndim
+        padding[axis] = (radius, radius)
+        padded = np.moveaxis(np.pad(image, padding, mode="reflect"), axis, 0)
+        total = padded[radius : radius + size] * weights[0]
+        for k in range(1, radius + 1):
+            below, above = radius - k, radius + k
+            total += (padded[below : below + size] + padded[above : above + size]) * weights[k]
+        image = np.moveaxis(total, 0, axis)
+    return np.ascontiguousarray(image)
