@@ -9,7 +9,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, get_args, get_origin
 
 import numpy as np
 import pytest
@@ -48,7 +48,8 @@ class Case:
     scene : a fixture of this module.
     refused : what ``megloc eval`` says instead of running.
     localize : what ``megloc localize`` says instead of running; empty: its result changes.
-    localize_value : for ``megloc localize``, where that takes a stronger change.
+    localize_value : for ``megloc localize``, where that takes another change.
+    also : what has to be set with it.
     """
 
     value: str
@@ -58,6 +59,7 @@ class Case:
     refused: str = ""
     localize: str = ""
     localize_value: str = ""
+    also: tuple[str, ...] = ()
 
 
 OF_MAPS = "nothing here uses it"
@@ -96,7 +98,9 @@ CASES: dict[str, Case] = {
     "fusion.gamma": Case("0.0001", "pairs/", FUSED),
     "fusion.alpha": Case("1.0", "pairs/", (*FUSED, "fusion.method=min_and_max")),
     "fusion.rank_constant": Case("0.01", "pairs/", (*FUSED, "fusion.method=reciprocal_rank")),
-    "fusion.list_length": Case("4", "pairs/", (*FUSED, "fusion.method=borda")),
+    "fusion.list_length": Case(
+        "4", "pairs/", (*FUSED, "fusion.method=borda"), localize_value="1"
+    ),
     "mapping_pairs.by": Case('["exhaustive"]', "pairs/mapping.txt", localize=OF_MAPS),
     "mapping_pairs.top_k": Case("2", "pairs/mapping.txt", localize=OF_MAPS),
     "mapping_pairs.poses.num_neighbours": Case(
@@ -126,7 +130,7 @@ CASES: dict[str, Case] = {
         ('mapping_pairs.by=["sequence"]', "mapping_pairs.sequence.window=1"),
         localize=OF_MAPS,
     ),
-    "query_pairs.by": Case('"exhaustive"', "pairs/query.txt", ("query_pairs.top_k=2",)),
+    "query_pairs.by": Case('"exhaustive"', "pairs/query.txt"),
     "query_pairs.top_k": Case("2", "pairs/query.txt"),
     "query_pairs.diversity.max_per_place": Case(
         "1",
@@ -143,7 +147,7 @@ CASES: dict[str, Case] = {
         "pairs/query.txt",
         ("query_pairs.top_k=3", "query_pairs.diversity={max_per_place=1,radius=0.9}"),
     ),
-    "reranking.by": Case('"verified"', "pairs/query.txt", ("reranking.keep=3",)),
+    "reranking.by": Case('"verified"', "pairs/query.txt", also=("reranking.keep=3",)),
     "reranking.keep": Case("2", "pairs/query.txt", ("reranking.by=coverage",)),
     "matching": Case('{name="nn",options={max_ratio=0.6}}', "matches/"),
     "verification": Case('"none"', "matches/"),
@@ -159,17 +163,25 @@ CASES: dict[str, Case] = {
     ),
     "query_verification.confidence": Case("0.01", "matches/query", LOOSE),
     "query_verification.seed": Case("7", "matches/query", LOOSE),
-    "guided_pyramid.mode": Case('"all"', "pyramid/"),
+    "guided_pyramid.mode": Case('"all"', "pyramid/", also=("guided_pyramid.min_matches=200",)),
     "guided_pyramid.min_matches": Case("200", "pyramid/", PYRAMID[:1]),
     "guided_pyramid.scales": Case("[1.0,2.0]", "pyramid/", PYRAMID),
     "guided_pyramid.rotations_deg": Case("[0]", "pyramid/", PYRAMID),
     "guided_pyramid.max_side_px": Case("500", "pyramid/", PYRAMID),
+    "guided_pyramid.probed_pairs": Case(
+        "1", "pyramid/", (*PYRAMID, "guided_pyramid.probe_matches=60")
+    ),
+    "guided_pyramid.probe_matches": Case(
+        "1000", "pyramid/", (*PYRAMID, "guided_pyramid.probed_pairs=1")
+    ),
     "map": Case('"lift"', "map/", scene="with_depth", localize=OF_MAPS),
     "given_features": Case('"rootsift"', refused="takes no given model", localize=OF_MAPS),
     "triangulation.max_reprojection_error_px": Case("0.2", "map/", localize=OF_MAPS),
     "triangulation.min_angle_deg": Case("8.0", "map/", localize=OF_MAPS),
     "triangulation.two_view_tracks": Case("true", "map/", localize=OF_MAPS),
-    "triangulation.seed": Case("5", "map/", ("verification=none",), localize=OF_MAPS),
+    "triangulation.seed": Case(
+        "5", "map/", ("verification=none", "matching.options.max_ratio=1.0"), localize=OF_MAPS
+    ),
     "lifting.max_jump": Case(
         "0.00001", "map/", ("map=lift",), scene="with_depth", localize=OF_MAPS
     ),
@@ -197,15 +209,19 @@ CASES: dict[str, Case] = {
     "refinement.uncertainty.max_deviation": Case("0.02", "map/", localize=OF_MAPS),
     "refinement.uncertainty.max_relative_deviation": Case("0.003", "map/", localize=OF_MAPS),
     "refinement.uncertainty.keep_quantile": Case("0.5", "map/", localize=OF_MAPS),
+    "refinement.uncertainty.max_robust_sigmas": Case("0.5", "map/", localize=OF_MAPS),
     "refinement.min_observations": Case(
         "4", "map/", ("refinement.consistency.max_reprojection_error_px=0.5",), localize=OF_MAPS
     ),
     "refinement.ply": Case("true", "map/reconstruction/refinement_kept.ply", localize=OF_MAPS),
-    "localization.clusters.by": Case('"none"', context=("query_pairs.top_k=7",)),
-    "localization.clusters.radius": Case(
-        "0.01", context=("localization.clusters={by='poses',radius=100.0}",)
+    "localization.clusters.by": Case(
+        '"poses"', context=("localization.clusters.max_clusters=1",),
+        also=("localization.clusters.radius=0.01",),
     ),
-    "localization.clusters.min_shared_points": Case("100000"),
+    "localization.clusters.radius": Case(
+        "0.01", context=("localization.clusters={by='poses',radius=100.0,max_clusters=1}",)
+    ),
+    "localization.clusters.min_shared_points": Case("100000", context=("localization.clusters.max_clusters=1",)),
     "localization.clusters.max_clusters": Case(
         "1", context=("localization.clusters={by='poses',radius=0.01}",)
     ),
@@ -224,9 +240,11 @@ CASES: dict[str, Case] = {
     "localization.pose.seed": Case("9", context=HASTY),
     "localization.rigs": Case("true", scene="with_rig"),
     "localization.fallback": Case('"retrieval"', context=("localization.pose.min_inliers=100000",)),
-    "pose_refinement.by": Case('["icp"]', "localized/refinement.csv", scene="with_depth"),
+    "pose_refinement.by": Case(
+        "[]", scene="with_depth", localize_value='["icp"]'  # this dataset's file has icp
+    ),
     "pose_refinement.max_references": Case(
-        "1", context=('pose_refinement.by=["icp"]',), scene="with_depth"
+        "1", context=('pose_refinement.by=["rendering"]',), scene="with_depth"
     ),
 }
 
@@ -234,7 +252,8 @@ CASES: dict[str, Case] = {
 def leaves(model: type[Options], above: str = "") -> Iterator[str]:
     """Paths of all options of a model, of models within it too; a list of plugins is one."""
     for name, field in model.model_fields.items():
-        inner = [kind for kind in (field.annotation, *get_args(field.annotation)) if is_model(kind)]
+        kinds = () if get_origin(field.annotation) is tuple else get_args(field.annotation)
+        inner = [kind for kind in (field.annotation, *kinds) if is_model(kind)]
         if inner:
             yield from leaves(inner[0], f"{above}{name}.")
         else:
@@ -365,7 +384,8 @@ def masks(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("masks")
     mask = np.full((300, 400), 255, np.uint8)
     mask[100:200] = 0
-    write_image(folder / "0004.jpg.png", mask)
+    for image in ("0000.jpg", "0001.jpg"):  # of the map and of the queries
+        write_image(folder / f"{image}.png", mask)
     return folder
 
 
@@ -380,7 +400,7 @@ def test_eval(
         f"{option}={case.value.format(masks=masks) if '{masks}' in case.value else case.value}"
     )
     arguments = ["eval", "kapture", "--root", root, "--executor", "inline", "-q"]
-    sets = flags((*context_of(case), changed))
+    sets = flags((*context_of(case), *case.also, changed))
     if case.refused:
         megloc(*arguments, "-w", tmp_path / "workspace", *sets).refused(case.refused)
         return
@@ -409,7 +429,7 @@ def test_localize(
     workspace = base(case.scene, context_of(case))
     arguments = ["localize", "-i", workspace / "map", "--query", scene / "query", "-q"]
     results = []
-    for name, more in (("old", ()), ("new", (f"{option}={value}",))):
+    for name, more in (("old", ()), ("new", (*case.also, f"{option}={value}"))):
         done = megloc(*arguments, "-o", tmp_path / name, *flags((*context_of(case), *more)))
         assert done.status == 0, done
         results.append(written(tmp_path / name))
