@@ -11,6 +11,8 @@ from megloc_kapture.cli.common import Force, Input, Linked, Output
 from megloc_kapture.cli.localize import LOCALIZED
 from megloc_kapture.cli.stage_command import StageCommand, restrictions_beside
 from megloc_kapture.errors import OptionError
+from megloc_kapture.evaluation.refined_poses import told_of_map
+from megloc_kapture.io.consistency_table import CONSISTENCY_FILE, read_consistency
 from megloc_kapture.io.outputs import staged_output
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
 from megloc_kapture.plugins import POSE_REFINERS, plugin_names
@@ -30,7 +32,7 @@ class RefinePoses(Linked, StageCommand):
     poses: Path
     """Result of megloc localize or megloc eval: kapture folder with status.csv."""
     output: Output
-    """Kapture folder of the refined result, with status.csv and refinement.csv."""
+    """Kapture folder of the refined result, with status.csv and the tables of refinement."""
     by: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
     """Pose refiner: icp or rendering; repeated, one after another; the preset's unless given."""
     force: Force = False
@@ -39,8 +41,9 @@ class RefinePoses(Linked, StageCommand):
     def run(self) -> int:
         """Run it."""
         console = self.console()
-        options = self.options().pose_refinement
-        if self.by:
+        changes: dict[str, object] = {"pose_refinement": {"by": list(self.by)}} if self.by else {}
+        options = self.options(changes).pose_refinement
+        if self.by:  # in this order, with the options that --set gives them
             known = {one.name: one.options for one in options.by}
             chosen = [{"name": name, "options": known.get(name, {})} for name in self.by]
             options = options.model_validate({**options.model_dump(), "by": chosen})
@@ -71,4 +74,7 @@ class RefinePoses(Linked, StageCommand):
             f"{counts['queries']:g} poses, {accepted}; status.csv and refinement.csv in "
             f"{self.output}"
         )
+        if (table := self.output / CONSISTENCY_FILE).is_file():
+            for row in read_consistency(table):
+                console.result(told_of_map(row))
         return 0

@@ -20,6 +20,7 @@ from megloc_kapture.evaluation.tables import (
     format_percent,
 )
 from megloc_kapture.evaluation.thresholds import Threshold
+from megloc_kapture.io.consistency_table import ConsistencyRow
 from megloc_kapture.values import RefinementRow, RigidTransform
 
 Poses = Mapping[str, RigidTransform]
@@ -57,10 +58,12 @@ class RefinedPoses:
     Attributes
     ----------
     recall : of all queries, before and after; empty where the truth is not known.
+    maps : what the map's own images say of each coordinate frame, where a step asked them.
     """
 
     steps: tuple[RefinerSummary, ...] = ()
     recall: str = ""
+    maps: tuple[str, ...] = ()
     views: tuple[RefinedView, ...] = ()
 
 
@@ -89,7 +92,21 @@ def refined_poses(
     return RefinedPoses(
         tuple(_summary(of_all, truth) for of_all in steps),
         _recall(refinements, estimated, truth, thresholds),
+        tuple(told_of_map(row) for row in around.consistency),
         tuple(refined_views(around, refinements, estimated, truth)),
+    )
+
+
+def told_of_map(row: ConsistencyRow) -> str:
+    """A sentence about the test of a map's own images."""
+    frame = f" in {row.frame}" if row.frame else ""
+    told = f"{row.method}{frame} is {f'not used: {row.reason}' if row.reason else 'used'}"
+    if row.reason:
+        return told
+    return (
+        f"{told}; {row.images} map images held out move by {format_metres(row.moved_m)} m, "
+        f"{format_degrees(row.turned_deg)} deg, {row.moved_px:.1f} px (medians; claimed "
+        f"to {format_metres(row.claimed_m)} m, {format_degrees(row.claimed_deg)} deg)"
     )
 
 

@@ -7,6 +7,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from megloc_kapture.io.cluster_table import CLUSTERS_FILE, ClusterRow, read_clusters
+from megloc_kapture.io.consistency_table import (
+    CONSISTENCY_FILE,
+    ConsistencyRow,
+    read_consistency,
+)
 from megloc_kapture.io.kapture_store import KaptureFolder
 from megloc_kapture.io.refinement_table import REFINEMENT_FILE, read_refinement
 from megloc_kapture.io.side_tables import PROTOCOL_FILE, SIDE_TABLES, read_groups
@@ -33,6 +38,7 @@ class Surroundings:
     frames : map image or query -> its coordinate frame, where a dataset has several.
     clusters : query -> the clusters of candidates it was tried in.
     refinements : query -> what each step of refining its pose came to.
+    consistency : what the map's own images said of it, before poses were refined.
     masked : folders whose images have masks, with the keypoints that were found in them.
     """
 
@@ -41,6 +47,7 @@ class Surroundings:
     frames: Mapping[str, str] = field(default_factory=dict)
     clusters: Mapping[str, Sequence[ClusterRow]] = field(default_factory=dict)
     refinements: Mapping[str, Sequence[RefinementRow]] = field(default_factory=dict)
+    consistency: Sequence[ConsistencyRow] = ()
     masked: Sequence[KaptureFolder] = ()
 
     def map_poses(self) -> dict[str, RigidTransform]:
@@ -87,10 +94,11 @@ def surroundings_of(result: Path | str, *, mapping: Path | str | None = None) ->
 
     Raises
     ------
-    DataError : broken side tables, or a broken table of clusters or of refinement.
+    DataError : broken side tables, or a broken table of clusters, of refinement or of consistency.
     """
     clusters = Path(result) / CLUSTERS_FILE
     refinement = Path(result) / REFINEMENT_FILE
+    consistency = Path(result) / CONSISTENCY_FILE
     workspace = workspace_of(result)
     features = []
     if workspace is not None:
@@ -114,6 +122,7 @@ def surroundings_of(result: Path | str, *, mapping: Path | str | None = None) ->
         frames={image: group.frame for image, group in groups.items() if group.frame},
         clusters=read_clusters(clusters) if clusters.is_file() else {},
         refinements=_by_image(read_refinement(refinement)) if refinement.is_file() else {},
+        consistency=read_consistency(consistency) if consistency.is_file() else (),
         masked=[] if workspace is None else _masked(workspace),
     )
 

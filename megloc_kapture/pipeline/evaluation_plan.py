@@ -211,7 +211,7 @@ def _refinement_stages(run: Run, dump: Mapping[str, Any]) -> list[Stage]:
     return [
         Stage(
             "refine_poses",
-            1,
+            2,
             {"pose_refinement": dump["pose_refinement"], "weights": weights},
             ("import", run.images_stage, "map", "localization"),
             (LOCALIZED, REFINEMENT_TIMING),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
@@ -28,7 +29,7 @@ from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.queries import KaptureQueries, Query, Unit
 from megloc_kapture.pipeline.query_images import Preprocessor, QueryImage, QueryImages
 from megloc_kapture.stages.matches import FeatureCache, Features
-from megloc_kapture.stages.parallel import ordered_map
+from megloc_kapture.stages.parallel import FolderSpec, ordered_map
 from megloc_kapture.stages.pose_refinement import PoseReferences, refine_pose
 from megloc_kapture.stages.query_poses import localize_unit, localize_views
 from megloc_kapture.stages.ranking_scene import KaptureScene
@@ -87,6 +88,8 @@ class Localizer:
         self._refiners = self.options.pose_refinement.make_refiners()
         self._preprocessor = Preprocessor(self.options)
         self.types = local_types_of(kapture_map, self.options, FeatureCache())
+        self._verdicts: dict[str, tuple[str, ...]] = {}
+        self._verdicts_lock = threading.Lock()
         self._retrieval = MapRetrieval(kapture_map, self.options, self.types, self._preprocessor)
 
     # ------------------------------------------------------------------ the public calls
@@ -234,8 +237,15 @@ class Localizer:
         if not self._refiners:
             return pose
         near = self._references.near(pose.cam_from_world, pose.candidates)
-        name = image.query.name
-        found = refine_pose(name, image.camera, pose.cam_from_world, near, self._refiners, scene)
+        found = refine_pose(
+            image.query.name,
+            image.camera,
+            pose.cam_from_world,
+            near,
+            self._refiners,
+            self._distrusted(self._references.frame(pose.candidates)),
+            scene,
+        )
         moved = any(row.accepted for row in found.rows)
         return replace(
             pose,
@@ -247,6 +257,15 @@ class Localizer:
 
     def _scene(self, images: Iterable[QueryImage]) -> KaptureScene:
         return KaptureScene(self.map.folder, QueryImages(images), map_camera=self.map.camera)
+
+    def _distrusted(self, frame: str) -> tuple[str, ...]:
+        """Of each refiner, why it must not be used in a coordinate frame; tested once."""
+        with self._verdicts_lock:
+            if frame not in self._verdicts:
+                spec = FolderSpec(self.map.folder)
+                found = self._references.verdicts(spec, [frame], self._refiners)
+                self._verdicts[frame] = tuple(one[frame].reason if one else "" for one in found)
+            return self._verdicts[frame]
 
     @cached_property
     def _references(self) -> PoseReferences:

@@ -1,4 +1,4 @@
-"""Which map images a pose is refined against."""
+"""Map images that a pose may be refined against, by where they look."""
 
 from __future__ import annotations
 
@@ -18,11 +18,15 @@ class ReferenceImages:
     Parameters
     ----------
     poses : ``cam_from_world`` of the map's images.
+
+    Attributes
+    ----------
+    names : of the images, sorted.
     """
 
     def __init__(self, poses: Mapping[str, RigidTransform]) -> None:
-        self._names = sorted(poses)
-        quats, translations = stack_poses([poses[name] for name in self._names])
+        self.names = tuple(sorted(poses))
+        quats, translations = stack_poses([poses[name] for name in self.names])
         self._centers = camera_centers(quats, translations)
         self._directions = rotate(invert_quats(quats), _FORWARD)
 
@@ -33,6 +37,7 @@ class ReferenceImages:
         *,
         max_references: int,
         max_angle_deg: float = 60.0,
+        min_distance_m: float = 0.0,
     ) -> list[str]:
         """Images that look a camera's way, nearest first; half of them, at least, of ``first``.
 
@@ -40,12 +45,14 @@ class ReferenceImages:
         ----------
         first : images that the pose comes from: they are known to match.
         max_angle_deg : between the viewing directions; images beyond it stay out.
+        min_distance_m : of the centres; images within it stay out, unit of the map.
         """
         forward = cam_from_world.rotation_matrix()[2]
         facing = self._directions @ forward >= np.cos(np.deg2rad(max_angle_deg))
         distances = np.linalg.norm(self._centers - cam_from_world.center(), axis=1)
-        order = [int(at) for at in np.argsort(distances, kind="stable") if facing[at]]
+        usable = facing & (distances >= min_distance_m)
+        order = [int(at) for at in np.argsort(distances, kind="stable") if usable[at]]
         known = set(first)
-        chosen = [at for at in order if self._names[at] in known][: (max_references + 1) // 2]
+        chosen = [at for at in order if self.names[at] in known][: (max_references + 1) // 2]
         chosen += [at for at in order if at not in set(chosen)][: max_references - len(chosen)]
-        return [self._names[at] for at in chosen]
+        return [self.names[at] for at in chosen]

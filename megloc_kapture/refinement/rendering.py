@@ -13,6 +13,7 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 from functools import partial
 
 from megloc_kapture.plugins import PoseRefinement, RankingScene
+from megloc_kapture.refinement.consistency import Displacement, held_out
 from megloc_kapture.refinement.photometric import MIN_POINTS, Alignment, LevelProblem
 from megloc_kapture.refinement.photometric_directions import beside
 from megloc_kapture.refinement.photometric_fit import correlation
@@ -26,6 +27,7 @@ from megloc_kapture.refinement.photometric_points import (
 )
 from megloc_kapture.refinement.photometric_pyramid import FeatureMaps
 from megloc_kapture.refinement.photometric_search import best_turns
+from megloc_kapture.refinement.references import ReferenceImages
 from megloc_kapture.refinement.rendering_acceptance import Candidate, judged
 from megloc_kapture.refinement.rendering_options import RenderingOptions
 from megloc_kapture.refinement.rendering_views import (
@@ -81,6 +83,39 @@ def refine_by_rendering(
         return _Refining(query, references, options, features, threads).refine(cam_from_world)
 
 
+def displacement_by_rendering(
+    query: RenderingQuery,
+    references: Sequence[RenderingReference],
+    cam_from_world: RigidTransform,
+    options: RenderingOptions | None = None,
+    *,
+    features: FeatureMaps | None = None,
+) -> Displacement | None:
+    """How far :func:`refine_by_rendering` moves a pose that should be right.
+
+    Where it keeps the pose, how far the least cost nearby is from it. None where the references do
+    not determine the pose: they cover too little, correlate too little, or lead out of its bounds.
+
+    Raises
+    ------
+    DataError : as there.
+    """
+    options = options or RenderingOptions()
+    with ThreadPoolExecutor(2) as threads:
+        refining = _Refining(query, references, options, features, threads)
+        refined = refining.refine(cam_from_world)
+        if not refined.accepted:
+            refined = refining.refine_nearby(cam_from_world)
+    found = refined.measures
+    if "squared_distance" not in found or (
+        found["moved_m"] > options.max_translation_m
+        or found["turned_deg"] > options.max_rotation_deg
+        or found["correlation_after"] < options.min_correlation
+    ):
+        return None
+    return Displacement(**{name: found[name] for name in Displacement.__dataclass_fields__})
+
+
 class _Refining:
     """The pyramids and points of one query and its references."""
 
@@ -104,11 +139,9 @@ class _Refining:
 
     def refine(self, start: RigidTransform) -> PoseRefinement:
         """See :func:`refine_by_rendering`."""
-        sight = visibility(self.points, self.camera, start)
-        overlap = self._overlap(sight)
-        if overlap < max(self.options.min_overlap, 1e-9):
-            reason = f"references with depth cover {overlap:.0%} of the query"
-            return PoseRefinement(start, reason, {"overlap_before": overlap})
+        sight, overlap = self._sight(start)
+        if sight is None:
+            return _uncovered(start, overlap)
         coarsest = min([len(self.query_levels), *map(len, self.levels)]) - 1
         searched = self._judged(start, overlap, self._searched(coarsest, start, sight))
         clear = searched.accepted and searched.measures["significance"] >= _CLEAR
@@ -119,6 +152,19 @@ class _Refining:
         if not searched.accepted:
             return direct if direct.accepted else searched
         return max((direct, searched), key=_correlation_after)
+
+    def refine_nearby(self, start: RigidTransform) -> PoseRefinement:
+        """The same at the finest level alone, without looking around."""
+        sight, overlap = self._sight(start)
+        if sight is None:
+            return _uncovered(start, overlap)
+        return self._judged(start, overlap, self._aligned(0, start, sight))
+
+    def _sight(self, start: RigidTransform) -> tuple[Visibility | None, float]:
+        """What is seen of the references, if enough, and the share of the query they cover."""
+        sight = visibility(self.points, self.camera, start)
+        overlap = self._overlap(sight)
+        return None if overlap < max(self.options.min_overlap, 1e-9) else sight, overlap
 
     def _searched(
         self, coarsest: int, start: RigidTransform, sight: Visibility
@@ -201,6 +247,11 @@ class _Refining:
         return float((sight.covered & usable).sum() / max(usable.sum(), 1))
 
 
+def _uncovered(start: RigidTransform, overlap: float) -> PoseRefinement:
+    reason = f"references with depth cover {overlap:.0%} of the query"
+    return PoseRefinement(start, reason, {"overlap_before": overlap})
+
+
 def _correlation_after(refined: PoseRefinement) -> float:
     return refined.measures.get("correlation_after", -1.0)
 
@@ -222,6 +273,14 @@ class Rendering:
     ) -> None:
         self.options = options or RenderingOptions()
         self.features = features
+        self.require_consistent_map = self.options.require_consistent_map
+
+    def hold_out(
+        self, image: str, images: ReferenceImages, scene: RankingScene
+    ) -> Displacement | None:
+        """How far a map image would move; see :func:`~.consistency.held_out`."""
+        displace = partial(displacement_by_rendering, options=self.options, features=self.features)
+        return held_out(image, images, scene, displace, max_references=self.options.max_references)
 
     def refine(
         self,

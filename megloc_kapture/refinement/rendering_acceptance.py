@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from megloc_kapture.geometry.cameras import project
 from megloc_kapture.geometry.poses import movement
 from megloc_kapture.plugins import PoseRefinement
 from megloc_kapture.refinement.photometric import MIN_POINTS, Alignment, LevelProblem
@@ -22,7 +23,7 @@ from megloc_kapture.values import RigidTransform
 
 # squared distance between two poses over the covariance of one that chance exceeds once in a
 # thousand times: the chi-squared distribution of six degrees of freedom
-_CHI2_OF_CHANCE = 22.46
+CHI2_OF_CHANCE = 22.46
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,16 +70,21 @@ def judged(
         "overlap_after": overlaps[1],
         "moved_m": moved_m,
         "turned_deg": turned_deg,
+        "moved_px": _moved_px(found.problem, start, pose),
         "points": float(comparison.after.count),
         "references": float(len(np.unique(found.problem.chosen.groups))),
     }
+    uncertainty = covariance(found.free, found.alignment)
+    if uncertainty is not None:
+        measures["claimed_m"] = float(np.sqrt(np.trace(uncertainty[3:, 3:])))
+        measures["claimed_deg"] = float(np.degrees(np.sqrt(np.trace(uncertainty[:3, :3]))))
+        measures["squared_distance"] = squared_distance(start, pose, uncertainty)
     reason = _too_far(moved_m, turned_deg, options) or _no_better(comparison, overlaps, options)
     if reason:
         return PoseRefinement(start, reason, measures)
-    uncertainty = covariance(found.free, found.alignment)
     if uncertainty is None:
         return PoseRefinement(start, "the images do not determine the pose", measures)
-    if not squared_distance(start, pose, uncertainty) > _CHI2_OF_CHANCE:
+    if not measures["squared_distance"] > CHI2_OF_CHANCE:
         return PoseRefinement(start, "it is as near as the images can tell", measures)
     return PoseRefinement(pose, "", measures, uncertainty)
 
@@ -92,6 +98,17 @@ def squared_distance(
     turn = 2.0 * np.copysign(1.0, w) * np.array([x, y, z])
     step = np.concatenate([turn, old_from_new.translation])
     return float(step @ np.linalg.solve(covariance, step))
+
+
+def _moved_px(problem: LevelProblem, old: RigidTransform, new: RigidTransform) -> float:
+    """Median by which points move in the image, in pixels of the level."""
+    points = problem.chosen.points
+    ahead = (old.apply(points)[:, 2] > 0) & (new.apply(points)[:, 2] > 0)
+    if not ahead.any():
+        return float("inf")
+    scale = np.array([problem.level.scale_x, problem.level.scale_y])
+    px = [project(problem.camera, pose, points[ahead]) * scale for pose in (old, new)]
+    return float(np.median(np.linalg.norm(px[1] - px[0], axis=1)))
 
 
 def _too_far(moved_m: float, turned_deg: float, options: RenderingOptions) -> str:

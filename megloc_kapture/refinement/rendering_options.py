@@ -50,6 +50,10 @@ class RenderingOptions(Options):
     max_rotation_deg: float = Field(
         default=5.0, gt=0, description="a pose that turns further is not accepted"
     )
+    require_consistent_map: bool = Field(
+        default=True,
+        description="refine only where the map's own images, held out, would stay where they are",
+    )
     min_significance: float = Field(
         default=2.5,
         ge=0,

@@ -16,6 +16,7 @@ from pydantic import Field
 from megloc_kapture.errors import PluginError
 from megloc_kapture.geometry.poses import movement
 from megloc_kapture.io.cluster_table import CLUSTERS_FILE
+from megloc_kapture.io.consistency_table import CONSISTENCY_FILE, write_consistency
 from megloc_kapture.io.csv_table import write_csv_table
 from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, write_sensors
 from megloc_kapture.io.links import link_images
@@ -33,7 +34,9 @@ from megloc_kapture.plugins import (
     RankingScene,
     load_plugin,
 )
+from megloc_kapture.refinement.consistency import Consistency, HoldsOut
 from megloc_kapture.refinement.references import ReferenceImages
+from megloc_kapture.stages.map_consistency import consistency_row, map_consistency
 from megloc_kapture.stages.parallel import FolderSpec, Track, ordered_map, untracked
 from megloc_kapture.stages.ranking_scene import KaptureScene
 from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
@@ -69,6 +72,7 @@ class _Job:
     map: FolderSpec
     query: FolderSpec
     refiners: tuple[PoseRefiner, ...]
+    distrusted: tuple[str, ...]  # of each refiner, why it must not be used; empty where it may
     image: str
     cam_from_world: RigidTransform
     references: tuple[str, ...]
@@ -113,6 +117,10 @@ class PoseReferences:
             for members in restrictions.frames(images)
         }
 
+    def frame(self, candidates: Sequence[str]) -> str:
+        """The coordinate frame of a pose, by the map images that it comes from."""
+        return self._restrictions.frame(candidates[0]) if candidates else ""
+
     def near(self, cam_from_world: RigidTransform, candidates: Sequence[str]) -> list[str]:
         """Map images that may show what a query sees, best first.
 
@@ -120,10 +128,31 @@ class PoseReferences:
         ----------
         candidates : map images that its pose comes from.
         """
-        frame = self._restrictions.frame(candidates[0]) if candidates else ""
-        return self._by_frame[frame].near(
+        return self._by_frame[self.frame(candidates)].near(
             cam_from_world, candidates, max_references=self._options.max_references
         )
+
+    def verdicts(
+        self,
+        mapping: FolderSpec,
+        frames: Sequence[str],
+        refiners: Sequence[PoseRefiner],
+        *,
+        executor: Executor | None = None,
+    ) -> list[dict[str, Consistency]]:
+        """Of each refiner whose poses are as good as the map is consistent, that of each frame.
+
+        Raises
+        ------
+        DataError : an image or a depth map cannot be read.
+        """
+        asked = {frame: self._by_frame[frame] for frame in frames}
+        return [
+            map_consistency(mapping, asked, refiner, executor=executor)
+            if isinstance(refiner, HoldsOut) and refiner.require_consistent_map
+            else {}
+            for refiner in refiners
+        ]
 
 
 def refine_poses(
@@ -141,7 +170,9 @@ def refine_poses(
     """Refine the poses of queries that were localized, and write them as a result of their own.
 
     A query that failed, or has a fallback pose, is left as it is. What became of each pose stands
-    in ``status.csv``, with measures in ``refinement.csv``.
+    in ``status.csv``, with measures in ``refinement.csv``. A refiner whose poses are as good as the
+    map is consistent is used in those coordinate frames only that prove to be; the measurement
+    stands in ``map_consistency.csv``.
 
     Parameters
     ----------
@@ -165,15 +196,28 @@ def refine_poses(
     data = localized.read()
     map_spec, query_spec = (FolderSpec(f) for f in (map_folder, query))
     references = PoseReferences(map_folder.read().poses(), restrictions, options)
+    refined = {
+        image: (pose, references.frame(status.candidates))
+        for image, status in statuses.items()
+        if status.status == "localized" and (pose := data.cam_from_world(image)) is not None
+    }
+    frames = sorted({frame for _, frame in refined.values()})
+    verdicts = references.verdicts(map_spec, frames, refiners, executor=executor)
     jobs = []
-    for image, status in statuses.items():
-        pose = data.cam_from_world(image)
-        if status.status == "localized" and pose is not None:
-            near = references.near(pose, status.candidates)
-            jobs.append(_Job(map_spec, query_spec, refiners, image, pose, tuple(near)))
+    for image, (pose, frame) in refined.items():
+        near = references.near(pose, statuses[image].candidates)
+        why = tuple(found[frame].reason if found else "" for found in verdicts)
+        jobs.append(_Job(map_spec, query_spec, refiners, why, image, pose, tuple(near)))
     results = track(ordered_map(_refine, jobs, executor), len(jobs), "refining")
     found = {job.image: refined for job, refined in zip(jobs, results, strict=True)}
     _write(output, data, localized, statuses, found)
+    tested = [
+        consistency_row(frame, refiner.name, verdict)
+        for refiner, verdict_of in zip(refiners, verdicts, strict=True)
+        for frame, verdict in verdict_of.items()
+    ]
+    if tested:
+        write_consistency(output / CONSISTENCY_FILE, tested)
     if timing is not None:
         rows = (
             (image, step, f"{seconds:.5f}")
@@ -189,6 +233,8 @@ def refine_poses(
             for row in refined.rows
             if row.method == refiner.name
         )
+    for row in tested:
+        counts[" ".join(filter(None, (row.method, "trusted", row.frame)))] = float(not row.reason)
     return counts
 
 
@@ -229,6 +275,7 @@ def _refine(job: _Job) -> RefinedPose:
         job.cam_from_world,
         job.references,
         job.refiners,
+        job.distrusted,
         KaptureScene(mapping, query),
     )
 
@@ -239,6 +286,7 @@ def refine_pose(
     cam_from_world: RigidTransform,
     references: Sequence[str],
     refiners: Sequence[PoseRefiner],
+    distrusted: Sequence[str],
     scene: RankingScene,
 ) -> RefinedPose:
     """Refine the pose of one query by one refiner after another.
@@ -246,15 +294,19 @@ def refine_pose(
     Parameters
     ----------
     references : map images, see :class:`PoseReferences`.
+    distrusted : of each refiner, why it must not be used in this map; empty where it may.
 
     Raises
     ------
     PluginError : a refiner breaks its protocol.
     """
     pose, covariance, rows, seconds = cam_from_world, None, [], {}
-    for refiner in refiners:
+    for refiner, reason in zip(refiners, distrusted, strict=True):
         started = time.perf_counter()
-        refined = refiner.refine(image, camera, pose, references, scene)
+        if reason:
+            refined = PoseRefinement(pose, reason)
+        else:
+            refined = refiner.refine(image, camera, pose, references, scene)
         rows.append(_row(refiner, image, pose, refined))
         if refined.accepted:
             pose, covariance = refined.cam_from_world, refined.covariance

@@ -98,9 +98,7 @@ CASES: dict[str, Case] = {
     "fusion.gamma": Case("0.0001", "pairs/", FUSED),
     "fusion.alpha": Case("1.0", "pairs/", (*FUSED, "fusion.method=min_and_max")),
     "fusion.rank_constant": Case("0.01", "pairs/", (*FUSED, "fusion.method=reciprocal_rank")),
-    "fusion.list_length": Case(
-        "4", "pairs/", (*FUSED, "fusion.method=borda"), localize_value="1"
-    ),
+    "fusion.list_length": Case("4", "pairs/", (*FUSED, "fusion.method=borda"), localize_value="1"),
     "mapping_pairs.by": Case('["exhaustive"]', "pairs/mapping.txt", localize=OF_MAPS),
     "mapping_pairs.top_k": Case("2", "pairs/mapping.txt", localize=OF_MAPS),
     "mapping_pairs.poses.num_neighbours": Case(
@@ -215,13 +213,16 @@ CASES: dict[str, Case] = {
     ),
     "refinement.ply": Case("true", "map/reconstruction/refinement_kept.ply", localize=OF_MAPS),
     "localization.clusters.by": Case(
-        '"poses"', context=("localization.clusters.max_clusters=1",),
+        '"poses"',
+        context=("localization.clusters.max_clusters=1",),
         also=("localization.clusters.radius=0.01",),
     ),
     "localization.clusters.radius": Case(
         "0.01", context=("localization.clusters={by='poses',radius=100.0,max_clusters=1}",)
     ),
-    "localization.clusters.min_shared_points": Case("100000", context=("localization.clusters.max_clusters=1",)),
+    "localization.clusters.min_shared_points": Case(
+        "100000", context=("localization.clusters.max_clusters=1",)
+    ),
     "localization.clusters.max_clusters": Case(
         "1", context=("localization.clusters={by='poses',radius=0.01}",)
     ),
@@ -241,7 +242,9 @@ CASES: dict[str, Case] = {
     "localization.rigs": Case("true", scene="with_rig"),
     "localization.fallback": Case('"retrieval"', context=("localization.pose.min_inliers=100000",)),
     "pose_refinement.by": Case(
-        "[]", scene="with_depth", localize_value='["icp"]'  # this dataset's file has icp
+        "[]",
+        scene="with_depth",
+        localize_value='["icp"]',  # this dataset's file has icp
     ),
     "pose_refinement.max_references": Case(
         "1", context=('pose_refinement.by=["rendering"]',), scene="with_depth"

@@ -130,7 +130,7 @@ def test_refinement_is_turned_on_and_off_in_one_workspace(first: Run) -> None:
         statuses = read_status(workspace.path("localized/status.csv")).values()
         said = {status.refinement for status in statuses}
         if options is refined:
-            assert said == {"rendering: no reference image has depth"}
+            assert said == {"rendering: no map image with depth is seen by others from elsewhere"}
             assert folder_bytes(workspace.path("localized_unrefined")) == plain
         else:
             assert said == {""}
