@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.datasets.synthetic.portable import settled_pose
 from megloc_kapture.values import RigidTransform
 
 _SEMI_MAJOR_M = 6378137.0
@@ -23,8 +22,7 @@ def earth_from_enu(latitude_deg: float, longitude_deg: float, height_m: float) -
     normal = _SEMI_MAJOR_M / np.sqrt(1 - _ECCENTRICITY_SQUARED * np.sin(lat) ** 2)
     position = up * (normal + height_m)
     position[2] -= normal * _ECCENTRICITY_SQUARED * np.sin(lat)
-    # to the micrometre: at the earth's surface a float64 holds no nanometres
-    return settled_pose(rotation, np.round(position, 6))
+    return RigidTransform.from_matrix(rotation, position)
 
 
 def geodetic(ecef_m: NDArray[np.float64]) -> tuple[float, float, float]:

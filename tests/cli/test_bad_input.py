@@ -191,7 +191,7 @@ def test_features_that_nobody_can_extract(megloc: Any, gallery: Path) -> None:
         of_unknown_type(gallery / part)
     megloc("info", gallery / "map").out.index("must be given in kapture: no extractor for orb_500")
     (gallery / "query" / "reconstruction" / "keypoints" / "orb_500" / f"{QUERY}.kpt").unlink()
-    message = r"query: image '.*rgb_00267\.jpg' has no features of type 'orb_500'.*no extractor"
+    message = r"image '.*rgb_00267\.jpg': features of type 'orb_500' are missing and no extractor"
     megloc(*localize(gallery)).refused(message)
     assert not (gallery.parent / "new").exists()
 

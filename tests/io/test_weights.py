@@ -33,7 +33,7 @@ COUNTS = {
     "aliked-n16": 678_324,
     "aliked-n16rot": 678_324,
     "aliked-n32": 980_468,
-    "xfeat": 660_654,
+    "xfeat": 1_551_625,  # with the fine matcher, which the ONNX file lacks
     "r2d2_WAF_N16": 485_803,
     "r2d2_WASF_N16": 485_803,
     "r2d2_WASF_N8_big": 1_041_019,

@@ -19,11 +19,20 @@ from megloc_kapture.datasets.geodesy import earth_from_enu, geodetic
 from megloc_kapture.datasets.grammars.sparse_points import SparsePoints
 from megloc_kapture.datasets.synthetic.fourseasons_drive import CAM1_FROM_CAM0, Frame
 from megloc_kapture.datasets.synthetic.options import stream
-from megloc_kapture.datasets.synthetic.portable import settled
+from megloc_kapture.datasets.synthetic.portable import settled, settled_pose
 from megloc_kapture.values import Camera, RigidTransform
 
+
+def _settled_earth_from_enu(
+    latitude_deg: float, longitude_deg: float, height_m: float
+) -> RigidTransform:
+    exact = earth_from_enu(latitude_deg, longitude_deg, height_m)
+    # to the micrometre: at the earth's surface a float64 holds no nanometres
+    return settled_pose(exact.rotation_matrix(), np.round(exact.translation, 6))
+
+
 # the world's origin: near Munich, its axes east, north and up
-EARTH_FROM_WORLD = earth_from_enu(48.1861, 11.6197, 540.0)
+EARTH_FROM_WORLD = _settled_earth_from_enu(48.1861, 11.6197, 540.0)
 
 # between the published calibrations of the distorted and the undistorted left camera
 _RECTIFICATION_DEG = 2.2
@@ -62,7 +71,7 @@ class SlamFrames:
         return cls(
             s_from_as=_as_written(_random_transform(rng, 0.03, 3.2e-2, 0.0)),
             w_from_gpsw=_as_written(_random_transform(rng, np.pi, 2e-2, 0.4)),
-            e_from_gpsw=_as_written(earth_from_enu(*place)),
+            e_from_gpsw=_as_written(_settled_earth_from_enu(*place)),
             scale=round(float(rng.uniform(0.96, 0.97)), 6),
             odometry_from_as=_random_transform(rng, np.pi, 0.1, 0.3),
             blank_lines=blank_lines,

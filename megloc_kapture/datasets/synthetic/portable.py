@@ -9,6 +9,8 @@ rounded where their last bits are gone.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -31,8 +33,9 @@ def settled_pose(rotation: Float64, translation: Float64) -> RigidTransform:
     """The transform of a rotation matrix (3, 3) and a translation (3,), without the last bits."""
     quat = settled(RigidTransform.from_matrix(rotation, translation).quat_wxyz)
     # half a turn has w = 0, give or take a last bit, by which either sign may come out
-    quat = quat * np.sign(quat[np.flatnonzero(quat)[0]])
-    w, x, y, z = (quat + 0.0).tolist()
+    w, x, y, z = (quat * np.sign(quat[np.flatnonzero(quat)[0]]) + 0.0).tolist()
+    length = math.sqrt(w * w + x * x + y * y + z * z)
+    w, x, y, z = w / length, x / length, y / length, z / length
     tx, ty, tz = settled(translation).tolist()
     return RigidTransform((w, x, y, z), (tx, ty, tz))
 
