@@ -88,7 +88,6 @@ class TriangulationOptions(Options):
     two_view_tracks: bool = Field(
         default=False, description="keep points that only two images observe"
     )
-    seed: int = Field(default=0, ge=0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,8 +192,8 @@ def triangulate(
         pipeline.num_threads = num_threads
         # with many residuals its threads add them up in whatever order they come: other last bits
         pipeline.ba_min_num_residuals_for_cpu_multi_threading = _NEVER
-        pipeline.random_seed = options.seed
-        pipeline.triangulation.random_seed = options.seed
+        # drawn from in tracks of many images only, and never seen to change a point
+        pipeline.random_seed = pipeline.triangulation.random_seed = 0
         pipeline.triangulation.ignore_two_view_tracks = not options.two_view_tracks
         pipeline.triangulation.min_angle = options.min_angle_deg
         pipeline.triangulation.merge_max_reproj_error = options.max_reprojection_error_px

@@ -13,7 +13,7 @@ from typing import Any, get_args, get_origin
 
 import numpy as np
 import pytest
-from corner import pose_at, write_kapture, write_scene
+from corner import write_scene
 
 from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, Sensor, write_sensors
@@ -177,14 +177,6 @@ CASES: dict[str, Case] = {
     "triangulation.max_reprojection_error_px": Case("0.2", "map/", localize=OF_MAPS),
     "triangulation.min_angle_deg": Case("8.0", "map/", localize=OF_MAPS),
     "triangulation.two_view_tracks": Case("true", "map/", localize=OF_MAPS),
-    # COLMAP draws samples only of tracks of more than 15 images
-    "triangulation.seed": Case(
-        "5",
-        "map/",
-        ("verification=none", "matching.options.max_ratio=1.0"),
-        scene="long",
-        localize=OF_MAPS,
-    ),
     "lifting.max_jump": Case(
         "0.00001", "map/", ("map=lift",), scene="with_depth", localize=OF_MAPS
     ),
@@ -294,19 +286,6 @@ def with_depth(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("with_depth")
     write_scene(root, with_depth=True)
     shutil.rmtree(root / "query_gt")
-    return root
-
-
-@pytest.fixture(scope="module")
-def long(plain: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """With 26 map images that stand close to each other."""
-    root = tmp_path_factory.mktemp("long") / "scene"
-    shutil.copytree(plain / "query", root / "query")
-    walk = {
-        f"{step:04}.jpg": pose_at((-0.6 + 0.05 * step, 0.1 * (-1) ** step, 0.0), 0.0, 0.0)
-        for step in range(20, 46)
-    }
-    write_kapture(root / "mapping", walk, with_poses=True)
     return root
 
 
