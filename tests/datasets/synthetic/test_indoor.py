@@ -168,7 +168,7 @@ def test_cutouts_turn_to_the_right_and_up() -> None:
         (0, 30, (-np.cos(np.pi / 6), 0, 0.5)),
     ):
         direction = cam_from_scan(yaw, pitch).inverse().apply(ahead)[0]
-        np.testing.assert_allclose(direction, expected, atol=1e-8)
+        np.testing.assert_allclose(direction, expected, atol=1e-8)  # of a settled pose
     assert phone_camera(4032, 3024).params[0] == 3136
     np.testing.assert_allclose(cutout_camera(1600, 1200).params[0], 1385.6406460551, rtol=1e-12)
 
