@@ -16,6 +16,10 @@ from megloc_kapture.nets.lightglue import (
 
 _SHAPE = LightGlueShape(width=96, num_heads=1)
 
+# the authors' file is of their module for training: the matcher, and the XFeat it was trained with
+_MATCHER = "matcher."
+_EXTRACTOR = "extractor.model.net."
+
 # The ONNX export of the first three layers names biases, but numbers the matrices of products, and
 # stores them transposed; a layer's numbers follow the layer before's at a fixed distance.
 _ONNX_PREFIX = "net."
@@ -43,8 +47,9 @@ _ONNX_OTHERS = {
 def load_lighterglue(tensors: Mapping[str, torch.Tensor], where: str) -> LightGlueNetwork:
     """The network with the tensors of a checkpoint, for inference.
 
-    Takes the authors' ``xfeat-lighterglue.pt`` (6 layers) and ``lighterglue_L3.onnx`` (the first 3,
-    with an assignment trained for them).
+    Takes the authors' ``xfeat-lighterglue.pt`` (6 layers, and beside them the XFeat they were
+    trained with, which is left out) and ``lighterglue_L3.onnx`` (the first 3 with their assignment,
+    the same values).
 
     Raises
     ------
@@ -54,7 +59,12 @@ def load_lighterglue(tensors: Mapping[str, torch.Tensor], where: str) -> LightGl
     if f"{_ONNX_PREFIX}input_proj.bias" in tensors:
         named = _of_onnx(tensors, where)
     else:
-        named = renamed_blocks({key.removeprefix("matcher."): tensors[key] for key in tensors})
+        matcher = {
+            key.removeprefix(_MATCHER): value
+            for key, value in tensors.items()
+            if not key.startswith(_EXTRACTOR)
+        }
+        named = renamed_blocks(matcher)
     return load_lightglue(named, where, _SHAPE)
 
 

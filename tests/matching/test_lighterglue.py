@@ -274,6 +274,47 @@ def test_the_authors_checkpoint_has_other_names(weights: str, tmp_path: Path) ->
         torch.testing.assert_close(value, theirs.state_dict()[key])
 
 
+def test_the_published_checkpoint_begins_with_the_onnx_file(
+    weights: str, shared_data: Path
+) -> None:
+    """Its first three layers, their assignment, and what stands before them are the same values."""
+    path = shared_data / "weights" / "lighterglue" / "xfeat-lighterglue.pt"
+    network = load_lighterglue(read_weights(find_weights(str(path))), path.name)
+    assert len(network.parts.transformers) == 6 and network.descriptor_size == 64
+    whole = network.parts.state_dict()
+    three = load_lighterglue(read_weights(find_weights(weights)), weights).parts.state_dict()
+    used = [
+        key
+        for key in three
+        if key.startswith(("input_proj.", "posenc.", "transformers.", "log_assignment.2."))
+    ]
+    assert len(used) == 73
+    for key in used:
+        torch.testing.assert_close(three[key], whole[key], rtol=0, atol=0, msg=key)
+
+
+def test_beside_the_matcher_the_published_checkpoint_holds_xfeat_alone(shared_data: Path) -> None:
+    """The published weights; what normalisation counted went on in training."""
+    folder = shared_data / "weights"
+    tensors = read_weights(find_weights(str(folder / "lighterglue" / "xfeat-lighterglue.pt")))
+    xfeat = read_weights(find_weights(str(folder / "xfeat" / "xfeat.pt")))
+    prefix = "extractor.model.net."
+    assert {key for key in tensors if not key.startswith("matcher.")} == {prefix + k for k in xfeat}
+    learned = [key for key in xfeat if key.endswith((".weight", ".bias"))]
+    assert len(learned) > 30
+    for key in learned:
+        assert torch.equal(tensors[prefix + key], xfeat[key]), key
+
+
+def test_other_keys_beside_the_matcher_are_refused(shared_data: Path) -> None:
+    path = shared_data / "weights" / "lighterglue" / "xfeat-lighterglue.pt"
+    tensors = read_weights(find_weights(str(path)))
+    for key in ("extractor.head.weight", "optimizer.step", "matcher.extra"):
+        unknown = key.removeprefix("matcher.")
+        with pytest.raises(DataError, match=rf"l\.pt: .*1 unexpected keys: {unknown}$"):
+            load_lighterglue({**tensors, key: torch.zeros(1)}, "l.pt")
+
+
 def test_what_does_not_fit_is_named(weights: str, shared_data: Path) -> None:
     tensors = read_weights(find_weights(weights))
     lost = tensors.pop("onnx::MatMul_1005")
