@@ -7,8 +7,9 @@ Every row is ``megloc eval kapture`` with the same options but for features and 
 is VLAD over the row's own features. A scene is a folder with mapping/, query/ and query_gt/ in
 kapture, or with map/ instead of mapping/, of which only images and poses are used. Rows whose
 weights are absent are named and left out (``megloc weights list``). Seconds are processor time of
-one thread, of three images and their pairs, without verification. Arguments that are not known
-here go to ``megloc eval``.
+one thread, of three images and their pairs, without verification. A seed changes all that draws
+random numbers, as in scenes.py; figures are means over the seeds, with the least and the greatest.
+Arguments that are not known here go to ``megloc eval``.
 """
 
 from __future__ import annotations
@@ -22,10 +23,13 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from scenes import SEEDED, THRESHOLDS  # which knows the way to timing
+from timing import table
 
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture_store import KaptureFolder
@@ -33,20 +37,27 @@ from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.values import ImageFeatures
 
-sys.path.append(str(Path(__file__).resolve().parent / "speed"))
-from timing import table  # noqa: E402
-
 LIGHTERGLUE = ("matching.name=lighterglue",)
 SUPERGLUE = ("local_features.superpoint.matching.name=superglue",)
+
+
+def _aliked_2048(threshold: float) -> tuple[str, ...]:
+    return (
+        "local_features=aliked",
+        f"local_features.options.threshold={threshold:g}",
+        "local_features.options.max_keypoints=2048",
+    )
+
+
 ROWS: dict[str, tuple[str, ...]] = {
     "rootsift nn": ("local_features=rootsift",),
     "aliked-t16 nn": ("local_features=aliked", "local_features.options.weights=aliked-t16"),
     "aliked-n16 nn": ("local_features=aliked",),
-    "aliked-n16 (2048 above 0.05) nn": (
-        "local_features=aliked",
-        "local_features.options.threshold=0.05",
-        "local_features.options.max_keypoints=2048",
-    ),
+    **{f"aliked-n16 (2048 above {t:g}) nn": _aliked_2048(t) for t in (0.2, 0.05, 0.01, 0.0)},
+    **{
+        f"aliked-n16 (2048 above {t:g}) lightglue": (*_aliked_2048(t), "matching.name=lightglue")
+        for t in (0.05, 0.01, 0.0)
+    },
     "aliked-n16rot nn": ("local_features=aliked", "local_features.options.weights=aliked-n16rot"),
     "aliked-n32 nn": ("local_features=aliked", "local_features.options.weights=aliked-n32"),
     "aliked-n16 lightglue": ("local_features=aliked", "matching.name=lightglue"),
@@ -65,7 +76,6 @@ ROWS: dict[str, tuple[str, ...]] = {
         *SUPERGLUE,
     ),
 }
-THRESHOLDS = ((0.05, 5.0), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
 _REFUSED = 2
 _TIMED_IMAGES = 3
 
@@ -82,12 +92,13 @@ def as_dataset(scene: Path, folder: Path) -> Path:
 
 
 def measure(
-    scene: Path, name: str, workspace: Path, workers: int, arguments: Sequence[str]
+    scene: Path, name: str, seed: int, workspace: Path, workers: int, arguments: Sequence[str]
 ) -> dict[str, float | str] | str:
-    """One row of a scene, or why there is none."""
+    """One row of a scene with one seed, or why there is none."""
     program = str(Path(sys.executable).with_name("megloc"))
     places = ("--root", str(scene), "--workspace", str(workspace), "--workers", str(workers))
-    sets = [part for text in ROWS[name] for part in ("--set", text)]
+    texts = (*ROWS[name], *(f"{key}={seed}" for key in SEEDED))
+    sets = [part for text in texts for part in ("--set", text)]
     done = subprocess.run(
         [program, "eval", "kapture", *places, *sets, *arguments, "-q"],
         stdout=subprocess.DEVNULL,
@@ -111,6 +122,7 @@ def measure(
     return {
         "scene": scene.name,
         "features": name,
+        "seed": seed,
         **{
             f"{m:g} m, {deg:g} deg": 100.0 * float(((error_m <= m) & (error_deg <= deg)).mean())
             for m, deg in THRESHOLDS
@@ -124,6 +136,7 @@ def measure(
     }
 
 
+@cache
 def processor_seconds(scene: Path, name: str) -> tuple[float, float]:
     """Of one image and of one pair, on one thread."""
     options = options_of_preset(assignments=ROWS[name])
@@ -154,22 +167,25 @@ _DIGITS = {"median m": 4, "median deg": 3, "s per image": 2, "ms per pair": 0, "
 
 
 def printed(results: pd.DataFrame) -> str:
-    """The rows as text."""
-    rows = [tuple(str(column) for column in results.columns)]
-    for _, row in results.iterrows():
-        rows.append(
-            tuple(
-                value if isinstance(value, str) else f"{value:.{_DIGITS.get(str(column), 1)}f}"
-                for column, value in row.items()
-            )
-        )
+    """The rows as text: means over the seeds, with the least and the greatest where they differ."""
+    figures = [column for column in results.columns if column not in ("scene", "features", "seed")]
+    rows = [("scene", "features", "seeds", *figures)]
+    for (scene, features), of_row in results.groupby(["scene", "features"], sort=False):
+        cells = (_over_seeds(of_row[column], _DIGITS.get(column, 1)) for column in figures)
+        rows.append((str(scene), str(features), str(len(of_row)), *cells))
     return table(rows)
+
+
+def _over_seeds(values: pd.Series[float], digits: int) -> str:
+    mean, least, greatest = (f"{v:.{digits}f}" for v in (values.mean(), values.min(), values.max()))
+    return mean if least == greatest else f"{mean} ({least}-{greatest})"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--scene", type=lambda text: Path(text).resolve(), action="append")
     parser.add_argument("--only", action="append", choices=ROWS, help="a row; may be repeated")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)))
     parser.add_argument("--workspace", type=Path, help="keep the runs here")
     parser.add_argument("--read", type=Path, help="a result written before, instead of scenes")
@@ -189,13 +205,14 @@ def main() -> None:
             dataset = as_dataset(scene, root / "scenes" / scene.name)
             for name in names:
                 place = root / f"{scene.name}-{name.replace(' ', '-')}"
-                row = measure(dataset, name, place, options.workers, arguments)
-                if isinstance(row, str):
-                    absent[name] = row
-                    continue
-                found.append(row)
-                if options.output is not None:
-                    pd.DataFrame(found).to_csv(options.output, index=False)
+                for seed in options.seeds:
+                    row = measure(dataset, name, seed, place, options.workers, arguments)
+                    if isinstance(row, str):
+                        absent[name] = row
+                        break
+                    found.append(row)
+                    if options.output is not None:
+                        pd.DataFrame(found).to_csv(options.output, index=False)
     if found:
         print(printed(pd.DataFrame(found)))
     for name, reason in absent.items():
