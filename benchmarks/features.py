@@ -37,6 +37,7 @@ from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.values import ImageFeatures
 
+LIGHTGLUE = ("matching.name=lightglue", "matching.options.weights=aliked_lightglue")
 LIGHTERGLUE = ("matching.name=lighterglue",)
 SUPERGLUE = ("local_features.superpoint.matching.name=superglue",)
 
@@ -54,13 +55,10 @@ ROWS: dict[str, tuple[str, ...]] = {
     "aliked-t16 nn": ("local_features=aliked", "local_features.options.weights=aliked-t16"),
     "aliked-n16 nn": ("local_features=aliked",),
     **{f"aliked-n16 (2048 above {t:g}) nn": _aliked_2048(t) for t in (0.2, 0.05, 0.01, 0.0)},
-    **{
-        f"aliked-n16 (2048 above {t:g}) lightglue": (*_aliked_2048(t), "matching.name=lightglue")
-        for t in (0.05, 0.01, 0.0)
-    },
+    "aliked-n16 (2048 above 0.05) lightglue": (*_aliked_2048(0.05), *LIGHTGLUE),
     "aliked-n16rot nn": ("local_features=aliked", "local_features.options.weights=aliked-n16rot"),
     "aliked-n32 nn": ("local_features=aliked", "local_features.options.weights=aliked-n32"),
-    "aliked-n16 lightglue": ("local_features=aliked", "matching.name=lightglue"),
+    "aliked-n16 lightglue": ("local_features=aliked", *LIGHTGLUE),
     "xfeat nn": ("local_features=xfeat",),
     "xfeat lighterglue": ("local_features=xfeat", *LIGHTERGLUE),
     "r2d2_WASF_N16 nn": ("local_features=r2d2",),
