@@ -43,7 +43,7 @@ class Preprocessor:
         if masks != MaskOptions(segmenter=masks.segmenter, dynamic=masks.dynamic):
             raise OptionError(
                 "preprocessing.masks.fixed, unchanging and user_masks are for folders of images: "
-                "make one with `megloc preprocess`; a single query brings its own mask"
+                "make one with `megloc preprocess`; a query brings its own mask: Query(mask=...)"
             )
 
     def of(self, query: Query) -> QueryImage:

@@ -53,7 +53,9 @@ def test_our_features_localize_as_well_as_those_it_came_with(
     with_theirs = errors(localizer.localize_query(query), truth)
 
     features = extractor.extract(query.read_image())
-    with_ours = errors(localizer.localize_query(replace(query, features=features)), truth)
+    with_ours = errors(
+        localizer.localize_query(replace(query, features={"r2d2_500": features})), truth
+    )
     assert with_ours[0] < 0.02 and with_ours[1] < 0.4
     for ours, theirs in zip(with_ours, with_theirs, strict=True):
         assert ours <= 1.5 * theirs
