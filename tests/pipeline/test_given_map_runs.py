@@ -29,7 +29,10 @@ SMALL = {
     "width": 400,
     "height": 300,
 }
-CHEAP = ["local_features.options.max_keypoints=800", "global_features.options.num_clusters=16"]
+CHEAP = {
+    "local_features": {"options": {"max_keypoints": 800}},
+    "global_features": {"options": {"num_clusters": 16}},
+}
 BOTH = ["map=given+triangulate", 'mapping_pairs.by=["covisibility"]']
 
 
@@ -41,7 +44,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Workspace]:
     source = replace(source, twin=twin_of("aachen", **SMALL))
 
     def run_with(*assignments: str) -> Workspace:
-        options = options_of_preset(assignments=[*CHEAP, *assignments])
+        options = options_of_preset(changes=[CHEAP], assignments=assignments)
         with workspace.lock(), single_threaded(), open_executor("processes", 2) as executor:
             of = Run(source, "classic", options, workspace, executor=executor)
             run_plan(plan_evaluation(of), workspace)
@@ -120,7 +123,8 @@ def test_both_need_features_of_two_types(tmp_path: Path) -> None:
 def test_covisibility_is_that_of_the_model_the_dataset_comes_with(tmp_path: Path) -> None:
     workspace = Workspace(tmp_path / "workspace")
     options = options_of_preset(
-        assignments=[*CHEAP, 'mapping_pairs.by=["covisibility"]', "preprocessing.max_size_px=320"]
+        changes=[CHEAP],
+        assignments=['mapping_pairs.by=["covisibility"]', "preprocessing.max_size_px=320"],
     )
     source = choose_dataset("synthetic-aachen", None)
     source = replace(source, twin=twin_of("aachen", **SMALL))
@@ -139,7 +143,8 @@ def test_without_a_model_there_is_no_covisibility(tmp_path: Path) -> None:
         with pytest.raises(OptionError, match=f"{name} comes with no model: .*by covisibility"):
             plan_evaluation(run)
     # points that are lifted need no pairs
-    options = options_of_preset(assignments=['mapping_pairs.by=["covisibility"]', "map=lift"])
+    by = {"mapping_pairs": {"by": ["covisibility"]}}
+    options = options_of_preset(changes=[by], assignments=["map=lift"])
     plan_evaluation(
         Run(choose_dataset("synthetic-inloc", None), "classic", options, Workspace(tmp_path / "i"))
     )

@@ -41,9 +41,9 @@ def options(shared_data: Path) -> PipelineOptions:
             f"local_features.xfeat.options.weights={weights}",
             "local_features.xfeat.options.max_keypoints=800",
             "preprocessing.max_size_px=640",
-            "guided_pyramid.scales=[1.0]",
             "global_features.options.num_clusters=16",
-        ]
+        ],
+        changes=[{"guided_pyramid": {"scales": [1.0]}}],
     )
 
 
