@@ -111,7 +111,10 @@ CASES: dict[str, Case] = {
         "2.0", "pairs/mapping.txt", ('mapping_pairs.by=["poses"]',), localize=OF_MAPS
     ),
     "mapping_pairs.poses.min_overlap": Case(
-        "0.5", context=('mapping_pairs.by=["poses"]',), refused="need points", localize=OF_MAPS
+        "0.5",
+        context=('mapping_pairs.by=["poses"]',),
+        refused="comes with no model",
+        localize=OF_MAPS,
     ),
     "mapping_pairs.covisibility.top_k": Case(
         "2", context=('mapping_pairs.by=["poses"]',), refused="is not in", localize=OF_MAPS
