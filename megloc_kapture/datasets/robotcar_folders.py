@@ -181,7 +181,8 @@ class SeasonsImages:
         test: dict[ImageKey, str] = {}
         unlisted = 0
         if version == 2 and test_list.is_file():
-            queries = {at: key for at, key in self._at_time.items() if key in set(keys)}
+            listed_keys = set(keys)
+            queries = {at: key for at, key in self._at_time.items() if key in listed_keys}
             test, unlisted = read_test_names(test_list, queries, train, allow_missing=allow_missing)
         elif version == 2:
             test = {
