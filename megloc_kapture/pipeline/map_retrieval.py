@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -49,12 +50,14 @@ class _Compared:
     name : the map's kapture type; of vectors that it has not, the one they would have.
     choice : what makes the query's; None where the query brings them.
     stored : whether the map has them.
+    lacks_weights : whether the query's cannot be made, as the network's weights are not there.
     """
 
     name: str
     choice: GlobalFeaturesChoice | None
     weight: float
     stored: bool
+    lacks_weights: bool = False
 
 
 class MapRetrieval:
@@ -63,7 +66,8 @@ class MapRetrieval:
     Compared are, first, global features that map and query both bring (of these, where there are
     any, those that the options name); else those of the options that the map has vectors of, or,
     of VLAD, descriptors to train it on; else those of the map that an extractor is known for; else
-    those of the options, for which the map's images are described once, in memory.
+    those of the options, for which the map's images are described once, in memory. Threads may
+    share it: what is found out about the map is found out by one of them.
     """
 
     def __init__(
@@ -78,6 +82,7 @@ class MapRetrieval:
         self._vectors: dict[str, NDArray[np.float32]] = {}
         self._extractors: dict[str, GlobalFeatureExtractor] = {}
         self._vocabularies: dict[str, tuple[Vocabulary, VladSettings]] = {}
+        self._lock = threading.RLock()
 
     def rank(
         self, image: QueryImage, features: Sequence[Features], permitted: Sequence[str]
@@ -98,7 +103,7 @@ class MapRetrieval:
         vectors = [self._of_query(one, image, features) for one in compared]
         names, weights = zip(*((one.name, one.weight) for one in compared), strict=True)
         rows = [_unit(np.asarray(v, np.float32).reshape(1, -1)) for v in vectors]
-        members = np.flatnonzero(np.isin(self._map.images, list(permitted)))
+        members = np.array(sorted({self._positions[name] for name in permitted}), np.int64)
         candidates = Candidates(
             lambda positions: [
                 # the whole map is by far the most frequent pool: no copy of it
@@ -114,17 +119,12 @@ class MapRetrieval:
     def is_at_hand(self, query: Query) -> bool:
         """Whether a query can be ranked without describing the map first, or lacking weights."""
         compared = self._compared(query.global_features)
-        try:
-            for one in compared:
-                if one.choice is not None and not one.choice.is_vlad:
-                    self._extractor(one.choice)
-        except MissingWeightsError:
-            return False
-        return all(one.stored for one in compared)
+        return all(one.stored and not one.lacks_weights for one in compared)
 
     def names_one_of(self, brought: Collection[str]) -> bool:
         """Whether the options name one of the types that queries bring."""
-        return any(self._wanted(one).name in brought for one in self._options.global_features)
+        with self._lock:
+            return any(one.name in brought for one in self._wanted)
 
     def describe(self, global_types: Collection[str]) -> str:
         """How queries that bring these global features are compared, for people."""
@@ -136,27 +136,38 @@ class MapRetrieval:
                 words.append(f"global features {one.name}")
         return ", ".join(words)
 
-    def _compared(self, brought: Collection[str]) -> list[_Compared]:
-        wanted = [self._wanted(choice) for choice in self._options.global_features]
+    def _compared(self, brought: Collection[str]) -> Sequence[_Compared]:
         shared = [name for name in self._map.global_types() if name in brought]
-        if shared:
-            weight_of = {one.name: one.weight for one in wanted}
-            named = [name for name in shared if name in weight_of]
-            return [
-                _Compared(name, None, weight_of.get(name, 1.0), stored=True)
-                for name in named or shared
-            ]
-        usable = [one for one in wanted if one.stored or self._trains_vlad(one)]
-        if usable:
-            return usable
-        known = [
-            _Compared(name, choice, 1.0, stored=True)
+        with self._lock:
+            if shared:
+                weight_of = {one.name: one.weight for one in self._wanted}
+                named = [name for name in shared if name in weight_of]
+                return [
+                    _Compared(name, None, weight_of.get(name, 1.0), stored=True)
+                    for name in named or shared
+                ]
+            usable = [one for one in self._wanted if one.stored or self._trains_vlad(one)]
+            return usable or self._known or self._wanted
+
+    @cached_property
+    def _wanted(self) -> tuple[_Compared, ...]:
+        """The options' features."""
+        return tuple(map(self._asked_for, self._options.global_features))
+
+    @cached_property
+    def _known(self) -> tuple[_Compared, ...]:
+        """The map's vectors that an extractor is known for."""
+        return tuple(
+            self._made_by(choice, name, 1.0, stored=True)
             for name in self._map.global_types()
             if (choice := _choice_of(name)) is not None
-        ]
-        return known or wanted
+        )
 
-    def _wanted(self, choice: GlobalFeaturesChoice) -> _Compared:
+    @cached_property
+    def _positions(self) -> dict[str, int]:
+        return {name: at for at, name in enumerate(self._map.images)}
+
+    def _asked_for(self, choice: GlobalFeaturesChoice) -> _Compared:
         """One of the options' features, under the name that the map knows them by."""
         if choice.is_vlad:
             name = self._vlad_name(choice)
@@ -167,12 +178,22 @@ class MapRetrieval:
         except MissingWeightsError:  # named when they are needed
             name = next((name for name in there if name.startswith(choice.name)), choice.name)
         if name in there:
-            return _Compared(name, choice, choice.weight, stored=True)
+            return self._made_by(choice, name, choice.weight, stored=True)
         for other in there:
             published = _PUBLISHED.get(other)
             if published is not None and published.name == choice.name:
-                return _Compared(other, published, choice.weight, stored=True)
-        return _Compared(name, choice, choice.weight, stored=False)
+                return self._made_by(published, other, choice.weight, stored=True)
+        return self._made_by(choice, name, choice.weight, stored=False)
+
+    def _made_by(
+        self, choice: GlobalFeaturesChoice, name: str, weight: float, *, stored: bool
+    ) -> _Compared:
+        """Vectors of an image network."""
+        try:
+            self._extractor(choice)
+        except MissingWeightsError:
+            return _Compared(name, choice, weight, stored, lacks_weights=True)
+        return _Compared(name, choice, weight, stored)
 
     def _vlad_name(self, choice: GlobalFeaturesChoice) -> str:
         """The type of VLAD's vectors: those that the map has, where the options allow them."""
@@ -201,9 +222,10 @@ class MapRetrieval:
         return aggregate(features[position].descriptors, vocabulary, settings.options)
 
     def _of_map(self, one: _Compared) -> NDArray[np.float32]:
-        if one.name not in self._vectors:
-            self._vectors[one.name] = self._read_or_describe(one)
-        return self._vectors[one.name]
+        with self._lock:
+            if one.name not in self._vectors:
+                self._vectors[one.name] = self._read_or_describe(one)
+            return self._vectors[one.name]
 
     def _read_or_describe(self, one: _Compared) -> NDArray[np.float32]:
         if one.stored:

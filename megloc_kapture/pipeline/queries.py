@@ -118,10 +118,17 @@ class KaptureQueries:
         self._folder, self._map = folder, kapture_map
         self._data = folder.read()
         self.names = self._data.image_names()
+        stored = kapture_map.stored_types()
+        brought = set(folder.types("keypoints")).intersection(folder.types("descriptors"))
         self._local: dict[str, tuple[FeatureReader, FeatureReader]] = {
             name: (folder.keypoints(name), folder.descriptors(name))
-            for name in _types_and_bases(kapture_map.stored_types())
-            if name in folder.types("keypoints") and name in folder.types("descriptors")
+            for name in _types_and_bases(stored)
+            if name in brought
+        }
+        # what the map says of keypoints of each type; looked up here, not for every query
+        self._like = {
+            name: kapture_map.keypoints_of(name if name in stored else pyramid_type(name))
+            for name in self._local
         }
         self._globals = {
             name: folder.global_features(name)
@@ -237,16 +244,11 @@ class KaptureQueries:
             check_lengths(keypoints, descriptors, name)
             stored = keypoints.read(name)
             found[local_type] = LocalFeatures(
-                self._to_colmap(local_type, stored),
+                self._like[local_type].to_colmap(stored),
                 np.zeros(len(stored), np.float32),
                 descriptors.read(name),
             )
         return found
-
-    def _to_colmap(self, local_type: str, keypoints: NDArray[Any]) -> NDArray[np.float32]:
-        stored = self._map.stored_types()
-        like = next(name for name in (local_type, pyramid_type(local_type)) if name in stored)
-        return self._map.keypoints_of(like).to_colmap(keypoints)
 
 
 def _types_and_bases(types: Sequence[str]) -> list[str]:
