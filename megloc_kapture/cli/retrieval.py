@@ -230,11 +230,7 @@ class PairsQuery(Reading, StageCommand):
                     executor=executor,
                     track=track,
                 )
-            matched = KaptureFolder(
-                query.root,
-                features_dirs=[*query.features_dirs, out],
-                allow_links_below=query.allow_links_below,
-            )
+            matched = query.with_features([*query.features_dirs, out])
             how = RerankingOptions(by=self.rerank_by, keep=keep)
             return reranked(pairs, matched, out, local_types, how)
 

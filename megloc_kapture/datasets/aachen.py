@@ -33,7 +33,7 @@ from megloc_kapture.datasets.aachen_model import (
     read_points,
 )
 from megloc_kapture.datasets.grammars.query_list import read_query_list
-from megloc_kapture.datasets.kapture_form import image_files
+from megloc_kapture.datasets.kapture_form import image_files, without_model
 from megloc_kapture.datasets.official import (
     REFERENCE,
     Count,
@@ -45,7 +45,7 @@ from megloc_kapture.datasets.official import (
     read_ground_truth,
 )
 from megloc_kapture.datasets.reference_map import write_reference_map
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.protocols import protocol_of
 from megloc_kapture.io.kapture_store import KaptureData, Sensor
 from megloc_kapture.io.side_tables import ImageGroup, World
@@ -102,10 +102,7 @@ class Aachen:
         """Raise MeglocError, quickly, when ``root`` cannot be what is wanted of Aachen."""
         if _kapture_of(root) is not None:
             if self.options.reference_model:
-                raise OptionError(
-                    f"the reference model is read from the official layout, and {root} has "
-                    "kapture folders; in a kapture map megloc localize localizes"
-                )
+                raise without_model(root)
             return
         layout = Layout(Path(root))
         absent = _absent(layout)

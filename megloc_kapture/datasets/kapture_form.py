@@ -15,6 +15,7 @@ from pathlib import Path
 
 from megloc_kapture.datasets.kapture_folders import MAPPING, check_image
 from megloc_kapture.datasets.official import Missing
+from megloc_kapture.errors import OptionError
 from megloc_kapture.io.kapture_store import KaptureFolder
 from megloc_kapture.values import Camera, RigidTransform
 
@@ -56,6 +57,14 @@ def kapture_parent(root: Path, part: str = MAPPING) -> Path | None:
 def parents(root: Path) -> tuple[Path, ...]:
     """The folders in which the parts of a dataset may lie, the root first."""
     return tuple(Path(root) / name for name in _PARENTS)
+
+
+def without_model(root: Path) -> OptionError:
+    """What says that a dataset's own model is asked for where kapture folders are."""
+    return OptionError(
+        f"the reference model is read from the official layout, and {root} has kapture folders; "
+        "in a kapture map megloc localize localizes"
+    )
 
 
 def is_kapture(folder: Path) -> bool:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from megloc_kapture.datasets.kapture_form import image_files
+from megloc_kapture.datasets.kapture_form import image_files, without_model
 from megloc_kapture.datasets.official import (
     REFERENCE,
     DatasetCard,
@@ -80,10 +80,7 @@ class RobotCar:
         """Raise MeglocError, quickly, when ``root`` cannot be what is wanted of RobotCar."""
         if _folders_of(root) is not None:
             if self.options.reference_model:
-                raise OptionError(
-                    f"the reference model is read from the official layout, and {root} has "
-                    "kapture folders; in a kapture map megloc localize localizes"
-                )
+                raise without_model(root)
             return
         absent = _absent(Layout(Path(root)))
         if absent:

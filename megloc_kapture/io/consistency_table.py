@@ -76,9 +76,7 @@ def read_consistency(path: Path | str) -> list[ConsistencyRow]:
             if not row[name].isdecimal():
                 raise DataError(f"{name} {row[name]!r} is no count", path=path, line=line)
         try:
-            moved_m, turned_deg, moved_px, claimed_m, claimed_deg, squared_distance = (
-                float(row[name] or "nan") for name in _MEASURES
-            )
+            measures = {name: float(row[name] or "nan") for name in _MEASURES}
         except ValueError:
             raise DataError(
                 f"{', '.join(_MEASURES)} are numbers or empty", path=path, line=line
@@ -89,13 +87,8 @@ def read_consistency(path: Path | str) -> list[ConsistencyRow]:
                 method=row["method"],
                 images=int(row["images"]),
                 contradicting=int(row["contradicting"]),
-                moved_m=moved_m,
-                turned_deg=turned_deg,
-                moved_px=moved_px,
-                claimed_m=claimed_m,
-                claimed_deg=claimed_deg,
-                squared_distance=squared_distance,
                 reason=row["reason"],
+                **measures,
             )
         )
     return rows

@@ -61,6 +61,12 @@ class KaptureFolder:
         self._points: NDArray[np.float64] | None = None
         self._observations: dict[str, Observations] | None = None
 
+    def with_features(self, features_dirs: Sequence[Path | str]) -> KaptureFolder:
+        """The same folder, with these feature folders in the places of its own."""
+        return KaptureFolder(
+            self.root, features_dirs=features_dirs, allow_links_below=self.allow_links_below
+        )
+
     def read(self) -> KaptureData:
         """Sensors, rigs, trajectories and records; parsed once.
 

@@ -93,11 +93,7 @@ def given_map(reference: KaptureFolder, mapping: KaptureFolder, output: Path) ->
     seen = reference.observations()[local_type]
     found_again = 1.0
     # what is the reference's own comes first
-    source = KaptureFolder(
-        reference.root,
-        features_dirs=mapping.features_dirs,
-        allow_links_below=reference.allow_links_below,
-    )
+    source = reference.with_features(mapping.features_dirs)
     if not has_descriptors(reference):
         moved = _moved(reference, mapping, seen)
         found_again = moved.num_found / len(seen)

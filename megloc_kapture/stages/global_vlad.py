@@ -107,7 +107,7 @@ def extract_vlad(
     place = output / "global_features" / type_name
     write_vocabulary(place, vocabulary, local_type, options)
     config = FeatureConfig(type_name, np.dtype(np.float32), vocabulary.size, metric_type="L2")
-    run = FolderSpec(KaptureFolder(place)).key
+    run = FolderSpec(mapping).key
     jobs = []
     for folder in folders:
         read = _Descriptors(FolderSpec(folder), local_type)

@@ -58,13 +58,15 @@ def rerank_pairs(
     """
     found = []
     for query, images in iterate_candidates(pairs):
-        order = sorted(
-            range(len(images)), key=lambda rank: (-counts.get((query, images[rank]), 0), rank)
-        )
-        for place, rank in enumerate(order[:keep]):
-            count = counts.get((query, images[rank]), 0)
-            found.append(ImagePair(query, images[rank], count + 1.0 / (2.0 + place)))
+        own = [counts.get((query, image), 0) for image in images]
+        for place, rank in enumerate(_greatest(own, keep)):
+            found.append(ImagePair(query, images[rank], own[rank] + 1.0 / (2.0 + place)))
     return found
+
+
+def _greatest(counts: Sequence[int], keep: int) -> list[int]:
+    """Positions of the greatest counts, greatest first; of equal ones the first stays first."""
+    return sorted(range(len(counts)), key=lambda at: (-counts[at], at))[:keep]
 
 
 def reranked(
@@ -119,7 +121,7 @@ def kept_candidates(
         sum(own[at].num_found if by_matches else len(own[at].matches) for own in of_types)
         for at in range(count)
     ]
-    return sorted(range(count), key=lambda at: (-counts[at], at))[: options.keep]
+    return _greatest(counts, options.keep)
 
 
 def cover_pairs(

@@ -139,7 +139,7 @@ def copy_features(
     somebody's data and copied, unless ``link_own`` says that they are ours; what comes out of a
     tar is copied.
     """
-    own = KaptureFolder(source.root, allow_links_below=source.allow_links_below)
+    own = source.with_features(())
     for kind in _COPIED:
         types = source.types(kind) if kind == "global_features" else [local_type]
         for type_name in types:
