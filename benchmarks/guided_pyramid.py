@@ -53,6 +53,7 @@ from megloc_kapture.stages.matches import match_pairs
 from megloc_kapture.stages.pyramid_pairs import COLUMNS, table_path
 from megloc_kapture.stages.query_poses import LocalizationOptions, localize_from_matches
 from megloc_kapture.stages.triangulation import triangulate_map
+from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera, Pose, RigidTransform
 
 sys.path.append(str(Path(__file__).resolve().parent / "speed"))
@@ -178,15 +179,15 @@ class Bench:
         pairs = [ImagePair(a, b, 1.0) for a in images for b in images if a < b]
         with open_executor("processes", self.jobs) as executor:
             extract_local_features(
-                [self.mapping()], self.extractor, self.root / "features", executor=executor
+                [self.mapping()], self.extractor, self.root / "features", work=Work(executor)
             )
             match_pairs(
                 self.mapping(), self.mapping(), pairs, local_type, self.matcher,
-                KnownPoseOptions(), self.root / "features", executor=executor,
+                KnownPoseOptions(), self.root / "features", work=Work(executor),
             )  # fmt: skip
             counts = pyramid_mapping(
                 self.mapping(), pairs, local_type, self.extractor, self.matcher,
-                KnownPoseOptions(), self.map_options, self.root / "pyramid", executor=executor,
+                KnownPoseOptions(), self.map_options, self.root / "pyramid", work=Work(executor),
             )  # fmt: skip
         points = triangulate_map(
             self.mapping(), self.mapping(), pyramid_type(local_type), self.root / "map",
@@ -210,16 +211,16 @@ class Bench:
         ]
         rows = []
         with open_executor("processes", self.jobs) as executor:
-            extract_local_features([query], self.extractor, features, executor=executor)
+            extract_local_features([query], self.extractor, features, work=Work(executor))
             match_pairs(
                 query, self.mapping(), pairs, local_type, self.matcher, TwoViewOptions(), features,
-                executor=executor,
+                work=Work(executor),
             )  # fmt: skip
             for name, options in ways.items():
                 output = root / name.replace(" ", "_").replace("/", "-").replace(",", "")
                 counts = pyramid_queries(
                     query, self.mapping(), pairs, local_type, self.extractor, self.matcher,
-                    TwoViewOptions(), options, output, executor=executor,
+                    TwoViewOptions(), options, output, work=Work(executor),
                 )  # fmt: skip
                 found = self._localize(KaptureFolder(query.root, features_dirs=[output]), pairs)
                 rows.append((change.name, name, *_figures(found, truth, counts)))

@@ -39,6 +39,7 @@ from megloc_kapture.retrieval.early_fusion import concatenate
 from megloc_kapture.retrieval.fusion import FusionOptions, fuse
 from megloc_kapture.stages.global_vlad import extract_vlad, vlad_type
 from megloc_kapture.stages.matches import match_pairs
+from megloc_kapture.stages.work import Work
 
 sys.path.append(str(Path(__file__).resolve().parent / "speed"))
 from timing import table  # noqa: E402
@@ -82,7 +83,9 @@ def describe(
     options = VladOptions()
     with open_executor("processes", workers) as executor:
         for local_type in LOCAL_TYPES.values():
-            extract_vlad(mapping, [mapping, query], local_type, output, options, executor=executor)
+            extract_vlad(
+                mapping, [mapping, query], local_type, output, options, work=Work(executor)
+            )
     mapping, query = opened(workspace, output)
     found: dict[str, NDArray[np.float32]] = {}
     for name, local_type in LOCAL_TYPES.items():
@@ -130,7 +133,14 @@ def match_counts(
     matcher = options.make_matcher(local_type)
     with open_executor("processes", workers) as executor:
         match_pairs(
-            query, mapping, pairs, local_type, matcher, TwoViewOptions(), output, executor=executor
+            query,
+            mapping,
+            pairs,
+            local_type,
+            matcher,
+            TwoViewOptions(),
+            output,
+            work=Work(executor),
         )
     reader = KaptureFolder(workspace / "query", features_dirs=[output]).matches(local_type)
     return {(pair.query, pair.map): matches_of(reader, pair) for pair in pairs}

@@ -44,6 +44,7 @@ from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.run import EVALUATION, LOCALIZED, Run
 from megloc_kapture.pipeline.submissions_folder import FOLDER, keep_submission
 from megloc_kapture.pipeline.workspace import Workspace
+from megloc_kapture.stages.work import Work
 
 BELOW_RECALL = 3
 
@@ -138,9 +139,7 @@ class Eval(Choosing, Working, Common):
                 options=options,
                 workspace=workspace,
                 benchmark=benchmark,
-                executor=executor,
-                track=console.track,
-                num_threads=self.workers or available_cores(),
+                work=Work(executor, console.track, self.workers or available_cores()),
                 steps=tuple(paper_steps(layers, facts_of(choice))),
             )
             stages = plan_evaluation(run)

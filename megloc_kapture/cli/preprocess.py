@@ -23,6 +23,7 @@ from megloc_kapture.stages.preprocessing_report import (
     PreprocessingReport,
     read_report,
 )
+from megloc_kapture.stages.work import Work
 
 PREPROCESSED = "preprocessed"
 
@@ -84,7 +85,7 @@ class Preprocess(Linked, Working, Common):
             open_executor(self.executor, self.workers) as executor,
         ):
             preprocess_images(
-                source, out, options, sequences=sequences, executor=executor, track=console.track
+                source, out, options, sequences=sequences, work=Work(executor, console.track)
             )
             report = read_report(out)
             # masks and images of an earlier run would be taken for this one's

@@ -12,6 +12,7 @@ from megloc_kapture.io.json_model import read_json_model
 from megloc_kapture.io.outputs import staged_output
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
 from megloc_kapture.stages.map_refinement import REPORT_FILE, RefinementReport, refine_map
+from megloc_kapture.stages.work import Work
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +45,7 @@ class RefineMap(Reading, StageCommand):
             staged_output(self.output, kind=MAP, force=self.force) as out,
             open_executor(self.executor, self.workers) as executor,
         ):
-            refine_map(source, out, options, executor=executor, track=console.track)
+            refine_map(source, out, options, work=Work(executor, console.track))
         for row in report_lines(self.output):
             console.say(row)
         return 0

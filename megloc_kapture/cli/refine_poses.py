@@ -17,6 +17,7 @@ from megloc_kapture.io.outputs import staged_output
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
 from megloc_kapture.plugins import POSE_REFINERS, plugin_names
 from megloc_kapture.stages.pose_refinement import refine_poses
+from megloc_kapture.stages.work import Work
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,8 +63,7 @@ class RefinePoses(Linked, StageCommand):
                 out,
                 options,
                 restrictions=restrictions_beside(self.query),
-                executor=executor,
-                track=console.track,
+                work=Work(executor, console.track),
             )
         accepted = ", ".join(
             f"{count:g} accepted by {name.removeprefix('accepted_by_')}"

@@ -27,6 +27,7 @@ from megloc_kapture.stages.global_vlad import extract_vlad, vlad_type
 from megloc_kapture.stages.image_pairs import PairingMethod, pair_map_images, pair_queries
 from megloc_kapture.stages.matches import match_pairs
 from megloc_kapture.stages.reranking import RerankingOptions, reranked
+from megloc_kapture.stages.work import Work
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,14 +72,13 @@ class ExtractGlobal(Reading, StageCommand):
                         local_type,
                         out,
                         options.of_vlad(),
-                        executor=executor,
-                        track=console.track,
+                        work=Work(executor, console.track),
                     )
                 else:
                     extractor = extractors[chosen.name]
                     type_name = extractor.name
                     counts = extract_global_features(
-                        folders, extractor, out, executor=executor, track=console.track
+                        folders, extractor, out, work=Work(executor, console.track)
                     )
                 console.say(f"{type_name}: {counts['images']} images")
         return 0
@@ -227,8 +227,7 @@ class PairsQuery(Reading, StageCommand):
                     options.make_matcher(local_type),
                     options.verify_queries(),
                     out,
-                    executor=executor,
-                    track=track,
+                    work=Work(executor, track),
                 )
             matched = query.with_features([*query.features_dirs, out])
             how = RerankingOptions(by=self.rerank_by, keep=keep)

@@ -19,6 +19,7 @@ from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS, load_plugin
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.matches import match_pairs
 from megloc_kapture.stages.triangulation import triangulate_map
+from megloc_kapture.stages.work import Work
 
 MAP = "map"
 
@@ -57,8 +58,7 @@ class ExtractLocal(Linked, StageCommand):
                     extractor,
                     out,
                     mask_margin_px=options.mask_margin_px,
-                    executor=executor,
-                    track=console.track,
+                    work=Work(executor, console.track),
                 )
                 console.say(
                     f"{extractor.name}: {counts['keypoints']} keypoints, {counts['images']} images"
@@ -120,8 +120,7 @@ class Match(Reading, StageCommand):
                 matcher,
                 verification,
                 out,
-                executor=executor,
-                track=console.track,
+                work=Work(executor, console.track),
             )
         console.say(f"{counts['matches']} matches in {counts['pairs_with_matches']} pairs")
         return 0

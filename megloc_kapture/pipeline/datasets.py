@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -28,7 +27,7 @@ from megloc_kapture.io.atomic import write_bytes
 from megloc_kapture.io.kapture_store import KaptureFolder
 from megloc_kapture.io.side_tables import SIDE_TABLES, Protocol
 from megloc_kapture.plugins import DATASETS, DatasetAdapter, load_plugin, plugin_names
-from megloc_kapture.stages.parallel import Track
+from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Options
 
 KAPTURE, SYNTHETIC = "kapture", "synthetic"
@@ -152,12 +151,12 @@ class DatasetChoice:
             "queries_with_truth": 0 if truth is None else len(truth.poses()),
         }
 
-    def renderer(self, executor: Executor | None, track: Track) -> Renderer | None:
+    def renderer(self, work: Work) -> Renderer | None:
         """Writes the rendered dataset below the folder it is given; None where there is a root."""
         twin = self.twin
         if twin is None:
             return None
-        return lambda out: twin.write(out / "world", twin.options, executor, track=track)
+        return lambda out: twin.write(out / "world", twin.options, work.executor, track=work.track)
 
     def render_options(self) -> dict[str, Any]:
         """What determines the rendered dataset."""

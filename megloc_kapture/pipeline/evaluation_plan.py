@@ -173,8 +173,7 @@ def _query_pyramid(run: Run, out: Path) -> dict[str, float]:
             options.guided_pyramid,
             out / QUERY_PYRAMID,
             mask_margin_px=options.mask_margin_px,
-            executor=run.executor,
-            track=run.track,
+            work=run.work,
         )
         counts |= {f"{extractor.name} {name}": count for name, count in found.items()}
     return counts
@@ -192,8 +191,7 @@ def _localization(run: Run, out: Path) -> dict[str, int]:
         run.options.query_types(),
         options,
         restrictions=run.restrictions(),
-        executor=run.executor,
-        track=run.track,
+        work=run.work,
     )
     return write_localized(
         out / run.first_poses,
@@ -228,8 +226,7 @@ def _refine_poses(run: Run, out: Path) -> dict[str, float]:
         out / LOCALIZED,
         run.options.pose_refinement,
         restrictions=run.restrictions(),
-        executor=run.executor,
-        track=run.track,
+        work=run.work,
         timing=out / REFINEMENT_TIMING,
     )
 

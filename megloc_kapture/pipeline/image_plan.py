@@ -62,7 +62,7 @@ def _dataset_stages(run: Run, hashes: FileHashes) -> list[Stage]:
     outputs = (MAPPING, QUERY, QUERY_GT, SIDE_TABLES, REFERENCE)
     wanted = None if run.benchmark is None else run.benchmark.change(Protocol())
     settings = {**source.settings(), "protocol": wanted and wanted.model_dump(mode="json")}
-    render = source.renderer(run.executor, run.track)
+    render = source.renderer(run.work)
     if render is not None:
         world = run.workspace.path("world")
         return [
@@ -143,8 +143,7 @@ def _preprocess(run: Run, out: Path) -> dict[str, float]:
             out / PREPROCESSED / folder.root.name,
             run.options.preprocessing,
             sequences=others,
-            executor=run.executor,
-            track=run.track,
+            work=run.work,
         )
         counts |= {f"{folder.root.name}_{name}": count for name, count in found.items()}
     return counts
@@ -183,8 +182,7 @@ def _local_features(run: Run, out: Path) -> dict[str, int]:
             extractor,
             out,
             mask_margin_px=run.options.mask_margin_px,
-            executor=run.executor,
-            track=run.track,
+            work=run.work,
         )
         counts.update(found)
     return counts

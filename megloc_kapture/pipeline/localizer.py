@@ -29,11 +29,11 @@ from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.queries import KaptureQueries, Query, Unit
 from megloc_kapture.pipeline.query_images import Preprocessor, QueryImage, QueryImages
 from megloc_kapture.stages.matches import FeatureCache, Features
-from megloc_kapture.stages.parallel import FolderSpec, ordered_map
 from megloc_kapture.stages.pose_refinement import PoseReferences, refine_pose
 from megloc_kapture.stages.query_poses import localize_unit, localize_views
 from megloc_kapture.stages.ranking_scene import KaptureScene
 from megloc_kapture.stages.reranking import kept_candidates
+from megloc_kapture.stages.work import FolderSpec, ordered_map
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
 _ALONE = RigidTransform.identity()

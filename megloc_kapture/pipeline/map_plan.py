@@ -72,8 +72,7 @@ def plan_map(run: Run, dump: Mapping[str, Any]) -> list[Stage]:
                 out / MAP,
                 run.options.refinement,
                 link_features=True,
-                executor=run.executor,
-                track=run.track,
+                work=run.work,
             ),
         )
     )
@@ -177,8 +176,7 @@ def _mapping_pyramid(run: Run, out: Path) -> dict[str, float]:
             run.options.guided_pyramid,
             out / MAPPING_PYRAMID,
             mask_margin_px=run.options.mask_margin_px,
-            executor=run.executor,
-            track=run.track,
+            work=run.work,
         )
         counts |= {f"{extractor.name} {name}": count for name, count in found.items()}
     return counts
@@ -221,8 +219,7 @@ def _mapping_matches(run: Run, out: Path) -> dict[str, int]:
             run.options.make_matcher(local_type),
             run.options.verify_mapping(),
             out / MAPPING_MATCHES,
-            executor=run.executor,
-            track=run.track,
+            work=run.work,
         )
         counts.update(found)
     return counts
@@ -234,8 +231,7 @@ def _lift(run: Run, out: Path) -> dict[str, float]:
         run.options.own_types(),
         out / UNREFINED,
         run.options.lifting,
-        executor=run.executor,
-        track=run.track,
+        work=run.work,
     )
 
 
@@ -254,7 +250,7 @@ def _triangulate(run: Run, out: Path) -> dict[str, float]:
         run.options.point_types(),
         own,
         run.options.triangulation,
-        num_threads=run.num_threads,
+        num_threads=run.work.num_threads,
     )
     if not joined:
         return counts

@@ -120,9 +120,7 @@ def _describe(run: Run, chosen: GlobalFeaturesChoice, out: Path) -> int:
     query = run.workspace.folder(run.query, "")
     if not chosen.is_vlad:
         folders = [run.workspace.folder(run.mapping), query]
-        found = extract_global_features(
-            folders, chosen.make(), out, executor=run.executor, track=run.track
-        )
+        found = extract_global_features(folders, chosen.make(), out, work=run.work)
         return found["images"]
     options = chosen.vlad_options()
     local_type = options.local_type or run.options.main_type()
@@ -133,8 +131,7 @@ def _describe(run: Run, chosen: GlobalFeaturesChoice, out: Path) -> int:
         local_type,
         out,
         options.of_vlad(),
-        executor=run.executor,
-        track=run.track,
+        work=run.work,
     )
     return found["images"]
 
@@ -165,8 +162,7 @@ def _query_matches(run: Run, out: Path, candidates: str) -> dict[str, int]:
             run.options.make_matcher(local_type),
             run.options.verify_queries(),
             out / QUERY_MATCHES,
-            executor=run.executor,
-            track=run.track,
+            work=run.work,
         )
         counts.update(found)
     return counts

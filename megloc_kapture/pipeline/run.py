@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,8 +14,8 @@ from megloc_kapture.pipeline.options import PipelineOptions
 from megloc_kapture.pipeline.paper_steps import PaperStep
 from megloc_kapture.pipeline.submission import place_of
 from megloc_kapture.pipeline.workspace import Workspace
-from megloc_kapture.stages.parallel import Track, untracked
 from megloc_kapture.stages.restrictions import Restrictions
+from megloc_kapture.stages.work import HERE, Work
 
 __all__ = [
     "EVALUATION",
@@ -68,9 +67,7 @@ class Run:
     options: PipelineOptions
     workspace: Workspace
     benchmark: BenchmarkFile | None = None
-    executor: Executor | None = None
-    track: Track = untracked
-    num_threads: int = 1
+    work: Work = HERE
     steps: tuple[PaperStep, ...] = ()
 
     @property

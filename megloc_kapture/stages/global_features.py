@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -16,7 +15,7 @@ from megloc_kapture.errors import DataError, PluginError
 from megloc_kapture.io.kapture_store import FeatureConfig, FeatureWriter, KaptureFolder
 from megloc_kapture.plugins import GlobalFeatureExtractor
 from megloc_kapture.stages.local_features import read_image_of
-from megloc_kapture.stages.parallel import Track, ordered_map, untracked
+from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera
 
 BATCH = 4  # images of one size that a network gets at once, where it can use them
@@ -33,8 +32,7 @@ def extract_global_features(
     extractor: GlobalFeatureExtractor,
     output: Path,
     *,
-    executor: Executor | None = None,
-    track: Track = untracked,
+    work: Work = HERE,
 ) -> dict[str, int]:
     """Describe all images of the folders, into ``output`` (orphan layout).
 
@@ -50,9 +48,9 @@ def extract_global_features(
     """
     jobs = _jobs(folders, extractor)
     writer: FeatureWriter | None = None
-    results = ordered_map(_describe, jobs, executor)
+    results = work.map(_describe, jobs, extractor.name)
     count, size = 0, 0
-    for job, vectors in zip(jobs, track(results, len(jobs), extractor.name), strict=True):
+    for job, vectors in zip(jobs, results, strict=True):
         if writer is None:
             size = vectors.shape[1]
             config = FeatureConfig(extractor.name, np.dtype(np.float32), size, metric_type="L2")

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -23,7 +22,7 @@ from megloc_kapture.features.vlad import VladOptions, Vocabulary, aggregate, tra
 from megloc_kapture.io.atomic import write_bytes
 from megloc_kapture.io.json_model import read_json_model, write_json_model
 from megloc_kapture.io.kapture_store import FeatureConfig, FeatureWriter, KaptureFolder
-from megloc_kapture.stages.parallel import FolderSpec, Track, ordered_map, untracked
+from megloc_kapture.stages.work import HERE, FolderSpec, Work, ordered_map
 from megloc_kapture.values import Options
 
 VOCABULARY_FILE = "vocabulary.npy"
@@ -67,7 +66,7 @@ def train_on_map(
     local_type: str,
     options: VladOptions,
     *,
-    executor: Executor | None = None,
+    work: Work = HERE,
 ) -> Vocabulary:
     """Train on the descriptors of the map's images.
 
@@ -80,7 +79,7 @@ def train_on_map(
     if not any(descriptors.length(image) for image in images):
         raise DataError(f"the map has no descriptors of type {local_type}", path=mapping.root)
     read = _Descriptors(FolderSpec(mapping), local_type)
-    each = partial(ordered_map, executor=executor)
+    each = partial(ordered_map, executor=work.executor)
     return train_vlad(images, descriptors.length, read, options, each=each)
 
 
@@ -91,8 +90,7 @@ def extract_vlad(
     output: Path,
     options: VladOptions,
     *,
-    executor: Executor | None = None,
-    track: Track = untracked,
+    work: Work = HERE,
 ) -> dict[str, int]:
     """Train on ``mapping``, aggregate for all images of the folders, write to ``output``.
 
@@ -102,7 +100,7 @@ def extract_vlad(
     -------
     Counts for the log: images, clusters, dimensions.
     """
-    vocabulary = train_on_map(mapping, local_type, options, executor=executor)
+    vocabulary = train_on_map(mapping, local_type, options, work=work)
     type_name = vlad_type(local_type)
     place = output / "global_features" / type_name
     write_vocabulary(place, vocabulary, local_type, options)
@@ -114,8 +112,8 @@ def extract_vlad(
         jobs += [_Job(read, image, place, run) for image in folder.read().image_names()]
     jobs.sort(key=lambda job: job.image)
     writer = FeatureWriter(output, "global_features", type_name, config, orphan=True)
-    results = ordered_map(_aggregate, jobs, executor)
-    for job, vector in zip(jobs, track(results, len(jobs), "VLAD"), strict=True):
+    results = work.map(_aggregate, jobs, "VLAD")
+    for job, vector in zip(jobs, results, strict=True):
         writer.write(job.image, vector)
     return {
         "images": len(jobs),

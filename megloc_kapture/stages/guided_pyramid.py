@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
-from concurrent.futures import Executor
 from pathlib import Path
 
 from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder
@@ -21,9 +20,9 @@ from megloc_kapture.mapping.frustum_overlap import views_can_overlap
 from megloc_kapture.matching.guided_pyramid import GuidedPyramidOptions, pyramid_type
 from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
 from megloc_kapture.plugins import LocalFeatureExtractor, Matcher
-from megloc_kapture.stages.parallel import FolderSpec, Track, untracked
 from megloc_kapture.stages.pyramid_jobs import HowToRetry, Retry
 from megloc_kapture.stages.pyramid_pairs import PyramidPairs
+from megloc_kapture.stages.work import HERE, FolderSpec, Work
 
 
 def pyramid_mapping(
@@ -37,8 +36,7 @@ def pyramid_mapping(
     output: Path,
     *,
     mask_margin_px: float = 0.0,
-    executor: Executor | None = None,
-    track: Track = untracked,
+    work: Work = HERE,
 ) -> dict[str, float]:
     """Try mapping pairs with few matches again, each image's variants with the other as it is.
 
@@ -84,7 +82,7 @@ def pyramid_mapping(
         others[b][1].append(a)
     for image in sorted(others):
         jobs.append(Retry(how, image, *map(tuple, others[image])))
-    return run.write(jobs, output, executor, track)
+    return run.write(jobs, output, work)
 
 
 def pyramid_queries(
@@ -99,8 +97,7 @@ def pyramid_queries(
     output: Path,
     *,
     mask_margin_px: float = 0.0,
-    executor: Executor | None = None,
-    track: Track = untracked,
+    work: Work = HERE,
 ) -> dict[str, float]:
     """Try query pairs with few matches again: the query's variants with the map's keypoints.
 
@@ -141,4 +138,4 @@ def pyramid_queries(
     for image, other in run.hard:
         others[image].append(other)
     jobs = [Retry(how, image, tuple(others[image])) for image in sorted(others)]
-    return run.write(jobs, output, executor, track)
+    return run.write(jobs, output, work)

@@ -8,7 +8,6 @@ share their centre and nothing could be triangulated.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,8 +26,8 @@ from megloc_kapture.io.kapture_store import (
 from megloc_kapture.io.links import link_images
 from megloc_kapture.mapping.lifting import LiftingOptions, lift_keypoints
 from megloc_kapture.stages.depth_records import DepthRecord, depth_records
-from megloc_kapture.stages.parallel import FolderSpec, Track, ordered_map, untracked
 from megloc_kapture.stages.triangulation import copy_features
+from megloc_kapture.stages.work import HERE, FolderSpec, Work
 
 
 @dataclass(frozen=True)
@@ -46,8 +45,7 @@ def lift_map(
     output: Path,
     options: LiftingOptions,
     *,
-    executor: Executor | None = None,
-    track: Track = untracked,
+    work: Work = HERE,
 ) -> dict[str, float]:
     """Lift the keypoints of the map's images through their depth maps, and write the map.
 
@@ -83,7 +81,7 @@ def lift_map(
         jobs = [_Job(spec, local_type, image, records[image], options) for image in with_depth]
         image_ids: list[NDArray[np.int32]] = []
         keypoint_ids: list[NDArray[np.int32]] = []
-        results = track(ordered_map(_lift, jobs, executor), len(jobs), f"lifting {local_type}")
+        results = work.map(_lift, jobs, f"lifting {local_type}")
         for image, (lifted, ids) in zip(with_depth, results, strict=True):
             points.append(poses[image].inverse().apply(lifted))
             image_ids.append(np.full(len(ids), row_of[image], np.int32))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from megloc_kapture.io.kapture_store import FeatureConfig, FeatureWriter, Kaptur
 from megloc_kapture.io.mask_counts import write_mask_counts
 from megloc_kapture.plugins import LocalFeatureExtractor
 from megloc_kapture.preprocessing.mask_margin import with_margin
-from megloc_kapture.stages.parallel import Track, ordered_map, untracked
+from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, LocalFeatures
 
 
@@ -37,8 +36,7 @@ def extract_local_features(
     output: Path,
     *,
     mask_margin_px: float = 0.0,
-    executor: Executor | None = None,
-    track: Track = untracked,
+    work: Work = HERE,
 ) -> dict[str, int]:
     """Extract from all images of the folders into ``output`` (orphan layout).
 
@@ -70,9 +68,8 @@ def extract_local_features(
     masked: dict[str, int] = {}
     keypoint_writer: FeatureWriter | None = None
     descriptor_writer: FeatureWriter | None = None
-    results = ordered_map(_extract, jobs, executor)
-    label = f"{extractor.name} features"
-    for job, features in zip(jobs, track(results, len(jobs), label), strict=True):
+    results = work.map(_extract, jobs, f"{extractor.name} features")
+    for job, features in zip(jobs, results, strict=True):
         if keypoint_writer is None or descriptor_writer is None:
             keypoint_writer, descriptor_writer = _writers(output, extractor, features)
         keypoint_writer.write(job.image, features.keypoints_px)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from concurrent.futures import Executor
 from dataclasses import dataclass, fields
 
 from megloc_kapture.io.consistency_table import ConsistencyRow
@@ -15,8 +14,8 @@ from megloc_kapture.refinement.consistency import (
     sample,
 )
 from megloc_kapture.refinement.references import ReferenceImages
-from megloc_kapture.stages.parallel import FolderSpec, ordered_map
 from megloc_kapture.stages.ranking_scene import KaptureScene
+from megloc_kapture.stages.work import HERE, FolderSpec, Work, ordered_map
 
 # images under way at once: of those, what comes behind the last that is needed is thrown away
 _WINDOW = 4
@@ -35,7 +34,7 @@ def map_consistency(
     by_frame: Mapping[str, ReferenceImages],
     refiner: HoldsOut,
     *,
-    executor: Executor | None = None,
+    work: Work = HERE,
 ) -> dict[str, Consistency]:
     """The verdict on each coordinate frame of a map, by a bounded sample of its images.
 
@@ -52,7 +51,7 @@ def map_consistency(
             ordered_map(
                 _hold_out,
                 (_Job(mapping, refiner, image, images) for image in sample(images.names)),
-                executor,
+                work.executor,
                 window=_WINDOW,
             )
         )

@@ -8,7 +8,6 @@ in ``reconstruction/point_covariances.npy``.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -51,8 +50,8 @@ from megloc_kapture.mapping.rejection import (
 )
 from megloc_kapture.mapping.uncertainty import point_covariances, point_deviations
 from megloc_kapture.stages.depth_records import DepthRecord, depth_records
-from megloc_kapture.stages.parallel import FolderSpec, Track, ordered_map, untracked
 from megloc_kapture.stages.triangulation import copy_features
+from megloc_kapture.stages.work import HERE, FolderSpec, Work
 from megloc_kapture.values import Options
 
 REPORT_FILE = "refinement.json"
@@ -120,8 +119,7 @@ def refine_map(
     options: MapRefinementOptions | None = None,
     *,
     link_features: bool = False,
-    executor: Executor | None = None,
-    track: Track = untracked,
+    work: Work = HERE,
 ) -> dict[str, float]:
     """Write a map without the points and observations that the options reject.
 
@@ -149,7 +147,7 @@ def refine_map(
         )
     selection = _Selection(source, options.min_observations)
     before = selection.covariances() if options.ply else None
-    _verify_depth(selection, options.depth, executor, track)
+    _verify_depth(selection, options.depth, work)
     _check_consistency(selection, options.consistency)
     _reject_uncertain(selection, options.uncertainty)
     report = selection.report(options)
@@ -363,8 +361,7 @@ def _keypoints_of(
 def _verify_depth(
     selection: _Selection,
     options: DepthVerificationOptions,
-    executor: Executor | None,
-    track: Track,
+    work: Work,
 ) -> None:
     records = depth_records(selection.data) if options.max_sigmas is not None else {}
     folder = selection.source
@@ -390,7 +387,7 @@ def _verify_depth(
     dropped = np.zeros(len(selection.kept), dtype=bool)
     num_checked = 0
     jobs = (job(image, rows) for image, rows in rows_of)
-    results = track(ordered_map(_compare, jobs, executor), len(rows_of), "depth")
+    results = work.map(_compare, jobs, "depth", len(rows_of))
     for (_, rows), (contradicted, checked) in zip(rows_of, results, strict=True):
         dropped[placed[rows[contradicted]]] = True
         num_checked += checked

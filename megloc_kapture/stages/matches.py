@@ -8,7 +8,6 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby, islice
@@ -34,7 +33,7 @@ from megloc_kapture.matching.verification import (
     verify_with_poses,
 )
 from megloc_kapture.plugins import Matcher
-from megloc_kapture.stages.parallel import FolderSpec, Track, ordered_map, untracked
+from megloc_kapture.stages.work import HERE, FolderSpec, Work
 from megloc_kapture.values import Camera, ImageFeatures, Options
 
 Item = TypeVar("Item")
@@ -111,8 +110,7 @@ def match_pairs(
     verification: Verification,
     output: Path,
     *,
-    executor: Executor | None = None,
-    track: Track = untracked,
+    work: Work = HERE,
 ) -> dict[str, int]:
     """Match each pair (image of ``first``, image of ``second``) and write what is verified.
 
@@ -140,8 +138,7 @@ def match_pairs(
         jobs.append(_Job(specs[0], specs[1], local_type, matcher, verification, image, others))
     writer = MatchesWriter(output, local_type, orphan=True)
     counts: list[PairCount] = []
-    results = ordered_map(_match, jobs, executor)
-    for job, found in zip(jobs, track(results, len(jobs), "matching"), strict=True):
+    for job, found in zip(jobs, work.map(_match, jobs, "matching"), strict=True):
         for other, pair in zip(job.others, found, strict=True):
             writer.write(job.image, other, pair.matches, pair.scores)
             counts.append(PairCount(job.image, other, pair.num_found, len(pair.matches)))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -37,9 +36,9 @@ from megloc_kapture.plugins import (
 from megloc_kapture.refinement.consistency import Consistency, HoldsOut
 from megloc_kapture.refinement.references import ReferenceImages
 from megloc_kapture.stages.map_consistency import consistency_row, map_consistency
-from megloc_kapture.stages.parallel import FolderSpec, Track, ordered_map, untracked
 from megloc_kapture.stages.ranking_scene import KaptureScene
 from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
+from megloc_kapture.stages.work import HERE, FolderSpec, Work
 from megloc_kapture.values import Camera, Options, RefinementRow, RigidTransform
 
 
@@ -138,7 +137,7 @@ class PoseReferences:
         frames: Sequence[str],
         refiners: Sequence[PoseRefiner],
         *,
-        executor: Executor | None = None,
+        work: Work = HERE,
     ) -> list[dict[str, Consistency]]:
         """Of each refiner whose poses are as good as the map is consistent, that of each frame.
 
@@ -148,7 +147,7 @@ class PoseReferences:
         """
         asked = {frame: self._by_frame[frame] for frame in frames}
         return [
-            map_consistency(mapping, asked, refiner, executor=executor)
+            map_consistency(mapping, asked, refiner, work=work)
             if isinstance(refiner, HoldsOut) and refiner.require_consistent_map
             else {}
             for refiner in refiners
@@ -163,8 +162,7 @@ def refine_poses(
     options: PoseRefinementOptions,
     *,
     restrictions: Restrictions = UNRESTRICTED,
-    executor: Executor | None = None,
-    track: Track = untracked,
+    work: Work = HERE,
     timing: Path | None = None,
 ) -> dict[str, float]:
     """Refine the poses of queries that were localized, and write them as a result of their own.
@@ -202,13 +200,13 @@ def refine_poses(
         if status.status == "localized" and (pose := data.cam_from_world(image)) is not None
     }
     frames = sorted({frame for _, frame in refined.values()})
-    verdicts = references.verdicts(map_spec, frames, refiners, executor=executor)
+    verdicts = references.verdicts(map_spec, frames, refiners, work=work)
     jobs = []
     for image, (pose, frame) in refined.items():
         near = references.near(pose, statuses[image].candidates)
         why = tuple(found[frame].reason if found else "" for found in verdicts)
         jobs.append(_Job(map_spec, query_spec, refiners, why, image, pose, tuple(near)))
-    results = track(ordered_map(_refine, jobs, executor), len(jobs), "refining")
+    results = work.map(_refine, jobs, "refining")
     found = {job.image: refined for job, refined in zip(jobs, results, strict=True)}
     _write(output, data, localized, statuses, found)
     tested = [

@@ -9,7 +9,6 @@ belong to the old pixels.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
@@ -24,7 +23,6 @@ from megloc_kapture.preprocessing.frame_plan import FrameOptions, FramePlan, pla
 from megloc_kapture.preprocessing.unchanging_region import UnchangingRegion
 from megloc_kapture.stages.class_masks import ClassMasks
 from megloc_kapture.stages.image_masks import MaskOptions, StandingMasks, mask_files
-from megloc_kapture.stages.parallel import Track, ordered_map, untracked
 from megloc_kapture.stages.preprocessing_report import (
     REPORT_FILE,
     PreprocessingReport,
@@ -32,6 +30,7 @@ from megloc_kapture.stages.preprocessing_report import (
 )
 from megloc_kapture.stages.processed_frames import CLASSES, FrameJob, process_frame
 from megloc_kapture.stages.unchanging_regions import find_unchanging_regions
+from megloc_kapture.stages.work import HERE, Work
 
 CLASSES_FILE = "classes.json"
 
@@ -50,8 +49,7 @@ def preprocess_images(
     segmenter: Segmenter | None = None,
     sequences: Sequence[KaptureFolder] = (),
     root: Path | None = None,
-    executor: Executor | None = None,
-    track: Track = untracked,
+    work: Work = HERE,
 ) -> dict[str, float]:
     """Write a kapture with the images, cameras and masks that the options make of one.
 
@@ -64,7 +62,7 @@ def preprocess_images(
     segmenter : the plugin; made of ``options.masks.segmenter`` unless given.
     sequences : more folders to find the cameras' unchanging regions in; the map's, for queries.
     root : of the options' relative paths.
-    executor : its processes write the images, so they must see the same files.
+    work : its processes write the images, so they must see the same files.
 
     Returns
     -------
@@ -91,7 +89,7 @@ def preprocess_images(
     files = mask_files(folder, data.image_names(), user_masks)
     regions: dict[str, UnchangingRegion] = {}
     if options.masks.unchanging:
-        regions = find_unchanging_regions(folder, sequences, executor=executor, track=track)
+        regions = find_unchanging_regions(folder, sequences, work=work)
     remarks = _remarks(regions, any(one.fallback for one in options.masks.fixed))
     standing = StandingMasks(options.masks.fixed, regions, root)
 
@@ -120,8 +118,7 @@ def preprocess_images(
     shares: dict[str, float] = {}
     num_images = len(data.records_camera)
     num_masked = 0
-    results = ordered_map(process_frame, jobs(), executor)
-    for found in track(results, num_images, "pre-processing"):
+    for found in work.map(process_frame, jobs(), "pre-processing", num_images):
         num_masked += bool(found)
         for source, share in found.items():
             shares[source] = shares.get(source, 0.0) + share

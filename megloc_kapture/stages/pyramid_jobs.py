@@ -37,7 +37,7 @@ from megloc_kapture.stages.matches import (
     cached_features,
     match_all,
 )
-from megloc_kapture.stages.parallel import FolderSpec
+from megloc_kapture.stages.work import FolderSpec
 from megloc_kapture.values import LocalFeatures
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,9 +22,9 @@ from megloc_kapture.io.kapture_store import KaptureFolder, MatchesReader, Matche
 from megloc_kapture.matching.guided_pyramid import pyramid_type
 from megloc_kapture.matching.keypoint_union import KeypointUnion
 from megloc_kapture.matching.pyramid_combination import Combined, Tried, combine
-from megloc_kapture.stages.parallel import Track, ordered_map
 from megloc_kapture.stages.pyramid_files import MatchSpool, PyramidFeatures, Spooled
 from megloc_kapture.stages.pyramid_jobs import HowToRetry, Retry, described, retry
+from megloc_kapture.stages.work import Work
 
 COLUMNS = (
     "image",
@@ -91,16 +90,14 @@ class PyramidPairs:
         # of equal counts in the order of the pairs
         self.hard = [pair for _, pair in sorted(found, key=lambda each: each[0])]
 
-    def write(
-        self, jobs: Sequence[Retry], output: Path, executor: Executor | None, track: Track
-    ) -> dict[str, float]:
+    def write(self, jobs: Sequence[Retry], output: Path, work: Work) -> dict[str, float]:
         name = pyramid_type(self._how.first_type)
         images = self._images()
         with (
             MatchSpool(output, self._keypoints, self._descriptors) as spool,
             closing(MatchesWriter(output, name, orphan=True)) as writer,
         ):
-            retried = _retried(jobs, spool, executor, track)
+            retried = _retried(jobs, spool, work)
             added: dict[str, _Added] = defaultdict(_Added)
             rows = []
             hard = set(self.hard)
@@ -245,11 +242,9 @@ class _AllRetried:
                 yield f"{name} {self.skipped[image]}"
 
 
-def _retried(
-    jobs: Sequence[Retry], spool: MatchSpool, executor: Executor | None, track: Track
-) -> _AllRetried:
+def _retried(jobs: Sequence[Retry], spool: MatchSpool, work: Work) -> _AllRetried:
     done = _AllRetried()
-    results = track(ordered_map(retry, jobs, executor), len(jobs), "guided pyramid")
+    results = work.map(retry, jobs, "guided pyramid")
     for job, result in zip(jobs, results, strict=True):
         done.seconds += result.seconds
         done.skipped[job.image] = described(result.skipped)

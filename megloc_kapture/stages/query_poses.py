@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -38,11 +37,11 @@ from megloc_kapture.plugins import (
     load_plugin,
 )
 from megloc_kapture.stages.matches import iterate_candidates
-from megloc_kapture.stages.parallel import FolderSpec, Track, ordered_map, untracked
 from megloc_kapture.stages.query_units import QueryUnit, query_units
 from megloc_kapture.stages.ranking_scene import KaptureScene
 from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.shared_index import index_map, open_index, shared_index
+from megloc_kapture.stages.work import HERE, FolderSpec, Work
 from megloc_kapture.values import Failure, Options, Pose
 
 
@@ -220,8 +219,7 @@ def localize_from_matches(
     options: LocalizationOptions,
     *,
     restrictions: Restrictions = UNRESTRICTED,
-    executor: Executor | None = None,
-    track: Track = untracked,
+    work: Work = HERE,
 ) -> Iterator[tuple[str, Pose | Failure]]:
     """Localize every query from stored matches: image and result; in order of units' names.
 
@@ -261,7 +259,7 @@ def localize_from_matches(
                     ranker=ranker,
                 )
             )
-        for results in track(ordered_map(_localize, jobs, executor), len(jobs), "localizing"):
+        for results in work.map(_localize, jobs, "localizing"):
             yield from results
 
 

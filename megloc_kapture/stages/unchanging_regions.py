@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +18,7 @@ from megloc_kapture.preprocessing.unchanging_region import (
     find_unchanging_region,
 )
 from megloc_kapture.stages.local_features import read_image_of
-from megloc_kapture.stages.parallel import Track, ordered_map, untracked
+from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera
 
 
@@ -33,8 +32,7 @@ def find_unchanging_regions(
     folder: KaptureFolder,
     sequences: Sequence[KaptureFolder] = (),
     *,
-    executor: Executor | None = None,
-    track: Track = untracked,
+    work: Work = HERE,
 ) -> dict[str, UnchangingRegion]:
     """The region of every camera of a folder, by sensor id; falsy with a reason where none is.
 
@@ -61,9 +59,7 @@ def find_unchanging_regions(
             picked = np.linspace(0, len(jobs) - 1, min(len(jobs), MAX_IMAGES)).round().astype(int)
             chosen[sensor] = [jobs[k] for k in picked]
     everything = [job for jobs in chosen.values() for job in jobs]
-    results = iter(
-        track(ordered_map(_edges, everything, executor), len(everything), "unchanging regions")
-    )
+    results = iter(work.map(_edges, everything, "unchanging regions"))
     for sensor, jobs in chosen.items():
         regions[sensor] = find_unchanging_region(next(results) for _ in jobs)
     # lets a progress bar see its end

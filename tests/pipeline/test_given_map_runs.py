@@ -18,6 +18,7 @@ from megloc_kapture.pipeline.plan import run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.run import Run
 from megloc_kapture.pipeline.workspace import Workspace
+from megloc_kapture.stages.work import Work
 
 pytestmark = pytest.mark.slow
 
@@ -46,7 +47,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Workspace]:
     def run_with(*assignments: str) -> Workspace:
         options = options_of_preset(changes=[CHEAP], assignments=assignments)
         with workspace.lock(), single_threaded(), open_executor("processes", 2) as executor:
-            of = Run(source, "classic", options, workspace, executor=executor)
+            of = Run(source, "classic", options, workspace, work=Work(executor))
             run_plan(plan_evaluation(of), workspace)
         return workspace
 

@@ -28,6 +28,7 @@ from megloc_kapture.pipeline.plan import run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.run import Run
 from megloc_kapture.pipeline.workspace import Workspace
+from megloc_kapture.stages.work import Work
 
 pytestmark = pytest.mark.slow
 
@@ -46,7 +47,7 @@ def localized(folder: Path, changes: Sequence[str]) -> Workspace:
     options = options_of_preset(changes=[benchmark.options], assignments=[*cheap, *changes])
     workspace = Workspace(folder)
     with workspace.lock(), single_threaded(), open_executor("processes", 2) as executor:
-        run = Run(source, "classic", options, workspace, benchmark, executor=executor)
+        run = Run(source, "classic", options, workspace, benchmark, work=Work(executor))
         run_plan(plan_evaluation(run), workspace)
     return workspace
 

@@ -19,6 +19,7 @@ from megloc_kapture.pipeline.plan import all_kept, run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.run import Run
 from megloc_kapture.pipeline.workspace import Workspace
+from megloc_kapture.stages.work import Work
 
 pytestmark = pytest.mark.slow
 
@@ -58,7 +59,7 @@ def finished(
 
     def again() -> list[Any]:
         with workspace.lock(), single_threaded(), open_executor("processes", 2) as executor:
-            run = Run(source, "classic", options, workspace, benchmark, executor=executor)
+            run = Run(source, "classic", options, workspace, benchmark, work=Work(executor))
             return run_plan(plan_evaluation(run), workspace)
 
     again()

@@ -13,6 +13,7 @@ import pytest
 from megloc_kapture.errors import DataError, PluginError
 from megloc_kapture.io.kapture_store import KaptureFolder
 from megloc_kapture.stages.global_features import BATCH, describe_images, extract_global_features
+from megloc_kapture.stages.work import Work
 
 
 class Colours:
@@ -71,7 +72,9 @@ def test_threads_write_the_same_bytes(
 ) -> None:
     extract_global_features([world.mapping()], Colours(), tmp_path / "here")
     with ThreadPoolExecutor(3) as executor:
-        extract_global_features([world.mapping()], Colours(), tmp_path / "there", executor=executor)
+        extract_global_features(
+            [world.mapping()], Colours(), tmp_path / "there", work=Work(executor)
+        )
     assert folder_bytes(tmp_path / "here") == folder_bytes(tmp_path / "there")
 
 

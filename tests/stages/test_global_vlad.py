@@ -25,6 +25,7 @@ from megloc_kapture.stages.global_vlad import (
     train_on_map,
     write_vocabulary,
 )
+from megloc_kapture.stages.work import Work
 
 VLAD = VladOptions(num_clusters=8, training_descriptors=2000)
 
@@ -68,7 +69,7 @@ def test_workers_write_the_same_bytes(
     with single_threaded():
         counts = extract_vlad(
             world.mapping(), [world.query(), world.mapping()], "rootsift", tmp_path, VLAD,
-            executor=two_processes,
+            work=Work(two_processes),
         )  # fmt: skip
     assert counts == {"images": 7, "clusters": 8, "dimensions": 1024}
     assert folder_bytes(tmp_path / "global_features") == folder_bytes(
@@ -94,7 +95,12 @@ def test_whitened_vectors_come_from_what_is_stored_beside_them(
     folders = [world.mapping(), world.query()]
     with single_threaded():
         counts = extract_vlad(
-            world.mapping(), folders, "rootsift", tmp_path / "two", WHITENED, executor=two_processes
+            world.mapping(),
+            folders,
+            "rootsift",
+            tmp_path / "two",
+            WHITENED,
+            work=Work(two_processes),
         )
         extract_vlad(world.mapping(), folders, "rootsift", tmp_path / "one", WHITENED)
     assert counts == {"images": 7, "clusters": 8, "dimensions": 3}

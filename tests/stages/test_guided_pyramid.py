@@ -38,6 +38,7 @@ from megloc_kapture.stages.pyramid_pairs import COLUMNS, table_path
 from megloc_kapture.stages.pyramid_query import retry_query
 from megloc_kapture.stages.query_poses import LocalizationOptions, localize_from_matches
 from megloc_kapture.stages.triangulation import triangulate_map
+from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera, ImageFeatures, LocalFeatures, Pose, RigidTransform
 
 MAP_IMAGES = ("left/1.png", "right/2.png", "right/3.png")
@@ -372,9 +373,9 @@ def test_workers_write_the_same_bytes(
     folder_bytes: Callable[[Path], dict[str, bytes]],
 ) -> None:
     if kind == "mapping":
-        counts = scene.retry_mapping(tmp_path / "there", executor=two_processes)
+        counts = scene.retry_mapping(tmp_path / "there", work=Work(two_processes))
     else:
-        counts = scene.retry_queries(kind, tmp_path / "there", executor=two_processes)
+        counts = scene.retry_queries(kind, tmp_path / "there", work=Work(two_processes))
     assert counts["pairs_gained"] > 0
     written = folder_bytes(tmp_path / "there")
     assert written == folder_bytes(scene.root / f"{kind}_all")

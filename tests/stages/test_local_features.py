@@ -18,6 +18,7 @@ from megloc_kapture.io.images import read_image_rgb, write_image
 from megloc_kapture.io.kapture_store import KaptureFolder
 from megloc_kapture.io.mask_counts import read_mask_counts
 from megloc_kapture.stages.local_features import extract_local_features
+from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera, LocalFeatures
 
 Image = NDArray[np.uint8]
@@ -73,7 +74,7 @@ def test_workers_write_the_same_bytes(
     folder_bytes: Callable[[Path], dict[str, bytes]],
 ) -> None:
     folders = [images_only.mapping(), images_only.query()]
-    counts = extract_local_features(folders, EXTRACTOR, tmp_path, executor=two_processes)
+    counts = extract_local_features(folders, EXTRACTOR, tmp_path, work=Work(two_processes))
     assert counts["images"] == 7
     ours = folder_bytes(tmp_path / "local_features")
     assert len(ours) == 2 * 7 + 2

@@ -22,6 +22,7 @@ from megloc_kapture.refinement.consistency import Displacement
 from megloc_kapture.stages.localized_folder import write_localized
 from megloc_kapture.stages.pose_refinement import PoseRefinementOptions, refine_poses
 from megloc_kapture.stages.restrictions import Restrictions
+from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Pose, RigidTransform
 
 SHIFT = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.25))
@@ -103,7 +104,7 @@ def test_each_coordinate_frame_is_judged_by_itself(
     assert told_of_map(good).startswith("sure in good is used; 6 map images held out move by 0.02")
     with ThreadPoolExecutor(2) as executor:
         refine_poses(
-            *folders, tmp_path / "threads", options, restrictions=RESTRICTIONS, executor=executor
+            *folders, tmp_path / "threads", options, restrictions=RESTRICTIONS, work=Work(executor)
         )
     for name in (CONSISTENCY_FILE, "refinement.csv", "status.csv"):
         assert (out / name).read_bytes() == (tmp_path / "threads" / name).read_bytes()

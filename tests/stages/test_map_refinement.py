@@ -36,6 +36,7 @@ from megloc_kapture.stages.map_refinement import (
     RefinementReport,
     refine_map,
 )
+from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera, RigidTransform
 
 CAMERA = Camera("SIMPLE_RADIAL", 320, 240, (250.0, 160.0, 120.0, 0.02))
@@ -349,7 +350,7 @@ def test_equal_bytes_whoever_works(
     )
     before = folder_bytes(wall.root)
     refine_map(wall.folder(), tmp_path / "one", options)
-    refine_map(wall.folder(), tmp_path / "two", options, executor=two_processes)
+    refine_map(wall.folder(), tmp_path / "two", options, work=Work(two_processes))
     assert folder_bytes(tmp_path / "one") == folder_bytes(tmp_path / "two")
     assert folder_bytes(wall.root) == before
 

@@ -30,6 +30,7 @@ from megloc_kapture.stages.matches import (
     match_and_verify,
     match_pairs,
 )
+from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera
 
 CAMERA = Camera("PINHOLE", 400, 300, (300.0, 302.0, 200.0, 150.0))
@@ -64,7 +65,7 @@ def test_workers_write_the_same_bytes(
     verification: Any,
 ) -> None:
     here = run(world, kind, verification, tmp_path / "here")
-    there = run(world, kind, verification, tmp_path / "there", executor=two_processes)
+    there = run(world, kind, verification, tmp_path / "there", work=Work(two_processes))
     assert here == there
     assert here["pairs"] == here["pairs_with_matches"] == 10
     assert here["matches"] > 2000

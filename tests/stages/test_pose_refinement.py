@@ -19,6 +19,7 @@ from megloc_kapture.plugins import POSE_REFINERS, PluginChoice, PoseRefinement, 
 from megloc_kapture.stages.localized_folder import write_localized
 from megloc_kapture.stages.pose_refinement import PoseRefinementOptions, refine_poses
 from megloc_kapture.stages.restrictions import Restrictions
+from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
 SHIFT = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.25))
@@ -99,7 +100,7 @@ def test_threads_write_the_same_bytes(
     arguments = (world.mapping(), world.query(), localized)
     refine_poses(*arguments, tmp_path / "here", options)
     with ThreadPoolExecutor(2) as executor:
-        refine_poses(*arguments, tmp_path / "there", options, executor=executor)
+        refine_poses(*arguments, tmp_path / "there", options, work=Work(executor))
     assert folder_bytes(tmp_path / "here") == folder_bytes(tmp_path / "there")
 
 

@@ -31,6 +31,7 @@ from megloc_kapture.stages.image_masks import MaskOptions
 from megloc_kapture.stages.local_features import extract_local_features, read_mask
 from megloc_kapture.stages.preprocessing import PreprocessingOptions, preprocess_images
 from megloc_kapture.stages.preprocessing_report import PreprocessingReport, pixel_maps, read_report
+from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera, RigidTransform
 
 Image = NDArray[np.uint8]
@@ -113,7 +114,7 @@ def run(
     """Pre-process; keyword arguments that are no options go to the stage."""
     stage = {
         name: options.pop(name)
-        for name in ("segmenter", "sequences", "root", "executor")
+        for name in ("segmenter", "sequences", "root", "work")
         if name in options
     }
     chosen = PreprocessingOptions(masks=MaskOptions(**masks or {}), **options)
@@ -462,7 +463,7 @@ def test_the_executor_changes_no_byte(
     options: dict[str, Any] = {"max_size_px": 160, "undistort": True, "blank_pixels": 0.5}
     masks = {"fixed": (FixedMask(camera="side", bottom_share=0.2),)}
     run(street, tmp_path / "a", masks, **options)
-    run(street, tmp_path / "b", masks, **options, executor=two_processes)
+    run(street, tmp_path / "b", masks, **options, work=Work(two_processes))
     first, second = folder_bytes(tmp_path / "a"), folder_bytes(tmp_path / "b")
     assert first == second and "sensors/masks/side/2.jpg.png" in first
 

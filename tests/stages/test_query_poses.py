@@ -26,6 +26,7 @@ from megloc_kapture.stages.query_poses import (
     localize_from_matches,
     localize_views,
 )
+from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
 Results = list[tuple[str, Pose | Failure]]
@@ -77,7 +78,7 @@ def test_errors_are_within_their_covariance(world: Any) -> None:
 
 
 def test_workers_find_the_same_poses(world: Any, two_processes: Executor) -> None:
-    here, there = localize(world), localize(world, executor=two_processes)
+    here, there = localize(world), localize(world, work=Work(two_processes))
     for (image_a, a), (image_b, b) in zip(here, there, strict=True):
         assert isinstance(a, Pose) and isinstance(b, Pose)
         assert (image_a, a.cam_from_world, a.num_inliers) == (

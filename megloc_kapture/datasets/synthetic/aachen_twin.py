@@ -31,7 +31,7 @@ from megloc_kapture.datasets.synthetic.shots import Shot
 from megloc_kapture.datasets.synthetic.sift_points import write_sift_database
 from megloc_kapture.io.atomic import write_bytes
 from megloc_kapture.io.kapture_store import KaptureData, Sensor, write_sensors
-from megloc_kapture.stages.parallel import Track, untracked
+from megloc_kapture.stages.work import Track, untracked
 
 __all__ = ["AACHEN_TWIN_VERSION", "AachenTwinOptions", "write_aachen_twin"]
 

@@ -48,7 +48,7 @@ from megloc_kapture.datasets.synthetic.views import View
 from megloc_kapture.io.atomic import write_bytes
 from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture_store import KaptureData, Sensor, write_sensors
-from megloc_kapture.stages.parallel import Track, untracked
+from megloc_kapture.stages.work import Track, untracked
 from megloc_kapture.values import Options, RigidTransform
 
 # raise when the same options draw other pixels or other files than before

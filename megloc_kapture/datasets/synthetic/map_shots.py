@@ -20,7 +20,7 @@ from megloc_kapture.datasets.synthetic.tracks import exact_tracks
 from megloc_kapture.datasets.synthetic.views import View
 from megloc_kapture.features.colmap_sift import ColmapSift
 from megloc_kapture.io.images import read_image_rgb, write_image
-from megloc_kapture.stages.parallel import Track
+from megloc_kapture.stages.work import Track
 from megloc_kapture.values import LocalFeatures
 
 

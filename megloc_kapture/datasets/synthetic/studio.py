@@ -12,7 +12,7 @@ from megloc_kapture.datasets.synthetic.options import SyntheticWorldOptions
 from megloc_kapture.datasets.synthetic.places import Place, build_place
 from megloc_kapture.datasets.synthetic.shots import Shot
 from megloc_kapture.datasets.synthetic.views import PlacePainter, View
-from megloc_kapture.stages.parallel import Track, ordered_map, untracked
+from megloc_kapture.stages.work import Track, ordered_map, untracked
 
 Result = TypeVar("Result")
 PlaceBuilder = Callable[[SyntheticWorldOptions, int], Place]

@@ -25,7 +25,7 @@ from megloc_kapture.io.side_tables import (
     write_protocol,
     write_world,
 )
-from megloc_kapture.stages.parallel import Track, untracked
+from megloc_kapture.stages.work import Track, untracked
 
 DATASET = "synthetic"
 

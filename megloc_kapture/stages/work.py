@@ -1,11 +1,12 @@
-"""Per-image and per-pair work on any executor, in order, with bounded memory."""
+"""Per-image and per-pair work: in order, with bounded memory and a progress bar."""
 
 from __future__ import annotations
 
 import itertools
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Protocol, TypeVar
@@ -51,6 +52,44 @@ def ordered_map(
     finally:
         for future in waiting:
             future.cancel()
+
+
+@dataclass(frozen=True)
+class Work:
+    """Where the work of a stage is done, and who is told how far it is.
+
+    Attributes
+    ----------
+    executor : None stands for this process.
+    num_threads : for what has threads of its own, as COLMAP's triangulation.
+    """
+
+    executor: Executor | None = None
+    track: Track = untracked
+    num_threads: int = 1
+
+    def map(
+        self,
+        function: Callable[[Item], Result],
+        items: Iterable[Item],
+        label: str,
+        total: int | None = None,
+    ) -> Iterator[Result]:
+        """Results in the order of the items, with a progress bar.
+
+        Parameters
+        ----------
+        function : of a module, so that it can be sent to another process.
+        items : paths and numbers; arrays of an image are read where the work is done.
+        total : number of items, where they have no length.
+        """
+        if total is None:
+            items = items if isinstance(items, Sequence) else list(items)
+            total = len(items)
+        return self.track(ordered_map(function, items, self.executor), total, label)
+
+
+HERE = Work()
 
 
 class FolderSpec:

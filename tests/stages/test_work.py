@@ -12,7 +12,7 @@ import pytest
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.kapture_store import KaptureFolder
-from megloc_kapture.stages.parallel import FolderSpec, ordered_map, untracked
+from megloc_kapture.stages.work import FolderSpec, ordered_map, untracked
 
 
 def fail_at_three(value: int) -> int:
