@@ -45,9 +45,10 @@ SMALL_WORLDS = {
 }
 SMALL_NETWORKS = {
     "random": [
-        "preprocessing.max_size_px=320",
-        "local_features.superpoint.options.max_keypoints=300",
-        "local_features.aslfeat.options.max_keypoints=300",
+        "preprocessing.max_size_px=240",
+        "local_features.superpoint.options.max_keypoints=200",
+        "local_features.aslfeat.options.max_keypoints=200",
+        "guided_pyramid.probed_pairs=1",
     ],
     "free": ["preprocessing.max_size_px=800"],
 }

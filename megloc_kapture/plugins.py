@@ -36,6 +36,7 @@ POSE_RANKERS = "megloc_kapture.pose_rankers"
 IMAGE_DISTANCES = "megloc_kapture.image_distances"
 POSE_REFINERS = "megloc_kapture.pose_refiners"
 DATASETS = "megloc_kapture.datasets"
+STAGES = "megloc_kapture.stages"
 
 
 class PluginChoice(Options):
@@ -305,6 +306,26 @@ class DatasetAdapter(Protocol):
         ...
 
 
+@runtime_checkable
+class StageOfAPlan(Protocol):
+    """Group ``megloc_kapture.stages``: a step of a run, see ``megloc_kapture.stages.stage.Stage``.
+
+    Deriving from that class leaves four things to say: what the stage is called, what it reads and
+    writes in a workspace, and what it does.
+    """
+
+    name: str
+    """Of its manifest, its command and its options, ``stages.NAME``."""
+    reads: Sequence[str]
+    """Paths in the workspace; it runs behind the stages that write them."""
+    writes: Sequence[str]
+    """Paths in the workspace."""
+
+    def run(self, work: Any) -> Mapping[str, float]:
+        """Do it, with a ``megloc_kapture.stages.stage.StageWork``; returns counts for the log."""
+        ...
+
+
 _PROTOCOLS: dict[str, type] = {
     LOCAL_FEATURES: LocalFeatureExtractor,
     GLOBAL_FEATURES: GlobalFeatureExtractor,
@@ -314,6 +335,7 @@ _PROTOCOLS: dict[str, type] = {
     IMAGE_DISTANCES: ImageDistance,
     POSE_REFINERS: PoseRefiner,
     DATASETS: DatasetAdapter,
+    STAGES: StageOfAPlan,
 }
 
 
@@ -329,6 +351,34 @@ def load_plugin(group: str, name: str, options: dict[str, Any] | None = None) ->
     ------
     PluginError : no such plugin, it cannot be imported, does not fulfil the group's protocol, or
         refuses its options; says which and why.
+    """
+    kind = plugin_class(group, name)
+    model = getattr(kind, "Options", None)
+    try:
+        if model is None:
+            if options:
+                raise ValueError(f"it takes no options, got {sorted(options)}")
+            return kind()
+        return kind(model(**(options or {})))
+    except MeglocError:
+        raise
+    except ValidationError as error:
+        first = error.errors()[0]
+        option = ".".join(str(part) for part in first["loc"])
+        raise PluginError(
+            f"plugin {name!r} refuses its options: {option}: {first['msg']}"
+        ) from error
+    except Exception as error:  # whatever a foreign constructor raises
+        reason = " ".join(str(error).split())
+        raise PluginError(f"plugin {name!r} refuses its options: {reason}") from error
+
+
+def plugin_class(group: str, name: str) -> Any:
+    """The class registered as ``name`` in ``group``.
+
+    Raises
+    ------
+    PluginError : none, it cannot be imported, or it does not fulfil the group's protocol.
     """
     found = [entry for entry in entry_points(group=group) if entry.name == name]
     if not found:
@@ -350,24 +400,7 @@ def load_plugin(group: str, name: str, options: dict[str, Any] | None = None) ->
         raise PluginError(
             f"plugin {name!r} ({found[0].value}) does not fulfil {protocol.__name__}: it {what}"
         )
-    model = getattr(kind, "Options", None)
-    try:
-        if model is None:
-            if options:
-                raise ValueError(f"it takes no options, got {sorted(options)}")
-            return kind()
-        return kind(model(**(options or {})))
-    except MeglocError:
-        raise
-    except ValidationError as error:
-        first = error.errors()[0]
-        option = ".".join(str(part) for part in first["loc"])
-        raise PluginError(
-            f"plugin {name!r} refuses its options: {option}: {first['msg']}"
-        ) from error
-    except Exception as error:  # whatever a foreign constructor raises
-        reason = " ".join(str(error).split())
-        raise PluginError(f"plugin {name!r} refuses its options: {reason}") from error
+    return kind
 
 
 def weights_of(plugin: object) -> dict[str, str]:

@@ -39,11 +39,13 @@ from megloc_kapture.pipeline.paper_steps import (
     paper_steps,
     steps_text,
 )
-from megloc_kapture.pipeline.plan import Stage, StageReport, all_kept, run_plan
+from megloc_kapture.pipeline.plan import all_kept, describe, run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.run import EVALUATION, LOCALIZED, Run
+from megloc_kapture.pipeline.run import Run
 from megloc_kapture.pipeline.submissions_folder import FOLDER, keep_submission
 from megloc_kapture.pipeline.workspace import Workspace
+from megloc_kapture.stages.layout import EVALUATION, LOCALIZED
+from megloc_kapture.stages.stage import Stage
 from megloc_kapture.stages.work import Work
 
 BELOW_RECALL = 3
@@ -139,13 +141,14 @@ class Eval(Choosing, Working, Common):
                 options=options,
                 workspace=workspace,
                 benchmark=benchmark,
-                work=Work(executor, console.track, self.workers or available_cores()),
                 steps=tuple(paper_steps(layers, facts_of(choice))),
             )
+            work = Work(executor, console.track, self.workers or available_cores())
             stages = plan_evaluation(run)
             reports = run_plan(
                 stages,
                 workspace,
+                work,
                 first=self.from_stage,
                 last=self.until,
                 dry_run=self.dry_run,
@@ -153,7 +156,7 @@ class Eval(Choosing, Working, Common):
                 on_report=lambda report: console.say(describe(report)),
             )
             if self.ablate and not self.dry_run:
-                self._ablate(console, run, stages, layers)
+                self._ablate(console, run, work, stages, layers)
         if self.dry_run:
             return 0
         if all_kept(reports):
@@ -168,7 +171,12 @@ class Eval(Choosing, Working, Common):
         return status
 
     def _ablate(
-        self, console: Console, run: Run, stages: Sequence[Stage], layers: LayeredOptions
+        self,
+        console: Console,
+        run: Run,
+        work: Work,
+        stages: Sequence[Stage],
+        layers: LayeredOptions,
     ) -> None:
         outcomes = [outcome("all steps", run.workspace, stages)]
         for variant in variants(run.options):
@@ -181,6 +189,7 @@ class Eval(Choosing, Working, Common):
                 run_plan(
                     planned,
                     workspace,
+                    work,
                     on_start=lambda name, why: console.say(f"{name}: {why}"),
                     on_report=lambda report: console.say(describe(report)),
                 )
@@ -257,20 +266,6 @@ def published_results(benchmark: BenchmarkFile) -> list[str]:
         recall = "   ".join(f"{name} {figures}" for name, figures in result.recall.items())
         lines.append(f"  {result.method:{width}s}  {recall}   [{result.source}]")
     return [*lines, ""]
-
-
-def describe(report: StageReport) -> str:
-    """One line about a stage."""
-    if report.state == "kept":
-        return f"{report.name}: up to date"
-    if report.state == "skipped":
-        return f"{report.name}: taken as it is"
-    if report.state == "pending":
-        return f"{report.name}: would run ({report.why})"
-    counts = ", ".join(
-        f"{value:g} {name.replace('_', ' ')}" for name, value in report.counts.items()
-    )
-    return f"{report.name}: {counts}; {report.seconds:.1f} s"
 
 
 def shown(path: Path) -> str:

@@ -8,26 +8,15 @@ import os
 import sys
 import traceback
 from collections.abc import Sequence
+from dataclasses import make_dataclass
+from importlib import import_module
 from typing import Annotated, Any, Protocol
 
 import tyro
 
 from megloc_kapture.cli.arguments import one_line_errors
-from megloc_kapture.cli.check import Check
-from megloc_kapture.cli.datasets import Import, Synth
-from megloc_kapture.cli.doctor import Doctor
-from megloc_kapture.cli.evaluate import Evaluate
-from megloc_kapture.cli.evaluate_dataset import Eval
-from megloc_kapture.cli.info import Info
-from megloc_kapture.cli.localize import Localize
-from megloc_kapture.cli.preprocess import Preprocess
-from megloc_kapture.cli.refine_map import RefineMap
-from megloc_kapture.cli.refine_poses import RefinePoses
-from megloc_kapture.cli.retrieval import ExtractGlobal, PairsMapping, PairsQuery
-from megloc_kapture.cli.stages import ExtractLocal, Match, Triangulate
-from megloc_kapture.cli.submit import Submit
-from megloc_kapture.cli.weights import WeightsCommand
 from megloc_kapture.errors import MeglocError
+from megloc_kapture.plugins import STAGES, plugin_names
 
 DONE, DEFECT, USER_ERROR, INTERRUPTED = 0, 1, 2, 130
 
@@ -42,35 +31,102 @@ class Command(Protocol):
         ...
 
 
-COMMANDS: dict[str, type[Any]] = {
-    "eval": Eval,
-    "import": Import,
-    "synth": Synth,
-    "preprocess": Preprocess,
-    "extract-local": ExtractLocal,
-    "extract-global": ExtractGlobal,
-    "pairs-mapping": PairsMapping,
-    "pairs-query": PairsQuery,
-    "match": Match,
-    "triangulate": Triangulate,
-    "refine-map": RefineMap,
-    "refine-poses": RefinePoses,
-    "localize": Localize,
-    "submit": Submit,
-    "check": Check,
-    "evaluate": Evaluate,
-    "weights": WeightsCommand,
-    "info": Info,
-    "doctor": Doctor,
+# module and class, and the first line of its help: only the command that runs is imported
+COMMANDS: dict[str, tuple[str, str]] = {
+    "eval": (
+        "evaluate_dataset:Eval",
+        "Run all stages on a dataset; what is done and still true is kept.",
+    ),
+    "import": (
+        "datasets:Import",
+        "Bring a dataset into DIR/{mapping,query,query_gt,megloc}; images are linked, not copied.",
+    ),
+    "synth": (
+        "datasets:Synth",
+        "Render a dataset: the synthetic world as kapture, or a small twin in an official layout.",
+    ),
+    "preprocess": (
+        "preprocess:Preprocess",
+        "Resize, undistort and mask the images of a kapture; poses stay, cameras follow.",
+    ),
+    "extract-local": (
+        "stages:ExtractLocal",
+        "Extract local features of all images of kapture folders.",
+    ),
+    "extract-global": (
+        "retrieval:ExtractGlobal",
+        "Describe every image by one vector: VLAD trained on the map, or image networks.",
+    ),
+    "pairs-mapping": (
+        "retrieval:PairsMapping",
+        "Choose which images of a map are matched with each other.",
+    ),
+    "pairs-query": ("retrieval:PairsQuery", "Choose the map images each query is matched with."),
+    "match": (
+        "stages:Match",
+        "Match and verify image pairs; with known poses within a map, else by a two-view model.",
+    ),
+    "triangulate": (
+        "stages:Triangulate",
+        "Triangulate verified matches of images with known poses into a kapture map.",
+    ),
+    "refine-map": (
+        "refine_map:RefineMap",
+        "Take points and observations out of a map that its images, or depth maps, contradict.",
+    ),
+    "refine-poses": (
+        "refine_poses:RefinePoses",
+        "Refine the poses of localized queries; a pose that gets no better stays, and says why.",
+    ),
+    "localize": ("localize:Localize", "Localize the images of a kapture folder in a kapture map."),
+    "submit": (
+        "submit:Submit",
+        "Write the pose file of a localized kapture folder, and its provenance beside it.",
+    ),
+    "check": (
+        "check:Check",
+        "Check a pose file, ours or foreign, against the rules of its challenge and the map.",
+    ),
+    "evaluate": (
+        "evaluate:Evaluate",
+        "Compare localized queries (kapture folders or pose files) with their true poses, and two "
+        "or more results with each other.",
+    ),
+    "weights": (
+        "weights:WeightsCommand",
+        "List, fetch, add, convert and check the weights of networks.",
+    ),
+    "info": ("info:Info", "Say what is in a kapture folder, and what a map allows."),
+    "doctor": (
+        "doctor:Doctor",
+        "Check the environment: versions, known-bad combinations, GPU, weights.",
+    ),
 }
 
 
-def _parser() -> Any:
+def command_class(name: str) -> type[Any]:
+    """The command of a name; its module is imported."""
+    if name in COMMANDS:
+        module, _, kind = COMMANDS[name][0].partition(":")
+        found: type[Any] = getattr(import_module(f"megloc_kapture.cli.{module}"), kind)
+        return found
+    from megloc_kapture.cli.outside_stages import stage_command
+
+    return stage_command(name.replace("-", "_"))
+
+
+def _parser(given: Sequence[str]) -> Any:
+    """What tyro parses: the command that is given, or the names of all of them for help."""
+    stages = [name.replace("_", "-") for name in plugin_names(STAGES)]
     annotated: Any = Annotated  # of types that are values here, which mypy does not follow
-    entries = [
-        annotated[kind, tyro.conf.subcommand(name, description=kind.__doc__)]
-        for name, kind in COMMANDS.items()
-    ]
+    names = [*COMMANDS, *(name for name in stages if name not in COMMANDS)]
+    entries = []
+    for name in names:
+        kind: type[Any] = make_dataclass(name.replace("-", "_"), [])
+        if name in given[:1] or name in stages:
+            kind = command_class(name)
+        text = COMMANDS[name][1] if name in COMMANDS else kind.__doc__
+        entries.append(annotated[kind, tyro.conf.subcommand(name, description=text)])
     return functools.reduce(operator.or_, entries)
 
 
@@ -81,7 +137,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         with one_line_errors(given):
             command: Command = tyro.cli(
-                _parser(), args=given, prog="megloc", config=(tyro.conf.OmitArgPrefixes,)
+                _parser(given), args=given, prog="megloc", config=(tyro.conf.OmitArgPrefixes,)
             )
         debug = command.debug
         status = command.run()

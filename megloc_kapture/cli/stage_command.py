@@ -14,8 +14,8 @@ from megloc_kapture.errors import OptionError
 from megloc_kapture.io.kapture_store import KaptureFolder
 from megloc_kapture.io.outputs import staged_output
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
-from megloc_kapture.pipeline.options import PipelineOptions
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, options_of_preset
+from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
 
 FEATURES = "features"

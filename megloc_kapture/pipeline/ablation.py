@@ -14,10 +14,10 @@ from megloc_kapture.io.atomic import output_error
 from megloc_kapture.io.csv_table import write_csv_table
 from megloc_kapture.io.links import hard_link
 from megloc_kapture.pipeline.manifests import read_manifest
-from megloc_kapture.pipeline.options import PipelineOptions
-from megloc_kapture.pipeline.plan import Stage
-from megloc_kapture.pipeline.run import EVALUATION
 from megloc_kapture.pipeline.workspace import LOCK, PARTIAL, Workspace
+from megloc_kapture.stages.layout import EVALUATION
+from megloc_kapture.stages.options import PipelineOptions
+from megloc_kapture.stages.stage import Stage
 
 ABLATION, TABLE = "ablation", "ablation/ablation.csv"
 

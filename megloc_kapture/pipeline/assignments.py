@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 from megloc_kapture.errors import OptionError
-from megloc_kapture.pipeline.options import PipelineOptions
+from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.values import Options
 
 

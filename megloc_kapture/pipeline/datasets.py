@@ -34,7 +34,6 @@ KAPTURE, SYNTHETIC = "kapture", "synthetic"
 DATA_VARIABLE = "MEGLOC_DATA"
 SUMMARY_FILE = f"{SIDE_TABLES}/summary.txt"
 
-Renderer = Callable[[Path], Mapping[str, float]]
 ProtocolChange = Callable[[Protocol], Protocol]
 
 
@@ -151,12 +150,11 @@ class DatasetChoice:
             "queries_with_truth": 0 if truth is None else len(truth.poses()),
         }
 
-    def renderer(self, work: Work) -> Renderer | None:
-        """Writes the rendered dataset below the folder it is given; None where there is a root."""
-        twin = self.twin
-        if twin is None:
-            return None
-        return lambda out: twin.write(out / "world", twin.options, work.executor, track=work.track)
+    def render_to(self, output: Path, work: Work) -> Mapping[str, float]:
+        """Write the rendered dataset; only where there is no root."""
+        if self.twin is None:
+            raise ValueError(f"dataset {self.name} is given, not rendered")
+        return self.twin.write(output, self.twin.options, work.executor, track=work.track)
 
     def render_options(self) -> dict[str, Any]:
         """What determines the rendered dataset."""

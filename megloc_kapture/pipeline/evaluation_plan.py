@@ -4,48 +4,64 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
-from pathlib import Path
 from typing import Any
 
-from megloc_kapture.errors import OptionError
+from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.evaluation.folders import evaluate_folders, results_without_truth
 from megloc_kapture.evaluation.outputs import write_evaluation
 from megloc_kapture.evaluation.provenance import package_versions
 from megloc_kapture.evaluation.rules import read_rules
 from megloc_kapture.evaluation.surroundings import surroundings_of
 from megloc_kapture.evaluation.without_truth_outputs import write_without_truth
-from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder, read_pairs
-from megloc_kapture.io.side_tables import SIDE_TABLES
+from megloc_kapture.io.side_tables import SIDE_TABLES, Protocol
 from megloc_kapture.pipeline.datasets import DatasetChoice, with_model
-from megloc_kapture.pipeline.image_plan import plan_images
-from megloc_kapture.pipeline.map_plan import matched_images, plan_map
 from megloc_kapture.pipeline.missing_weights import check_weights
-from megloc_kapture.pipeline.plan import Stage
-from megloc_kapture.pipeline.retrieval_plan import plan_global_features, plan_query_pairs
-from megloc_kapture.pipeline.run import (
+from megloc_kapture.pipeline.run import Run
+from megloc_kapture.pipeline.submission import write_submission
+from megloc_kapture.plugins import STAGES, load_plugin
+from megloc_kapture.stages.global_features import ExtractGlobalFeatures
+from megloc_kapture.stages.guided_pyramid import PyramidMapping, PyramidQueries
+from megloc_kapture.stages.image_pairs import PairMapping, PairQueries
+from megloc_kapture.stages.layout import (
     EVALUATION,
     LOCALIZED,
-    MAP,
     MAPPING,
     QUERY,
     QUERY_GT,
-    QUERY_MATCHES,
-    QUERY_PAIRS,
-    QUERY_PYRAMID,
-    REFINEMENT_TIMING,
+    REFERENCE,
     SUBMISSIONS,
-    TIMING,
-    UNREFINED_POSES,
-    Run,
 )
-from megloc_kapture.pipeline.submission import write_submission
-from megloc_kapture.plugins import weights_of
-from megloc_kapture.stages.guided_pyramid import pyramid_queries
-from megloc_kapture.stages.localized_folder import write_localized
-from megloc_kapture.stages.matches import iterate_candidates
-from megloc_kapture.stages.pose_refinement import refine_poses
-from megloc_kapture.stages.query_poses import localize_from_matches
-from megloc_kapture.values import RigidTransform
+from megloc_kapture.stages.local_features import ExtractLocalFeatures
+from megloc_kapture.stages.map_points import GivenMap, LiftPoints, TriangulatePoints
+from megloc_kapture.stages.map_refinement import RefineMap
+from megloc_kapture.stages.matches import MatchMapping, MatchQueries
+from megloc_kapture.stages.pose_refinement import RefinePoses
+from megloc_kapture.stages.preprocessing import Preprocess
+from megloc_kapture.stages.query_poses import LocalizeQueries
+from megloc_kapture.stages.reranking import RerankQueries
+from megloc_kapture.stages.stage import Hashes, PipelineStage, Stage, StageWork, is_below
+
+WORLD = "world"
+
+# between import and pose file, in this order; each is there where the options ask for it
+PIPELINE: tuple[type[PipelineStage], ...] = (
+    Preprocess,
+    ExtractLocalFeatures,
+    ExtractGlobalFeatures,
+    PairMapping,
+    MatchMapping,
+    PyramidMapping,
+    TriangulatePoints,
+    LiftPoints,
+    GivenMap,
+    RefineMap,
+    PairQueries,
+    MatchQueries,
+    RerankQueries,
+    PyramidQueries,
+    LocalizeQueries,
+    RefinePoses,
+)
 
 
 def plan_evaluation(run: Run) -> list[Stage]:
@@ -71,57 +87,29 @@ def plan_evaluation(run: Run) -> list[Stage]:
         )
     if given or options.pairs_by_points():
         run = replace(run, source=_with_model(run, given))
-    dump = options.model_dump(mode="json")
-    last = "refine_poses" if options.pose_refinement.refines() else "localization"
-    stages = [
-        *plan_images(run, dump),
-        plan_global_features(run, dump),
-        *plan_map(run, dump),
-        *plan_query_pairs(run, dump),
-        *(_pyramid_stages(run, dump) if options.matches_again() else ()),
-        Stage(
-            "localization",
-            4,
-            {
-                "localization": dump["localization"],
-                "weights": weights_of(options.localization.make_ranker()),
-            },
-            (
-                "import",
-                run.images_stage,
-                "local_features",
-                "map",
-                "query_pairs",
-                "query_matches",
-                *(["query_pyramid"] if options.matches_again() else []),
-            ),
-            (run.first_poses, TIMING),
-            lambda out: _localization(run, out),
-        ),
-        *(_refinement_stages(run, dump) if options.pose_refinement.refines() else ()),
-        Stage(
-            "submission",
-            3,
-            {"dataset": run.dataset, "preset": run.preset, "options": dump},
-            ("import", last),
-            (SUBMISSIONS,),
-            lambda out: _submission(run, out),
-        ),
-        Stage(
-            "evaluation",
-            3,
-            {
-                "dataset": run.dataset,
-                "preset": run.preset,
-                "options": dump,
-                "steps": [asdict(step) for step in run.steps],
-            },
-            ("import", last),
-            (EVALUATION,),
-            lambda out: _evaluation(run, out),
-        ),
-    ]
+    run.source.check()
+    stages: list[Stage] = [Render(run)] if run.source.twin is not None else []
+    stages.append(Import(run))
+    stages += [kind(options) for kind in PIPELINE if kind.is_wanted(options)]
+    stages += [Submit(run), Evaluate(run)]
+    for name, values in options.stages.items():
+        _insert(stages, load_plugin(STAGES, name, dict(values)))
     return stages
+
+
+def _insert(stages: list[Stage], stage: Stage) -> None:
+    """Put a stage of another package behind the last one that writes what it reads."""
+    if any(stage.name == one.name for one in stages):
+        raise OptionError(f"stages.{stage.name}: there is a stage of this name")
+    for path in stage.reads:
+        if not any(is_below(path, written) for one in stages for written in one.writes):
+            raise OptionError(f"stages.{stage.name} reads {path}, which no stage of the run writes")
+    places = [
+        number
+        for number, one in enumerate(stages)
+        if any(is_below(path, written) for path in stage.reads for written in one.writes)
+    ]
+    stages.insert(max(places, default=len(stages) - 1) + 1, stage)
 
 
 def _with_model(run: Run, given: bool) -> DatasetChoice:
@@ -138,154 +126,120 @@ def _with_model(run: Run, given: bool) -> DatasetChoice:
         raise OptionError(f"{error}: {wanted}") from error
 
 
-def _pyramid_stages(run: Run, dump: Mapping[str, Any]) -> list[Stage]:
-    return [
-        Stage(
-            "query_pyramid",
-            1,
-            {
-                "guided_pyramid": dump["guided_pyramid"],
-                "two_view": dump["query_verification"],
-                "mask_margin_px": dump["mask_margin_px"],
-            },
-            (run.images_stage, "local_features", "map", "query_pairs", "query_matches"),
-            (QUERY_PYRAMID,),
-            lambda out: _query_pyramid(run, out),
+class _RunStage(Stage):
+    """A stage that needs to know of the run: its dataset, its preset, all of its options."""
+
+    def __init__(self, run: Run) -> None:
+        super().__init__(run.options)
+        self._run = run
+
+
+class Render(_RunStage):
+    """Render a dataset that is made rather than given."""
+
+    name = "render"
+    writes = (WORLD,)
+
+    def settings(self) -> dict[str, Any]:
+        return self._run.source.render_options()
+
+    def run(self, work: StageWork) -> Mapping[str, float]:
+        return self._run.source.render_to(work.out / WORLD, work)
+
+
+class Import(_RunStage):
+    """Import the dataset as kapture."""
+
+    name = "import"
+    version = 3
+    writes = (MAPPING, QUERY, QUERY_GT, SIDE_TABLES, REFERENCE)
+
+    @property
+    def reads(self) -> Sequence[str]:  # type: ignore[override]
+        return (WORLD,) if self._run.source.twin is not None else ()
+
+    def settings(self) -> dict[str, Any]:
+        benchmark = self._run.benchmark
+        wanted = None if benchmark is None else benchmark.change(Protocol())
+        protocol = wanted and wanted.model_dump(mode="json")
+        return {**self._run.source.settings(), "protocol": protocol}
+
+    def external(self, hashes: Hashes) -> Mapping[str, str]:
+        source = self._run.source
+        if source.root is None:
+            return {}
+        root = source.root.resolve()
+        content = hashes.of_files(root, source.input_files(root))
+        return {"dataset files": content, "dataset root": str(root)}
+
+    def run(self, work: StageWork) -> Mapping[str, float]:
+        source = self._run.source
+        root = work.path(WORLD) if source.root is None else source.root.resolve()
+        counts = source.import_to(root, work.out, self._change)
+        if not counts["queries"]:
+            raise DataError("no query image is left to localize", path=root)
+        return counts
+
+    def _change(self, given: Protocol) -> Protocol:
+        if given.dataset == Protocol().dataset:
+            given = given.model_copy(update={"dataset": self._run.dataset})
+        return given if self._run.benchmark is None else self._run.benchmark.change(given)
+
+
+class Submit(_RunStage):
+    """Write the pose file, with its provenance beside it."""
+
+    name = "submission"
+    version = 3
+    writes = (SUBMISSIONS,)
+
+    @property
+    def reads(self) -> Sequence[str]:  # type: ignore[override]
+        return (SIDE_TABLES, LOCALIZED)
+
+    def settings(self) -> dict[str, Any]:
+        return self._run.provenance()
+
+    def run(self, work: StageWork) -> Mapping[str, float]:
+        return write_submission(
+            work.path(LOCALIZED),
+            self._run.submission_below(work.out),
+            tables=work.path(SIDE_TABLES),
+            provenance=self._run.provenance(),
         )
-    ]
 
 
-def _query_pyramid(run: Run, out: Path) -> dict[str, float]:
-    counts: dict[str, float] = {}
-    options = run.options
-    pairs = read_pairs(run.workspace.path(QUERY_PAIRS))
-    for extractor in options.query_extractors():
-        mapping = matched_images(run, extractor.name)
-        described = mapping.descriptors(extractor.name)
-        found = pyramid_queries(
-            run.workspace.folder(run.query, "", QUERY_MATCHES),
-            mapping,
-            [pair for pair in pairs if pair.map in described],
-            extractor.name,
-            extractor,
-            options.make_matcher(extractor.name),
-            options.query_verification,
-            options.guided_pyramid,
-            out / QUERY_PYRAMID,
-            mask_margin_px=options.mask_margin_px,
-            work=run.work,
+class Evaluate(_RunStage):
+    """Measure recall where the true poses are known, else what can be known without them."""
+
+    name = "evaluation"
+    version = 3
+    reads = (MAPPING, QUERY_GT, SIDE_TABLES, LOCALIZED)
+    writes = (EVALUATION,)
+
+    def settings(self) -> dict[str, Any]:
+        return self._run.provenance() | {"steps": [asdict(step) for step in self._run.steps]}
+
+    def run(self, work: StageWork) -> Mapping[str, float]:
+        localized, truth, tables = map(work.path, (LOCALIZED, QUERY_GT, SIDE_TABLES))
+        label = f"{self._run.dataset}, {self._run.preset}"
+        map_poses = work.folder(MAPPING).read().poses()
+        provenance = self.settings() | {"versions": package_versions()}
+        around, output = surroundings_of(localized), work.out / EVALUATION
+        if not truth.is_dir():
+            found = results_without_truth(
+                [localized], read_rules(tables), map_poses=map_poses, labels=[label]
+            )
+            write_without_truth(
+                output, found, map_poses=map_poses, provenance=provenance, around=[around]
+            )
+            return {"queries_with_truth": 0}
+        evaluation = evaluate_folders(
+            localized, truth, side_tables=tables, label=label, mapping=work.path(MAPPING)
         )
-        counts |= {f"{extractor.name} {name}": count for name, count in found.items()}
-    return counts
-
-
-def _localization(run: Run, out: Path) -> dict[str, int]:
-    query = run.workspace.folder(run.query, *run.query_features())
-    pairs = read_pairs(run.workspace.path(QUERY_PAIRS))
-    options = run.options.localization
-    results = localize_from_matches(
-        run.workspace.folder(MAP),
-        query,
-        query,
-        pairs,
-        run.options.query_types(),
-        options,
-        restrictions=run.restrictions(),
-        work=run.work,
-    )
-    return write_localized(
-        out / run.first_poses,
-        run.workspace.folder(QUERY),  # as imported: the poses are theirs as well
-        results,
-        fallback=options.fallback,
-        first_candidates=first_candidates(pairs, run.workspace.folder(MAPPING)),
-        timing=out / TIMING,
-    )
-
-
-def _refinement_stages(run: Run, dump: Mapping[str, Any]) -> list[Stage]:
-    chosen = run.options.pose_refinement
-    weights = [weights_of(refiner) for refiner in chosen.make_refiners()]
-    return [
-        Stage(
-            "refine_poses",
-            2,
-            {"pose_refinement": dump["pose_refinement"], "weights": weights},
-            ("import", run.images_stage, "map", "localization"),
-            (LOCALIZED, REFINEMENT_TIMING),
-            lambda out: _refine_poses(run, out),
+        write_evaluation(
+            output, evaluation, map_poses=map_poses, provenance=provenance, around=around
         )
-    ]
-
-
-def _refine_poses(run: Run, out: Path) -> dict[str, float]:
-    return refine_poses(
-        run.workspace.folder(MAP),
-        run.workspace.folder(run.query),
-        run.workspace.folder(UNREFINED_POSES),
-        out / LOCALIZED,
-        run.options.pose_refinement,
-        restrictions=run.restrictions(),
-        work=run.work,
-        timing=out / REFINEMENT_TIMING,
-    )
-
-
-def first_candidates(
-    pairs: Sequence[ImagePair], mapping: KaptureFolder
-) -> dict[str, tuple[str, RigidTransform]]:
-    """Query to its best retrieved map image and that image's pose."""
-    poses = mapping.read().poses()
-    best = {}
-    for query, images in iterate_candidates(pairs):
-        if images and images[0] in poses:
-            best[query] = (images[0], poses[images[0]])
-    return best
-
-
-def _provenance(run: Run) -> dict[str, Any]:
-    return {
-        "dataset": run.dataset,
-        "preset": run.preset,
-        "options": run.options.model_dump(mode="json"),
-    }
-
-
-def _submission(run: Run, out: Path) -> dict[str, int]:
-    tables = run.workspace.path(SIDE_TABLES)
-    return write_submission(
-        run.workspace.path(LOCALIZED),
-        run.submission_below(out),
-        tables=tables,
-        provenance=_provenance(run),
-    )
-
-
-def _evaluation(run: Run, out: Path) -> dict[str, float]:
-    """Recall where the true poses are known, else what can be known without them."""
-    localized, truth = run.workspace.path(LOCALIZED), run.workspace.path(QUERY_GT)
-    tables = run.workspace.path(SIDE_TABLES)
-    label = f"{run.dataset}, {run.preset}"
-    map_poses = run.workspace.folder(MAPPING).read().poses()
-    provenance = _provenance(run) | {
-        "steps": [asdict(step) for step in run.steps],
-        "versions": package_versions(),
-    }
-    around = surroundings_of(localized)
-    if not truth.is_dir():
-        found = results_without_truth(
-            [localized], read_rules(tables), map_poses=map_poses, labels=[label]
-        )
-        write_without_truth(
-            out / EVALUATION, found, map_poses=map_poses, provenance=provenance, around=[around]
-        )
-        return {"queries_with_truth": 0}
-    evaluation = evaluate_folders(
-        localized, truth, side_tables=tables, label=label, mapping=run.workspace.path(MAPPING)
-    )
-    write_evaluation(
-        out / EVALUATION, evaluation, map_poses=map_poses, provenance=provenance, around=around
-    )
-    row = evaluation.row()
-    recall = {f"recall at {at.threshold}": round(at.recall, 4) for at in row.recall}
-    return {"queries_with_truth": len(evaluation.queries), **recall}
+        row = evaluation.row()
+        recall = {f"recall at {at.threshold}": round(at.recall, 4) for at in row.recall}
+        return {"queries_with_truth": len(evaluation.queries), **recall}

@@ -14,7 +14,6 @@ from megloc_kapture.io.weights import MissingWeightsError
 from megloc_kapture.localization.cluster_poses import ImageMatches
 from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.pipeline.kapture_map import KaptureMap, MapKeypoints
-from megloc_kapture.pipeline.options import LocalFeaturesChoice, PipelineOptions
 from megloc_kapture.pipeline.query_images import QueryImage
 from megloc_kapture.plugins import (
     LOCAL_FEATURES,
@@ -35,6 +34,7 @@ from megloc_kapture.stages.matches import (
     match_and_verify,
     two_view_verification,
 )
+from megloc_kapture.stages.options import LocalFeaturesChoice, PipelineOptions
 from megloc_kapture.stages.pyramid_query import retry_query
 from megloc_kapture.values import LocalFeatures
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from megloc_kapture.io.weights import MissingWeightsError
-from megloc_kapture.pipeline.options import PipelineOptions
 from megloc_kapture.plugins import (
     LOCAL_FEATURES,
     MATCHERS,
@@ -15,6 +14,7 @@ from megloc_kapture.plugins import (
     PluginChoice,
     load_plugin,
 )
+from megloc_kapture.stages.options import PipelineOptions
 
 
 def check_weights(options: PipelineOptions) -> None:

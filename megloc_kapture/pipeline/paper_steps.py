@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from megloc_kapture.pipeline.options import PipelineOptions
 from megloc_kapture.stages.image_pairs import PairingMethod
+from megloc_kapture.stages.options import PipelineOptions
 
 RETRIEVAL = frozenset({"netvlad", "delg", "apgem", "openibl"})
 

@@ -5,40 +5,18 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any, Literal
 
 from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.provenance import package_versions
+from megloc_kapture.io.atomic import write_bytes
 from megloc_kapture.io.json_model import write_json_model
-from megloc_kapture.pipeline.manifests import Manifest, fingerprint, read_manifest
-from megloc_kapture.pipeline.workspace import Workspace
-
-
-@dataclass(frozen=True)
-class Stage:
-    """One step of a plan.
-
-    Attributes
-    ----------
-    version : to be raised when the stage's output changes for the same options and inputs.
-    options : what determines its output, as plain JSON values.
-    after : names of the stages whose output it reads.
-    outputs : paths below the workspace that it writes.
-    run : writes the outputs below the folder it is given; returns counts for the log.
-    external : fingerprints of what it reads from outside the workspace.
-    """
-
-    name: str
-    version: int
-    options: Mapping[str, Any]
-    after: tuple[str, ...]
-    outputs: tuple[str, ...]
-    run: Callable[[Path], Mapping[str, float]]
-    external: Mapping[str, str] = field(default_factory=dict)
-
+from megloc_kapture.pipeline.manifests import FileHashes, Manifest, fingerprint, read_manifest
+from megloc_kapture.pipeline.workspace import HASHES, Workspace
+from megloc_kapture.stages.stage import Stage, StageWork, is_below
+from megloc_kapture.stages.work import HERE, Work
 
 State = Literal["run", "kept", "pending", "skipped"]
 
@@ -57,6 +35,7 @@ class StageReport:
 def run_plan(
     stages: Sequence[Stage],
     workspace: Workspace,
+    work: Work = HERE,
     *,
     first: str | None = None,
     last: str | None = None,
@@ -65,6 +44,8 @@ def run_plan(
     on_report: Callable[[StageReport], None] = lambda report: None,
 ) -> list[StageReport]:
     """Run the stages that have to be run.
+
+    A stage runs behind those that write what it reads.
 
     Parameters
     ----------
@@ -89,13 +70,16 @@ def run_plan(
         raise OptionError(f"--until {last} stands before --from {first}")
     asked = _with_followers(stages, first) if first else {}
     _check_done(stages[:start], workspace, first)
+    external = _external(stages, workspace)
     if not dry_run:
         # whatever stops this run, the next one has to do what was asked for
         for name in asked:
             workspace.manifest_path(name).unlink(missing_ok=True)
     for number, stage in enumerate(stages[:stop]):
-        inputs = {name: fingerprints[name] for name in stage.after} | dict(stage.external)
-        mark = fingerprint(stage.name, stage.version, stage.options, inputs)
+        inputs = {name: fingerprints[name] for name in _before(stages, stage)}
+        inputs |= _there(stages, stage, workspace) | external[stage.name]
+        settings = stage.settings()
+        mark = fingerprint(stage.name, stage.version, settings, inputs)
         manifest = read_manifest(workspace.manifest_path(stage.name))
         if number < start and manifest is not None:
             fingerprints[stage.name] = manifest.fingerprint
@@ -104,7 +88,7 @@ def run_plan(
             on_report(report)
             continue
         fingerprints[stage.name] = mark
-        why = asked.get(stage.name) or _why(stage, manifest, mark, inputs, workspace)
+        why = asked.get(stage.name) or _why(stage, manifest, mark, settings, inputs, workspace)
         if not why and manifest is not None:
             report = StageReport(stage.name, "kept", manifest.seconds, manifest.counts, "")
         elif dry_run:
@@ -112,17 +96,55 @@ def run_plan(
         else:
             on_start(stage.name, why)
             former = [] if manifest is None else _former_outputs(stage, manifest)
-            report = _run(stage, workspace, mark, inputs, why, former)
+            report = _run(stage, workspace, work, mark, settings, inputs, why, former)
         reports.append(report)
         on_report(report)
     return reports
+
+
+def _before(stages: Sequence[Stage], stage: Stage) -> list[str]:
+    """Names of the stages that write what a stage reads."""
+    earlier = stages[: stages.index(stage)]
+    return [
+        other.name
+        for other in earlier
+        if any(is_below(path, written) for path in stage.reads for written in other.writes)
+    ]
+
+
+def _there(stages: Sequence[Stage], stage: Stage, workspace: Workspace) -> dict[str, str]:
+    """Fingerprints of what a stage reads that earlier runs left, and that none of these writes."""
+    written = [path for other in stages for path in other.writes]
+    missing = [path for path in stage.reads if not any(is_below(path, other) for other in written)]
+    if not missing:
+        return {}
+    manifests = [m for path in workspace.manifest_paths() if (m := read_manifest(path)) is not None]
+    found = {}
+    for path in missing:
+        made = [m for m in manifests if any(is_below(path, output) for output in m.outputs)]
+        if not made:
+            raise OptionError(
+                f"stage {stage.name} reads {path}, which no stage has written in {workspace.root}"
+            )
+        found.update({manifest.stage: manifest.fingerprint for manifest in made})
+    return found
+
+
+def _external(stages: Sequence[Stage], workspace: Workspace) -> dict[str, dict[str, str]]:
+    """Fingerprints of what stages read from outside the workspace; hashes are remembered in it."""
+    remembered = workspace.path(HASHES)
+    hashes = FileHashes(remembered)
+    found = {stage.name: dict(stage.external(hashes)) for stage in stages}
+    if hashes.content():
+        write_bytes(remembered, (json.dumps(hashes.content()) + "\n").encode())
+    return found
 
 
 def _with_followers(stages: Sequence[Stage], first: str) -> dict[str, str]:
     """A stage and those that read its output, directly or not, each with why it is run again."""
     found = {first: "asked for"}
     for stage in stages:
-        if not found.keys().isdisjoint(stage.after):
+        if not found.keys().isdisjoint(_before(stages, stage)):
             found[stage.name] = f"follows {first}"
     return found
 
@@ -139,6 +161,7 @@ def _why(
     stage: Stage,
     manifest: Manifest | None,
     mark: str,
+    settings: Mapping[str, Any],
     inputs: Mapping[str, str],
     workspace: Workspace,
 ) -> str:
@@ -159,13 +182,13 @@ def _why(
     ) or sorted(set(manifest.inputs) - set(inputs))
     if changed:
         return f"{changed[0]} changed"
-    options = json.loads(json.dumps(stage.options))  # a manifest knows no tuples
+    options = json.loads(json.dumps(settings))  # a manifest knows no tuples
     return f"options changed: {', '.join(_differences(manifest.options, options)[:3])}"
 
 
 def _former_outputs(stage: Stage, manifest: Manifest) -> list[str]:
     """What a stage wrote and does not write now: options may give an output another name."""
-    return sorted(set(manifest.outputs) - set(stage.outputs))
+    return sorted(set(manifest.outputs) - set(stage.writes))
 
 
 def _take_over(stage: Stage, workspace: Workspace) -> None:
@@ -174,7 +197,7 @@ def _take_over(stage: Stage, workspace: Workspace) -> None:
         other = read_manifest(path)
         if other is None or other.stage == stage.name:
             continue
-        if not set(other.outputs).isdisjoint(stage.outputs):
+        if not set(other.outputs).isdisjoint(stage.writes):
             path.unlink(missing_ok=True)
 
 
@@ -190,7 +213,9 @@ def _differences(old: Any, new: Any, prefix: str = "") -> list[str]:
 def _run(
     stage: Stage,
     workspace: Workspace,
+    work: Work,
     mark: str,
+    settings: Mapping[str, Any],
     inputs: Mapping[str, str],
     why: str,
     former_outputs: Sequence[str],
@@ -198,19 +223,19 @@ def _run(
     started = datetime.now(UTC).isoformat(timespec="seconds")
     clock = time.perf_counter()
     with workspace.staging(stage.name) as folder:
-        counts = dict(stage.run(folder))
+        counts = dict(stage.run(StageWork(**vars(work), root=workspace.root, out=folder)))
         # without its manifest a stage counts as not done: killed between here and the end, it
         # runs again whatever of its output has moved by then
         workspace.manifest_path(stage.name).unlink(missing_ok=True)
         _take_over(stage, workspace)
-        written = tuple(o for o in stage.outputs if (folder / o).exists())
-        workspace.publish(folder, stage.outputs)
+        written = tuple(o for o in stage.writes if (folder / o).exists())
+        workspace.publish(folder, tuple(stage.writes))
         workspace.remove(former_outputs)
     seconds = time.perf_counter() - clock
     manifest = Manifest(
         stage=stage.name,
         version=stage.version,
-        options=dict(stage.options),
+        options=dict(settings),
         inputs=dict(inputs),
         fingerprint=mark,
         outputs=written,
@@ -226,3 +251,17 @@ def _run(
 def all_kept(reports: Iterable[StageReport]) -> bool:
     """Whether nothing had to be done."""
     return all(report.state in ("kept", "skipped") for report in reports)
+
+
+def describe(report: StageReport) -> str:
+    """One line about a stage."""
+    if report.state == "kept":
+        return f"{report.name}: up to date"
+    if report.state == "skipped":
+        return f"{report.name}: taken as it is"
+    if report.state == "pending":
+        return f"{report.name}: would run ({report.why})"
+    counts = ", ".join(
+        f"{value:g} {name.replace('_', ' ')}" for name, value in report.counts.items()
+    )
+    return f"{report.name}: {counts}; {report.seconds:.1f} s"

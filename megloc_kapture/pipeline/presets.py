@@ -12,12 +12,12 @@ from megloc_kapture.errors import OptionError
 from megloc_kapture.mapping.rejection import UncertaintyOptions
 from megloc_kapture.matching.guided_pyramid import GuidedPyramidOptions
 from megloc_kapture.pipeline.assignments import check_assigned
-from megloc_kapture.pipeline.global_choice import GlobalFeaturesChoice
-from megloc_kapture.pipeline.options import LocalFeaturesChoice, PipelineOptions
 from megloc_kapture.plugins import PluginChoice
 from megloc_kapture.stages.candidates import QueryPairsOptions
+from megloc_kapture.stages.global_choice import GlobalFeaturesChoice
 from megloc_kapture.stages.image_pairs import MappingPairsOptions
 from megloc_kapture.stages.map_refinement import MapRefinementOptions
+from megloc_kapture.stages.options import LocalFeaturesChoice, PipelineOptions
 from megloc_kapture.stages.preprocessing import PreprocessingOptions
 from megloc_kapture.stages.reranking import RerankingOptions
 from megloc_kapture.values import Options

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import OptionError
-from megloc_kapture.pipeline.options import PipelineOptions
 from megloc_kapture.pipeline.queries import Query
 from megloc_kapture.plugins import (
     SEGMENTERS,
@@ -25,6 +24,7 @@ from megloc_kapture.stages.class_masks import ClassMasks
 from megloc_kapture.stages.global_features import describe_images
 from megloc_kapture.stages.image_masks import MaskOptions
 from megloc_kapture.stages.local_features import checked_features
+from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.processed_frames import frame_as_stored
 from megloc_kapture.values import Camera, LocalFeatures
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -14,7 +14,11 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError, PluginError
 from megloc_kapture.io.kapture_store import FeatureConfig, FeatureWriter, KaptureFolder
 from megloc_kapture.plugins import GlobalFeatureExtractor
+from megloc_kapture.stages.global_vlad import extract_vlad
+from megloc_kapture.stages.layout import FEATURES, GLOBAL_FEATURES, LOCAL_FEATURES, REFERENCE
 from megloc_kapture.stages.local_features import read_image_of
+from megloc_kapture.stages.map_points import described_images
+from megloc_kapture.stages.stage import PipelineStage, StageWork
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera
 
@@ -132,3 +136,57 @@ def _jobs(folders: Sequence[KaptureFolder], extractor: GlobalFeatureExtractor) -
 def _describe(job: _Job) -> NDArray[np.float32]:
     images = [read_image_of(path, camera) for _, path, camera in job.images]
     return describe_images(job.extractor, images, job.images[0][0])
+
+
+class ExtractGlobalFeatures(PipelineStage):
+    """Describe every image by the vectors that retrieval compares."""
+
+    name = "global_features"
+    version = 2
+    uses = (
+        "global_features.name",
+        "global_features.options",
+        "map",
+        "local_features.name",
+        "local_features.options",
+        "given_features",
+    )
+    writes = (GLOBAL_FEATURES,)
+
+    @property
+    def reads(self) -> Sequence[str]:  # type: ignore[override]
+        images = (self.layout.mapping, self.layout.query)
+        return (*images, *self._given(), LOCAL_FEATURES) if self._trains() else images
+
+    def _trains(self) -> bool:
+        return any(chosen.is_vlad for chosen in self.options.global_features)
+
+    def _given(self) -> Sequence[str]:
+        return (REFERENCE,) if self.options.uses_given_map() else ()
+
+    def settings(self) -> dict[str, Any]:
+        found = super().settings()
+        if self._trains():
+            return found
+        # image networks know nothing of local features
+        return {key: found[key] for key in ("global_features", "weights") if key in found}
+
+    def plugins(self) -> Sequence[object]:
+        return [chosen.make() for chosen in self.options.global_features if not chosen.is_vlad]
+
+    def run(self, work: StageWork) -> Mapping[str, float]:
+        query = work.folder(self.layout.query, FEATURES)
+        counts = {}
+        for chosen in self.options.global_features:
+            if chosen.is_vlad:
+                vlad = chosen.vlad_options()
+                local_type = vlad.local_type or self.options.main_type()
+                mapping = described_images(work, self, local_type)
+                found = extract_vlad(
+                    mapping, [mapping, query], local_type, work.out, vlad.of_vlad(), work=work
+                )
+            else:
+                folders = [work.folder(self.layout.mapping), query]
+                found = extract_global_features(folders, chosen.make(), work.out, work=work)
+            counts[chosen.name] = found["images"]
+        return counts

@@ -12,17 +12,35 @@ pairs. Map images whose poses leave them no view in common are not tried.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder
+from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder, read_pairs
 from megloc_kapture.mapping.frustum_overlap import views_can_overlap
 from megloc_kapture.matching.guided_pyramid import GuidedPyramidOptions, pyramid_type
 from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
 from megloc_kapture.plugins import LocalFeatureExtractor, Matcher
+from megloc_kapture.stages.layout import (
+    FEATURES,
+    LOCAL_FEATURES,
+    MAP,
+    MAPPING_MATCHES,
+    MAPPING_PAIRS,
+    MAPPING_PYRAMID,
+    QUERY_MATCHES,
+    QUERY_PAIRS,
+    QUERY_PYRAMID,
+)
+from megloc_kapture.stages.map_points import matched_images
+from megloc_kapture.stages.matches import MATCHING_OPTIONS
 from megloc_kapture.stages.pyramid_jobs import HowToRetry, Retry
 from megloc_kapture.stages.pyramid_pairs import PyramidPairs
+from megloc_kapture.stages.stage import PipelineStage, StageWork
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
+
+if TYPE_CHECKING:
+    from megloc_kapture.stages.options import PipelineOptions
 
 
 def pyramid_mapping(
@@ -139,3 +157,76 @@ def pyramid_queries(
         others[image].append(other)
     jobs = [Retry(how, image, tuple(others[image])) for image in sorted(others)]
     return run.write(jobs, output, work)
+
+
+class PyramidMapping(PipelineStage):
+    """Match map images with few matches again, at other scales and turns."""
+
+    name = "mapping_pyramid"
+    uses = (*MATCHING_OPTIONS, "mapping_verification", "guided_pyramid", "mask_margin_px")
+    writes = (MAPPING_PYRAMID,)
+
+    @property
+    def reads(self) -> Sequence[str]:  # type: ignore[override]
+        return (self.layout.mapping, LOCAL_FEATURES, MAPPING_PAIRS, MAPPING_MATCHES)
+
+    @classmethod
+    def is_wanted(cls, options: PipelineOptions) -> bool:
+        return options.matches_again() and options.triangulates()
+
+    def run(self, work: StageWork) -> Mapping[str, float]:
+        counts: dict[str, float] = {}
+        for extractor in self.options.make_extractors():
+            found = pyramid_mapping(
+                work.folder(self.layout.mapping, FEATURES, MAPPING_MATCHES),
+                read_pairs(work.path(MAPPING_PAIRS)),
+                extractor.name,
+                extractor,
+                self.options.make_matcher(extractor.name),
+                self.options.mapping_verification,
+                self.options.guided_pyramid,
+                work.out / MAPPING_PYRAMID,
+                mask_margin_px=self.options.mask_margin_px,
+                work=work,
+            )
+            counts |= {f"{extractor.name} {name}": count for name, count in found.items()}
+        return counts
+
+
+class PyramidQueries(PipelineStage):
+    """Match queries with few matches again; see :class:`PyramidMapping`."""
+
+    name = "query_pyramid"
+    uses = (*MATCHING_OPTIONS, "query_verification", "guided_pyramid", "mask_margin_px")
+    writes = (QUERY_PYRAMID,)
+
+    @property
+    def reads(self) -> Sequence[str]:  # type: ignore[override]
+        images = (self.layout.mapping, self.layout.query)
+        return (*images, LOCAL_FEATURES, MAP, QUERY_PAIRS, QUERY_MATCHES)
+
+    @classmethod
+    def is_wanted(cls, options: PipelineOptions) -> bool:
+        return options.matches_again()
+
+    def run(self, work: StageWork) -> Mapping[str, float]:
+        counts: dict[str, float] = {}
+        pairs = read_pairs(work.path(QUERY_PAIRS))
+        for extractor in self.options.query_extractors():
+            mapping = matched_images(work, self, extractor.name)
+            described = mapping.descriptors(extractor.name)
+            found = pyramid_queries(
+                work.folder(self.layout.query, FEATURES, QUERY_MATCHES),
+                mapping,
+                [pair for pair in pairs if pair.map in described],
+                extractor.name,
+                extractor,
+                self.options.make_matcher(extractor.name),
+                self.options.query_verification,
+                self.options.guided_pyramid,
+                work.out / QUERY_PYRAMID,
+                mask_margin_px=self.options.mask_margin_px,
+                work=work,
+            )
+            counts |= {f"{extractor.name} {name}": count for name, count in found.items()}
+        return counts

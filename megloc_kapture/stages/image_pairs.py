@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,9 @@ from megloc_kapture.io.kapture_store import (
     ImagePair,
     KaptureData,
     KaptureFolder,
+    write_pairs,
 )
+from megloc_kapture.io.side_tables import SIDE_TABLES
 from megloc_kapture.mapping.frustum_overlap import frustum_overlap
 from megloc_kapture.mapping.pairs import exhaustive_pairs
 from megloc_kapture.mapping.pairs_by_covisibility import (
@@ -31,8 +33,21 @@ from megloc_kapture.stages.candidates import (
     Retrieval,
     vectors_of,
 )
+from megloc_kapture.stages.layout import (
+    FEATURES,
+    GLOBAL_FEATURES,
+    MAPPING_PAIRS,
+    QUERY_PAIRS,
+    REFERENCE,
+)
+from megloc_kapture.stages.map_points import described_images
 from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
+from megloc_kapture.stages.stage import PipelineStage, StageWork
 from megloc_kapture.values import Options, RigidTransform
+
+if TYPE_CHECKING:
+    from megloc_kapture.stages.options import PipelineOptions
+
 
 PairingMethod = Literal["poses", "covisibility", "retrieval", "sequence", "exhaustive"]
 
@@ -240,3 +255,74 @@ def pair_queries(
                 if i >= 0
             ]
     return [pair for pairs in of_query for pair in pairs]
+
+
+# what decides which global features there are, and how they are fused
+RETRIEVAL_OPTIONS = (
+    "global_features",
+    "fusion",
+    "local_features.name",
+    "local_features.options",
+    "given_features",
+)
+
+
+class PairMapping(PipelineStage):
+    """Choose which map images are matched with each other."""
+
+    name = "mapping_pairs"
+    version = 4
+    uses = ("mapping_pairs", "map", *RETRIEVAL_OPTIONS)
+    writes = (MAPPING_PAIRS,)
+
+    @property
+    def reads(self) -> Sequence[str]:  # type: ignore[override]
+        by_points = (REFERENCE,) if self.options.pairs_by_points() else ()
+        return (self.layout.mapping, SIDE_TABLES, GLOBAL_FEATURES, *by_points)
+
+    @classmethod
+    def is_wanted(cls, options: PipelineOptions) -> bool:
+        return options.triangulates()
+
+    def run(self, work: StageWork) -> Mapping[str, float]:
+        pairs = pair_map_images(
+            work.folder(self.layout.mapping, FEATURES),
+            self.options.mapping_pairs,
+            retrieval=self.options.retrieval(),
+            restrictions=work.restrictions(),
+            covisible=work.folder(REFERENCE) if self.options.pairs_by_points() else None,
+        )
+        write_pairs(work.out / MAPPING_PAIRS, pairs)
+        return {"pairs": len(pairs)}
+
+
+class PairQueries(PipelineStage):
+    """Choose the map images that each query is matched with."""
+
+    version = 3
+    uses = ("query_pairs", "map", *RETRIEVAL_OPTIONS)
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        return "query_pairs" if self.layout.candidates == QUERY_PAIRS else "query_candidates"
+
+    @property
+    def reads(self) -> Sequence[str]:  # type: ignore[override]
+        given = (REFERENCE,) if self.options.uses_given_map() else ()
+        images = (self.layout.mapping, self.layout.query)
+        return (*images, SIDE_TABLES, GLOBAL_FEATURES, *given)
+
+    @property
+    def writes(self) -> Sequence[str]:  # type: ignore[override]
+        return (self.layout.candidates,)
+
+    def run(self, work: StageWork) -> Mapping[str, float]:
+        pairs = pair_queries(
+            described_images(work, self, self.options.main_type()),
+            work.folder(self.layout.query, FEATURES),
+            self.options.query_pairs,
+            retrieval=self.options.retrieval(),
+            restrictions=work.restrictions(),
+        )
+        write_pairs(work.out / self.layout.candidates, pairs)
+        return {"pairs": len(pairs)}

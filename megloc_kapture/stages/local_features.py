@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,10 @@ from megloc_kapture.io.kapture_store import FeatureConfig, FeatureWriter, Kaptur
 from megloc_kapture.io.mask_counts import write_mask_counts
 from megloc_kapture.plugins import LocalFeatureExtractor
 from megloc_kapture.preprocessing.mask_margin import with_margin
+from megloc_kapture.stages.given_map import has_descriptors
+from megloc_kapture.stages.layout import LOCAL_FEATURES, REFERENCE
+from megloc_kapture.stages.map_points import check_given_type
+from megloc_kapture.stages.stage import PipelineStage, StageWork
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, LocalFeatures
 
@@ -188,3 +193,43 @@ def checked_features(extractor: LocalFeatureExtractor, features: Any, image: str
     if not (np.isfinite(keypoints).all() and np.isfinite(descriptors).all()):
         raise refuse("values that are not finite")
     return features
+
+
+class ExtractLocalFeatures(PipelineStage):
+    """Extract local features of all images; of a given map's, where it brings none."""
+
+    name = "local_features"
+    uses = (
+        "mask_margin_px",
+        "map",
+        "local_features.name",
+        "local_features.options",
+        "given_features",
+    )
+    writes = (LOCAL_FEATURES,)
+
+    @property
+    def reads(self) -> Sequence[str]:  # type: ignore[override]
+        given = (REFERENCE,) if self.options.uses_given_map() else ()
+        return (self.layout.mapping, self.layout.query, *given)
+
+    def plugins(self) -> Sequence[object]:
+        return self.options.query_extractors()
+
+    def run(self, work: StageWork) -> Mapping[str, float]:
+        mapping, query = work.folder(self.layout.mapping), work.folder(self.layout.query)
+        todo = [(extractor, [mapping, query]) for extractor in self.options.own_extractors()]
+        if self.options.uses_given_map():
+            extractor, reference = self.options.make_given_extractor(), work.folder(REFERENCE)
+            check_given_type(reference, extractor.name)
+            folders = [query] if has_descriptors(reference) else [mapping, query]
+            todo.append((extractor, folders))
+        counts: Counter[str] = Counter()
+        for extractor, folders in todo:
+            margin_px = self.options.mask_margin_px
+            counts.update(
+                extract_local_features(
+                    folders, extractor, work.out, mask_margin_px=margin_px, work=work
+                )
+            )
+        return counts

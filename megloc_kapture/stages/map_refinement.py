@@ -7,7 +7,7 @@ in ``reconstruction/point_covariances.npy``.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -50,6 +50,8 @@ from megloc_kapture.mapping.rejection import (
 )
 from megloc_kapture.mapping.uncertainty import point_covariances, point_deviations
 from megloc_kapture.stages.depth_records import DepthRecord, depth_records
+from megloc_kapture.stages.layout import MAP, UNREFINED
+from megloc_kapture.stages.stage import PipelineStage, StageWork
 from megloc_kapture.stages.triangulation import copy_features
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
 from megloc_kapture.values import Options
@@ -461,3 +463,17 @@ def _write_pictures(folder: Path, points: Floats, deviations: Floats, kept: Mask
         colours[known] = np.stack([np.interp(place, steps, c) for c in _RAMP.T], axis=1)
     for name, chosen in ((KEPT_FILE, kept), (REJECTED_FILE, ~kept)):
         write_ply(folder / name, points[chosen, :3], colours[chosen], deviation=deviations[chosen])
+
+
+class RefineMap(PipelineStage):
+    """Take out of the map what its images or their depth contradict, and what is uncertain."""
+
+    name = "map"
+    version = 2
+    uses = ("refinement",)
+    reads = (UNREFINED,)
+    writes = (MAP,)
+
+    def run(self, work: StageWork) -> Mapping[str, float]:
+        folder, options = work.folder(UNREFINED), self.options.refinement
+        return refine_map(folder, work.out / MAP, options, link_features=True, work=work)

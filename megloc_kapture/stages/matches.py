@@ -6,13 +6,13 @@ Mapping pairs are verified with their known poses, query pairs by a two-view mod
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby, islice
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ from megloc_kapture.io.kapture_store import (
     ImagePair,
     KaptureFolder,
     MatchesWriter,
+    read_pairs,
 )
 from megloc_kapture.io.match_counts import PairCount, write_match_counts
 from megloc_kapture.matching.verification import (
@@ -33,8 +34,22 @@ from megloc_kapture.matching.verification import (
     verify_with_poses,
 )
 from megloc_kapture.plugins import Matcher
+from megloc_kapture.stages.layout import (
+    FEATURES,
+    LOCAL_FEATURES,
+    MAP,
+    MAPPING_MATCHES,
+    MAPPING_PAIRS,
+    QUERY_MATCHES,
+)
+from megloc_kapture.stages.map_points import matched_images
+from megloc_kapture.stages.stage import PipelineStage, StageWork
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
 from megloc_kapture.values import Camera, ImageFeatures, Options
+
+if TYPE_CHECKING:
+    from megloc_kapture.stages.options import PipelineOptions
+
 
 Item = TypeVar("Item")
 
@@ -311,3 +326,82 @@ def iterate_candidates(pairs: Sequence[ImagePair]) -> Iterator[tuple[str, list[s
     for query in sorted(candidates):
         best_first = sorted(candidates[query], key=lambda pair: (-pair.score, pair.map))
         yield query, [pair.map for pair in best_first]
+
+
+# what decides which types of local features there are, and how each is matched
+MATCHING_OPTIONS = ("map", "local_features", "given_features", "matching", "verification")
+
+
+class MatchMapping(PipelineStage):
+    """Match and verify pairs of map images."""
+
+    name = "mapping_matches"
+    version = 2
+    uses = (*MATCHING_OPTIONS, "mapping_verification")
+    writes = (MAPPING_MATCHES,)
+
+    @property
+    def reads(self) -> Sequence[str]:  # type: ignore[override]
+        return (self.layout.mapping, LOCAL_FEATURES, MAPPING_PAIRS)
+
+    @classmethod
+    def is_wanted(cls, options: PipelineOptions) -> bool:
+        return options.triangulates()
+
+    def plugins(self) -> Sequence[object]:
+        return [self.options.make_matcher(name) for name in self.options.own_types()]
+
+    def run(self, work: StageWork) -> Mapping[str, float]:
+        mapping = work.folder(self.layout.mapping, FEATURES)
+        pairs = read_pairs(work.path(MAPPING_PAIRS))
+        counts: Counter[str] = Counter()
+        for local_type in self.options.own_types():
+            found = match_pairs(
+                mapping,
+                mapping,
+                pairs,
+                local_type,
+                self.options.make_matcher(local_type),
+                self.options.verify_mapping(),
+                work.out / MAPPING_MATCHES,
+                work=work,
+            )
+            counts.update(found)
+        return counts
+
+
+class MatchQueries(PipelineStage):
+    """Match and verify queries with their candidates; where those are reranked, with all."""
+
+    name = "query_matches"
+    version = 3
+    uses = (*MATCHING_OPTIONS, "query_verification")
+    writes = (QUERY_MATCHES,)
+
+    @property
+    def reads(self) -> Sequence[str]:  # type: ignore[override]
+        given = (MAP,) if self.options.uses_given_map() else ()
+        images = (self.layout.mapping, self.layout.query)
+        return (*images, LOCAL_FEATURES, self.layout.candidates, *given)
+
+    def plugins(self) -> Sequence[object]:
+        return [self.options.make_matcher(name) for name in self.options.local_types()]
+
+    def run(self, work: StageWork) -> Mapping[str, float]:
+        pairs = read_pairs(work.path(self.layout.candidates))
+        counts: Counter[str] = Counter()
+        for local_type in self.options.local_types():
+            mapping = matched_images(work, self, local_type)
+            described = mapping.descriptors(local_type)
+            found = match_pairs(
+                work.folder(self.layout.query, FEATURES),
+                mapping,
+                [pair for pair in pairs if pair.map in described],
+                local_type,
+                self.options.make_matcher(local_type),
+                self.options.verify_queries(),
+                work.out / QUERY_MATCHES,
+                work=work,
+            )
+            counts.update(found)
+        return counts

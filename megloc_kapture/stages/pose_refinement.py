@@ -7,6 +7,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ from megloc_kapture.io.refinement_table import (
     refinement_text,
     write_refinement,
 )
+from megloc_kapture.io.side_tables import SIDE_TABLES
 from megloc_kapture.io.status_table import STATUS_FILE, QueryStatus, read_status, write_status
 from megloc_kapture.plugins import (
     POSE_REFINERS,
@@ -35,11 +37,16 @@ from megloc_kapture.plugins import (
 )
 from megloc_kapture.refinement.consistency import Consistency, HoldsOut
 from megloc_kapture.refinement.references import ReferenceImages
+from megloc_kapture.stages.layout import LOCALIZED, MAP, REFINEMENT_TIMING, UNREFINED_POSES
 from megloc_kapture.stages.map_consistency import consistency_row, map_consistency
 from megloc_kapture.stages.ranking_scene import KaptureScene
 from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
+from megloc_kapture.stages.stage import PipelineStage, StageWork
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
 from megloc_kapture.values import Camera, Options, RefinementRow, RigidTransform
+
+if TYPE_CHECKING:
+    from megloc_kapture.stages.options import PipelineOptions
 
 
 class PoseRefinementOptions(Options):
@@ -331,3 +338,35 @@ def _row(
         measures=tuple(f"{name}={value:.6g}" for name, value in refined.measures.items()),
         before=before,
     )
+
+
+class RefinePoses(PipelineStage):
+    """Refine the poses of localized queries by ICP or by rendering."""
+
+    name = "refine_poses"
+    version = 2
+    uses = ("pose_refinement",)
+    writes = (LOCALIZED, REFINEMENT_TIMING)
+
+    @property
+    def reads(self) -> Sequence[str]:  # type: ignore[override]
+        return (SIDE_TABLES, self.layout.query, MAP, UNREFINED_POSES)
+
+    @classmethod
+    def is_wanted(cls, options: PipelineOptions) -> bool:
+        return options.pose_refinement.refines()
+
+    def plugins(self) -> Sequence[object]:
+        return self.options.pose_refinement.make_refiners()
+
+    def run(self, work: StageWork) -> Mapping[str, float]:
+        return refine_poses(
+            work.folder(MAP),
+            work.folder(self.layout.query),
+            work.folder(UNREFINED_POSES),
+            work.out / LOCALIZED,
+            self.options.pose_refinement,
+            restrictions=work.restrictions(),
+            work=work,
+            timing=work.out / REFINEMENT_TIMING,
+        )

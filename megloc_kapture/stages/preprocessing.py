@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING
 
 from megloc_kapture.errors import DataError, OptionError, OutputError
 from megloc_kapture.io.atomic import output_error
@@ -23,14 +24,20 @@ from megloc_kapture.preprocessing.frame_plan import FrameOptions, FramePlan, pla
 from megloc_kapture.preprocessing.unchanging_region import UnchangingRegion
 from megloc_kapture.stages.class_masks import ClassMasks
 from megloc_kapture.stages.image_masks import MaskOptions, StandingMasks, mask_files
+from megloc_kapture.stages.layout import MAPPING, PREPROCESSED, QUERY
 from megloc_kapture.stages.preprocessing_report import (
     REPORT_FILE,
     PreprocessingReport,
     camera_reports,
 )
 from megloc_kapture.stages.processed_frames import CLASSES, FrameJob, process_frame
+from megloc_kapture.stages.stage import Hashes, PipelineStage, StageWork
 from megloc_kapture.stages.unchanging_regions import find_unchanging_regions
 from megloc_kapture.stages.work import HERE, Work
+
+if TYPE_CHECKING:
+    from megloc_kapture.stages.options import PipelineOptions
+
 
 CLASSES_FILE = "classes.json"
 
@@ -214,3 +221,45 @@ def _link_records(folder: KaptureFolder, output: Path, plans: Mapping[str, Frame
             raise DataError("no such depth map", path=source)
         link_file(source, output / "sensors" / "records_data" / name)
     return False
+
+
+class Preprocess(PipelineStage):
+    """Resize, undistort and mask the images of map and queries."""
+
+    name = "preprocess"
+    uses = ("preprocessing",)
+    reads = (MAPPING, QUERY)
+    writes = (PREPROCESSED,)
+
+    @classmethod
+    def is_wanted(cls, options: PipelineOptions) -> bool:
+        return options.preprocesses()
+
+    def plugins(self) -> Sequence[object]:
+        chosen = self.options.preprocessing.masks.segmenter
+        return () if chosen is None else (load_plugin(SEGMENTERS, chosen.name, chosen.options),)
+
+    def external(self, hashes: Hashes) -> Mapping[str, str]:
+        masks = self.options.preprocessing.masks
+        drawn = [fixed.file for fixed in masks.fixed if fixed.file is not None]
+        found = {f"mask {path}": hashes.of_file(path.resolve()) for path in drawn}
+        if masks.user_masks is not None:
+            root = masks.user_masks.resolve()
+            found["user masks"] = hashes.of_files(root, root.rglob("*.png"))
+        return found
+
+    def run(self, work: StageWork) -> Mapping[str, float]:
+        mapping, query = work.folder(MAPPING), work.folder(QUERY)
+        counts: dict[str, float] = {}
+        # the queries of one camera may be few, or all at night
+        for folder, others in ((mapping, []), (query, [mapping])):
+            name = folder.root.name
+            found = preprocess_images(
+                folder,
+                work.out / PREPROCESSED / name,
+                self.options.preprocessing,
+                sequences=others,
+                work=work,
+            )
+            counts |= {f"{name}_{key}": count for key, count in found.items()}
+        return counts

@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder
+from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder, read_pairs
+from megloc_kapture.io.side_tables import SIDE_TABLES
 from megloc_kapture.io.status_table import Fallback
 from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions
 from megloc_kapture.localization.cluster_poses import (
@@ -36,13 +37,24 @@ from megloc_kapture.plugins import (
     RankingScene,
     load_plugin,
 )
+from megloc_kapture.stages.layout import (
+    FEATURES,
+    LOCAL_FEATURES,
+    MAP,
+    MAPPING,
+    QUERY,
+    QUERY_PAIRS,
+    TIMING,
+)
+from megloc_kapture.stages.localized_folder import write_localized
 from megloc_kapture.stages.matches import iterate_candidates
 from megloc_kapture.stages.query_units import QueryUnit, query_units
 from megloc_kapture.stages.ranking_scene import KaptureScene
 from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.shared_index import index_map, open_index, shared_index
+from megloc_kapture.stages.stage import PipelineStage, StageWork
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
-from megloc_kapture.values import Failure, Options, Pose
+from megloc_kapture.values import Failure, Options, Pose, RigidTransform
 
 
 class LocalizationOptions(Options):
@@ -268,3 +280,65 @@ def _type_in_map(map_folder: KaptureFolder, local_type: str) -> str:
     names = (local_type, base_type(local_type))
     known = (map_folder.observations(), map_folder.types("keypoints"))
     return next((name for where in known for name in names if name in where), names[-1])
+
+
+class LocalizeQueries(PipelineStage):
+    """Estimate the poses of the queries from their matches with the map."""
+
+    name = "localization"
+    version = 4
+    uses = (
+        "localization",
+        "map",
+        "local_features.name",
+        "local_features.options",
+        "given_features",
+        "guided_pyramid.mode",
+    )
+
+    @property
+    def reads(self) -> Sequence[str]:  # type: ignore[override]
+        images = (MAPPING, QUERY, self.layout.query, SIDE_TABLES)
+        return (*images, LOCAL_FEATURES, MAP, QUERY_PAIRS, *self.layout.query_matches)
+
+    @property
+    def writes(self) -> Sequence[str]:  # type: ignore[override]
+        return (self.layout.poses, TIMING)
+
+    def plugins(self) -> Sequence[object]:
+        return (self.options.localization.make_ranker(),)
+
+    def run(self, work: StageWork) -> Mapping[str, float]:
+        query = work.folder(self.layout.query, FEATURES, *self.layout.query_matches)
+        pairs = read_pairs(work.path(QUERY_PAIRS))
+        options = self.options.localization
+        results = localize_from_matches(
+            work.folder(MAP),
+            query,
+            query,
+            pairs,
+            self.options.query_types(),
+            options,
+            restrictions=work.restrictions(),
+            work=work,
+        )
+        return write_localized(
+            work.out / self.layout.poses,
+            work.folder(QUERY),  # as imported: the poses are theirs as well
+            results,
+            fallback=options.fallback,
+            first_candidates=first_candidates(pairs, work.folder(MAPPING)),
+            timing=work.out / TIMING,
+        )
+
+
+def first_candidates(
+    pairs: Sequence[ImagePair], mapping: KaptureFolder
+) -> dict[str, tuple[str, RigidTransform]]:
+    """Query to its best retrieved map image and that image's pose."""
+    poses = mapping.read().poses()
+    best = {}
+    for query, images in iterate_candidates(pairs):
+        if images and images[0] in poses:
+            best[query] = (images[0], poses[images[0]])
+    return best

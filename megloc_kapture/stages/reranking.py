@@ -9,17 +9,29 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder
+from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder, read_pairs, write_pairs
 from megloc_kapture.io.match_counts import read_match_counts
 from megloc_kapture.retrieval.coverage import most_covering
+from megloc_kapture.stages.layout import (
+    FEATURES,
+    LOCAL_FEATURES,
+    QUERY_CANDIDATES,
+    QUERY_MATCHES,
+    QUERY_PAIRS,
+)
 from megloc_kapture.stages.matches import VerifiedMatches, iterate_candidates
+from megloc_kapture.stages.stage import PipelineStage, StageWork
 from megloc_kapture.values import Options
+
+if TYPE_CHECKING:
+    from megloc_kapture.stages.options import PipelineOptions
+
 
 Pair = tuple[str, str]
 Counted = Literal["matches", "verified"]
@@ -184,3 +196,38 @@ def correspondences(features_dir: Path, local_types: Iterable[str], by: Counted)
         for row in read_match_counts(features_dir, local_type):
             total[row.image, row.other] += row.matches if by == "matches" else row.verified
     return total
+
+
+class RerankQueries(PipelineStage):
+    """Keep of each query's candidates those that its local features say are right."""
+
+    name = "query_pairs"
+    version = 3
+    uses = (
+        "reranking",
+        "map",
+        "local_features.name",
+        "local_features.options",
+        "given_features",
+    )
+    writes = (QUERY_PAIRS,)
+
+    @property
+    def reads(self) -> Sequence[str]:  # type: ignore[override]
+        return (self.layout.query, LOCAL_FEATURES, QUERY_CANDIDATES, QUERY_MATCHES)
+
+    @classmethod
+    def is_wanted(cls, options: PipelineOptions) -> bool:
+        return options.reranking.reranks()
+
+    def run(self, work: StageWork) -> Mapping[str, float]:
+        pairs = reranked(
+            read_pairs(work.path(QUERY_CANDIDATES)),
+            work.folder(self.layout.query, FEATURES, QUERY_MATCHES),
+            work.path(QUERY_MATCHES),
+            self.options.local_types(),
+            self.options.reranking,
+        )
+        write_pairs(work.out / QUERY_PAIRS, pairs)
+        matched = sum(pair.score >= 1 for pair in pairs)
+        return {"pairs": len(pairs), "with_correspondences": matched}

@@ -160,7 +160,7 @@ def test_all_queries_are_localized_well(finished: Path) -> None:
 def test_a_manifest_says_what_was_done(finished: Path) -> None:
     manifest = json.loads((finished / "stages" / "local_features.json").read_text())
     assert manifest["options"]["local_features"] == [
-        {"name": "rootsift", "options": {"max_keypoints": 800}, "weights": {}}
+        {"name": "rootsift", "options": {"max_keypoints": 800}}
     ]
     assert manifest["counts"]["images"] == 11
     assert set(manifest["inputs"]) == {"import"}

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from megloc_kapture.cli.arguments import summary
-from megloc_kapture.cli.main import COMMANDS
+from megloc_kapture.cli.main import COMMANDS, command_class
 
 BAD_ARGUMENTS = {
     "no command": ([], r"Missing subcommand: Expected one of \{eval, import"),
@@ -100,6 +100,21 @@ def test_help(megloc: Any, command: str | None, flag: str) -> None:
         assert all(name in done.out for name in COMMANDS)
     else:
         assert done.out.startswith(f"usage: megloc {command} ")
+
+
+def test_the_list_says_of_each_command_what_its_own_help_says() -> None:
+    for name, (_, told) in COMMANDS.items():
+        assert " ".join((command_class(name).__doc__ or "").split()).startswith(told)
+
+
+def test_the_list_of_commands_costs_no_solver() -> None:
+    code = (
+        "import sys\nfrom megloc_kapture.cli.main import main\n"
+        "try: main(['--help'])\n"
+        "except SystemExit: print(sorted({'torch', 'scipy', 'numba', 'cv2'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.endswith("\n[]\n")
 
 
 def test_the_traceback_is_shown_with_debug_only(megloc: Any, tmp_path: Path) -> None:

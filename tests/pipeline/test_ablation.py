@@ -18,11 +18,11 @@ from megloc_kapture.pipeline.ablation import (
 from megloc_kapture.pipeline.benchmarks import find_benchmark
 from megloc_kapture.pipeline.datasets import TWIN_PREFIX, choose_dataset
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
-from megloc_kapture.pipeline.options import PipelineOptions
 from megloc_kapture.pipeline.plan import run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.run import Run
 from megloc_kapture.pipeline.workspace import Workspace
+from megloc_kapture.stages.options import PipelineOptions
 
 
 def names(*assignments: str, preset: str = "classic") -> list[str]:
@@ -123,7 +123,7 @@ def test_refinement_is_turned_on_and_off_in_one_workspace(first: Run) -> None:
     )
     for options in (refined, first.options, refined):
         stages = plan_evaluation(Run(first.source, "classic", options, workspace))
-        outputs = [output for stage in stages for output in stage.outputs]
+        outputs = [output for stage in stages for output in stage.writes]
         assert len(outputs) == len(set(outputs))
         with workspace.lock():
             run_plan(stages, workspace)

@@ -22,11 +22,11 @@ from megloc_kapture.io.status_table import read_status
 from megloc_kapture.pipeline.datasets import choose_dataset
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
 from megloc_kapture.pipeline.executors import single_threaded
-from megloc_kapture.pipeline.options import PipelineOptions
 from megloc_kapture.pipeline.plan import run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.run import Run
 from megloc_kapture.pipeline.workspace import Workspace
+from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.values import Failure, RigidTransform
 
 FEW = ("local_features.rootsift.options.max_keypoints=300",)

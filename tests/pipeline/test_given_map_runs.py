@@ -47,8 +47,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Workspace]:
     def run_with(*assignments: str) -> Workspace:
         options = options_of_preset(changes=[CHEAP], assignments=assignments)
         with workspace.lock(), single_threaded(), open_executor("processes", 2) as executor:
-            of = Run(source, "classic", options, workspace, work=Work(executor))
-            run_plan(plan_evaluation(of), workspace)
+            of = Run(source, "classic", options, workspace)
+            run_plan(plan_evaluation(of), workspace, Work(executor))
         return workspace
 
     return run_with

@@ -17,11 +17,11 @@ from megloc_kapture.io.images import read_image_rgb, write_image
 from megloc_kapture.io.kapture_store import KaptureFolder, Sensor, write_sensors
 from megloc_kapture.pipeline.datasets import choose_dataset
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
-from megloc_kapture.pipeline.options import PipelineOptions
 from megloc_kapture.pipeline.plan import StageReport, run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.run import Run
 from megloc_kapture.pipeline.workspace import Workspace
+from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.values import RigidTransform
 
 pytestmark = pytest.mark.slow

@@ -14,11 +14,11 @@ from megloc_kapture.evaluation.pose_errors import pose_errors
 from megloc_kapture.io.kapture_store import KaptureFolder
 from megloc_kapture.pipeline.datasets import choose_dataset
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
-from megloc_kapture.pipeline.options import PipelineOptions
 from megloc_kapture.pipeline.plan import run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.run import Run
 from megloc_kapture.pipeline.workspace import Workspace
+from megloc_kapture.stages.options import PipelineOptions
 
 pytestmark = pytest.mark.slow
 

@@ -17,8 +17,8 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.pose_errors import pose_errors
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder
-from megloc_kapture.pipeline.options import PipelineOptions
 from megloc_kapture.pipeline.presets import options_of_preset
+from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.values import LocalFeatures, RigidTransform
 
 FEW = options_of_preset(assignments=["local_features.options.max_keypoints=800"])

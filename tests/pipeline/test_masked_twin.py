@@ -47,8 +47,8 @@ def localized(folder: Path, changes: Sequence[str]) -> Workspace:
     options = options_of_preset(changes=[benchmark.options], assignments=[*cheap, *changes])
     workspace = Workspace(folder)
     with workspace.lock(), single_threaded(), open_executor("processes", 2) as executor:
-        run = Run(source, "classic", options, workspace, benchmark, work=Work(executor))
-        run_plan(plan_evaluation(run), workspace)
+        run = Run(source, "classic", options, workspace, benchmark)
+        run_plan(plan_evaluation(run), workspace, Work(executor))
     return workspace
 
 

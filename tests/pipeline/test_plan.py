@@ -2,16 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.pipeline.plan import Stage, StageReport, all_kept, run_plan
+from megloc_kapture.pipeline.plan import StageReport, all_kept, run_plan
 from megloc_kapture.pipeline.workspace import Workspace
+from megloc_kapture.stages.stage import Hashes, Stage, StageWork
+from megloc_kapture.values import Options
+
+
+class Step(Stage):
+    """A stage of nothing but what it is told."""
+
+    def __init__(
+        self,
+        name: str,
+        version: int,
+        settings: dict[str, Any],
+        reads: Sequence[str],
+        writes: Sequence[str],
+        do: Callable[[Path], Mapping[str, float]],
+        outside: Mapping[str, str] | None = None,
+    ) -> None:
+        super().__init__(Options())
+        self.name, self.reads, self.writes, self._do = name, reads, writes, do
+        self.version = version  # type: ignore[misc]
+        self._settings, self._outside = settings, outside or {}
+
+    def settings(self) -> dict[str, Any]:
+        return self._settings
+
+    def external(self, hashes: Hashes) -> Mapping[str, str]:
+        return self._outside
+
+    def run(self, work: StageWork) -> Mapping[str, float]:
+        return self._do(work.out)
 
 
 @dataclass
@@ -26,11 +56,11 @@ class Kitchen:
 
     def stages(self) -> list[Stage]:
         return [
-            Stage(
-                "a", self.version, self.options["a"], (), ("a.txt",), self.do("a"), self.external
+            Step("a", self.version, self.options["a"], (), ("a.txt",), self.do("a"), self.external),
+            Step("b", 1, self.options["b"], ("a.txt",), ("b", "b.csv"), self.do("b", "a.txt")),
+            Step(
+                "c", 1, self.options["c"], ("a.txt", "b/b.txt"), ("c.txt",), self.do("c", "b/b.txt")
             ),
-            Stage("b", 1, self.options["b"], ("a",), ("b", "b.csv"), self.do("b", "a.txt")),
-            Stage("c", 1, self.options["c"], ("a", "b"), ("c.txt",), self.do("c", "b/b.txt")),
         ]
 
     def do(self, name: str, reads: str | None = None) -> Callable[[Path], Mapping[str, float]]:
@@ -131,10 +161,10 @@ class Diner(Kitchen):
 
     def stages(self) -> list[Stage]:
         plain = "plain.txt" if self.seasoned else "soup.txt"
-        soup = [Stage("cook", 1, {}, (), (plain,), self.put(plain, "soup"))]
+        soup: list[Stage] = [Step("cook", 1, {}, (), (plain,), self.put(plain, "soup"))]
         if self.seasoned:
             salted = self.put("soup.txt", "soup, salted")
-            soup.append(Stage("season", 1, {}, ("cook",), ("soup.txt",), salted))
+            soup.append(Step("season", 1, {}, (plain,), ("soup.txt",), salted))
         return soup
 
     def put(self, name: str, text: str) -> Callable[[Path], Mapping[str, float]]:
@@ -217,7 +247,7 @@ def test_first_takes_earlier_stages_as_they_are(kitchen: Kitchen) -> None:
 
 def test_first_leaves_alone_what_does_not_read_its_output(kitchen: Kitchen) -> None:
     stages = kitchen.stages()
-    stages[2] = replace(stages[2], after=("a",))
+    stages[2].reads = ("a.txt",)
     run_plan(stages, kitchen.workspace)
     kitchen.log.clear()
     reports = run_plan(stages, kitchen.workspace, first="b")

@@ -38,7 +38,6 @@ from megloc_kapture.io.side_tables import (
 from megloc_kapture.io.status_table import QueryStatus, write_status
 from megloc_kapture.pipeline.datasets import DatasetChoice
 from megloc_kapture.pipeline.manifests import Manifest
-from megloc_kapture.pipeline.options import PipelineOptions
 from megloc_kapture.pipeline.run import Run
 from megloc_kapture.pipeline.submission import (
     check_dataset,
@@ -48,6 +47,7 @@ from megloc_kapture.pipeline.submission import (
     write_submission,
 )
 from megloc_kapture.pipeline.workspace import Workspace
+from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.values import Camera, RigidTransform
 
 CAMERA = Sensor.from_camera(Camera("PINHOLE", 640, 480, (500, 500, 320, 240)))

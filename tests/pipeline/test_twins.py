@@ -59,8 +59,8 @@ def finished(
 
     def again() -> list[Any]:
         with workspace.lock(), single_threaded(), open_executor("processes", 2) as executor:
-            run = Run(source, "classic", options, workspace, benchmark, work=Work(executor))
-            return run_plan(plan_evaluation(run), workspace)
+            run = Run(source, "classic", options, workspace, benchmark)
+            return run_plan(plan_evaluation(run), workspace, Work(executor))
 
     again()
     return name, workspace, again

@@ -11,7 +11,6 @@ from megloc_kapture.io.colmap import TriangulationOptions
 from megloc_kapture.mapping.lifting import LiftingOptions
 from megloc_kapture.matching.guided_pyramid import GuidedPyramidOptions, base_type, pyramid_type
 from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
-from megloc_kapture.pipeline.global_choice import GlobalFeaturesChoice
 from megloc_kapture.plugins import (
     LOCAL_FEATURES,
     MATCHERS,
@@ -22,6 +21,7 @@ from megloc_kapture.plugins import (
 )
 from megloc_kapture.retrieval.fusion import FusionOptions
 from megloc_kapture.stages.candidates import QueryPairsOptions, Retrieval
+from megloc_kapture.stages.global_choice import GlobalFeaturesChoice
 from megloc_kapture.stages.image_pairs import MappingPairsOptions
 from megloc_kapture.stages.map_refinement import MapRefinementOptions
 from megloc_kapture.stages.matches import NoVerification, Verification
@@ -84,6 +84,10 @@ class PipelineOptions(Options):
     refinement: MapRefinementOptions = MapRefinementOptions()
     localization: LocalizationOptions = LocalizationOptions()
     pose_refinement: PoseRefinementOptions = PoseRefinementOptions()
+    stages: dict[str, dict[str, Any]] = Field(
+        default_factory=dict,
+        description="stages of other packages that run as well, by name, with their options",
+    )
 
     @field_validator("local_features", "global_features", mode="before")
     @classmethod

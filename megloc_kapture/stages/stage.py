@@ -1,0 +1,168 @@
+"""A stage: what it is called, what it reads and writes in a workspace, and what it does.
+
+All else follows from that: which stages it runs behind (those that write what it reads), when it
+has to run again (its options, its version or what it reads have changed), its manifest and, for a
+stage of another package, its command. ``docs/plugins.md`` has an example.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, cast
+
+from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.side_tables import SIDE_TABLES
+from megloc_kapture.plugins import weights_of
+from megloc_kapture.stages.layout import Layout
+from megloc_kapture.stages.restrictions import Restrictions
+from megloc_kapture.stages.work import Work
+from megloc_kapture.values import Options
+
+if TYPE_CHECKING:
+    from megloc_kapture.stages.options import PipelineOptions
+
+
+class Hashes(Protocol):
+    """Fingerprints of files outside the workspace."""
+
+    def of_file(self, path: Path) -> str:
+        """Hash of one file's content; raises DataError when it cannot be read."""
+        ...
+
+    def of_files(self, root: Path, files: Iterable[Path]) -> str:
+        """One hash of many files: their names relative to ``root`` and their contents."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageWork(Work):
+    """What a stage works with.
+
+    Attributes
+    ----------
+    root : the workspace; nothing is written there.
+    out : folder to write into, under the names that the stage says it writes.
+    """
+
+    root: Path
+    out: Path
+
+    def path(self, name: str) -> Path:
+        """Something in the workspace."""
+        return self.root / name
+
+    def folder(self, name: str, *features: str) -> KaptureFolder:
+        """A kapture folder of the workspace, with features folders of the workspace."""
+        return KaptureFolder(self.path(name), features_dirs=[self.path(one) for one in features])
+
+    def restrictions(self) -> Restrictions:
+        """What the dataset's side tables permit."""
+        return Restrictions.read(self.path(SIDE_TABLES))
+
+
+def is_below(path: str, folder: str) -> bool:
+    """Whether a path in the workspace is that of a folder, or of something in it."""
+    return path == folder or path.startswith(f"{folder}/")
+
+
+class Stage:
+    """One step of a run. A class says what it is in its attributes, or in properties.
+
+    Attributes
+    ----------
+    name : of its manifest, as ``--from`` and ``--until`` take it.
+    version : to be raised when the output changes for the same options and inputs.
+    reads, writes : paths in the workspace; a path stands for all that is below it.
+    """
+
+    name: str
+    version: ClassVar[int] = 1
+    reads: Sequence[str] = ()
+    writes: Sequence[str] = ()
+
+    def __init__(self, options: Options) -> None:
+        self.options: Any = options
+
+    def settings(self) -> dict[str, Any]:
+        """What determines the output beside what is read, as plain JSON values."""
+        chosen: dict[str, Any] = self.options.model_dump(mode="json")
+        return chosen
+
+    def external(self, hashes: Hashes) -> Mapping[str, str]:
+        """Fingerprints of what is read from outside the workspace, by what they are of."""
+        return {}
+
+    def run(self, work: StageWork) -> Mapping[str, float]:
+        """Write the outputs; returns counts for the log.
+
+        Raises
+        ------
+        MeglocError : the data or the options cannot be used; the workspace stays as it was.
+        """
+        raise NotImplementedError
+
+
+class PipelineStage(Stage):
+    """A stage of ours: it has the options of the pipeline that it declares, and no others.
+
+    Attributes
+    ----------
+    uses : the keys of the options that determine the output; ``local_features.name`` is the
+        names of all choices, when all else about them does not matter. What a stage does not
+        declare it cannot read, so that none of it can be forgotten.
+    """
+
+    uses: ClassVar[tuple[str, ...]] = ()
+
+    def __init__(self, options: PipelineOptions) -> None:
+        self.options: PipelineOptions = cast(
+            "PipelineOptions", _Declared(options, type(self).__name__, self.uses)
+        )
+        self.layout = Layout(options)
+        self._all = options
+
+    @classmethod
+    def is_wanted(cls, options: PipelineOptions) -> bool:
+        """Whether the options ask for what the stage does."""
+        return True
+
+    def plugins(self) -> Sequence[object]:
+        """The plugins at work, whose weights determine the output."""
+        return ()
+
+    def settings(self) -> dict[str, Any]:
+        dump = self._all.model_dump(mode="json")
+        chosen: dict[str, Any] = _selected(dump, [key.split(".") for key in self.uses])
+        weights = {
+            file: sha for plugin in self.plugins() for file, sha in weights_of(plugin).items()
+        }
+        return {**chosen, "weights": weights} if weights else chosen
+
+
+class _Declared:
+    """Options of which only some may be read; methods see what those that call them see."""
+
+    def __init__(self, options: PipelineOptions, stage: str, uses: Sequence[str]) -> None:
+        self._options, self._stage = options, stage
+        self._allowed = {key.split(".")[0] for key in uses}
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in type(self._options).model_fields:
+            return getattr(type(self._options), name).__get__(self)
+        if name not in self._allowed:
+            raise AttributeError(f"{self._stage} reads option {name}, which it does not declare")
+        return getattr(self._options, name)
+
+
+def _selected(dump: Any, paths: Sequence[Sequence[str]]) -> Any:
+    """The parts of nested values that stand at paths; of a list, those of each of its members."""
+    if not all(paths):
+        return dump
+    if isinstance(dump, list):
+        return [_selected(one, paths) for one in dump]
+    keys = dict.fromkeys(path[0] for path in paths)
+    return {
+        key: _selected(dump[key], [path[1:] for path in paths if path[0] == key]) for key in keys
+    }

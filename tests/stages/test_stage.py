@@ -1,0 +1,48 @@
+"""What follows from what a stage declares: its settings, and the options that it may read."""
+
+from __future__ import annotations
+
+import pytest
+
+from megloc_kapture.pipeline.evaluation_plan import PIPELINE
+from megloc_kapture.stages.matches import MatchQueries
+from megloc_kapture.stages.options import PipelineOptions
+from megloc_kapture.stages.query_poses import LocalizeQueries
+from megloc_kapture.stages.stage import PipelineStage
+
+
+class Declares(PipelineStage):
+    name = "declares"
+    uses = ("local_features.name", "mask_margin_px", "triangulation.min_angle_deg")
+
+
+def test_settings_are_the_declared_options_and_no_more() -> None:
+    options = PipelineOptions(
+        local_features=({"name": "rootsift", "options": {"max_keypoints": 5}}, {"name": "sift"})
+    )
+    assert Declares(options).settings() == {
+        "local_features": [{"name": "rootsift"}, {"name": "sift"}],
+        "mask_margin_px": 4.0,
+        "triangulation": {"min_angle_deg": options.triangulation.min_angle_deg},
+    }
+
+
+def test_what_is_not_declared_cannot_be_read_by_methods_either() -> None:
+    stage = Declares(PipelineOptions())
+    assert stage.options.mask_margin_px == 4.0
+    with pytest.raises(AttributeError, match="Declares reads option matching"):
+        _ = stage.options.matching
+    with pytest.raises(AttributeError, match="Declares reads option map, which it does not"):
+        stage.options.uses_given_map()
+    assert MatchQueries(PipelineOptions()).options.local_types() == ["rootsift"]
+
+
+def test_the_matcher_does_not_concern_extraction_and_localization() -> None:
+    changed = PipelineOptions(matching={"name": "nn", "options": {"max_ratio": 0.5}})
+    same = [kind.name for kind in PIPELINE if isinstance(kind.name, str)]
+    for kind in PIPELINE:
+        before, after = kind(PipelineOptions()), kind(changed)
+        if before.settings() != after.settings():
+            same.remove(before.name)
+    assert set(same) >= {"local_features", "global_features", LocalizeQueries.name, "map"}
+    assert not {"mapping_matches", "query_matches"} & set(same)
