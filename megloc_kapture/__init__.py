@@ -1,8 +1,9 @@
 """Visual localization in kapture: MegLoc's stages as kapture plugins.
 
->>> from megloc_kapture import KaptureMap, Localizer
->>> localizer = Localizer(KaptureMap.open("somebody_elses_map"))   # doctest: +SKIP
->>> found = localizer.localize("query.jpg", camera)                # doctest: +SKIP
+>>> import megloc_kapture as megloc
+>>> m = megloc.open_map("somebody_elses_map")                               # doctest: +SKIP
+>>> found = m.localize("query.jpg", megloc.Camera.pinhole(1920, 1080, 1371))  # doctest: +SKIP
+>>> found.cam_from_world if found else found.reason                         # doctest: +SKIP
 """
 
 # pycolmap 4.1.1 to 4.2.1 corrupt the heap when they are imported before zlib; this import
@@ -15,9 +16,11 @@ from megloc_kapture.errors import DataError, MeglocError, OptionError, OutputErr
 from megloc_kapture.values import Camera, Failure, LocalFeatures, Pose, RigidTransform
 
 if TYPE_CHECKING:
+    from megloc_kapture.api import Map, build_map, extract, match, open_map, run, solve_pose
     from megloc_kapture.pipeline.kapture_map import KaptureMap
     from megloc_kapture.pipeline.localizer import Localizer
     from megloc_kapture.pipeline.queries import Query
+    from megloc_kapture.pipeline.results import Results
 
 __all__ = [
     "Camera",
@@ -26,13 +29,21 @@ __all__ = [
     "KaptureMap",
     "LocalFeatures",
     "Localizer",
+    "Map",
     "MeglocError",
     "OptionError",
     "OutputError",
     "PluginError",
     "Pose",
     "Query",
+    "Results",
     "RigidTransform",
+    "build_map",
+    "extract",
+    "match",
+    "open_map",
+    "run",
+    "solve_pose",
 ]
 
 # loaded when asked for: the small types above must not cost the import of the solvers
@@ -40,6 +51,14 @@ _LAZY = {
     "KaptureMap": "megloc_kapture.pipeline.kapture_map",
     "Localizer": "megloc_kapture.pipeline.localizer",
     "Query": "megloc_kapture.pipeline.queries",
+    "Results": "megloc_kapture.pipeline.results",
+    "Map": "megloc_kapture.api",
+    "build_map": "megloc_kapture.api",
+    "extract": "megloc_kapture.api",
+    "match": "megloc_kapture.api",
+    "open_map": "megloc_kapture.api",
+    "run": "megloc_kapture.api",
+    "solve_pose": "megloc_kapture.api",
 }
 
 

@@ -92,6 +92,11 @@ class Camera:
         if min(focals) <= 0:
             raise DataError(f"focal length {min(focals)} is not positive")
 
+    @classmethod
+    def pinhole(cls, width: int, height: int, focal: float) -> Camera:
+        """A camera without distortion, its principal point in the middle; focal length in px."""
+        return cls("SIMPLE_PINHOLE", width, height, (focal, width / 2, height / 2))
+
 
 @dataclass(frozen=True, slots=True)
 class RigidTransform:

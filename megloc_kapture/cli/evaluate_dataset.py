@@ -24,24 +24,17 @@ from megloc_kapture.pipeline.ablation import (
     variants,
     write_outcomes,
 )
-from megloc_kapture.pipeline.benchmarks import BenchmarkFile, find_benchmark, read_benchmark
+from megloc_kapture.pipeline.benchmarks import BenchmarkFile
 from megloc_kapture.pipeline.datasets import (
-    TWIN_PREFIX,
     DatasetChoice,
-    choose_dataset,
-    has_model,
 )
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
 from megloc_kapture.pipeline.executors import available_cores, open_executor, single_threaded
 from megloc_kapture.pipeline.paper_steps import (
-    DatasetFacts,
-    LayeredOptions,
-    paper_steps,
     steps_text,
 )
 from megloc_kapture.pipeline.plan import all_kept, describe, run_plan
-from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.run import Run
+from megloc_kapture.pipeline.run import RunChoice, choose_run
 from megloc_kapture.pipeline.submissions_folder import FOLDER, keep_submission
 from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.stages.layout import EVALUATION, LOCALIZED
@@ -91,43 +84,27 @@ class Eval(Choosing, Working, Common):
     def run(self) -> int:
         """Run it; returns the exit status."""
         console = self.console()
-        benchmark = find_benchmark(self.dataset, TWIN_PREFIX)
-        if self.config:
-            benchmark = read_benchmark(self.config)
-            if benchmark.dataset != self.dataset:
-                raise OptionError(
-                    f"{self.config} is for dataset {benchmark.dataset}, not {self.dataset}"
-                )
-        preset = self.preset or benchmark.preset
-        choice = choose_dataset(
+        choice = choose_run(
             self.dataset,
             self.root,
-            import_options=benchmark.import_options_of(preset),
+            preset=self.preset,
+            assignments=self.set,
+            config=self.config,
             query_prefix=self.query_prefix,
             allow_missing=self.allow_missing,
             find_root=not self.explain,
         )
-        return self._run(console, choice, benchmark, preset)
-
-    def _run(
-        self, console: Console, choice: DatasetChoice, benchmark: BenchmarkFile, preset: str
-    ) -> int:
-        choice.check()
-        changes = benchmark.changes(preset, query_depth=choice.has_query_depth())
-        options = options_of_preset(preset, changes=changes, assignments=self.set)
-        layers = LayeredOptions(
-            preset, options_of_preset(preset), options_of_preset(preset, changes=changes), options
-        )
         if self.explain:
-            console.result(steps_text(paper_steps(layers, facts_of(choice))))
+            console.result(steps_text(choice.steps()))
             return 0
         if self.thresholds:
             parsed = [Threshold.parse(text) for text in self.thresholds]
             pairs = tuple((t.position_m, t.angle_deg) for t in parsed)
-            benchmark = benchmark.model_copy(update={"thresholds": pairs})
-        self._check_judging(choice)
-        self._check_ablation(choice)
-        place = self.workspace or Path("runs") / f"{self.dataset}-{preset}"
+            wanted = choice.benchmark.model_copy(update={"thresholds": pairs})
+            choice = replace(choice, benchmark=wanted)
+        self._check_judging(choice.source)
+        self._check_ablation(choice.source)
+        place = self.workspace or Path("runs") / f"{self.dataset}-{choice.preset}"
         submissions = self.submissions or (None if self.workspace else Path(FOLDER))
         workspace = Workspace(place, force=self.force)
         with (
@@ -135,14 +112,7 @@ class Eval(Choosing, Working, Common):
             single_threaded(),
             open_executor(self.executor, self.workers) as executor,
         ):
-            run = Run(
-                source=choice,
-                preset=preset,
-                options=options,
-                workspace=workspace,
-                benchmark=benchmark,
-                steps=tuple(paper_steps(layers, facts_of(choice))),
-            )
+            run = choice.run_in(workspace)
             work = Work(executor, console.track, self.workers or available_cores())
             stages = plan_evaluation(run)
             reports = run_plan(
@@ -156,13 +126,13 @@ class Eval(Choosing, Working, Common):
                 on_report=lambda report: console.say(describe(report)),
             )
             if self.ablate and not self.dry_run:
-                self._ablate(console, run, work, stages, layers)
+                self._ablate(console, choice, work, workspace, stages)
         if self.dry_run:
             return 0
         if all_kept(reports):
             console.say("nothing to do: every stage is up to date")
         done = {report.name for report in reports}
-        status = self._conclude(console, workspace, benchmark) if "evaluation" in done else 0
+        status = self._conclude(console, workspace, choice.benchmark) if "evaluation" in done else 0
         if "submission" in done:
             self._hand_in(console, run.submission_below(workspace.root), submissions)
         report = workspace.path(EVALUATION) / REPORT_HTML
@@ -173,17 +143,16 @@ class Eval(Choosing, Working, Common):
     def _ablate(
         self,
         console: Console,
-        run: Run,
+        choice: RunChoice,
         work: Work,
+        whole: Workspace,
         stages: Sequence[Stage],
-        layers: LayeredOptions,
     ) -> None:
-        outcomes = [outcome("all steps", run.workspace, stages)]
-        for variant in variants(run.options):
+        outcomes = [outcome("all steps", whole, stages)]
+        for variant in variants(choice.options):
             console.say(f"ablation: without {variant.name}")
-            workspace = fresh_copy(run.workspace, variant.slug)
-            steps = paper_steps(replace(layers, chosen=variant.options), facts_of(run.source))
-            changed = replace(run, options=variant.options, workspace=workspace, steps=tuple(steps))
+            workspace = fresh_copy(whole, variant.slug)
+            changed = choice.with_options(variant.options).run_in(workspace)
             with workspace.lock():
                 planned = plan_evaluation(changed)
                 run_plan(
@@ -194,7 +163,7 @@ class Eval(Choosing, Working, Common):
                     on_report=lambda report: console.say(describe(report)),
                 )
             outcomes.append(outcome(f"without {variant.name}", workspace, planned))
-        path = write_outcomes(run.workspace, outcomes)
+        path = write_outcomes(whole, outcomes)
         console.result(outcomes_text(outcomes))
         console.result(f"ablation   {shown(path)}")
 
@@ -249,11 +218,6 @@ class Eval(Choosing, Working, Common):
             console.say(f"recall {recall:.3f} is below {self.fail_below:.3f}")
             return BELOW_RECALL
         return 0
-
-
-def facts_of(choice: DatasetChoice) -> DatasetFacts:
-    """What of a dataset decides which steps of the paper it permits."""
-    return DatasetFacts(choice.has_map_depth(), choice.has_query_depth(), has_model(choice))
 
 
 def published_results(benchmark: BenchmarkFile) -> list[str]:

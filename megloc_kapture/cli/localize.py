@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,20 +12,18 @@ from typing import Annotated, Any
 import tyro
 
 from megloc_kapture.cli.common import Choosing, Common, Force, Input, Output, Reading, existing
-from megloc_kapture.cli.console import Console
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import OptionError
 from megloc_kapture.io.kapture_store import KaptureFolder, read_pairs
 from megloc_kapture.io.outputs import staged_output
 from megloc_kapture.pipeline.executors import available_cores
 from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, assigned, options_of_preset
-from megloc_kapture.pipeline.queries import KaptureQueries, Query
-from megloc_kapture.stages.localized_folder import write_localized
+from megloc_kapture.pipeline.queries import KaptureQueries
+from megloc_kapture.pipeline.results import Results
+from megloc_kapture.stages.layout import LOCALIZED
 from megloc_kapture.stages.matches import iterate_candidates
-from megloc_kapture.values import Failure, Pose, RigidTransform
 
-LOCALIZED = "localized"
 # the others are of maps that are made
 _USED = (
     "preprocessing",
@@ -70,8 +67,6 @@ class Localize(Reading, Choosing, Common):
         """Run it."""
         console = self.console()
         workers = available_cores() if self.workers is None else self.workers
-        if workers < 1:
-            raise OptionError(f"{workers} workers cannot work; give 1 or more")
         kapture_map = KaptureMap.open(
             self.input,
             keypoints_types=self.keypoints_type,
@@ -81,24 +76,17 @@ class Localize(Reading, Choosing, Common):
         )
         options = options_of_preset(self.preset or DEFAULT_PRESET, assignments=self.set, used=_USED)
         folder = self.kapture(self.query)
-        queries = KaptureQueries(folder, kapture_map)
         given = None if self.pairs is None else dict(iterate_candidates(read_pairs(self.pairs)))
         # what is wrong is found before the first query, and before anything is written
-        kapture_map.check()
-        queries.check()
         localizer = Localizer(kapture_map, options=options)
-        _check_extractors(localizer, queries)
+        results = Results(localizer, folder, workers=workers, candidates=given, track=console.track)
+        queries = results.queries
         check_acted_on(assigned(self.set), localizer, queries, folder, pairs=given is not None)
         with staged_output(self.output, kind=LOCALIZED, force=self.force) as out:
             started = time.perf_counter()
-            named = _localized(localizer, queries, workers, given, console)
+            named = list(results.items())
             seconds = time.perf_counter() - started
-            fallback = options.localization.fallback
-            best = {}
-            if fallback == "retrieval":
-                failed = [name for name, result in named if not result]
-                best = best_candidates(localizer, map(queries.query, failed), given)
-            counts = write_localized(out, folder, named, fallback=fallback, first_candidates=best)
+            counts = results.write_to(out)
         how = "as given"
         if given is None:
             how = localizer.describe_retrieval(queries.types_of_all())
@@ -166,58 +154,3 @@ def check_acted_on(
     for name in typed:
         if name in idle:
             raise OptionError(f"--set {name} changes nothing: {idle[name]}")
-
-
-def _localized(
-    localizer: Localizer,
-    queries: KaptureQueries,
-    workers: int,
-    given: Mapping[str, Sequence[str]] | None,
-    console: Console,
-) -> list[tuple[str, Pose | Failure]]:
-    """Results by query, with a progress bar."""
-    rigs = localizer.options.localization.rigs
-    units = queries.units(rigs=rigs)
-    named: list[tuple[str, Pose | Failure]] = []
-    with ThreadPoolExecutor(workers) as executor:
-        results = localizer.localize_units(
-            queries.read_units(rigs=rigs), executor, candidates=given
-        )
-        tracked = console.track(results, len(units), "localizing")
-        for names, found in zip(units, tracked, strict=True):
-            named += zip(names, found, strict=True)
-    return named
-
-
-def _check_extractors(localizer: Localizer, queries: KaptureQueries) -> None:
-    """Make the extractors that queries without features need.
-
-    Raises
-    ------
-    DataError : there is no extractor for a type; names the first image that needs it.
-    PluginError, MissingWeightsError : it cannot be made.
-    """
-    for local in localizer.types:
-        lacking = queries.lacking(local.name)
-        if lacking is None:
-            continue
-        try:
-            _ = local.extractor
-        except DataError as error:
-            raise DataError(f"image {lacking!r}: {error.message}", path=error.path) from error
-
-
-def best_candidates(
-    localizer: Localizer,
-    queries: Iterable[Query],
-    given: Mapping[str, Sequence[str]] | None,
-) -> dict[str, tuple[str, RigidTransform]]:
-    """Query to its best candidate and that image's pose; nothing for a query without any."""
-    poses = localizer.map.poses
-    best = {}
-    for query in queries:
-        ranked = localizer.ranked(query) if given is None else given.get(query.name, ())
-        first = next((image for image in ranked if image in poses), None)
-        if first is not None:
-            best[query.name] = (first, poses[first])
-    return best

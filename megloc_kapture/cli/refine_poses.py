@@ -8,7 +8,6 @@ from pathlib import Path
 import tyro
 
 from megloc_kapture.cli.common import Force, Input, Linked, Output
-from megloc_kapture.cli.localize import LOCALIZED
 from megloc_kapture.cli.stage_command import StageCommand, restrictions_beside
 from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.refined_poses import told_of_map
@@ -16,6 +15,7 @@ from megloc_kapture.io.consistency_table import CONSISTENCY_FILE, read_consisten
 from megloc_kapture.io.outputs import staged_output
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
 from megloc_kapture.plugins import POSE_REFINERS, plugin_names
+from megloc_kapture.stages.layout import LOCALIZED
 from megloc_kapture.stages.pose_refinement import refine_poses
 from megloc_kapture.stages.work import Work
 

@@ -151,6 +151,24 @@ def import_kapture_folders(
     }
 
 
+def import_mapping(mapping: KaptureFolder, output: Path) -> dict[str, float]:
+    """Import images with poses, without queries; see :func:`import_kapture_folders`."""
+    check_images(mapping)
+    data = mapping.read()
+    poses = data.poses()
+    if not poses:
+        raise DataError("no mapping image has a pose", path=mapping.root)
+    write_sensors(output / MAPPING, data)
+    link_images(mapping.root, output / MAPPING)
+    names = set(data.image_names())
+    found = read_groups(mapping.root.resolve().parent / SIDE_TABLES)
+    groups = {name: group for name, group in found.items() if name in names}
+    write_protocol(output / SIDE_TABLES, Protocol())
+    if groups:
+        write_groups(output / SIDE_TABLES, groups)
+    return {"map_images": len(names), "map_images_with_pose": len(poses)}
+
+
 def check_images(folder: KaptureFolder) -> None:
     """Every image is there, is an image, and has the size its camera says; headers only.
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
+from megloc_kapture.datasets.kapture_folders import import_mapping
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.evaluation.folders import evaluate_folders, results_without_truth
 from megloc_kapture.evaluation.outputs import write_evaluation
@@ -13,6 +14,7 @@ from megloc_kapture.evaluation.provenance import package_versions
 from megloc_kapture.evaluation.rules import read_rules
 from megloc_kapture.evaluation.surroundings import surroundings_of
 from megloc_kapture.evaluation.without_truth_outputs import write_without_truth
+from megloc_kapture.io.kapture_store import KaptureFolder
 from megloc_kapture.io.side_tables import SIDE_TABLES, Protocol
 from megloc_kapture.pipeline.datasets import DatasetChoice, with_model
 from megloc_kapture.pipeline.missing_weights import check_weights
@@ -35,11 +37,13 @@ from megloc_kapture.stages.local_features import ExtractLocalFeatures
 from megloc_kapture.stages.map_points import GivenMap, LiftPoints, TriangulatePoints
 from megloc_kapture.stages.map_refinement import RefineMap
 from megloc_kapture.stages.matches import MatchMapping, MatchQueries
+from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.pose_refinement import RefinePoses
 from megloc_kapture.stages.preprocessing import Preprocess
 from megloc_kapture.stages.query_poses import LocalizeQueries
 from megloc_kapture.stages.reranking import RerankQueries
 from megloc_kapture.stages.stage import Hashes, PipelineStage, Stage, StageWork, is_below
+from megloc_kapture.values import Options
 
 WORLD = "world"
 
@@ -95,6 +99,22 @@ def plan_evaluation(run: Run) -> list[Stage]:
     for name, values in options.stages.items():
         _insert(stages, load_plugin(STAGES, name, dict(values)))
     return stages
+
+
+def plan_map(mapping: KaptureFolder, options: PipelineOptions) -> list[Stage]:
+    """The stages that make a map of images with poses, without queries.
+
+    Raises
+    ------
+    OptionError : the options need a model that a dataset comes with.
+    """
+    check_weights(options)
+    options.retrieval()
+    if options.uses_given_map() or options.pairs_by_points():
+        raise OptionError("images with poses come with no model: map, mapping_pairs.by")
+    behind = PIPELINE.index(RefineMap) + 1
+    kinds = [kind for kind in PIPELINE[:behind] if kind.is_wanted(options)]
+    return [ImportMapping(mapping), *(kind(options) for kind in kinds)]
 
 
 def _insert(stages: list[Stage], stage: Stage) -> None:
@@ -184,6 +204,27 @@ class Import(_RunStage):
         if given.dataset == Protocol().dataset:
             given = given.model_copy(update={"dataset": self._run.dataset})
         return given if self._run.benchmark is None else self._run.benchmark.change(given)
+
+
+class ImportMapping(Stage):
+    """Import images with poses alone, with the coordinate frames that tables beside them name."""
+
+    name = "import"
+    version = 3
+    writes = (MAPPING, QUERY, SIDE_TABLES)  # no queries: what stages read of them is nothing
+
+    def __init__(self, mapping: KaptureFolder) -> None:
+        super().__init__(Options())
+        self._mapping = mapping
+
+    def external(self, hashes: Hashes) -> Mapping[str, str]:
+        root = self._mapping.root.resolve()
+        sensors = sorted((root / "sensors").glob("*.txt"))
+        images = [self._mapping.image_path(name) for name in self._mapping.read().image_names()]
+        return {"images": hashes.of_files(root, [*sensors, *images]), "root": str(root)}
+
+    def run(self, work: StageWork) -> Mapping[str, float]:
+        return import_mapping(self._mapping, work.out)
 
 
 class Submit(_RunStage):

@@ -2,18 +2,118 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from megloc_kapture.errors import OptionError
 from megloc_kapture.io.side_tables import SIDE_TABLES, read_protocol
-from megloc_kapture.pipeline.benchmarks import BenchmarkFile
-from megloc_kapture.pipeline.datasets import TWIN_PREFIX, DatasetChoice
-from megloc_kapture.pipeline.paper_steps import PaperStep
+from megloc_kapture.pipeline.benchmarks import BenchmarkFile, find_benchmark, read_benchmark
+from megloc_kapture.pipeline.datasets import TWIN_PREFIX, DatasetChoice, choose_dataset, has_model
+from megloc_kapture.pipeline.paper_steps import (
+    DatasetFacts,
+    LayeredOptions,
+    PaperStep,
+    paper_steps,
+)
+from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.submission import place_of
 from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.stages.layout import SUBMISSIONS
 from megloc_kapture.stages.options import PipelineOptions
+
+
+@dataclass(frozen=True)
+class RunChoice:
+    """A dataset, its benchmark file and the options, chosen together; nothing is written yet.
+
+    Attributes
+    ----------
+    layers : the options by who chose them: preset, benchmark file, user.
+    facts : what of the dataset decides which steps of the paper it permits.
+    """
+
+    source: DatasetChoice
+    benchmark: BenchmarkFile
+    layers: LayeredOptions
+    facts: DatasetFacts
+
+    @property
+    def preset(self) -> str:
+        """The preset's name."""
+        return self.layers.preset
+
+    @property
+    def options(self) -> PipelineOptions:
+        """The options of the run."""
+        return self.layers.chosen
+
+    def steps(self) -> list[PaperStep]:
+        """The steps of the paper, and which of them the run does."""
+        return paper_steps(self.layers, self.facts)
+
+    def with_options(self, options: PipelineOptions) -> RunChoice:
+        """The same run with other options."""
+        return replace(self, layers=replace(self.layers, chosen=options))
+
+    def run_in(self, workspace: Workspace) -> Run:
+        """The run, in a workspace."""
+        return Run(
+            self.source, self.preset, self.options, workspace, self.benchmark, tuple(self.steps())
+        )
+
+
+def choose_run(
+    dataset: str,
+    root: Path | None = None,
+    *,
+    preset: str | None = None,
+    assignments: Sequence[str] = (),
+    changes: Sequence[dict[str, Any]] = (),
+    config: Path | None = None,
+    query_prefix: str = "",
+    allow_missing: bool = False,
+    find_root: bool = True,
+) -> RunChoice:
+    """Choose what ``megloc eval`` runs.
+
+    Parameters
+    ----------
+    root : folder of the dataset as it is published; looked for below MEGLOC_DATA unless given.
+    preset : that of the benchmark file unless given.
+    assignments : ``key.key=value`` texts; ``changes`` the same as nested tables.
+    config : a benchmark file instead of the one that we bring.
+    find_root : false: an official dataset may be without a root; it cannot be imported then.
+
+    Raises
+    ------
+    MeglocError : the dataset, its benchmark file or the options cannot be used.
+    """
+    benchmark = find_benchmark(dataset, TWIN_PREFIX)
+    if config:
+        benchmark = read_benchmark(config)
+        if benchmark.dataset != dataset:
+            raise OptionError(f"{config} is for dataset {benchmark.dataset}, not {dataset}")
+    preset = preset or benchmark.preset
+    source = choose_dataset(
+        dataset,
+        root,
+        import_options=benchmark.import_options_of(preset),
+        query_prefix=query_prefix,
+        allow_missing=allow_missing,
+        find_root=find_root,
+    )
+    source.check()
+    facts = DatasetFacts(source.has_map_depth(), source.has_query_depth(), has_model(source))
+    of_file = benchmark.changes(preset, query_depth=facts.query_depth)
+    layers = LayeredOptions(
+        preset,
+        options_of_preset(preset),
+        options_of_preset(preset, changes=of_file),
+        options_of_preset(preset, changes=[*of_file, *changes], assignments=assignments),
+    )
+    return RunChoice(source, benchmark, layers, facts)
 
 
 @dataclass(frozen=True)

@@ -175,7 +175,7 @@ class ExtractGlobalFeatures(PipelineStage):
         return [chosen.make() for chosen in self.options.global_features if not chosen.is_vlad]
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        query = work.folder(self.layout.query, FEATURES)
+        queries = work.folders((self.layout.query,), FEATURES)
         counts = {}
         for chosen in self.options.global_features:
             if chosen.is_vlad:
@@ -183,10 +183,10 @@ class ExtractGlobalFeatures(PipelineStage):
                 local_type = vlad.local_type or self.options.main_type()
                 mapping = described_images(work, self, local_type)
                 found = extract_vlad(
-                    mapping, [mapping, query], local_type, work.out, vlad.of_vlad(), work=work
+                    mapping, [mapping, *queries], local_type, work.out, vlad.of_vlad(), work=work
                 )
             else:
-                folders = [work.folder(self.layout.mapping), query]
+                folders = [work.folder(self.layout.mapping), *queries]
                 found = extract_global_features(folders, chosen.make(), work.out, work=work)
             counts[chosen.name] = found["images"]
         return counts

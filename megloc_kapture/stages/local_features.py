@@ -217,13 +217,12 @@ class ExtractLocalFeatures(PipelineStage):
         return self.options.query_extractors()
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        mapping, query = work.folder(self.layout.mapping), work.folder(self.layout.query)
-        todo = [(extractor, [mapping, query]) for extractor in self.options.own_extractors()]
+        everything = work.folders((self.layout.mapping, self.layout.query))
+        todo = [(extractor, everything) for extractor in self.options.own_extractors()]
         if self.options.uses_given_map():
             extractor, reference = self.options.make_given_extractor(), work.folder(REFERENCE)
             check_given_type(reference, extractor.name)
-            folders = [query] if has_descriptors(reference) else [mapping, query]
-            todo.append((extractor, folders))
+            todo.append((extractor, everything[1:] if has_descriptors(reference) else everything))
         counts: Counter[str] = Counter()
         for extractor, folders in todo:
             margin_px = self.options.mask_margin_px

@@ -51,7 +51,7 @@ def write_localized(
     statuses = []
     for image, result in named:
         guess = None if result else guesses.get(image)
-        statuses.append(_status(image, result, "none" if guess is None else fallback))
+        statuses.append(query_status(image, result, "none" if guess is None else fallback))
         if isinstance(result, Pose):
             poses[data.record_of(image)] = result.cam_from_world
         elif guess is not None:
@@ -96,7 +96,8 @@ def write_localized(
     }
 
 
-def _status(image: str, result: Pose | Failure, fallback: Fallback) -> QueryStatus:
+def query_status(image: str, result: Pose | Failure, fallback: Fallback = "none") -> QueryStatus:
+    """The row of ``status.csv`` of a query."""
     return QueryStatus(
         image=image,
         status="localized" if result else "failed",

@@ -249,11 +249,12 @@ class Preprocess(PipelineStage):
         return found
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        mapping, query = work.folder(MAPPING), work.folder(QUERY)
+        mapping, *queries = work.folders((MAPPING, QUERY))
         counts: dict[str, float] = {}
-        # the queries of one camera may be few, or all at night
-        for folder, others in ((mapping, []), (query, [mapping])):
+        for folder in (mapping, *queries):
             name = folder.root.name
+            # the queries of one camera may be few, or all at night
+            others = [] if folder is mapping else [mapping]
             found = preprocess_images(
                 folder,
                 work.out / PREPROCESSED / name,

@@ -57,6 +57,10 @@ class StageWork(Work):
         """A kapture folder of the workspace, with features folders of the workspace."""
         return KaptureFolder(self.path(name), features_dirs=[self.path(one) for one in features])
 
+    def folders(self, names: Sequence[str], *features: str) -> list[KaptureFolder]:
+        """Those of the kapture folders that are there: a map may be made without queries."""
+        return [self.folder(name, *features) for name in names if self.path(name).is_dir()]
+
     def restrictions(self) -> Restrictions:
         """What the dataset's side tables permit."""
         return Restrictions.read(self.path(SIDE_TABLES))

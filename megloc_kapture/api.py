@@ -1,0 +1,348 @@
+"""The package in a few calls: open or build a map, localize in it, run a benchmark, evaluate.
+
+>>> import megloc_kapture as megloc
+>>> m = megloc.open_map("somebody_elses_map")                                 # doctest: +SKIP
+>>> pose = m.localize("query.jpg", megloc.Camera.pinhole(1920, 1080, 1371))   # doctest: +SKIP
+>>> m.localize("query_kapture/", refine="icp").save("localized")              # doctest: +SKIP
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.errors import OptionError
+from megloc_kapture.io.images import read_image_rgb
+from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions, absolute_pose
+from megloc_kapture.pipeline.evaluation_plan import plan_evaluation, plan_map
+from megloc_kapture.pipeline.executors import open_executor, single_threaded
+from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
+from megloc_kapture.pipeline.localizer import Localizer
+from megloc_kapture.pipeline.plan import run_plan
+from megloc_kapture.pipeline.presets import options_of_preset
+from megloc_kapture.pipeline.results import Results
+from megloc_kapture.pipeline.run import choose_run
+from megloc_kapture.pipeline.workspace import Workspace
+from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS, load_plugin
+from megloc_kapture.stages.layout import EVALUATION, LOCALIZED, MAP
+from megloc_kapture.stages.work import Work
+from megloc_kapture.values import Camera, Failure, ImageFeatures, Pose
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Changes = Mapping[str, Any]
+Image = Path | str | NDArray[np.uint8]
+
+
+class Map:
+    """A kapture map and how it is localized in. The map is never written to.
+
+    Attributes
+    ----------
+    kapture_map : the map itself: its images, points and keypoints types.
+    """
+
+    def __init__(
+        self, kapture_map: KaptureMap, preset: str = "classic", set: Changes | None = None
+    ) -> None:
+        self.kapture_map = kapture_map
+        self._preset, self._set = preset, dict(set or {})
+        self._localizers: dict[tuple[str, ...], Localizer] = {}
+
+    def localizer(self, refine: str | Sequence[str] = ()) -> Localizer:
+        """The localizer that :meth:`localize` uses, with these pose refiners; kept.
+
+        Raises
+        ------
+        OptionError, PluginError, MissingWeightsError : the options cannot be used.
+        """
+        refiners = (refine,) if isinstance(refine, str) else tuple(refine)
+        if refiners not in self._localizers:
+            changes = nested(self._set)
+            if refiners:
+                changes["pose_refinement"] = {
+                    **changes.get("pose_refinement", {}),
+                    "by": [{"name": name} for name in refiners],
+                }
+            options = options_of_preset(self._preset, changes=[changes])
+            self._localizers[refiners] = Localizer(self.kapture_map, options=options)
+        return self._localizers[refiners]
+
+    @overload
+    def localize(
+        self,
+        query: Image,
+        camera: Camera,
+        *,
+        prior: Sequence[str] | None = None,
+        refine: str | Sequence[str] = (),
+    ) -> Pose | Failure: ...
+
+    @overload
+    def localize(
+        self,
+        query: KaptureFolder | Path | str,
+        camera: None = None,
+        *,
+        refine: str | Sequence[str] = (),
+        workers: int = 1,
+    ) -> Results: ...
+
+    def localize(
+        self,
+        query: KaptureFolder | Image,
+        camera: Camera | None = None,
+        *,
+        prior: Sequence[str] | None = None,
+        refine: str | Sequence[str] = (),
+        workers: int = 1,
+    ) -> Pose | Failure | Results:
+        """Localize one image of a camera, or all images of a kapture folder.
+
+        Parameters
+        ----------
+        query : image file, or uint8 (H, W, 3) RGB; without a camera, a kapture folder.
+        camera : intrinsics of the image, COLMAP's models and pixel origin.
+        prior : names of the map images that the image may be matched with.
+        refine : pose refiners by name, one after another: icp, rendering.
+        workers : threads, for a folder.
+
+        Returns
+        -------
+        Pose, or Failure, which is falsy and says why; of a folder :class:`Results`, image name to
+        either, lazy.
+
+        Raises
+        ------
+        DataError : something cannot be read, or features can neither be read nor extracted.
+        OptionError : an image without its camera.
+        """
+        localizer = self.localizer(refine)
+        if camera is not None:
+            if isinstance(query, KaptureFolder):
+                raise OptionError(f"{query.root}: a kapture folder has cameras of its own")
+            return localizer.localize(query, camera, prior=prior)
+        if not isinstance(query, KaptureFolder):
+            if isinstance(query, np.ndarray) or Path(query).is_file():
+                raise OptionError("an image needs its camera: localize(image, camera)")
+            query = KaptureFolder(query)
+        return Results(localizer, query, workers=workers)
+
+
+def open_map(
+    path: Path | str,
+    preset: str = "classic",
+    *,
+    set: Changes | None = None,
+    features_dirs: Sequence[Path | str] = (),
+    pixel_origin: PixelOriginChoice = "auto",
+) -> Map:
+    """Open a kapture map, ours or another tool's, with all keypoints types that have points.
+
+    Parameters
+    ----------
+    preset, set : how it is localized in; ``{"localization.rank.name": "perceptual"}``.
+    features_dirs : folders with features beside the map.
+    pixel_origin : where the map's intrinsics put the pixel origin; auto finds it out.
+
+    Raises
+    ------
+    DataError : it is no map, or broken; names file and line.
+    """
+    opened = KaptureMap.open(
+        path, features_dirs=[Path(one) for one in features_dirs], pixel_origin=pixel_origin
+    )
+    return Map(opened, preset, set)
+
+
+def build_map(
+    mapping: Path | str,
+    preset: str = "classic",
+    *,
+    set: Changes | None = None,
+    workspace: Path | str | None = None,
+    workers: int = 1,
+) -> Map:
+    """Build a map of images with poses: features, pairs, matches, points, refinement.
+
+    Parameters
+    ----------
+    mapping : kapture folder with images and poses; it stays as it is.
+    workspace : where everything is kept, ``runs/MAPPING-PRESET`` unless given; what is done and
+        still true is kept, the map is its folder ``map``.
+    workers : processes; more than one needs ``if __name__ == "__main__":`` in a script.
+
+    Raises
+    ------
+    MeglocError : images, poses or options cannot be used.
+    """
+    source = KaptureFolder(mapping)
+    options = options_of_preset(preset, changes=[nested(set or {})])
+    place = Path(workspace or Path("runs") / f"{source.root.resolve().name}-{preset}")
+    stages = plan_map(source, options)
+    opened = Workspace(place)
+    with opened.lock(), single_threaded(), open_executor("processes", workers) as executor:
+        run_plan(stages, opened, Work(executor, num_threads=workers))
+    return open_map(opened.path(MAP), preset, set=set)
+
+
+@dataclass(frozen=True)
+class FinishedRun:
+    """A run of ``megloc eval`` and what it made.
+
+    Attributes
+    ----------
+    workspace : where everything is.
+    pose_file : what is handed in; a folder where it is several files.
+    """
+
+    workspace: Path
+    pose_file: Path
+    preset: str
+
+    @cached_property
+    def map(self) -> Map:
+        """The map."""
+        return open_map(self.workspace / MAP, self.preset)
+
+    @property
+    def localized(self) -> Path:
+        """Kapture folder of the localized queries, with ``status.csv``."""
+        return self.workspace / LOCALIZED
+
+    @property
+    def report(self) -> Path:
+        """The report as a page."""
+        return self.workspace / EVALUATION / "report.html"
+
+    @cached_property
+    def recall(self) -> pd.DataFrame:
+        """Recall by condition (rows) and threshold (columns); empty where no truth is known."""
+        import json
+
+        import pandas as pd
+
+        path = self.workspace / EVALUATION / "recall.json"
+        if not path.is_file():
+            return pd.DataFrame()
+        rows = json.loads(path.read_text(encoding="utf-8"))["rows"]
+        table = {
+            row["name"]: {_threshold(at["threshold"]): at["recall"] for at in row["recall"]}
+            for row in rows
+        }
+        return pd.DataFrame.from_dict(table, orient="index")
+
+
+def run(
+    dataset: str,
+    root: Path | str | None = None,
+    *,
+    preset: str | None = None,
+    set: Changes | None = None,
+    workspace: Path | str | None = None,
+    workers: int = 1,
+) -> FinishedRun:
+    """Run a benchmark as ``megloc eval`` does; what is done and still true is kept.
+
+    Parameters
+    ----------
+    root : the dataset as it is published; looked for below MEGLOC_DATA unless given.
+    preset : that of the dataset's benchmark file unless given.
+    set : options, ``{"localization.rank.name": "perceptual"}``.
+    workspace : ``runs/DATASET-PRESET`` unless given.
+    workers : processes; more than one needs ``if __name__ == "__main__":`` in a script.
+
+    Raises
+    ------
+    MeglocError : the dataset or the options cannot be used.
+    """
+    choice = choose_run(
+        dataset, None if root is None else Path(root), preset=preset, changes=[nested(set or {})]
+    )
+    opened = Workspace(Path(workspace or Path("runs") / f"{dataset}-{choice.preset}"))
+    with opened.lock(), single_threaded(), open_executor("processes", workers) as executor:
+        chosen = choice.run_in(opened)
+        run_plan(plan_evaluation(chosen), opened, Work(executor, num_threads=workers))
+    return FinishedRun(opened.root, chosen.submission_below(opened.root), choice.preset)
+
+
+def extract(features: str, image: Image, **options: Any) -> ImageFeatures:
+    """Local features of an image, by the name of their extractor.
+
+    Parameters
+    ----------
+    image : path of an image file, or uint8 (H, W, 3) RGB.
+    options : the extractor's.
+
+    Raises
+    ------
+    PluginError, MissingWeightsError : there is no such extractor, or it cannot be made.
+    """
+    pixels = image if isinstance(image, np.ndarray) else read_image_rgb(Path(image))
+    found = load_plugin(LOCAL_FEATURES, features, options).extract(pixels)
+    height, width = pixels.shape[:2]
+    return ImageFeatures(found.keypoints_px, found.descriptors, width, height)
+
+
+def match(
+    matcher: str, first: ImageFeatures, second: ImageFeatures, **options: Any
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Matches of two images by the name of a matcher: int64 (K, 2) rows, and scores (K,).
+
+    Raises
+    ------
+    PluginError, MissingWeightsError : there is no such matcher, or it cannot be made.
+    """
+    found: tuple[NDArray[np.int64], NDArray[np.float32]]
+    found = load_plugin(MATCHERS, matcher, options).match(first, second)
+    return found
+
+
+def solve_pose(
+    points_px: NDArray[Any],
+    points_world: NDArray[Any],
+    camera: Camera,
+    *,
+    max_error_px: float = 12.0,
+    min_inliers: int = 12,
+    seed: int = 0,
+) -> Pose | Failure:
+    """The pose of one image from 2D-3D matches: LO-RANSAC, then refinement with covariance.
+
+    Parameters
+    ----------
+    points_px : (N, 2), first pixel's centre at (0.5, 0.5).
+    points_world : (N, 3).
+    max_error_px : reprojection error of an inlier.
+
+    Raises
+    ------
+    DataError : the arrays do not have these shapes.
+    """
+    options = AbsolutePoseOptions(max_error_px=max_error_px, min_inliers=min_inliers, seed=seed)
+    return absolute_pose(points_px, np.asarray(points_world, np.float64), camera, options)
+
+
+def nested(changes: Changes) -> dict[str, Any]:
+    """Nested tables of options that are given by dotted names."""
+    tree: dict[str, Any] = {}
+    for key, value in changes.items():
+        *above, last = key.split(".")
+        place = tree
+        for part in above:
+            place = place.setdefault(part, {})
+        place[last] = value
+    return tree
+
+
+def _threshold(threshold: Mapping[str, float | None]) -> str:
+    metres = f"{threshold['position_m']:g} m"
+    return metres if threshold["angle_deg"] is None else f"{metres}, {threshold['angle_deg']:g} deg"

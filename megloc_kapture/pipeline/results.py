@@ -1,0 +1,167 @@
+"""Results of the images of a kapture folder: localized when asked for, saved as kapture."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.outputs import staged_output
+from megloc_kapture.pipeline.localizer import Localizer
+from megloc_kapture.pipeline.queries import KaptureQueries
+from megloc_kapture.stages.layout import LOCALIZED
+from megloc_kapture.stages.localized_folder import query_status, write_localized
+from megloc_kapture.stages.work import Track, untracked
+from megloc_kapture.values import Failure, Pose, RigidTransform
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Candidates = Mapping[str, Sequence[str]]
+
+
+class Results(Mapping[str, Pose | Failure]):
+    """Image name to result, in the order of the names (rigs: of their moments).
+
+    An image is localized when its result is asked for, together with those before it; what is
+    found is kept.
+
+    Parameters
+    ----------
+    folder : kapture folder of the queries, and their features where they bring some.
+    workers : threads that localize.
+    candidates : query name to the map images it is matched with, instead of retrieval.
+    track : shows progress.
+
+    Raises
+    ------
+    DataError : the folder or the map is broken, or features can neither be read nor extracted.
+    OptionError : no worker.
+    """
+
+    def __init__(
+        self,
+        localizer: Localizer,
+        folder: KaptureFolder | Path | str,
+        *,
+        workers: int = 1,
+        candidates: Candidates | None = None,
+        track: Track = untracked,
+    ) -> None:
+        if workers < 1:
+            raise OptionError(f"{workers} workers cannot work; give 1 or more")
+        self.localizer = localizer
+        self.folder = folder if isinstance(folder, KaptureFolder) else KaptureFolder(folder)
+        self.queries = KaptureQueries(self.folder, localizer.map)
+        # what is wrong is found before the first query
+        localizer.map.check()
+        self.queries.check()
+        _check_extractors(localizer, self.queries)
+        self._candidates = candidates
+        self._rigs = localizer.options.localization.rigs
+        self._units = self.queries.units(rigs=self._rigs)
+        self._found: dict[str, Pose | Failure | None] = {
+            name: None for unit in self._units for name in unit
+        }
+        self._stream = self._localized(workers, track)
+
+    def __getitem__(self, name: str) -> Pose | Failure:
+        found = self._found[name]
+        while found is None:
+            other, result = next(self._stream)
+            self._found[other] = result
+            found = self._found[name]
+        return found
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._found)
+
+    def __len__(self) -> int:
+        return len(self._found)
+
+    def save(self, output: Path | str, *, force: bool = False) -> dict[str, int]:
+        """Write a kapture folder of the localized images, with ``status.csv`` and its like.
+
+        Failed queries get what ``localization.fallback`` says.
+
+        Returns
+        -------
+        Counts: queries, localized, failed, fallbacks.
+
+        Raises
+        ------
+        OutputError : the folder has other things in it, unless ``force``.
+        """
+        with staged_output(Path(output), kind=LOCALIZED, force=force) as out:
+            return self.write_to(out)
+
+    def write_to(self, output: Path) -> dict[str, int]:
+        """As :meth:`save`, into a folder that is ours already."""
+        fallback = self.localizer.options.localization.fallback
+        best = self._best_candidates() if fallback == "retrieval" else {}
+        return write_localized(
+            output, self.folder, self.items(), fallback=fallback, first_candidates=best
+        )
+
+    def to_pandas(self) -> pd.DataFrame:
+        """One row per image: the columns of ``status.csv``, and the pose, NaN where there is none.
+
+        The pose is ``cam_from_world``: qw qx qy qz, tx ty tz in the map's unit.
+        """
+        import pandas as pd
+
+        rows = []
+        for name, result in self.items():
+            row: dict[str, Any] = query_status(name, result).model_dump()
+            row["candidates"] = list(row["candidates"])
+            if isinstance(result, Pose):
+                pose = result.cam_from_world
+                row |= dict(zip(("qw", "qx", "qy", "qz"), pose.quat_wxyz, strict=True))
+                row |= dict(zip(("tx", "ty", "tz"), pose.translation, strict=True))
+            rows.append(row)
+        return pd.DataFrame(rows).set_index("image")
+
+    def _localized(self, workers: int, track: Track) -> Iterator[tuple[str, Pose | Failure]]:
+        with ThreadPoolExecutor(workers) as executor:
+            units = self.queries.read_units(rigs=self._rigs)
+            results = self.localizer.localize_units(units, executor, candidates=self._candidates)
+            tracked = track(results, len(self._units), "localizing")
+            for names, found in zip(self._units, tracked, strict=True):
+                yield from zip(names, found, strict=True)
+
+    def _best_candidates(self) -> dict[str, tuple[str, RigidTransform]]:
+        """Failed query to its best candidate and that image's pose."""
+        poses = self.localizer.map.poses
+        best = {}
+        for name, result in self.items():
+            if result:
+                continue
+            if self._candidates is None:
+                ranked: Sequence[str] = self.localizer.ranked(self.queries.query(name))
+            else:
+                ranked = self._candidates.get(name, ())
+            first = next((image for image in ranked if image in poses), None)
+            if first is not None:
+                best[name] = (first, poses[first])
+        return best
+
+
+def _check_extractors(localizer: Localizer, queries: KaptureQueries) -> None:
+    """Make the extractors that queries without features need.
+
+    Raises
+    ------
+    DataError : there is no extractor for a type; names the first image that needs it.
+    PluginError, MissingWeightsError : it cannot be made.
+    """
+    for local in localizer.types:
+        lacking = queries.lacking(local.name)
+        if lacking is None:
+            continue
+        try:
+            _ = local.extractor
+        except DataError as error:
+            raise DataError(f"image {lacking!r}: {error.message}", path=error.path) from error

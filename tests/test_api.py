@@ -1,0 +1,145 @@
+"""The package in a few calls, on a rendered scene whose poses are known."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import megloc_kapture as megloc
+from megloc_kapture.cli.main import main
+from megloc_kapture.io.images import read_image_rgb
+from megloc_kapture.io.kapture_store import KaptureFolder
+
+SMALL = {
+    "local_features.options.max_keypoints": 800,
+    "global_features.options.num_clusters": 8,
+}
+
+
+@pytest.fixture(scope="module")
+def built(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> megloc.Map:
+    workspace = tmp_path_factory.mktemp("api") / "workspace"
+    return megloc.build_map(scene / "mapping", set=SMALL, workspace=workspace)
+
+
+def errors(scene: Path, name: str, pose: megloc.RigidTransform) -> tuple[float, float]:
+    """Metres and degrees from the true pose."""
+    truth = KaptureFolder(scene / "query_gt").read().poses()[name]
+    difference = pose @ truth.inverse()
+    centers = np.asarray(pose.center()) - np.asarray(truth.center())
+    angle = 2 * np.degrees(np.arccos(min(1.0, abs(difference.quat_wxyz[0]))))
+    return float(np.linalg.norm(centers)), float(angle)
+
+
+def test_a_map_of_images_with_poses(built: megloc.Map, scene: Path) -> None:
+    folder = KaptureFolder(scene / "query")
+    data = folder.read()
+    name = data.image_names()[0]
+    camera = data.camera_of(name)
+    for image in (folder.image_path(name), read_image_rgb(folder.image_path(name))):
+        found = built.localize(image, camera)
+        assert found, found
+        assert np.less(errors(scene, name, found.cam_from_world), (0.05, 0.5)).all()
+        assert found.covariance is not None and found.covariance.shape == (6, 6)
+
+
+def test_a_folder_is_localized_when_it_is_asked_for(
+    built: megloc.Map, scene: Path, tmp_path: Path
+) -> None:
+    results = built.localize(scene / "query")
+    names = KaptureFolder(scene / "query").read().image_names()
+    assert list(results) == names and len(results) == len(names)
+    last = results[names[-1]]
+    assert last and results[names[-1]] is last
+    for name in names:
+        found = results[name]
+        assert found and np.less(errors(scene, name, found.cam_from_world), (0.05, 0.5)).all()
+    with pytest.raises(KeyError):
+        _ = results["nowhere.jpg"]
+    table = results.to_pandas()
+    assert list(table.index) == names and set(table["status"]) == {"localized"}
+    assert table.loc[names[0], "tx"] == results[names[0]].cam_from_world.translation[0]  # type: ignore[union-attr]
+    counts = results.save(tmp_path / "localized")
+    assert counts == {"queries": 4, "localized": 4, "failed": 0, "fallbacks": 0}
+    assert set(KaptureFolder(tmp_path / "localized").read().poses()) == set(names)
+    with pytest.raises(megloc.OutputError, match="is not empty"):
+        (tmp_path / "mine").mkdir()
+        (tmp_path / "mine" / "file").touch()
+        results.save(tmp_path / "mine")
+
+
+def test_the_command_writes_the_same_bytes(built: megloc.Map, scene: Path, tmp_path: Path) -> None:
+    changes = [part for key, value in SMALL.items() for part in ("--set", f"{key}={value}")]
+    place = built.kapture_map.folder.root
+    query = scene / "query"
+    command = ["localize", "-i", str(place), "--query", str(query), "-o", str(tmp_path / "there")]
+    with pytest.raises(SystemExit) as end:
+        main([*command, "-q", *changes])
+    assert end.value.code == 0
+    built.localize(query, workers=2).save(tmp_path / "here")
+    for name in ("status.csv", "clusters.csv", "sensors/trajectories.txt"):
+        assert (tmp_path / "here" / name).read_bytes() == (tmp_path / "there" / name).read_bytes()
+
+
+def test_a_run_and_the_map_it_made(scene: Path, tmp_path: Path) -> None:
+    run = megloc.run("kapture", scene, set=SMALL, workspace=tmp_path / "run")
+    assert run.recall.loc["all", "0.25 m, 2 deg"] == 1.0
+    assert run.pose_file.is_file() and run.report.is_file()
+    assert set(KaptureFolder(run.localized).read().poses()) == set(
+        run.map.localize(scene / "query")
+    )
+    before = {path: path.stat().st_mtime_ns for path in run.workspace.glob("stages/[a-z]*.json")}
+    again = megloc.run("kapture", scene, set=SMALL, workspace=tmp_path / "run")
+    assert again.recall.equals(run.recall)
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+
+
+def test_features_matches_and_a_pose_by_arrays(built: megloc.Map, scene: Path) -> None:
+    mapping, query = KaptureFolder(scene / "mapping"), KaptureFolder(scene / "query")
+    name, other = query.read().image_names()[0], mapping.read().image_names()[0]
+    first = megloc.extract("rootsift", query.image_path(name), max_keypoints=800)
+    second = megloc.extract("rootsift", mapping.image_path(other), max_keypoints=800)
+    matches, scores = megloc.match("nn", first, second)
+    assert matches.shape == (len(scores), 2) and len(matches) > 50
+    assert len(np.unique(matches[:, 0])) == len(matches)
+
+    rng = np.random.default_rng(0)
+    camera = megloc.Camera.pinhole(640, 480, 500)
+    points = rng.uniform((-2, -2, 4), (2, 2, 8), (60, 3))
+    points_px = 500 * points[:, :2] / points[:, 2:] + (320, 240)
+    found = megloc.solve_pose(points_px, points, camera)
+    assert found and np.allclose(found.cam_from_world.translation, 0, atol=1e-6)
+    failed = megloc.solve_pose(rng.uniform(0, 480, (60, 2)), points, camera)
+    assert not failed and failed.reason
+
+
+def test_refused(built: megloc.Map, scene: Path, tmp_path: Path) -> None:
+    image = next((scene / "query").rglob("*.jpg"))
+    with pytest.raises(megloc.OptionError, match="an image needs its camera"):
+        built.localize(image)
+    with pytest.raises(megloc.OptionError, match="has cameras of its own"):
+        camera: Any = megloc.Camera.pinhole(64, 48, 50)
+        built.localize(KaptureFolder(scene / "query"), camera)
+    with pytest.raises(megloc.DataError, match="nowhere"):
+        megloc.open_map(tmp_path / "nowhere").localize(scene / "query")
+    with pytest.raises(megloc.OptionError, match="unknown option localization.speed"):
+        megloc.open_map(built.kapture_map.folder.root, set={"localization.speed": 1}).localize(
+            scene / "query"
+        )
+    with pytest.raises(megloc.OptionError, match="come with no model"):
+        megloc.build_map(scene / "mapping", set={"map": "given"}, workspace=tmp_path / "given")
+    assert not (tmp_path / "given").exists()
+
+
+def test_importing_the_package_loads_no_network_and_no_solver() -> None:
+    code = (
+        "import sys, megloc_kapture\n"
+        "print(sorted({'torch', 'scipy', 'pandas', 'numba', 'cv2', 'pycolmap'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
