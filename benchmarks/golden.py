@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from paper_on_twins import SMALL_NETWORKS, SMALL_WORLDS
+from paper_on_twins import DATASETS, SMALL_NETWORKS, SMALL_WORLDS
 from whole_preset import WIRINGS, Megloc, add_weights, program, weights_environment
 from whole_preset_weights import write_random_weights
 
@@ -68,11 +68,12 @@ def cases(place: Path) -> Iterator[Case]:
         yield Case("virtual_gallery-classic", "free", ("localize", *maps))
     for preset in ("classic", "modern", "megloc"):
         sizes = [part for change in SMALL[preset] for part in ("--set", change)]
-        for twin in SMALL_WORLDS:
-            root = ("--root", str(place / "worlds" / twin))
+        wiring = "random" if preset == "megloc" else "free"
+        for twin in DATASETS:
+            root = ("--root", str(place / "worlds" / wiring / twin))
             yield Case(
                 f"{twin}-{preset}",
-                "random" if preset == "megloc" else "free",
+                wiring,
                 ("eval", f"synthetic-{twin}", *root, "--preset", preset, *sizes),
             )
 
@@ -105,8 +106,9 @@ def execute(case: Case, place: Path, output: Path) -> float:
 
 def render(root: Path, megloc: Megloc) -> None:
     """Render a twin unless its folder is there."""
-    if root.name in SMALL_WORLDS and not root.is_dir():
-        world = [part for change in SMALL_WORLDS[root.name] for part in ("--set", change)]
+    worlds = SMALL_WORLDS.get(root.parent.name, {})
+    if root.name in worlds and not root.is_dir():
+        world = [part for change in worlds[root.name] for part in ("--set", change)]
         megloc("synth", ["synth", root.name, "-o", str(root), *world])
 
 

@@ -246,6 +246,9 @@ CASES: dict[str, Case] = {
         scene="with_depth",
         localize_value='["icp"]',  # this dataset's file has icp
     ),
+    "stages": Case(
+        "{nothing={}}", refused="no plugin 'nothing' in megloc_kapture.stages", localize=OF_MAPS
+    ),
     "pose_refinement.max_references": Case(
         "1", context=('pose_refinement.by=["rendering"]',), scene="with_depth"
     ),
