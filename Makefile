@@ -4,7 +4,7 @@
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .SUFFIXES:
-.PHONY: help venv eval test test-slow test-all lint bench kloc-env clean
+.PHONY: help venv eval test test-slow test-all lint docs bench kloc-env clean
 
 # make eval
 DATASET ?= synthetic-aachen
@@ -34,6 +34,7 @@ help:
 	@echo 'make test-slow  run those that it leaves out: whole runs; BUDGET_S=seconds to begin none later'
 	@echo 'make test-all   run all tests, the property tests with many new examples'
 	@echo 'make lint       check style, types and the import contracts'
+	@echo 'make docs       write the API reference into build/docs, from the docstrings'
 	@echo 'make bench      measure speed; SCENE=folder, KLOC_PYTHON=.venv-kloc/bin/python to compare'
 	@echo 'make kloc-env   build .venv-kloc: kapture-localization with its old packages, and COLMAP'
 	@echo 'make clean      remove caches; leaves .venv, runs/ and submissions/ alone'
@@ -65,6 +66,9 @@ lint: $(STAMP)
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports --no-cache --no-logo
 
+docs: $(STAMP)
+	@$(BIN)/python scripts/api_reference.py build/docs
+
 bench: $(STAMP)
 	@$(BIN)/python benchmarks/speed/run.py --scene '$(SCENE)' \
 		$(if $(KLOC_PYTHON),--kloc-python '$(KLOC_PYTHON)') $(ARGS)
@@ -83,6 +87,6 @@ $(STAMP):
 		{ test -x $(BIN)/python || "$$python" -m venv $(VENV); }
 	@echo 'Setting up $(VENV), once: about 2 GB of packages, a few minutes.'
 	@$(INSTALL) $(if $(TORCH_INDEX),--index-url '$(TORCH_INDEX)') -c constraints.txt torch
-	@$(INSTALL) -c constraints.txt -e '.[dev]'
+	@$(INSTALL) -c constraints.txt -e '.[dev,docs]'
 	@$(INSTALL) -c constraints.txt --no-deps kapture-localization
 	@rm -f $(VENV)/.installed-* && touch $@

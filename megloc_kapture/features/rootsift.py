@@ -1,7 +1,7 @@
 """RootSIFT local features (Arandjelovic and Zisserman, CVPR 2012, section 3).
 
 OpenCV's SIFT is used rather than pycolmap's: 2 to 5 times faster per image, with matches that fit
-the true poses as well (docs/choices.md; measured by benchmarks/speed/sift.py).
+the true poses as well (docs/experiments/features.md; measured by benchmarks/speed/sift.py).
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ covariance C for a noise of 1 px, the residual's is ``sigma^2 (I + m^2 J C J^T)`
 is Mahalanobis'; m is the noise of the map's keypoints as a share of sigma, which also has what
 viewpoint, calibration and the map's poses do to a query. The Cauchy loss' scale follows the
 residuals: a map that is good to a tenth of a pixel and one that is good to three need different
-ones (figures in docs/choices.md).
+ones (figures in docs/experiments/pose.md).
 
 A pose that its inliers do not determine, or place too badly to be of use, is a failure.
 """

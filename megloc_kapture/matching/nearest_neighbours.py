@@ -20,7 +20,7 @@ _BLOCK_ROWS = 512
 
 
 class NearestNeighbourOptions(Options):
-    """Options of nearest-neighbour matching; the defaults are measured in docs/choices.md."""
+    """Options of nearest-neighbour matching; defaults: docs/experiments/matching.md."""
 
     mutual: bool = True
     max_ratio: float | None = Field(

@@ -25,7 +25,7 @@ from megloc_kapture.values import Options
 # every step of the paper that needs nothing of the dataset; what hangs on it (masks, co-visibility,
 # sequences, weights for rooms) stands in benchmarks/*.toml, and docs/paper.md has all of them
 _MEGLOC = PipelineOptions(
-    # cameras without distortion stay as they are; enlarging is measured in docs/choices.md
+    # cameras without distortion stay as they are; enlarging: docs/experiments/preprocessing.md
     preprocessing=PreprocessingOptions(max_size_px=1600, upscale=True, undistort=True),
     local_features=(
         LocalFeaturesChoice(name="superpoint", matching=PluginChoice(name="superglue")),
@@ -44,7 +44,7 @@ _MEGLOC = PipelineOptions(
     guided_pyramid=GuidedPyramidOptions(mode="all"),
     refinement=MapRefinementOptions(uncertainty=UncertaintyOptions(max_robust_sigmas=2.5)),
 )
-# chosen by benchmarks/features.py among weights that are free for any use: docs/choices.md
+# chosen by benchmarks/features.py among weights free for any use: docs/experiments/presets.md
 _MODERN = PipelineOptions(
     preprocessing=PreprocessingOptions(max_size_px=1600),
     local_features=(

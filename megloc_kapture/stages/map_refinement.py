@@ -69,7 +69,7 @@ Mask = NDArray[np.bool_]
 
 
 class MapRefinementOptions(Options):
-    """What is taken out of a map; figures behind the defaults stand in docs/choices.md."""
+    """What is taken out of a map; defaults: docs/experiments/map-refinement.md."""
 
     depth: DepthVerificationOptions = DepthVerificationOptions()
     consistency: ConsistencyOptions = ConsistencyOptions()

@@ -1,0 +1,211 @@
+"""The examples and links of README.md and docs/, as their readers meet them."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import megloc_kapture
+from megloc_kapture.cli.main import main
+from megloc_kapture.features.vlad import VladOptions
+from megloc_kapture.plugins import PluginChoice
+from megloc_kapture.stages.options import PipelineOptions
+from megloc_kapture.values import Options
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+PAGES = sorted([REPOSITORY / "README.md", *(REPOSITORY / "docs").rglob("*.md")])
+NAMES = [str(page.relative_to(REPOSITORY)) for page in PAGES]
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    """Contents of the fenced blocks of a language, '' for those without one."""
+    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(), flags=re.DOTALL | re.M)
+
+
+def commands(page: Path) -> list[list[str]]:
+    """Words of each ``megloc`` command in a page's blocks."""
+    lines = "".join(blocks(page, "")).replace("\\\n", " ").splitlines()
+    return [shlex.split(line, comments=True) for line in lines if line.startswith("megloc ")]
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors that GitHub makes of a page's headings."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.M)
+    headings = re.findall(r"^#+ (.*)$", text, flags=re.M)
+    plain = (re.sub(r"[^\w\- ]", "", heading.lower()) for heading in headings)
+    return {heading.replace(" ", "-") for heading in plain}
+
+
+def test_python_examples_pass_a_strict_type_checker(tmp_path: Path) -> None:
+    examples = [example for page in PAGES for example in blocks(page, "python")]
+    assert len(examples) >= 2
+    for number, example in enumerate(examples):
+        (tmp_path / f"example_{number}.py").write_text(example)
+    # errors of the package itself are what `make lint` is for
+    options = ["--strict", "--config-file=", "--follow-imports=silent", "--cache-dir=cache"]
+    done = subprocess.run(
+        [sys.executable, "-m", "mypy", *options, *sorted(tmp_path.glob("example_*.py"))],
+        cwd=tmp_path,
+        env={**os.environ, "MYPYPATH": str(REPOSITORY)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_links_lead_somewhere(page: Path) -> None:
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.M)
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        if re.match(r"https?://", target):
+            continue
+        path, _, anchor = target.partition("#")
+        other = (page.parent / path).resolve() if path else page
+        assert other.exists(), target
+        assert not anchor or anchor in anchors(other), target
+
+
+def test_every_page_is_reached_from_readme() -> None:
+    reached, to_read = set(), [REPOSITORY / "README.md"]
+    while to_read:
+        page = to_read.pop()
+        if page not in reached and page.suffix == ".md":
+            reached.add(page)
+            found = re.findall(r"\]\(([^)#\s]+\.md)", page.read_text())
+            to_read += [(page.parent / one).resolve() for one in found if "://" not in one]
+    assert set(PAGES) <= reached
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_files_of_the_repository_that_are_named_exist(page: Path) -> None:
+    # the tutorial's package and the scenes lie elsewhere
+    elsewhere = ("my_plugins", "redkitchen_rgbd")
+    for name in re.findall(r"(?<![\w/])(\w+/[\w/]+\.py)\b", page.read_text()):
+        if not name.startswith(elsewhere):
+            folders = (REPOSITORY, REPOSITORY / "megloc_kapture")
+            assert any((folder / name).is_file() for folder in folders), name
+
+
+def test_commands_have_their_options(capsys: pytest.CaptureFixture[str]) -> None:
+    known: dict[str, str] = {}
+    for page in PAGES:
+        for _, *words in commands(page):
+            nested = 2 if words[0] in ("weights", "import") else 1
+            command = words[:nested]
+            name = " ".join(command)
+            if name not in known:
+                with pytest.raises(SystemExit) as end:
+                    main([*command, "--help"])
+                assert end.value.code == 0, name
+                known[name] = capsys.readouterr().out
+            for word in words[nested:]:
+                if re.match(r"--?[a-z]", word):
+                    assert re.search(rf"{word}\b", known[name]), f"{page.name}: {name} {word}"
+
+
+def shown(value: Any) -> str:
+    """A default as docs/options.md writes it."""
+    if isinstance(value, PluginChoice):
+        return value.name
+    if isinstance(value, tuple | list):
+        return f"[{', '.join(shown(one) for one in value)}]"
+    if value is None or isinstance(value, bool):
+        return str(value).lower()
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def defaults(model: type[Options], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Key and default of each option of a model and the models in it."""
+    for name, field in model.model_fields.items():
+        value = field.get_default(call_default_factory=True)
+        if isinstance(value, Options) and not isinstance(value, PluginChoice):
+            yield from defaults(type(value), f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", shown(value)
+
+
+def test_every_option_stands_in_the_table_with_its_default() -> None:
+    text = (REPOSITORY / "docs" / "options.md").read_text()
+    pipeline, of_plugins = text.split("## Options of plugins")
+    assert dict(re.findall(r"^\| `([\w.]+)` \| `(.*?)` \|", pipeline, flags=re.M)) == dict(
+        defaults(PipelineOptions)
+    )
+    rows = re.findall(r"^\| `(\w+)`, `(\w+)` \| `(.*?)` \|", of_plugins, flags=re.M)
+    assert len(rows) > 5
+    for plugin, option, default in rows:
+        found = [one for one in entry_points(name=plugin) if one.group.startswith("megloc_kapture")]
+        model = VladOptions if plugin == "vlad" else found[0].load().Options
+        assert shown(model.model_fields[option].default) == default, (plugin, option)
+
+
+@pytest.mark.slow
+def test_the_stages_one_by_one(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "my_scene").symlink_to(scene)
+    # what needs weights, or many runs
+    absent = ("deeplabv3plus", "--ablate")
+    for _, *words in commands(REPOSITORY / "docs" / "stages.md"):
+        if any(word in absent for word in words):
+            continue
+        inline = [] if words[0] in ("info", "localize", "evaluate") else ["--executor", "inline"]
+        with pytest.raises(SystemExit) as end:
+            main([*words, *inline])
+        assert end.value.code == 0, (words, capsys.readouterr().err)
+    assert "100.0 / 100.0 / 100.0 / 100.0" in capsys.readouterr().out
+
+
+def test_the_plugins_of_the_tutorial(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = REPOSITORY / "docs" / "plugins.md"
+    source, site = tmp_path / "my_plugins", tmp_path / "site"
+    source.mkdir()
+    (pyproject,), (module,) = blocks(page, "toml"), blocks(page, "python")
+    (source / "pyproject.toml").write_text(pyproject)
+    (source / "my_plugins.py").write_text(module)
+    pip = [sys.executable, "-m", "pip", "install", "-q", "--disable-pip-version-check"]
+    alone = ["--no-index", "--no-deps", "--no-build-isolation", "--target", str(site)]
+    done = subprocess.run([*pip, *alone, str(source)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    shutil.rmtree(source)
+
+    monkeypatch.syspath_prepend(site)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "my_scene").symlink_to(scene)
+    try:
+        for number, (_, *words) in enumerate(commands(page)):
+            with pytest.raises(SystemExit) as end:
+                main([*words, "--executor", "inline", "--workspace", f"run_{number}"])
+            out, err = capsys.readouterr()
+            assert end.value.code == 0, err
+            assert "100.0 / 100.0 / 100.0 / 100.0" in out
+    finally:
+        sys.modules.pop("my_plugins", None)
+
+
+def test_the_api_reference_has_the_public_names_and_no_module_below(tmp_path: Path) -> None:
+    script = REPOSITORY / "scripts" / "api_reference.py"
+    done = subprocess.run(
+        [sys.executable, str(script), str(tmp_path)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "does not resolve" not in done.stderr
+    page = (tmp_path / "megloc_kapture.html").read_text()
+    for name in megloc_kapture.__all__:
+        assert f'id="{name}"' in page
+    assert 'id="Localizer.localize_many"' in page
+    assert {path.stem for path in tmp_path.rglob("*.html")} == {
+        *("index", "megloc_kapture", "plugins", "values", "errors")
+    }
