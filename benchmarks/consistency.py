@@ -22,7 +22,7 @@ from refinement import REGARDLESS, Thresholds
 from scenes import errors_of, megloc
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.datasets.grammars.inloc_files import read_transformation, write_transformation
+from megloc_kapture.datasets.formats.inloc_files import read_transformation, write_transformation
 from megloc_kapture.io.consistency_table import CONSISTENCY_FILE, read_consistency
 from megloc_kapture.io.refinement_table import REFINEMENT_FILE, read_refinement
 from megloc_kapture.values import RigidTransform

@@ -207,10 +207,9 @@ def prefixed(prefix: str) -> Callable[[str], str]:
 def _renamed(data: KaptureData, rename: Callable[[str], str], *, is_truth: bool) -> KaptureData:
     """The queries' records under their names in the workspace, with poses or with depth."""
     depth = {} if is_truth else data.records_depth
-    return KaptureData(
-        sensors=dict(data.sensors),
-        rigs={rig: dict(members) for rig, members in data.rigs.items()},
-        trajectories=dict(data.trajectories) if is_truth else {},
+    return replace(
+        data,
+        trajectories=data.trajectories if is_truth else {},
         records_camera={key: rename(name) for key, name in data.records_camera.items()},
         records_depth={key: rename(name) for key, name in depth.items()},
     )
@@ -224,12 +223,12 @@ def _link_queries(source: Path, output: Path, prefix: str) -> None:
         folder = source.resolve() / "sensors" / name
         if not folder.exists():
             continue
-        place = output / "sensors" / name / prefix.rstrip("/")
+        link = output / "sensors" / name / prefix.rstrip("/")
         try:
-            place.parent.mkdir(parents=True, exist_ok=True)
-            place.symlink_to(folder.resolve(), target_is_directory=True)
+            link.parent.mkdir(parents=True, exist_ok=True)
+            link.symlink_to(folder.resolve(), target_is_directory=True)
         except OSError as error:
-            raise output_error(place, error) from error
+            raise output_error(link, error) from error
 
 
 def _write_side_tables(
@@ -240,7 +239,7 @@ def _write_side_tables(
     query_data: KaptureData,
     protocol_change: Callable[[Protocol], Protocol] | None,
 ) -> None:
-    source, place = root / SIDE_TABLES, output / SIDE_TABLES
+    source, target = root / SIDE_TABLES, output / SIDE_TABLES
     of_map, of_query = set(map_data.image_names()), set(query_data.image_names())
     groups: dict[str, ImageGroup] = {}
     for name, group in read_groups(source).items():
@@ -250,17 +249,17 @@ def _write_side_tables(
         if name in of_map or name not in of_query:
             groups[name] = group
     if groups:
-        write_groups(place, groups)
+        write_groups(target, groups)
     priors = read_priors(source)
     if priors:
-        write_priors(place, {rename(query): permitted for query, permitted in priors.items()})
+        write_priors(target, {rename(query): permitted for query, permitted in priors.items()})
     names = read_names(source)
     if names:
-        write_names(place, {rename(query): name for query, name in names.items()})
+        write_names(target, {rename(query): name for query, name in names.items()})
     pairs = read_relocalization(source)
     if pairs:
-        write_relocalization(place, [replace(pair, query=rename(pair.query)) for pair in pairs])
+        write_relocalization(target, [replace(pair, query=rename(pair.query)) for pair in pairs])
     protocol = read_protocol(source)
-    write_protocol(place, protocol_change(protocol) if protocol_change else protocol)
+    write_protocol(target, protocol_change(protocol) if protocol_change else protocol)
     if (source / WORLD_FILE).is_file():
-        write_world(place, read_world(source))
+        write_world(target, read_world(source))

@@ -60,7 +60,7 @@ def parents(root: Path) -> tuple[Path, ...]:
 
 
 def without_model(root: Path) -> OptionError:
-    """What says that a dataset's own model is asked for where kapture folders are."""
+    """The error where a dataset's own model is asked for and kapture folders are there."""
     return OptionError(
         f"the reference model is read from the official layout, and {root} has kapture folders; "
         "in a kapture map megloc localize localizes"
@@ -68,7 +68,7 @@ def without_model(root: Path) -> OptionError:
 
 
 def is_kapture(folder: Path) -> bool:
-    """Whether a folder is a kapture."""
+    """True where a folder is a kapture."""
     return (folder / SENSORS).is_file()
 
 

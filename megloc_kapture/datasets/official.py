@@ -1,4 +1,4 @@
-"""What an adapter makes of a dataset's official layout, and how it becomes kapture folders.
+"""A dataset as its adapter read it from the official layout, and its kapture folders.
 
 An adapter (group ``megloc_kapture.datasets``) reads; :func:`write_official` writes, the same way
 for every dataset: ``mapping/``, ``query/``, ``query_gt/`` where truth is known, ``megloc/`` and,
@@ -7,11 +7,12 @@ where asked for, ``reference/``, the model the dataset ships. Images are linked.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
 from megloc_kapture.datasets.kapture_folders import MAPPING, QUERY, QUERY_GT
+from megloc_kapture.datasets.reference_map import ReferenceModel, write_reference_map
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.challenge_tables import (
     RelocalizationPair,
@@ -39,7 +40,7 @@ _MISSING_SHOWN = 5
 
 
 class DatasetCard(Options):
-    """Where a dataset is published and how it has to lie on disk; for messages.
+    """The address of a dataset and its layout on disk; for messages.
 
     Parameters
     ----------
@@ -55,6 +56,13 @@ class DatasetCard(Options):
     size: str
     folders: tuple[str, ...]
     layout: str
+
+    def without(self, root: Path, absent: Sequence[str]) -> DataError:
+        """The error for a folder that is not this dataset, as it has no folders of these names."""
+        return DataError(
+            f"not {self.title}, no folder {' and '.join(absent)}; it has to lie as {self.layout}",
+            path=root,
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,14 +88,14 @@ class Missing:
     files: list[Path] = field(default_factory=list)
 
     def require(self, file: Path) -> bool:
-        """Whether ``file`` exists; remembered if not."""
+        """Return True where ``file`` exists; else remember it as missing."""
         if file.exists():
             return True
         self.files.append(file)
         return False
 
     def by_folder(self) -> list[str]:
-        """What is missing, a text for each folder, sorted."""
+        """The missing files, a text for each folder, sorted."""
         folders: dict[Path, list[str]] = {}
         for file in self.files:
             folders.setdefault(file.parent, []).append(file.name)
@@ -134,8 +142,9 @@ class OfficialDataset:
     summary : what was found beside what is published.
     remarks : what a user should know, a sentence each.
     missing : what is not there.
-    write_more : writes what else belongs to the dataset (depth maps below ``mapping``, the
-        reference model) below the folder it is given.
+    reference : the model the dataset ships, where it is asked for.
+    write_more : writes what else belongs to the dataset (depth maps below ``mapping``) below the
+        folder it is given.
     """
 
     mapping: KaptureData
@@ -152,6 +161,7 @@ class OfficialDataset:
     summary: Sequence[Count] = ()
     remarks: Sequence[str] = ()
     missing: Missing | None = None
+    reference: ReferenceModel | None = None
     write_more: Callable[[Path], None] | None = None
 
 
@@ -192,6 +202,16 @@ def write_official(dataset: OfficialDataset, output: Path, *, allow_missing: boo
         write_names(tables, dataset.names)
     if dataset.relocalization:
         write_relocalization(tables, dataset.relocalization)
+    if dataset.reference is not None:
+        names, points = dataset.reference.read()
+        write_reference_map(
+            output / REFERENCE,
+            dataset.mapping,
+            dataset.links,
+            names,
+            points,
+            database=dataset.reference.database,
+        )
     if dataset.write_more is not None:
         dataset.write_more(output)
 
@@ -235,35 +255,7 @@ def read_ground_truth(
 
 def with_poses(data: KaptureData, poses: Mapping[tuple[int, str], RigidTransform]) -> KaptureData:
     """``data`` with these trajectories, by (timestamp, device), instead of its own."""
-    return KaptureData(
-        sensors=dict(data.sensors),
-        rigs={rig: dict(members) for rig, members in data.rigs.items()},
-        trajectories=dict(poses),
-        records_camera=dict(data.records_camera),
-    )
-
-
-def without_images(data: KaptureData, gone: Iterable[str]) -> KaptureData:
-    """``data`` without the records of these images, and poses and sensors nothing needs."""
-    left_out = set(gone)
-    records = {key: name for key, name in data.records_camera.items() if name not in left_out}
-    times = {timestamp for timestamp, _ in records}
-    used = {sensor for _, sensor in records} | {s for _, s in data.records_depth}
-    rigs = {
-        rig: {sensor: pose for sensor, pose in members.items() if sensor in used}
-        for rig, members in data.rigs.items()
-    }
-    return KaptureData(
-        sensors={key: sensor for key, sensor in data.sensors.items() if key in used},
-        rigs={rig: members for rig, members in rigs.items() if members},
-        trajectories={
-            (timestamp, device): pose
-            for (timestamp, device), pose in data.trajectories.items()
-            if (timestamp, device) in records or (device in data.rigs and timestamp in times)
-        },
-        records_camera=records,
-        records_depth=dict(data.records_depth),
-    )
+    return replace(data, trajectories=dict(poses), records_depth={})
 
 
 def last_part(image: str) -> str:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.datasets.grammars.colmap_database import ColmapDatabase
-from megloc_kapture.datasets.grammars.sparse_points import SparsePoints, image_order
+from megloc_kapture.datasets.formats.colmap_database import ColmapDatabase
+from megloc_kapture.datasets.formats.sparse_points import SparsePoints, image_order
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.kapture_store import (
     FeatureConfig,
@@ -28,6 +29,20 @@ _KEYPOINTS = FeatureConfig("SIFT", np.dtype(np.float32), 2)
 _MAX_SHIFT_PX = 1.0
 
 
+@dataclass(frozen=True)
+class ReferenceModel:
+    """The model a dataset ships.
+
+    Parameters
+    ----------
+    read : returns the names of its images, in its order, and its points.
+    database : COLMAP database with its features; None where there is none.
+    """
+
+    read: Callable[[], tuple[Sequence[str], SparsePoints]]
+    database: Path | None
+
+
 def write_reference_map(
     output: Path,
     data: KaptureData,
@@ -43,7 +58,7 @@ def write_reference_map(
     Row i of ``points3d.txt`` is point i of the model. Images of the model that ``data`` does not
     record are left out, with their observations. Without a database the keypoints of an image are
     those that see points, in the order of their ids in the model, numbered anew without gaps; of
-    two places for one feature the first counts. With one they are all keypoints of the database,
+    two positions for one feature the first counts. With one they are all keypoints of the database,
     under its numbers, beside their descriptors, and an image that has none there has empty ones,
     as if they had been extracted. An image that sees a point twice with the same
     feature does so once.
@@ -238,10 +253,10 @@ def _write_features(
     ends = np.cumsum([0, *np.bincount(points.image_ids, minlength=len(image_names)).tolist()])
     numbers = np.zeros(len(order), np.int32)
     kept = np.zeros(len(order), np.bool_)
-    places = np.zeros(len(image_names), np.int32)
-    for place, name in enumerate(names):
+    new_ids = np.zeros(len(image_names), np.int32)
+    for new_id, name in enumerate(names):
         position = positions[name]
-        places[position] = place
+        new_ids[position] = new_id
         # ascending, as the order among equals is kept
         rows = order[ends[position] : ends[position + 1]]
         keypoints, numbers_of_image = features.of_image(name, rows)
@@ -254,13 +269,13 @@ def _write_features(
         writer.type_name,
         tuple(names),
         points.point_ids[selected],
-        places[points.image_ids[selected]],
+        new_ids[points.image_ids[selected]],
         numbers[selected],
     )
 
 
 def _first_time(point_ids: NDArray[np.int64], numbers: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Where a pair of a point and a keypoint stands for the first time."""
+    """Mask (O,) of the first observations of each pair of a point and a keypoint."""
     first = np.ones(len(point_ids), np.bool_)
     # points ascend: only where one repeats can a pair do so
     if len(point_ids) and (point_ids[1:] == point_ids[:-1]).any():

@@ -1,23 +1,30 @@
-"""Variables of MATLAB's MAT files of level 5, plain data only; written by MATLAB's ``save -v7``.
+"""Variables of MATLAB's MAT files (level 5, as ``save -v7`` writes them), plain data only.
 
-SciPy's reader says of itself that it is not made for files from strangers: a wrong type code lets
-it follow a wild pointer. This one takes numbers, text, cells and structs, and skips everything
-else (objects, functions, sparse and complex arrays), whose size every element tells.
+:func:`read_mat` reads all of a file, :func:`read_mat_array` one array of a large one, of which
+nothing else is unpacked. SciPy's reader says of itself that it is not made for files from
+strangers: a wrong type code lets it follow a wild pointer. This one takes numbers, text, cells and
+structs, and skips everything else (objects, functions, sparse and complex arrays), whose size
+every element tells; counts are believed only as far as the file's bytes can bear them.
 
 Format: MathWorks, MAT-File Format, chapter 1, level 5.
 """
 
 from __future__ import annotations
 
+import io
 import math
 import struct
 import zlib
-from typing import Any, TypeAlias
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
+from megloc_kapture.io.atomic import write_bytes
+from megloc_kapture.io.kapture_csv import read_content
 
 MatValue: TypeAlias = "NDArray[Any] | str | list[MatValue] | dict[str, MatValue] | None"
 """Numbers (MATLAB's shape), text, a cell or an array of structs, one struct; None: not read."""
@@ -25,6 +32,7 @@ MatValue: TypeAlias = "NDArray[Any] | str | list[MatValue] | dict[str, MatValue]
 _HEADER = 128
 _ENDIAN = {b"IM": "<", b"MI": ">"}
 _LEVEL_5, _LEVEL_7_3 = 0x0100, 0x0200
+_HDF5_MARK = b"\x89HDF\r\n\x1a\n"
 _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8"} | {
     12: "i8",
     13: "u8",
@@ -35,11 +43,23 @@ _CELL, _STRUCT, _CHAR, _NUMBERS = 1, 2, 4, range(6, 16)
 _COMPLEX = 0x0800
 _DEEPEST = 32  # cells in structs in cells: a file that goes on is refused
 _LARGEST = 1 << 31  # bytes of one variable unpacked; NetVLAD's has 0.6e9
+_MAX_RATIO = 1032  # no stream of zlib unpacks to more than this many times its size
+_HEAD_BYTES = 512  # enough for an array's flags, dimensions and name
 _CHUNK = 1 << 20
 
 
 class _BrokenError(ValueError):
-    """The bytes are no MAT file; becomes a DataError that names the file."""
+    """The bytes are no MAT file; becomes a DataError that names the file and the variable."""
+
+
+class _Head(NamedTuple):
+    """The beginning of an array; ``values_at`` is the offset of its values."""
+
+    kind: int
+    is_complex: bool
+    shape: tuple[int, ...]
+    name: str
+    values_at: int
 
 
 def read_mat(content: bytes, where: str) -> dict[str, MatValue]:
@@ -52,38 +72,126 @@ def read_mat(content: bytes, where: str) -> dict[str, MatValue]:
 
     Raises
     ------
-    DataError : no MAT file of level 5, damaged, or larger unpacked than 2 GiB.
+    DataError : no MAT file of level 5, damaged, or larger unpacked than 2 GiB; names the file and
+        the byte where the broken variable begins.
     """
-    try:
-        order = _byte_order(content)
-        found: dict[str, MatValue] = {}
-        at = _HEADER
-        while at < len(content):
-            kind, body, at = _element(memoryview(content), at, order)
+    order = _byte_order(content, where)
+    found: dict[str, MatValue] = {}
+    for offset, kind, body in _variables(content, order, where):
+        with _Named(where, offset):
             if kind == _COMPRESSED:
                 kind, body, _ = _element(_unpacked(body, order), 0, order)
             if kind == _MATRIX:
                 name, value = _matrix(body, order, 0)
                 found[name] = value
-        return found
-    except (_BrokenError, struct.error, UnicodeDecodeError, zlib.error) as error:
-        raise DataError(f"not a MAT file that can be read: {error}", path=where) from error
+    return found
 
 
-def _byte_order(content: bytes) -> str:
-    order = _ENDIAN.get(content[_HEADER - 2 : _HEADER])
-    if order is None:
-        raise _BrokenError("it is none of level 5, as MATLAB's save -v7 writes them")
-    version = struct.unpack_from(order + "H", content, _HEADER - 4)[0]
-    if version == _LEVEL_7_3:
-        raise _BrokenError("it is of level 7.3 (HDF5); save it with -v7")
-    if version != _LEVEL_5:
-        raise _BrokenError(f"its level is {version:#x}, not {_LEVEL_5:#x}")
+def read_mat_array(path: Path | str, name: str) -> NDArray[np.float64]:
+    """Read the array ``name`` of real numbers; other variables are neither unpacked nor kept.
+
+    Returns
+    -------
+    float64, of the shape it has in MATLAB.
+
+    Raises
+    ------
+    DataError : missing, truncated, another format, no such variable, or it is no array of real
+        numbers; names the file, and the byte where the variable begins.
+    """
+    path = Path(path)
+    content = read_content(path, text=False)
+    order = _byte_order(content, path)
+    names = []
+    for offset, kind, body in _variables(content, order, path):
+        with _Named(path, offset):
+            if kind not in (_MATRIX, _COMPRESSED):
+                raise _BrokenError(f"data type {kind}, not an array")
+            head = _head(body if kind == _MATRIX else _first_bytes(body), order)
+            if head.name != name:
+                names.append(head.name)
+                continue
+            if head.kind not in _NUMBERS or head.is_complex:
+                raise _BrokenError(f"no array of real numbers (class {head.kind})")
+            if kind == _COMPRESSED:
+                _, body, _ = _element(_unpacked(body, order), 0, order)
+            values = _numbers(body, head.values_at, order, head.shape)
+            return values.astype(np.float64)
+    there = ", ".join(map(repr, names[:5])) or "none"
+    raise DataError(f"no variable {name!r}; it has {there}", path=path)
+
+
+def write_mat_arrays(path: Path | str, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write real arrays as MATLAB's save does (v7, compressed), the same bytes each time.
+
+    Raises
+    ------
+    ValueError : an array of fewer than two dimensions, which MATLAB does not know.
+    OutputError : the file cannot be written.
+    """
+    from scipy.io import savemat
+
+    for name, array in arrays.items():
+        if array.ndim < 2 or array.dtype.kind not in "fiu":
+            raise ValueError(f"cannot write {name}: {array.dtype} of {array.ndim} dimensions")
+    out = io.BytesIO()
+    savemat(out, dict(arrays), do_compression=True)
+    text = b"MATLAB 5.0 MAT-file".ljust(_HEADER - 12)  # SciPy's has the date
+    write_bytes(path, text + out.getvalue()[len(text) :])
+
+
+class _Named:
+    """Context of one variable: what is wrong with its bytes becomes a DataError that names it."""
+
+    def __init__(self, where: Path | str, offset: int) -> None:
+        self._where, self._offset = where, offset
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, _BrokenError | struct.error | UnicodeDecodeError | zlib.error):
+            raise DataError(
+                f"not a MAT file that can be read: {error}, in the variable at byte {self._offset}",
+                path=self._where,
+            ) from error
+
+
+def _byte_order(content: bytes, where: Path | str) -> str:
+    problem = None
+    order = _ENDIAN.get(content[_HEADER - 2 : _HEADER], "")
+    version = struct.unpack_from(order + "H", content, _HEADER - 4)[0] if order else None
+    if (
+        version == _LEVEL_7_3
+        or _HDF5_MARK in (content[:8], content[512:520])
+        or content.startswith(b"MATLAB 7.3")
+    ):
+        problem = "it is of level 7.3 (HDF5); save it with -v7"
+    elif version is None:
+        problem = "it is none of level 5, as MATLAB's save -v7 writes them"
+    elif version != _LEVEL_5:
+        problem = f"its level is {version:#x}, not {_LEVEL_5:#x}"
+    if problem:
+        raise DataError(f"not a MAT file that can be read: {problem}", path=where)
     return order
 
 
+def _variables(
+    content: bytes, order: str, where: Path | str
+) -> Iterator[tuple[int, int, memoryview]]:
+    """Offset, type and bytes of the elements of a file."""
+    at, view = _HEADER, memoryview(content)
+    while at < len(content):
+        offset = at
+        with _Named(where, offset):
+            kind, body, at = _element(view, at, order)
+        yield offset, kind, body
+
+
 def _element(data: memoryview, at: int, order: str) -> tuple[int, memoryview, int]:
-    """Type and bytes of the element at a place, and the place of the next one."""
+    """Type and bytes of the element at an offset, and the offset of the next one."""
+    if at + 8 > len(data):
+        raise _BrokenError("it ends too early")
     kind, size = struct.unpack_from(order + "II", data, at)
     if kind >> 16:  # up to four bytes stand in the tag itself
         kind, size, start, after = kind & 0xFFFF, kind >> 16, at + 4, at + 8
@@ -94,8 +202,13 @@ def _element(data: memoryview, at: int, order: str) -> tuple[int, memoryview, in
         # all but packed elements fill up to whole eights; the last one of a file need not
         after = start + size + (0 if kind == _COMPRESSED else -size % 8)
     if start + size > len(data):
-        raise _BrokenError("it ends too early")
+        raise _BrokenError(f"it ends too early: {size} bytes announced, {len(data) - start} there")
     return kind, data[start : start + size], after
+
+
+def _first_bytes(packed: memoryview) -> memoryview:
+    """The beginning of the array in a packed element, without its tag."""
+    return memoryview(zlib.decompressobj().decompress(packed, 8 + _HEAD_BYTES))[8:]
 
 
 def _unpacked(packed: memoryview, order: str) -> memoryview:
@@ -104,6 +217,8 @@ def _unpacked(packed: memoryview, order: str) -> memoryview:
     size = struct.unpack(order + "II", tag)[1] + 8
     if size > _LARGEST:
         raise _BrokenError(f"a variable of {size} bytes, more than {_LARGEST}")
+    if size > _MAX_RATIO * len(packed):
+        raise _BrokenError(f"{size} bytes announced, more than there can be")
     # memory is asked for in one piece, as joining pieces would need it twice, and taken as it fills
     unpacked, filled, stream = np.empty(size, np.uint8), 0, zlib.decompressobj()
     for start in range(0, len(packed), _CHUNK):
@@ -112,9 +227,21 @@ def _unpacked(packed: memoryview, order: str) -> memoryview:
             raise _BrokenError("more is packed in an element than it says")
         unpacked[filled : filled + len(part)] = np.frombuffer(part, np.uint8)
         filled += len(part)
-    if filled < size:
+    if filled < size or not stream.eof:
         raise _BrokenError("it ends too early")
     return unpacked.data
+
+
+def _head(data: memoryview, order: str) -> _Head:
+    _, flags, at = _element(data, 0, order)
+    word = struct.unpack_from(order + "I", flags)[0]
+    _, sizes, at = _element(data, at, order)
+    shape = struct.unpack(f"{order}{len(sizes) // 4}i", sizes)
+    if len(shape) < 2 or len(shape) > 32 or min(shape) < 0:
+        raise _BrokenError(f"an array of shape {shape[:4]}")
+    _, letters, at = _element(data, at, order)
+    name = bytes(letters).decode("latin-1")
+    return _Head(word & 0xFF, bool(word & _COMPLEX), shape, name, at)
 
 
 def _matrix(data: memoryview, order: str, depth: int) -> tuple[str, MatValue]:
@@ -123,21 +250,14 @@ def _matrix(data: memoryview, order: str, depth: int) -> tuple[str, MatValue]:
         return "", np.zeros((0, 0))
     if depth > _DEEPEST:
         raise _BrokenError(f"more than {_DEEPEST} arrays in one another")
-    _, flags, at = _element(data, 0, order)
-    word = struct.unpack_from(order + "I", flags)[0]
-    _, sizes, at = _element(data, at, order)
-    shape = struct.unpack(f"{order}{len(sizes) // 4}i", sizes)
-    if len(shape) < 2 or len(shape) > 32 or min(shape) < 0:
-        raise _BrokenError(f"an array of shape {shape[:4]}")
-    _, letters, at = _element(data, at, order)
-    name, kind, count = bytes(letters).decode("latin-1"), word & 0xFF, math.prod(shape)
+    kind, is_complex, shape, name, at = _head(data, order)
     if kind == _CELL:
-        return name, _items(data, at, order, depth, count)
+        return name, _items(data, at, order, depth, math.prod(shape))
     if kind == _STRUCT:
-        return name, _structs(data, at, order, depth, count)
+        return name, _structs(data, at, order, depth, math.prod(shape))
     if kind == _CHAR:
         return name, _text(data, at, order)
-    if kind in _NUMBERS and not word & _COMPLEX:
+    if kind in _NUMBERS and not is_complex:
         return name, _numbers(data, at, order, shape)
     return name, None
 

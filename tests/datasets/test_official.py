@@ -15,8 +15,6 @@ from megloc_kapture.datasets.official import (
     Missing,
     OfficialDataset,
     read_ground_truth,
-    with_poses,
-    without_images,
     write_official,
 )
 from megloc_kapture.errors import DataError
@@ -166,18 +164,3 @@ def test_ground_truth_beside_a_dataset_comes_in_the_local_frame(tmp_path: Path) 
     back = world.pose_in_official(found.poses()["q/1.jpg"])
     np.testing.assert_allclose(back.center(), POSE.center(), atol=1e-6)
     np.testing.assert_allclose(back.quat_wxyz, POSE.quat_wxyz, atol=1e-12)
-
-
-def test_images_are_left_out_with_all_that_only_they_needed() -> None:
-    data = records("1.jpg", "2.jpg", poses=True)
-    data.sensors["other"] = CAMERA
-    data.rigs["rig"] = {"cam": RigidTransform.identity(), "other": RigidTransform.identity()}
-    data.records_camera[7, "other"] = "7.jpg"
-    data.trajectories[7, "rig"] = POSE
-    left = without_images(data, ["7.jpg", "1.jpg"])
-    assert left.image_names() == ["2.jpg"]
-    assert list(left.sensors) == ["cam"] and list(left.rigs["rig"]) == ["cam"]
-    assert left.poses() == {"2.jpg": POSE} and list(left.trajectories) == [(1, "cam")]
-    kept = without_images(data, ["1.jpg"])
-    assert list(kept.poses()) == ["2.jpg", "7.jpg"]
-    assert with_poses(left, {}).poses() == {}

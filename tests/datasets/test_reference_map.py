@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from kapture.converter.colmap.database import COLMAPDatabase
 
-from megloc_kapture.datasets.grammars.sparse_points import SparsePoints
+from megloc_kapture.datasets.formats.sparse_points import SparsePoints
 from megloc_kapture.datasets.reference_map import write_reference_map
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, Sensor
@@ -108,7 +108,7 @@ def test_our_own_reader_finds_nothing_wrong(tmp_path: Path) -> None:
 def test_the_order_of_observations_in_memory_does_not_matter(tmp_path: Path) -> None:
     model = points()
     write_reference_map(tmp_path / "sorted", data(), {}, NAMES, model)
-    # by image, as some grammar might have them; the order within a point is the same
+    # by image, as a format might have them; the order within a point is the same
     order = np.argsort(-model.point_ids, kind="stable")
     mixed = SparsePoints(
         model.xyz,

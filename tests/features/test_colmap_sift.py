@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from megloc_kapture.datasets.grammars.colmap_database import ColmapDatabase
+from megloc_kapture.datasets.formats.colmap_database import ColmapDatabase
 from megloc_kapture.features.colmap_sift import ColmapSift, ColmapSiftOptions
 from megloc_kapture.io.images import read_image_rgb, write_image
 from megloc_kapture.plugins import LOCAL_FEATURES, load_plugin

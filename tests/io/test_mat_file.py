@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import struct
 import zlib
-from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from scipy.io import loadmat, savemat
 from scipy.sparse import csr_array
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.mat_file import read_mat
+from megloc_kapture.io.mat_file import read_mat, read_mat_array, write_mat_arrays
 
 
 def saved(values: dict[str, Any], *, compressed: bool = False, **options: Any) -> bytes:
@@ -131,11 +131,19 @@ REFUSED = {
     "level 7.3": (PLAIN[:124] + b"\x00\x02IM" + PLAIN[128:], r"level 7\.3 \(HDF5\)"),
     "level 9": (PLAIN[:124] + b"\x00\x09IM" + PLAIN[128:], "its level is 0x900"),
     "cut short": (PLAIN[:-20], "ends too early"),
-    "cut short in a tag": (PLAIN[:131], "requires a buffer"),
+    "cut short in a tag": (PLAIN[:131], "ends too early, in the variable at byte 128"),
     "packed cut short": (packed(PLAIN[128:])[:-12], "ends too early"),
     "longer than said": (packed(PLAIN[128:] + bytes(99)), "more is packed"),
     "shorter than said": (packed(struct.pack("<II", 14, 500) + bytes(99)), "too early"),
     "two gigabytes": (packed(struct.pack("<II", 14, 1 << 31) + bytes(9)), "more than 2147483648"),
+    "too much for its size": (
+        packed(struct.pack("<II", 14, 1 << 20) + bytes(9)),
+        "more than there",
+    ),
+    "another check sum": (packed(PLAIN[128:])[:-4] + b"1234", "while decompressing"),
+    "without check sum": (packed(PLAIN[128:])[:-2], "ends too early"),
+    "HDF5": (b"\x89HDF\r\n\x1a\n" + bytes(600), r"level 7\.3 \(HDF5\)"),
+    "HDF5 behind a block": (bytes(512) + b"\x89HDF\r\n\x1a\n", r"level 7\.3 \(HDF5\)"),
     "not packed": (saved({})[:128] + struct.pack("<II", 15, 90) + bytes(90), "while decompressing"),
     "too deep": (saved({"a": deep(40)}), "more than 32 arrays in one another"),
     "shape": (PLAIN[:AT_DIMS] + struct.pack("<i", -2) + PLAIN[AT_DIMS + 4 :], r"shape \(-2, 3\)"),
@@ -160,15 +168,95 @@ def test_many_cells_in_few_bytes_are_refused_before_they_are_made() -> None:
         read_mat(huge, "x.mat")
 
 
-WHOLE = {compressed: saved(NESTED, compressed=compressed) for compressed in (False, True)}
+# --------------------------------------------------------------------------- one array of a file
 
 
-@given(st.data(), st.booleans())
-def test_mutations_give_data_errors(data: st.DataObject, compressed: bool) -> None:
-    content = bytearray(WHOLE[compressed])
-    for _ in range(data.draw(st.integers(1, 5))):
-        content[data.draw(st.integers(100, len(content) - 1))] = data.draw(st.integers(0, 255))
-    cut = data.draw(st.integers(0, len(content)))
-    for broken in (bytes(content), bytes(content[:cut])):
-        with suppress(DataError):
-            read_mat(broken, "x.mat")
+def points() -> np.ndarray:
+    values = np.random.default_rng(0).normal(0, 5, (5, 7, 3))
+    values[1, 2] = np.nan
+    return values
+
+
+COLOURS = np.arange(5 * 7 * 3, dtype=np.uint8).reshape(5, 7, 3)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "a.jpg.mat"
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_one_array_of_what_scipy_writes(path: Path, compressed: bool, dtype: type) -> None:
+    written = points().astype(dtype)
+    path.write_bytes(saved({"RGBcut": COLOURS, "XYZcut": written}, compressed=compressed))
+    read = read_mat_array(path, "XYZcut")
+    assert read.dtype == np.float64
+    np.testing.assert_array_equal(read, written)
+
+
+def test_what_we_write_scipy_reads_and_the_bytes_are_the_same_each_time(path: Path) -> None:
+    content = {"RGBcut": COLOURS, "XYZcut": points(), "s": COLOURS[0] / np.float32(7)}
+    write_mat_arrays(path, content)
+    read = loadmat(path)
+    np.testing.assert_array_equal(read["XYZcut"], points())
+    np.testing.assert_array_equal(read["RGBcut"], COLOURS)
+    assert read["RGBcut"].dtype == np.uint8 and read["s"].dtype == np.float32
+    np.testing.assert_array_equal(read_mat_array(path, "XYZcut"), points())
+    assert path.read_bytes()[:124] == b"MATLAB 5.0 MAT-file".ljust(116) + bytes(8)
+
+
+def test_matlab_may_store_whole_numbers_as_such(path: Path) -> None:
+    header, body = saved({})[:128], b""
+    for kind, data in (
+        (6, struct.pack("<II", 6, 0)),
+        (5, struct.pack("<2i", 2, 2)),
+        (1, b"XYZcut"),
+        (3, struct.pack("<4h", -1, 2, 3, -4)),
+    ):
+        body += struct.pack("<II", kind, len(data)) + data + bytes(-len(data) % 8)
+    path.write_bytes(header + struct.pack("<II", 14, len(body)) + body)
+    np.testing.assert_array_equal(read_mat_array(path, "XYZcut"), [[-1, 3], [2, -4]])
+    np.testing.assert_array_equal(loadmat(path)["XYZcut"], [[-1, 3], [2, -4]])
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "none of level 5"),
+        (saved({}), "no variable 'a'; it has none"),
+        (saved({"b": np.ones((1, 1)), "c": "text"}), "no variable 'a'; it has 'b', 'c'"),
+        (saved({"a": cell(np.ones((1, 1)))}), r"no array of real numbers \(class 1\), in the var"),
+        (saved({"a": np.array([[1 + 2j]])}), "no array of real numbers"),
+        (PLAIN[:-8], "96 bytes announced, 88 there, in the variable at byte 128"),
+        (PLAIN[:128] + struct.pack("<IId", 9, 8, 1.0), "data type 9, not an array"),
+        (PLAIN[:131], "ends too early, in the variable at byte 128"),
+        (packed(bytes(99)), "requires a buffer|ends too early|shape"),
+        (packed(PLAIN[128:] + bytes(99)), "more is packed"),
+    ],
+)
+def test_files_without_that_array_are_refused(path: Path, content: bytes, message: str) -> None:
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=message) as caught:
+        read_mat_array(path, "a")
+    assert str(caught.value).startswith(f"{path}: ")
+
+
+def test_what_is_no_file_is_refused(path: Path) -> None:
+    with pytest.raises(DataError, match="missing"):
+        read_mat_array(path, "XYZcut")
+    with pytest.raises(DataError, match="not a plain file"):
+        read_mat_array(path.parent, "XYZcut")
+
+
+def test_a_broken_variable_that_is_not_asked_for_does_no_harm(path: Path) -> None:
+    broken = packed(saved({"b": np.ones((9, 9))})[128:])[:-4] + b"1234"
+    path.write_bytes(broken + PLAIN[128:])
+    np.testing.assert_array_equal(read_mat_array(path, "a"), np.arange(6.0).reshape(2, 3))
+
+
+def test_what_cannot_be_written_is_refused(path: Path) -> None:
+    for array in (np.zeros(3), np.zeros((2, 2), np.complex128)):
+        with pytest.raises(ValueError, match="cannot write"):
+            write_mat_arrays(path, {"a": array})
+    assert not path.exists()

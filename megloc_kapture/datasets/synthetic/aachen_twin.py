@@ -10,14 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
-from megloc_kapture.datasets.aachen_layout import Layout
-from megloc_kapture.datasets.grammars.colmap_model import (
+from megloc_kapture.datasets.aachen.layout import Layout
+from megloc_kapture.datasets.formats.colmap_model import (
     ColmapImage,
     ColmapModel,
     write_colmap_binary,
 )
-from megloc_kapture.datasets.grammars.nvm import NvmModel, write_nvm
-from megloc_kapture.datasets.grammars.query_list import write_query_list
+from megloc_kapture.datasets.formats.nvm import NvmModel, write_nvm
+from megloc_kapture.datasets.formats.query_list import write_query_list
 from megloc_kapture.datasets.official import GROUND_TRUTH
 from megloc_kapture.datasets.synthetic.aachen_shots import (
     AachenShots,

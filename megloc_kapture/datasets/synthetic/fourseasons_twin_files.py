@@ -15,8 +15,8 @@ from datetime import UTC, datetime
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.datasets.geodesy import earth_from_enu, geodetic
-from megloc_kapture.datasets.grammars.sparse_points import SparsePoints
+from megloc_kapture.datasets.formats.sparse_points import SparsePoints
+from megloc_kapture.datasets.fourseasons.poses import earth_from_enu, geodetic
 from megloc_kapture.datasets.synthetic.fourseasons_drive import CAM1_FROM_CAM0, Frame
 from megloc_kapture.datasets.synthetic.options import stream
 from megloc_kapture.datasets.synthetic.portable import settled, settled_pose

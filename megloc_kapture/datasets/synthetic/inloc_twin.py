@@ -11,8 +11,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from pydantic import Field
 
-from megloc_kapture.datasets.grammars.inloc_files import COLOURS, POINTS, write_transformation
-from megloc_kapture.datasets.grammars.mat_file import write_mat_arrays
+from megloc_kapture.datasets.formats.inloc_files import COLOURS, POINTS, write_transformation
 from megloc_kapture.datasets.official import GROUND_TRUTH
 from megloc_kapture.datasets.synthetic.indoor_floors import FloorBuilder
 from megloc_kapture.datasets.synthetic.indoor_queries import query_views
@@ -31,6 +30,7 @@ from megloc_kapture.datasets.synthetic.studio import draw_shots
 from megloc_kapture.datasets.synthetic.views import View
 from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture_store import KaptureData, Sensor, write_sensors
+from megloc_kapture.io.mat_file import write_mat_arrays
 from megloc_kapture.io.side_tables import SIDE_TABLES, ImageGroup, write_groups
 from megloc_kapture.stages.work import Track, untracked
 from megloc_kapture.values import Options, RigidTransform

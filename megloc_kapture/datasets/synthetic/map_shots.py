@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.datasets.grammars.sparse_points import SparsePoints
+from megloc_kapture.datasets.formats.sparse_points import SparsePoints
 from megloc_kapture.datasets.synthetic.options import SyntheticWorldOptions
 from megloc_kapture.datasets.synthetic.shots import Shot
 from megloc_kapture.datasets.synthetic.sift_points import sift_points

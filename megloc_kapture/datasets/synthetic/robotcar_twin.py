@@ -10,16 +10,12 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.datasets.grammars.colmap_model import (
-    ColmapImage,
-    ColmapModel,
-    write_colmap_text,
-)
-from megloc_kapture.datasets.grammars.nvm import NvmModel, write_nvm
-from megloc_kapture.datasets.grammars.sparse_points import SparsePoints
+from megloc_kapture.datasets.formats.colmap_model import ColmapImage, ColmapModel, write_colmap_text
+from megloc_kapture.datasets.formats.nvm import NvmModel, write_nvm
+from megloc_kapture.datasets.formats.sparse_points import SparsePoints
 from megloc_kapture.datasets.official import GROUND_TRUTH
-from megloc_kapture.datasets.robotcar_kapture import RIG_ID
-from megloc_kapture.datasets.robotcar_layout import Layout
+from megloc_kapture.datasets.robotcar.images import RIG_ID
+from megloc_kapture.datasets.robotcar.layout import Layout
 from megloc_kapture.datasets.synthetic.map_shots import MapShots, draw_map_and_queries
 from megloc_kapture.datasets.synthetic.options import stream
 from megloc_kapture.datasets.synthetic.robotcar_shots import (

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.datasets.grammars.sparse_points import SparsePoints
+from megloc_kapture.datasets.formats.sparse_points import SparsePoints
 from megloc_kapture.datasets.synthetic.render import project, sample_grid
 from megloc_kapture.datasets.synthetic.shots import Shot
 from megloc_kapture.values import Camera

@@ -16,7 +16,7 @@ from kapture.io.features import get_keypoints_fullpath, image_keypoints_from_fil
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.datasets.aachen import Aachen, AachenOptions
+from megloc_kapture.datasets.aachen.adapter import Aachen, AachenOptions
 from megloc_kapture.datasets.official import write_official
 from megloc_kapture.datasets.synthetic.aachen_shots import AachenShots, build_aachen_shots
 from megloc_kapture.datasets.synthetic.aachen_twin import AachenTwinOptions, write_aachen_twin

@@ -12,12 +12,15 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.datasets.fourseasons import FourSeasons, FourSeasonsOptions
-from megloc_kapture.datasets.geodesy import earth_from_enu, geodetic
-from megloc_kapture.datasets.grammars.fourseasons_keyframes import Keyframe, read_keyframe
-from megloc_kapture.datasets.grammars.fourseasons_poses import read_gnss_poses
-from megloc_kapture.datasets.grammars.fourseasons_times import read_times
-from megloc_kapture.datasets.grammars.fourseasons_transformations import read_transformations
+from megloc_kapture.datasets.formats.fourseasons_files import (
+    Keyframe,
+    read_gnss_poses,
+    read_keyframe,
+    read_times,
+    read_transformations,
+)
+from megloc_kapture.datasets.fourseasons.adapter import FourSeasons, FourSeasonsOptions
+from megloc_kapture.datasets.fourseasons.poses import earth_from_enu, geodetic
 from megloc_kapture.datasets.official import OfficialDataset, write_official
 from megloc_kapture.datasets.synthetic.fourseasons_twin import (
     DUSK,

@@ -13,7 +13,7 @@ import pytest
 import scipy.io
 
 import megloc_kapture  # noqa: F401  before kapture
-from megloc_kapture.datasets.inloc import InLoc, InLocOptions
+from megloc_kapture.datasets.inloc.adapter import InLoc, InLocOptions
 from megloc_kapture.datasets.official import write_official
 from megloc_kapture.datasets.synthetic.inloc_twin import InLocTwinOptions, write_inloc_twin
 from megloc_kapture.io.depth_maps import read_depth_map

@@ -21,7 +21,7 @@ from kapture.io.features import (
 )
 
 from megloc_kapture.datasets.official import write_official
-from megloc_kapture.datasets.robotcar import RobotCar, RobotCarOptions
+from megloc_kapture.datasets.robotcar.adapter import RobotCar, RobotCarOptions
 from megloc_kapture.datasets.synthetic.road_looks import WEATHERS, road_look
 from megloc_kapture.datasets.synthetic.robotcar_shots import OFFICIAL_FROM_WORLD
 from megloc_kapture.datasets.synthetic.robotcar_twin import (

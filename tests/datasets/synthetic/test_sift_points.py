@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.datasets.aachen import Aachen, AachenOptions
-from megloc_kapture.datasets.grammars.colmap_database import ColmapDatabase
+from megloc_kapture.datasets.aachen.adapter import Aachen, AachenOptions
+from megloc_kapture.datasets.formats.colmap_database import ColmapDatabase
 from megloc_kapture.datasets.official import write_official
-from megloc_kapture.datasets.robotcar import RobotCar, RobotCarOptions
+from megloc_kapture.datasets.robotcar.adapter import RobotCar, RobotCarOptions
 from megloc_kapture.datasets.synthetic.aachen_shots import build_aachen_shots, official
 from megloc_kapture.datasets.synthetic.aachen_twin import AachenTwinOptions, write_aachen_twin
 from megloc_kapture.datasets.synthetic.movers import mover_surfaces

@@ -9,7 +9,7 @@ import pycolmap
 import pytest
 from numpy.typing import NDArray
 
-from megloc_kapture.datasets.grammars.sparse_points import SparsePoints
+from megloc_kapture.datasets.formats.sparse_points import SparsePoints
 from megloc_kapture.datasets.synthetic.cameras import looking_at
 from megloc_kapture.datasets.synthetic.looks import day_look
 from megloc_kapture.datasets.synthetic.options import SyntheticWorldOptions

@@ -1,0 +1,206 @@
+"""COLMAP's databases (sqlite): cameras, images, keypoints and descriptors; never written to.
+
+The file is opened as one that nobody changes (``immutable``): sqlite would otherwise put files of
+its own beside a database in WAL mode, which is what COLMAP's are, or fail in a read-only folder.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.datasets.formats.colmap_model import CAMERA_MODELS
+from megloc_kapture.datasets.formats.text_lines import check_plain, image_name
+from megloc_kapture.errors import DataError
+from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera
+
+_SIZE_END = 2**31
+_SIFT = 0
+# x y; x y scale orientation; x y and an affine shape
+_KEYPOINT_COLUMNS = (2, 4, 6)
+
+
+@dataclass(frozen=True, slots=True)
+class DatabaseImage:
+    """One row of the table of images."""
+
+    image_id: int
+    camera_id: int
+
+
+class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
+    """An open database. Use as a context manager.
+
+    Attributes
+    ----------
+    images : by name (without ``./`` before it), sorted.
+
+    Raises
+    ------
+    DataError : missing, no COLMAP database, broken, or not closed by who wrote it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = Path(path)
+        check_plain(self.path)
+        log = self.path.with_name(self.path.name + "-wal")
+        if log.is_file() and log.stat().st_size:
+            raise DataError(
+                f"was not closed: what is in {log.name} is not part of it yet; "
+                "open and close it once with COLMAP or sqlite3",
+                path=path,
+            )
+        self._connection = self._connect()
+        try:
+            with self._reading():
+                self._tables = {
+                    name
+                    for (name,) in self._connection.execute(
+                        "SELECT name FROM sqlite_master WHERE type = 'table'"
+                    )
+                }
+            self.images = self._read_images()
+        except BaseException:
+            self._connection.close()
+            raise
+
+    def cameras(self) -> dict[int, Camera]:
+        """All cameras by their ids.
+
+        Raises
+        ------
+        DataError : a camera of an unknown model, or parameters that are none.
+        """
+        cameras = {}
+        for camera_id, model_id, width, height, content in self._rows(
+            "cameras", "camera_id, model, width, height, params"
+        ):
+            what = f"camera {camera_id!r}"
+            self._check_integer(model_id, 0, len(CAMERA_MODELS), f"{what}: model")
+            self._check_integer(width, 0, _SIZE_END, f"{what}: width")
+            self._check_integer(height, 0, _SIZE_END, f"{what}: height")
+            model = CAMERA_MODELS[model_id]
+            params = self._array(content, "<f8", (CAMERA_MODEL_NUM_PARAMS[model],), what)
+            try:
+                cameras[int(camera_id)] = Camera(model, width, height, tuple(params.tolist()))
+            except DataError as error:
+                raise self._error(f"{what}: {error.message}") from None
+        return dict(sorted(cameras.items()))
+
+    def keypoints(self, name: str) -> NDArray[np.float32]:
+        """Keypoints of an image, float32 (N, 2), COLMAP pixels; none is no error.
+
+        Raises
+        ------
+        DataError : no such image, or a row that does not fit its own sizes.
+        """
+        found = self._blob("keypoints", name)
+        if found is None:
+            return np.empty((0, 2), np.float32)
+        rows, columns, content = found
+        if columns not in _KEYPOINT_COLUMNS and rows:
+            raise self._error(f"keypoints of {name!r} have {columns} columns, not 2, 4 or 6")
+        what = f"keypoints of {name!r}"
+        array = self._array(content, "<f4", (rows, columns if rows else 2), what)[:, :2]
+        if not np.isfinite(array).all():
+            raise self._error(f"{what} are not finite")
+        return np.ascontiguousarray(array)
+
+    def descriptors(self, name: str) -> NDArray[np.uint8] | None:
+        """SIFT descriptors of an image, uint8 (N, D); None where it has none.
+
+        Raises
+        ------
+        DataError : no such image, another kind of descriptors, or a row that does not fit its own
+            sizes.
+        """
+        found = self._blob("descriptors", name)
+        if found is None or found[0] == 0:
+            return None
+        rows, columns, content = found
+        self._check_sift(name)
+        return self._array(content, "u1", (rows, columns), f"descriptors of {name!r}")
+
+    def __exit__(self, *raised: object) -> None:
+        self._connection.close()
+
+    def _connect(self) -> sqlite3.Connection:
+        path = quote(str(self.path.resolve()))
+        with self._reading():
+            return sqlite3.connect(f"file:{path}?mode=ro&immutable=1", uri=True)
+
+    def _read_images(self) -> dict[str, DatabaseImage]:
+        images = {}
+        for image_id, name, camera_id in self._rows("images", "image_id, name, camera_id"):
+            if not isinstance(name, str) or not isinstance(camera_id, int):
+                raise self._error(f"image {image_id!r} has no name or no camera")
+            try:
+                known = image_name(name)
+            except DataError as error:
+                raise self._error(f"image {image_id}: {error.message}") from None
+            if known in images:
+                raise self._error(f"image {known!r} is listed twice")
+            images[known] = DatabaseImage(int(image_id), camera_id)
+        return dict(sorted(images.items()))
+
+    def _blob(self, table: str, name: str) -> tuple[int, int, Any] | None:
+        """(rows, columns, content) of an image in a table; None where it is not there."""
+        image = self.images.get(name)
+        if image is None:
+            raise self._error(f"has no image {name!r}")
+        if table not in self._tables:
+            return None
+        found = list(self._rows(table, "rows, cols, data", f"WHERE image_id = {image.image_id:d}"))
+        if not found:
+            return None
+        rows, columns, content = found[0]
+        for value, what in ((rows, "rows"), (columns, "columns")):
+            self._check_integer(value, 0, _SIZE_END, f"{table} of {name!r}: {what}")
+        return rows, columns, content
+
+    def _array(self, content: Any, dtype: str, shape: tuple[int, ...], what: str) -> NDArray[Any]:
+        content = b"" if content is None else content
+        expected = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+        if not isinstance(content, bytes) or len(content) != expected:
+            size = f"{len(content)} bytes" if isinstance(content, bytes) else "no bytes"
+            raise self._error(f"{what}: expected {expected} bytes of data, got {size}")
+        return np.frombuffer(content, dtype).reshape(shape)
+
+    def _check_sift(self, name: str) -> None:
+        """Since version 4 there may be others, whose numbers are no bytes."""
+        with self._reading():
+            columns = {row[1] for row in self._connection.execute("PRAGMA table_info(descriptors)")}
+        if "type" in columns:
+            condition = f"WHERE image_id = {self.images[name].image_id:d}"
+            kinds = [kind for (kind,) in self._rows("descriptors", "type", condition)]
+            if kinds != [_SIFT]:
+                raise self._error(f"descriptors of {name!r} are not SIFT (type {kinds[0]!r})")
+
+    def _check_integer(self, value: Any, first: int, end: int, what: str) -> None:
+        if not isinstance(value, int) or not first <= value < end:
+            raise self._error(f"{what} is {value!r}")
+
+    def _rows(self, table: str, columns: str, condition: str = "") -> Iterator[tuple[Any, ...]]:
+        # a view of that name could take forever, or say anything
+        if table not in self._tables:
+            raise self._error(f"no COLMAP database: it has no table {table!r}")
+        with self._reading():
+            yield from self._connection.execute(f"SELECT {columns} FROM {table} {condition}")
+
+    @contextmanager
+    def _reading(self) -> Iterator[None]:
+        try:
+            yield
+        except (sqlite3.Error, UnicodeDecodeError, OverflowError) as error:
+            raise self._error(f"no readable COLMAP database: {error}") from error
+
+    def _error(self, message: str) -> DataError:
+        return DataError(message, path=self.path)

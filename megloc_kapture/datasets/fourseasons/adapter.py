@@ -1,0 +1,392 @@
+"""4Seasons and the MLAD challenges on it: one recording localized in another.
+
+A root has recordings, folders of the published names, and ``calibration/`` beside or in them. The
+map is made of the keyframes of the reference recordings, whose poses are published; queries are
+images of other recordings. Where relocalization files of a challenge lie below the root, they say
+which recordings are meant, which of their images are asked for, and near which keyframe each was
+taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, field_validator
+
+from megloc_kapture.datasets.formats.fourseasons_files import (
+    StereoCalibration,
+    read_keyframe_accuracy,
+    read_times,
+)
+from megloc_kapture.datasets.fourseasons.images import (
+    ChallengeTables,
+    ImageRecords,
+    challenge_tables,
+    write_depth_maps,
+)
+from megloc_kapture.datasets.fourseasons.poses import (
+    KeyframePoses,
+    LocalFrame,
+    read_keyframe_poses,
+)
+from megloc_kapture.datasets.fourseasons.recordings import (
+    ACCURACY,
+    CAMERAS,
+    GNSS_POSES,
+    POSES,
+    TIMES,
+    TRANSFORMATIONS,
+    Recording,
+    RelocalizationFile,
+    Selection,
+    select,
+)
+from megloc_kapture.datasets.official import (
+    Count,
+    DatasetCard,
+    Missing,
+    OfficialDataset,
+    ground_truth_files,
+    read_ground_truth,
+    with_poses,
+)
+from megloc_kapture.errors import DataError
+from megloc_kapture.evaluation.protocols import protocol_of
+from megloc_kapture.io.kapture_store import KaptureData
+from megloc_kapture.io.side_tables import ImageGroup, Protocol
+from megloc_kapture.values import Options, RigidTransform
+
+NAME = "4seasons"
+
+
+class FourSeasonsOptions(Options):
+    """The part of 4Seasons to import."""
+
+    reference: tuple[str, ...] = Field(
+        default=(),
+        description="recordings of the map; unless given, those that relocalization files name as "
+        "source, without such files the first by name that has poses",
+    )
+    queries: tuple[str, ...] = Field(
+        default=(),
+        description="recordings of the queries; unless given, those that relocalization files ask "
+        "for, without such files all others",
+    )
+    frames: Literal["keyframes", "all"] = Field(
+        default="keyframes",
+        description="images: those of keyframes with a pose, or all that are on disk; of a query "
+        "recording the keyframes that relocalization files ask for, or all where nothing tells",
+    )
+    stereo: bool = Field(default=True, description="take the right camera too")
+    depth: bool = Field(
+        default=False, description="the map keyframes' point clouds as sparse depth maps"
+    )
+    min_fusion_quality: int = Field(
+        default=1,
+        ge=0,
+        le=2,
+        description="keyframes with less are dropped: 2 fused with GNSS, 1 interpolated, 0 none",
+    )
+
+    @field_validator("reference", "queries", mode="before")
+    @classmethod
+    def _listed(cls, value: Any) -> Any:
+        # one name, or several between commas, as a command line gives them
+        return tuple(name.strip() for name in value.split(",")) if isinstance(value, str) else value
+
+
+class FourSeasons:
+    """Adapter of 4Seasons (group ``megloc_kapture.datasets``)."""
+
+    name = NAME
+    Options = FourSeasonsOptions
+    card = DatasetCard(
+        title="4Seasons",
+        published_at="https://www.4seasons-dataset.com",
+        size="several GB per recording: its undistorted stereo images and reference poses, and "
+        "calibration.zip once",
+        folders=("4Seasons",),
+        layout="ROOT/calibration/ and ROOT/<recording>/{undistorted_images/,GNSSPoses.txt,"
+        "Transformations.txt,times.txt} of two recordings or more; relocalization files of a "
+        "challenge in ROOT or the reference recording's folder; or the recordings as "
+        "kapture_import_4seasons converts them, in ROOT/records/",
+    )
+
+    def __init__(self, options: FourSeasonsOptions | None = None) -> None:
+        self.options = options or FourSeasonsOptions()
+
+    def check(self, root: Path) -> None:
+        """Raise DataError, quickly, when ``root`` has not the recordings or no calibration."""
+        chosen = self._select(root, Missing(root))
+        for recording in (*chosen.references, *chosen.queries):
+            recording.calibration(root)
+
+    def input_files(self, root: Path) -> Iterator[Path]:
+        """Every file an import depends on: text files, images, point clouds where asked for."""
+        dataset = self.read(root, allow_missing=True)
+        chosen = self._select(root, Missing(root))
+        yield from (file.path for file in chosen.files)
+        recordings = (*chosen.references, *chosen.queries)
+        yield from dict.fromkeys(f for r in recordings for f in r.calibration_files(root))
+        for recording in recordings:
+            for name in (GNSS_POSES, TRANSFORMATIONS, POSES, ACCURACY, TIMES):
+                if (recording.folder / name).is_file():
+                    yield recording.folder / name
+        for data in (dataset.mapping, dataset.query):
+            for image in data.image_names():
+                yield chosen.recordings[image.partition("/")[0]].file_of(image)
+        if self.options.depth:
+            taken = {timestamp for timestamp, _ in dataset.mapping.records_depth}
+            for recording in chosen.references:
+                files = (recording.keyframe_file(timestamp) for timestamp in sorted(taken))
+                yield from (file for file in files if file.is_file())
+        yield from ground_truth_files(root)
+
+    def read(self, root: Path, *, allow_missing: bool = False) -> OfficialDataset:
+        """Read the selected recordings.
+
+        Raises
+        ------
+        DataError : something is broken, or there is nothing to import; names file and line.
+        OptionError : an option names a recording that is not here, or one for both parts.
+        """
+        missing = Missing(root)
+        suffixes: dict[StereoCalibration, str] = {}
+        chosen = self._select(root, missing)
+        poses = self._reference_poses(chosen.references, missing)
+        frame = LocalFrame.around(poses[chosen.references[0].name])
+        local = {name: frame.cams_from_local(of) for name, of in poses.items()}
+        mapping = ImageRecords(suffixes, missing, self.options.stereo)
+        for recording in chosen.references:
+            self._add_map(mapping, recording, root, poses[recording.name], local[recording.name])
+        query = ImageRecords(suffixes, missing, self.options.stereo)
+        truth: dict[tuple[int, str], RigidTransform] = {}
+        cars: dict[str, str] = {}
+        for recording in chosen.queries:
+            known = self._query_poses(recording, frame, missing)
+            times = self._query_times(recording, known, chosen.files, missing)
+            calibration = recording.calibration(root)
+            cars[recording.name] = query.add(recording, calibration, times)
+            truth |= {(time, cars[recording.name]): pose for time, pose in known.items()}
+        tables = challenge_tables(chosen.files, chosen.recordings, local, mapping.data, query.data)
+        truth |= {(time, cars[name]): pose for (name, time), pose in tables.truth.items()}
+        groups = image_groups(chosen, mapping.data, query.data)
+        beside, beside_groups = read_ground_truth(root, query.data, frame.world())
+        for image in groups.keys() & beside_groups.keys():
+            condition = beside_groups[image].condition or groups[image].condition
+            groups[image] = groups[image].model_copy(update={"condition": condition})
+        query_gt = _known_poses(query.data, truth, beside)
+        used = (*chosen.references, *chosen.queries)
+        return OfficialDataset(
+            mapping=mapping.data,
+            query=query.data,
+            query_gt=query_gt,
+            links={recording.name: recording.folder for recording in used},
+            protocol=protocol(NAME, chosen.queries, challenge=bool(chosen.files)),
+            groups=groups,
+            priors=tables.priors,
+            relocalization=tables.pairs,
+            world=frame.world(),
+            summary=summary(chosen, poses, mapping.data, query.data, query_gt),
+            remarks=remarks(poses, frame, tables, self.options.min_fusion_quality),
+            missing=missing,
+            write_more=partial(write_depth_maps, mapping.depth_jobs)
+            if self.options.depth
+            else None,
+        )
+
+    def _select(self, root: Path, missing: Missing) -> Selection:
+        return select(root, self.options.reference, self.options.queries, missing)
+
+    def _reference_poses(
+        self, references: Sequence[Recording], missing: Missing
+    ) -> dict[str, KeyframePoses]:
+        found = {}
+        for recording in references:
+            # the frame of a poses.txt is its recording's own
+            poses = read_keyframe_poses(
+                recording,
+                min_fusion_quality=self.options.min_fusion_quality,
+                on_earth=len(references) > 1,
+                missing=missing,
+            )
+            if poses is None:
+                raise DataError(
+                    f"no poses for the map: {GNSS_POSES} and {TRANSFORMATIONS} are needed"
+                    + (f", or {POSES}" if len(references) == 1 else ""),
+                    path=recording.folder,
+                )
+            found[recording.name] = poses
+        return found
+
+    def _add_map(
+        self,
+        mapping: ImageRecords,
+        recording: Recording,
+        root: Path,
+        poses: KeyframePoses,
+        cams_from_local: Mapping[int, RigidTransform],
+    ) -> None:
+        times: Iterable[int] = sorted(cams_from_local)
+        if self.options.frames == "all":
+            times = recording.times_on_disk(CAMERAS[0])
+        calibration = recording.calibration(root)
+        car = mapping.add(recording, calibration, times)
+        taken = {timestamp for timestamp, _ in mapping.data.records_camera}
+        for timestamp, pose in cams_from_local.items():
+            if timestamp in taken:
+                mapping.data.trajectories[timestamp, car] = pose
+        if self.options.depth:
+            scales = {t: s for t, s in poses.scales.items() if t in cams_from_local}
+            if not scales:
+                raise DataError(
+                    f"depth needs the scale of the keyframes, which is in {GNSS_POSES}",
+                    path=recording.folder,
+                )
+            mapping.add_depth(recording, calibration, scales)
+
+    def _query_poses(
+        self, recording: Recording, frame: LocalFrame, missing: Missing
+    ) -> dict[int, RigidTransform]:
+        if frame.earth_from_scene is None:
+            return {}
+        poses = read_keyframe_poses(
+            recording,
+            min_fusion_quality=self.options.min_fusion_quality,
+            on_earth=True,
+            missing=missing,
+        )
+        return {} if poses is None else frame.cams_from_local(poses)
+
+    def _query_times(
+        self,
+        recording: Recording,
+        poses: Mapping[int, RigidTransform],
+        files: Sequence[RelocalizationFile],
+        missing: Missing,
+    ) -> list[int]:
+        asked = {row.query for f in files if f.target == recording.name for row in f.rows}
+        wanted = asked or set(poses)
+        if self.options.frames == "all" or not wanted:
+            wanted = asked | set(recording.times_on_disk(CAMERAS[0]))
+        if not wanted:
+            missing.require(recording.image_file(0, CAMERAS[0]).parent)
+        return sorted(wanted)
+
+
+def _known_poses(
+    query: KaptureData,
+    published: Mapping[tuple[int, str], RigidTransform],
+    beside: KaptureData | None,
+) -> KaptureData | None:
+    """The queries with the poses that are published; where none is, with those beside the data."""
+    times = {timestamp for timestamp, _ in query.records_camera}
+    poses = {key: pose for key, pose in published.items() if key[0] in times}
+    known = with_poses(query, poses)
+    if beside is not None:
+        for (timestamp, device), pose in beside.trajectories.items():
+            if known.device_from_world(timestamp, device) is None:
+                poses[timestamp, device] = pose
+    return with_poses(query, poses) if poses else None
+
+
+# of other long-term benchmarks, where no challenge asks
+GENERAL_THRESHOLDS = ((0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
+
+
+def image_groups(
+    chosen: Selection, mapping: KaptureData, query: KaptureData
+) -> dict[str, ImageGroup]:
+    """Groups of all images: a query's condition is its recording.
+
+    Scored are left images; where relocalization files ask for images of a recording, these.
+    """
+    groups = {
+        image: ImageGroup(location=image.partition("/")[0]) for image in mapping.image_names()
+    }
+    asked = {
+        chosen.recordings[file.target].image(row.query, CAMERAS[0])
+        for file in chosen.files
+        for row in file.rows
+    }
+    asked_recordings = {file.target for file in chosen.files}
+    for (timestamp, _), image in query.records_camera.items():
+        name = image.partition("/")[0]
+        left = image == chosen.recordings[name].image(timestamp, CAMERAS[0])
+        scored = left and (name not in asked_recordings or image in asked)
+        groups[image] = ImageGroup(condition=name, scored=scored)
+    return groups
+
+
+def protocol(name: str, queries: Sequence[Recording], *, challenge: bool) -> Protocol:
+    """The scoring rules: the MLAD challenges' where one is there, else those of long-term sets.
+
+    Without a challenge nobody takes a pose file; ours has absolute poses in ECEF then.
+    """
+    own: dict[str, Any] = {"conditions": tuple(recording.name for recording in queries)}
+    if not challenge:
+        own |= {"thresholds": GENERAL_THRESHOLDS, "pose_file": "ltvl"}
+    return protocol_of(name).model_copy(update=own)
+
+
+def summary(
+    chosen: Selection,
+    poses: Mapping[str, KeyframePoses],
+    mapping: KaptureData,
+    query: KaptureData,
+    query_gt: KaptureData | None,
+) -> list[Count]:
+    """Counts of the import, beside those published."""
+    counts = [Count("recordings", len(chosen.recordings))]
+    images = [image.partition("/")[0] for data in (mapping, query) for image in data.image_names()]
+    for part, recordings in (("map", chosen.references), ("query", chosen.queries)):
+        for recording in recordings:
+            counts.append(Count(f"{recording.name}: {part} images", images.count(recording.name)))
+            if recording.name in poses:
+                good = poses[recording.name]
+                rows = len(good.scene_from_cam) + len(good.dropped)
+                counts.append(Count("  keyframes with a pose", len(good.scene_from_cam), rows))
+            if (recording.folder / TIMES).is_file():
+                listed = len(read_times(recording.folder / TIMES))
+                counts.append(Count(f"  frames in {TIMES}", listed))
+                on_disk = len(recording.times_on_disk(CAMERAS[0]))
+                counts.append(Count("  frames with a left image", on_disk))
+            if (recording.folder / ACCURACY).is_file():
+                accurate = read_keyframe_accuracy(recording.folder / ACCURACY)
+                counts.append(Count("  keyframes known to 0.05 m", len(accurate)))
+    counts += [file.count() for file in chosen.files]
+    counts.append(Count("images with a pose in the map", len(mapping.poses())))
+    counts.append(Count("queries", len(query.records_camera)))
+    known = 0 if query_gt is None else len(query_gt.poses())
+    counts.append(Count("queries with a known pose", known))
+    return counts
+
+
+def remarks(
+    poses: Mapping[str, KeyframePoses],
+    frame: LocalFrame,
+    tables: ChallengeTables,
+    min_fusion_quality: int,
+) -> list[str]:
+    """Sentences for the user."""
+    told = []
+    for name, of in poses.items():
+        if of.dropped:
+            told.append(
+                f"{name}: {len(of.dropped)} keyframes are left out, their fusion quality is below "
+                f"{min_fusion_quality} (min_fusion_quality)."
+            )
+    if frame.earth_from_scene is None:
+        told.append(
+            f"The map's poses are those of {POSES}, whose frame is its own: of the queries only "
+            "poses in relocalization files are known."
+        )
+    if tables.lost:
+        told.append(
+            f"{tables.lost} pairs of relocalization files are left out: their reference has no "
+            "pose or image, or their query no image. A challenge expects every pair."
+        )
+    return told

@@ -1,0 +1,300 @@
+"""InLoc: cutouts of laser scans as the map, with depth; telephone images as queries.
+
+Every floor is a coordinate frame of its own. A cutout's pose follows from its name and from where
+its scan stands in the floor; its depth from the points the scanner measured in its pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from pydantic import Field
+
+from megloc_kapture.datasets.formats.inloc_files import Cutout
+from megloc_kapture.datasets.inloc.depth import DepthJob, depth_camera, write_depth_maps
+from megloc_kapture.datasets.inloc.layout import (
+    DISTRACTOR_FLOORS,
+    FLOORS,
+    LAYOUT,
+    PITCHES_DEG,
+    POINTS_SUFFIX,
+    YAWS_DEG,
+    Layout,
+    Scan,
+)
+from megloc_kapture.datasets.official import (
+    Count,
+    DatasetCard,
+    Missing,
+    OfficialDataset,
+    ground_truth_files,
+    last_part,
+    read_ground_truth,
+)
+from megloc_kapture.errors import DataError
+from megloc_kapture.evaluation.protocols import protocol_of
+from megloc_kapture.io.images import image_size
+from megloc_kapture.io.kapture_store import KaptureData, Sensor
+from megloc_kapture.io.side_tables import ImageGroup, World
+from megloc_kapture.values import Camera, Options, RigidTransform
+
+CUTOUTS, QUERIES, DEPTH = "database/cutouts", "query/iphone7", "depth"
+DATASET = "inloc"
+# iPhone 7: 28 mm lens on a 36 mm film, 4032 px along the longer side
+_FOCAL_SHARE = 28 / 36
+# the cutouts' horizontal field of view is 60 degrees; 0.5 / tan(30 deg)
+_CUTOUT_FOCAL_SHARE = 3**0.5 / 2
+# the 277 scans of the paper's 9,972 cutouts, by floor as the scans' authors publish them
+_PUBLISHED_SCANS = {"DUC1": 50, "DUC2": 80, "CSE3": 7, "CSE4": 75, "CSE5": 65}
+_PUBLISHED_QUERIES = 356
+_EXIF_ORIENTATION = 0x0112
+_MANY_GIGABYTES = 5
+
+
+class InLocOptions(Options):
+    """The part of InLoc to import."""
+
+    distractor_floors: bool = Field(
+        default=False, description="also CSE3, CSE4 and CSE5, where no query was taken"
+    )
+    depth: bool = Field(default=True, description="the scanned points as depth maps")
+    depth_step: int = Field(
+        default=1,
+        ge=1,
+        le=64,
+        description="only every n-th row and column of the scanned points is kept",
+    )
+
+
+class InLoc:
+    """Adapter of InLoc's official layout."""
+
+    name = DATASET
+    Options = InLocOptions
+    card = DatasetCard(
+        title="InLoc",
+        published_at="https://github.com/HajimeTaira/InLoc_dataset",
+        size="356 queries, 9,972 cutouts of 1600x1200 with points; hundreds of GB, far less "
+        "without the points (depth = false)",
+        folders=("InLoc", "inloc"),
+        layout=LAYOUT,
+    )
+
+    def __init__(self, options: InLocOptions | None = None) -> None:
+        self.options = options or InLocOptions()
+
+    @property
+    def floors(self) -> tuple[str, ...]:
+        """The floors that are imported."""
+        return FLOORS + DISTRACTOR_FLOORS * self.options.distractor_floors
+
+    def check(self, root: Path) -> None:
+        """Raise DataError when ``root`` cannot be InLoc."""
+        layout = Layout.find(root)
+        if not any((layout.cutouts / floor).is_dir() for floor in self.floors):
+            raise DataError(f"none of {', '.join(self.floors)} is there", path=layout.cutouts)
+
+    def input_files(self, root: Path) -> Iterator[Path]:
+        """Every file an import of ``root`` may depend on."""
+        layout = Layout.find(root)
+        yield from layout.input_files(self.floors, with_points=self.options.depth)
+        yield from ground_truth_files(root)
+
+    def read(self, root: Path, *, allow_missing: bool = False) -> OfficialDataset:
+        """Read the dataset; the depth maps are made when it is written.
+
+        Raises
+        ------
+        DataError : names the file and what is wrong with it.
+        """
+        self.check(root)
+        layout, missing = Layout.find(root), Missing(root)
+        map_ = _Map(self.options)
+        wrong = {floor: layout.wrong_scans(floor) for floor in self.floors}
+        left_out = []
+        for floor in self.floors:
+            for scan in layout.scans(floor, missing):
+                if scan.number in wrong[floor]:
+                    left_out.append(scan.location)
+                else:
+                    map_.add(scan, missing)
+        if self.options.depth and map_.groups and not (map_.depth_jobs or allow_missing):
+            raise DataError(
+                f"no cutout has its points beside it (.jpg{POINTS_SUFFIX}); the download without "
+                "them is imported with the option depth = false",
+                path=layout.cutouts,
+            )
+        names = [f"{QUERIES}/{name}" for name in layout.queries()]
+        query, turned = _queries(names, layout.query)
+        truth, true_groups = read_ground_truth(root, query, World())
+        groups = {image: true_groups.get(image, ImageGroup()) for image in names}
+        records = Path("mapping") / "sensors" / "records_data"
+        return OfficialDataset(
+            mapping=map_.data,
+            query=query,
+            query_gt=truth,
+            links={CUTOUTS: layout.cutouts, QUERIES: layout.query},
+            groups=map_.groups | groups,
+            names={image: last_part(image) for image in names},
+            protocol=protocol_of(DATASET),
+            summary=self._summary(map_, groups),
+            remarks=self._remarks(map_, groups, left_out, turned),
+            missing=missing,
+            write_more=lambda output: write_depth_maps(
+                map_.depth_jobs, self.options.depth_step, output / records
+            ),
+        )
+
+    def _summary(self, map_: _Map, groups: Mapping[str, ImageGroup]) -> list[Count]:
+        cutouts = len(YAWS_DEG) * len(PITCHES_DEG)
+        published = sum(_PUBLISHED_SCANS[floor] for floor in self.floors)
+        counts = [
+            Count("map images (cutouts of scans)", len(map_.groups), published * cutouts),
+            Count("query images", len(groups), _PUBLISHED_QUERIES),
+        ]
+        if self.options.depth:
+            counts.append(Count("map images with depth", len(map_.depth_jobs)))
+        for floor in self.floors:
+            scans = {g.location for g in map_.groups.values() if g.frame == floor}
+            counts.append(Count(f"scans of {floor}", len(scans), _PUBLISHED_SCANS[floor]))
+        for condition in sorted({g.condition for g in groups.values()} - {""}):
+            taken = sum(g.condition == condition for g in groups.values())
+            counts.append(Count(f"queries taken on {condition}", taken))
+        return counts
+
+    def _remarks(
+        self, map_: _Map, groups: Mapping[str, ImageGroup], left_out: list[str], turned: int
+    ) -> list[str]:
+        remarks = [
+            "Each floor is a coordinate frame of its own (frame in groups.csv): a pose that rests "
+            "on images of two floors means nothing.",
+        ]
+        if not any(group.condition for group in groups.values()):
+            remarks.append(
+                "The layout does not say on which floor a query was taken; the server reports "
+                "DUC1 and DUC2 apart, here all queries stand together."
+            )
+        step = self.options.depth_step
+        depths = [depth_camera(job.camera, step) for job in map_.depth_jobs]
+        gigabytes = sum(4 * camera.width * camera.height for camera in depths) / 1e9
+        if gigabytes > _MANY_GIGABYTES:
+            remarks.append(
+                f"The depth maps take {gigabytes:.0f} GB; with depth_step = {4 * step} it would "
+                "be a sixteenth."
+            )
+        if left_out:
+            remarks.append(
+                f"Left out, as the dataset's authors list them as wrongly placed: scans "
+                f"{', '.join(left_out)}."
+            )
+        if turned:
+            remarks.append(
+                f"{turned} queries have an EXIF orientation, which is ignored: cameras and poses "
+                "refer to the pixels as they are stored."
+            )
+        return remarks
+
+
+def cutout_camera(width: int, height: int) -> Camera:
+    """The camera of cutouts of a size: 60 degrees wide."""
+    focal = _CUTOUT_FOCAL_SHARE * width
+    return Camera("SIMPLE_PINHOLE", width, height, (focal, width / 2, height / 2))
+
+
+def query_camera(width: int, height: int) -> Camera:
+    """The telephone's camera, its images upright or not."""
+    focal = _FOCAL_SHARE * max(width, height)
+    return Camera("SIMPLE_PINHOLE", width, height, (focal, width / 2, height / 2))
+
+
+@dataclass
+class _Map:
+    """The map's images as they are collected, scan by scan."""
+
+    options: InLocOptions
+    data: KaptureData = field(default_factory=KaptureData)
+    groups: dict[str, ImageGroup] = field(default_factory=dict)
+    depth_jobs: list[DepthJob] = field(default_factory=list)
+
+    def add(self, scan: Scan, missing: Missing) -> None:
+        """A scan's cutouts with their poses; nothing of those whose pose is not known."""
+        without = [c.image for c in scan.cutouts if c.image not in scan.with_points]
+        if self.options.depth:
+            missing.files += [scan.folder / f"{image}{POINTS_SUFFIX}" for image in without]
+        poses = scan.poses()
+        for cutout in scan.cutouts:
+            if cutout.image not in poses:
+                continue
+            pose = poses[cutout.image]
+            image = f"{CUTOUTS}/{scan.location}/{cutout.image}"
+            camera = cutout_camera(*image_size(scan.folder / cutout.image))
+            timestamp = _timestamp(scan, cutout)
+            self.groups[image] = ImageGroup(frame=scan.floor, location=scan.location)
+            sensor = self._sensor(camera)
+            self.data.records_camera[timestamp, sensor] = image
+            if not self.options.depth:
+                self.data.trajectories[timestamp, sensor] = pose
+                continue
+            self.data.trajectories[timestamp, _rig(sensor)] = pose
+            if cutout.image in scan.with_points:
+                record = f"{DEPTH}/{scan.location}/{cutout.image.removesuffix('.jpg')}.depth"
+                self.data.records_depth[timestamp, _depth(sensor)] = record
+                points = scan.folder / f"{cutout.image}{POINTS_SUFFIX}"
+                self.depth_jobs.append(DepthJob(points, cutout, camera, record))
+
+    def _sensor(self, camera: Camera) -> str:
+        """Id of the cutouts' camera of a size; with depth, beside a depth sensor on a rig."""
+        sensor = f"cutout_{camera.width}x{camera.height}"
+        if sensor not in self.data.sensors:
+            self.data.sensors[sensor] = Sensor.from_camera(camera, name=sensor)
+            if self.options.depth:
+                depth = depth_camera(camera, self.options.depth_step)
+                self.data.sensors[_depth(sensor)] = Sensor.from_camera(
+                    depth, name=_depth(sensor), sensor_type="depth"
+                )
+                self.data.rigs[_rig(sensor)] = {
+                    sensor: RigidTransform.identity(),
+                    _depth(sensor): RigidTransform.identity(),
+                }
+        return sensor
+
+
+def _depth(sensor: str) -> str:
+    return f"{sensor}_depth"
+
+
+def _rig(sensor: str) -> str:
+    return f"{sensor}_rig"
+
+
+def _timestamp(scan: Scan, cutout: Cutout) -> int:
+    """A moment of its own for each cutout, the same whatever else is there."""
+    floor = (FLOORS + DISTRACTOR_FLOORS).index(scan.floor) + 1
+    return ((floor * 1000 + int(scan.number)) * 1000 + cutout.yaw_deg) * 1000 + (
+        cutout.pitch_deg + 90
+    )
+
+
+def _queries(names: list[str], folder: Path) -> tuple[KaptureData, int]:
+    """Sensors and records of the queries, and how many are stored turned."""
+    data, turned = KaptureData(), 0
+    for timestamp, name in enumerate(names):
+        path = folder / last_part(name)
+        camera = query_camera(*image_size(path))
+        sensor = f"iphone7_{camera.width}x{camera.height}"
+        data.sensors[sensor] = Sensor.from_camera(camera, name=sensor)
+        data.records_camera[timestamp, sensor] = name
+        turned += _is_turned(path)
+    return data, turned
+
+
+def _is_turned(path: Path) -> bool:
+    from PIL import Image
+
+    try:
+        with Image.open(path) as image:
+            return image.getexif().get(_EXIF_ORIENTATION, 1) != 1
+    except Exception:  # pillow raises many kinds on broken metadata, which nobody needs
+        return False

@@ -1,0 +1,219 @@
+"""Valid files of every format changed at random: a value or one clear error, and nothing else."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from kapture.converter.colmap.database import COLMAPDatabase
+
+from megloc_kapture.datasets.formats import fourseasons_files, inloc_files, robotcar_files
+from megloc_kapture.datasets.formats.colmap_database import ColmapDatabase
+from megloc_kapture.datasets.formats.colmap_model import (
+    BINARY_FILES,
+    TEXT_FILES,
+    ColmapImage,
+    ColmapModel,
+    write_colmap_binary,
+    write_colmap_text,
+)
+from megloc_kapture.datasets.formats.colmap_reading import read_colmap_model
+from megloc_kapture.datasets.formats.nvm import NvmModel, read_nvm, write_nvm
+from megloc_kapture.datasets.formats.query_list import read_query_list
+from megloc_kapture.datasets.formats.sparse_points import SparsePoints
+from megloc_kapture.datasets.formats.text_lines import TextFile, read_rigid_matrix
+from megloc_kapture.errors import DataError
+from megloc_kapture.values import Camera, RigidTransform
+
+TIME = 1602074877390449152
+POSE = "-0.06,0.05,-0.15,0,0.6,0,0.8"
+MATRIX = "0 -1 0 5.0\n1 0 0 2.0\n0 0 1 -1e-1\n0 0 0 1\n"
+TEXTS: dict[Callable[[Path], Any], str] = {
+    fourseasons_files.read_pinhole: "Pinhole 501.5 502.5 421.8 167.7 0.0 0.0 0.0 0.0\n800 400\n"
+    "crop\n800 400\n",
+    read_rigid_matrix: MATRIX,
+    fourseasons_files.read_gnss_poses: f"# header\n{TIME},{POSE},0.96,2\n{TIME + 1},{POSE},1,2,5\n",
+    fourseasons_files.read_poses: f"{TIME},{POSE}\n{TIME + 1},{POSE}\n".replace(",", " "),
+    fourseasons_files.read_keyframe_accuracy: f"{TIME}\n{TIME + 1}\n",
+    fourseasons_files.read_times: f"{TIME} 1602074877.39 0.25\r\n{TIME + 1} 1602074877.39 0.25\r\n",
+    fourseasons_files.read_relocalization: f"{TIME} 1\n{TIME} 2 {POSE.replace(',', ' ')}\n",
+    fourseasons_files.read_transformations: f"# transform_S_AS: t, q\n{POSE}\n"
+    f"# transform_w_gpsw: t\n{POSE}\n\n# transform_e_gpsw: t, q\n{POSE}\n# GNSS scale\n0.96\n",
+    fourseasons_files.read_keyframe: f"# timestamp\n{TIME}\n\n# fx, fy\n1,1,1,1,8,4,1\n\n"
+    f"# camToWorld:\n{POSE}\n\n# Exposure\n0.25\n\n# Point Cloud\n# u,v\n1.0,2.0,0.5,9,0,0,1\n"
+    "1,2,3,4,5,6,7,8,\n",
+    robotcar_files.read_intrinsics: "fx 400.0\nfy 400.0\ncx 508.2\ncy 498.187378\n",
+    robotcar_files.read_query_location: "dawn/left/1418721355075498.jpg\ndawn/rear/14.jpg\n",
+    robotcar_files.read_test_list: "rear/1418721355075498.png\nrear/1418721354984638.png\n",
+    robotcar_files.read_train_poses: "dawn/rear/1.png 1 0 0 10.0 0 1 0 0.0 0 0 1 -2.0 0 0 0 1\n",
+    read_query_list: "query/day/a.jpg SIMPLE_RADIAL 1600 1200 1469.2 800 600 -0.0353\r\n"
+    "query/b.jpg PINHOLE 768 1024 971.838 384 512 -0.00177789",
+    inloc_files.read_transformation: f"Before general icp:\n{MATRIX}\nAfter general icp:\n{MATRIX}",
+    inloc_files.read_wrong_scans: "known wrong:\n\n008\nDUC_scan_12.ptx 31\r\n2017\n",
+}
+
+POINTS = SparsePoints(
+    np.array([[1.5, -2.0, 30.0], [4.0, 5.0, 6.0], [-7.0, 8.0, 9.0]]),
+    np.array([[255, 0, 7], [1, 2, 3], [0, 0, 0]], dtype=np.uint8),
+    np.array([0, 0, 0, 1]),
+    np.array([0, 1, 0, 1], dtype=np.int32),
+    np.array([2, 3, 0, 1], dtype=np.int32),
+    np.array([[10.5, 20.25], [30, 40], [11, 21], [100, 0.5]], dtype=np.float32),
+)
+NVM = NvmModel(
+    ("db/7.jpg", "db/8.jpg"),
+    np.array([1000.0, 900.5]),
+    np.array([[1.0, 0, 0, 0], [0.5, -0.5, 0.5, 0.5]]),
+    np.array([[2.0, 0, -5], [1, 2, 3]]),
+    np.array([-0.08, 0.25]),
+    POINTS,
+)
+COLMAP = ColmapModel(
+    {1: Camera("SIMPLE_RADIAL", 640, 480, (500, 320, 240, 0.1))},
+    (
+        ColmapImage(1, "db/7.jpg", 1, RigidTransform((1.0, 0.0, 0.0, 0.0), (0.5, 0.0, 2.0))),
+        ColmapImage(4, "db/8.jpg", 1, RigidTransform((0.5, 0.5, 0.5, 0.5), (0.5, 0.0, 2.0))),
+    ),
+    POINTS,
+)
+
+# what parsers of numbers trip over
+TOKENS = st.sampled_from(
+    [b"nan", b"-inf", b"1e999", b"-1", b"0", b"1", b"2", b"99999999999", b"18446744073709551616"]
+    + [b"1_0", b"0x1", b".5", b"5.", b"-.5e-3", b"+7", b"1e", b"#", b"\xff", b"\0", b"\n", b"\r\n"]
+    + [b" ", b"\t", b"\x0b", b"\x1c", b"\xc2\xa0", b"\xd9\xa1", b"../x", b"256", b"2147483648"]
+    + [b"179769313486231570000e290", b"8.5070591730234615e37", b"1.7014118346046923e38", b"-0.0"]
+    + [b"9" * 400, b",", b"\xef\xbb\xbf", b"\n\n\n"]
+)
+OFFSETS = st.integers(0, 1 << 16)
+EDITS = st.lists(
+    st.one_of(
+        st.tuples(st.just("insert"), OFFSETS, TOKENS | st.binary(max_size=30)),
+        st.tuples(st.just("token"), OFFSETS, TOKENS),
+        st.tuples(st.just("delete"), OFFSETS, st.integers(1, 40)),
+        st.tuples(st.just("double"), OFFSETS, st.integers(1, 80)),
+        st.tuples(st.just("byte"), OFFSETS, st.integers(0, 255)),
+        st.tuples(st.just("cut"), OFFSETS, st.none()),
+    ),
+    min_size=1,
+    max_size=4,
+)
+MANY = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+def changed(content: bytes, edits: list[tuple[str, int, Any]]) -> bytes:
+    """Apply edits; offsets wrap around the length."""
+    for kind, offset, value in edits:
+        k = offset % (len(content) + 1)
+        if kind == "insert":
+            content = content[:k] + value + content[k:]
+        elif kind == "token":  # instead of a field
+            end = min((e for e in (content.find(c, k) for c in b" \n") if e >= 0), default=k)
+            begin = max(content.rfind(b" ", 0, end), content.rfind(b"\n", 0, end)) + 1
+            content = content[:begin] + value + content[end:]
+        elif kind == "delete":
+            content = content[:k] + content[k + value :]
+        elif kind == "double":
+            content = content[: k + value] + content[k:]
+        elif kind == "byte":
+            content = content[:k] + bytes([value]) + content[k + 1 :]
+        else:
+            content = content[:k]
+    return content
+
+
+def outcome(read: Callable[[], Any], path: Path) -> Any:
+    """The value, of finite poses, or the error's one line, which names the file."""
+    try:
+        value = read()
+    except DataError as error:
+        assert str(error).startswith(str(path)) and "\n" not in str(error)
+        return str(error)
+    for item in value if isinstance(value, list) else [value]:
+        pose = getattr(item, "cam_from_world", item)
+        if isinstance(pose, RigidTransform):
+            assert np.isfinite([*pose.quat_wxyz, *pose.translation]).all()
+            assert np.linalg.norm(pose.quat_wxyz) == pytest.approx(1, abs=1e-9)
+    return value
+
+
+@pytest.fixture(params=[64, 1 << 20], ids=["small blocks", "one block"])
+def block_bytes(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let borders of blocks be everywhere, or nowhere."""
+    monkeypatch.setitem(TextFile.__init__.__kwdefaults__, "block_bytes", request.param)
+
+
+@pytest.mark.parametrize("reader", TEXTS, ids=lambda reader: reader.__name__)
+@given(edits=EDITS)
+@MANY
+def test_texts(
+    tmp_path: Path, reader: Callable[[Path], Any], edits: list[tuple[str, int, Any]]
+) -> None:
+    path = tmp_path / "file.txt"
+    path.write_bytes(changed(TEXTS[reader].encode(), edits))
+    outcome(lambda: reader(path), path)
+
+
+@given(EDITS)
+@MANY
+@pytest.mark.usefixtures("block_bytes")
+def test_nvm(tmp_path: Path, edits: list[tuple[str, int, Any]]) -> None:
+    path = tmp_path / "m.nvm"
+    write_nvm(path, NVM)
+    path.write_bytes(changed(path.read_bytes(), edits))
+    found = outcome(lambda: read_nvm(path), path)
+    poses = outcome(lambda: read_nvm(path, with_points=False), path)
+    if not isinstance(found, str):
+        assert [model.names for model in found] == [model.names for model in poses]
+
+
+@given(st.sampled_from([*TEXT_FILES, *BINARY_FILES]), EDITS)
+@MANY
+@pytest.mark.usefixtures("block_bytes")
+def test_colmap_models(tmp_path: Path, name: str, edits: list[tuple[str, int, Any]]) -> None:
+    folder = tmp_path / name
+    (write_colmap_text if name in TEXT_FILES else write_colmap_binary)(folder, COLMAP)
+    (folder / name).write_bytes(changed((folder / name).read_bytes(), edits))
+    found = outcome(lambda: read_colmap_model(folder), folder)
+    poses = outcome(lambda: read_colmap_model(folder, with_points=False), folder)
+    if not isinstance(found, str):
+        assert poses.images == found.images
+
+
+@pytest.fixture(scope="module")
+def database(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("database") / "good.db"
+    opened = COLMAPDatabase.connect(str(path))
+    opened.create_tables()
+    camera_id = opened.add_camera(2, 640, 480, np.array([500.0, 320, 240, 0.1]))
+    for name in ("a.jpg", "b/c.jpg"):
+        image_id = opened.add_image(name, camera_id)
+        opened.add_keypoints(image_id, np.arange(24, dtype=np.float32).reshape(4, 6))
+        opened.add_descriptors(image_id, np.arange(64, dtype=np.uint8).reshape(4, 16))
+    opened.commit()
+    opened.close()
+    return path
+
+
+@given(EDITS)
+@MANY
+def test_colmap_database(tmp_path: Path, database: Path, edits: list[tuple[str, int, Any]]) -> None:
+    path = tmp_path / "d.db"
+    shutil.copy(database, path)
+    path.write_bytes(changed(path.read_bytes(), edits))
+
+    def read() -> Any:
+        with ColmapDatabase(path) as opened:
+            features = {
+                name: (opened.keypoints(name), opened.descriptors(name)) for name in opened.images
+            }
+            return opened.cameras(), features
+
+    outcome(read, path)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["d.db"]

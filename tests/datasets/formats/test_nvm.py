@@ -1,0 +1,398 @@
+"""NVM models: every quirk of the published files, against kapture's own importer and by hand."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import kapture
+import kapture.io.csv
+import numpy as np
+import pytest
+from kapture.io.records import TransferAction
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from megloc_kapture.datasets.formats.nvm import NvmModel, read_nvm, write_nvm
+from megloc_kapture.datasets.formats.sparse_points import SparsePoints
+from megloc_kapture.datasets.formats.text_lines import TextFile
+from megloc_kapture.errors import DataError
+
+SAMPLE = "kapture_samples/Aachen-Day-Night"
+
+CAMERA = "db/7.jpg 1000.0 1 0 0 0 2.0 0.0 -5.0 0.08 0"
+TURNED = "db/8.jpg 900.5 0.5 -0.5 0.5 0.5 1 2 3 -0.25 0"
+POINTS = [
+    "1.5 -2 3e1 255 0 7 3 0 12 10.5 20.25 1 3 30.125 40 0 9 11 21",
+    "4 5 6 1 2 3 1 1 2147483647 1e2 .5",
+    "-7 8 9 0 0 0 0",
+]
+MODEL = ["2", CAMERA, TURNED, "", "3", *POINTS]
+ARRAYS = ("xyz", "rgb", "point_ids", "image_ids", "feature_ids", "xy_px")
+
+
+@pytest.fixture
+def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let borders of blocks be everywhere."""
+    monkeypatch.setitem(TextFile.__init__.__kwdefaults__, "block_bytes", 100)
+
+
+def file(path: Path, lines: list[str], end: str = "\n") -> Path:
+    path.write_bytes(end.join(["NVM_V3", "", *lines]).encode())
+    return path
+
+
+def equal_points(first: SparsePoints, second: SparsePoints) -> bool:
+    return all(
+        getattr(first, name).dtype == getattr(second, name).dtype
+        and np.array_equal(getattr(first, name), getattr(second, name))
+        for name in ARRAYS
+    )
+
+
+def check_model(model: NvmModel) -> None:
+    """What the lines above say."""
+    assert model.names == ("db/7.jpg", "db/8.jpg")
+    assert model.focal_px.tolist() == [1000.0, 900.5]
+    assert model.k_colmap.tolist() == [-0.08, 0.25]
+    assert model.centers.tolist() == [[2, 0, -5], [1, 2, 3]]
+    assert model.cam_from_world(0).translation == (-2.0, 0.0, 5.0)
+    rotation = Rotation.from_quat([-0.5, 0.5, 0.5, 0.5])
+    expected = -rotation.as_matrix() @ [1, 2, 3]
+    assert model.cam_from_world(1).quat_wxyz == (0.5, -0.5, 0.5, 0.5)
+    assert np.allclose(model.cam_from_world(1).translation, expected, atol=1e-14)
+    points = model.points
+    assert points.xyz.tolist() == [[1.5, -2, 30], [4, 5, 6], [-7, 8, 9]]
+    assert points.rgb.tolist() == [[255, 0, 7], [1, 2, 3], [0, 0, 0]]
+    assert points.point_ids.tolist() == [0, 0, 0, 1]
+    assert points.image_ids.tolist() == [0, 1, 0, 1]
+    assert points.feature_ids.tolist() == [12, 3, 9, 2147483647]
+    assert points.xy_px.tolist() == [[10.5, 20.25], [30.125, 40], [11, 21], [100, 0.5]]
+    dtypes = [getattr(points, name).dtype for name in ARRAYS]
+    assert dtypes == [np.float64, np.uint8, np.int64, np.int32, np.int32, np.float32]
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+@pytest.mark.usefixtures("small_blocks")
+def test_the_plain_form(tmp_path: Path, end: str) -> None:
+    for tail in ([], [""], ["0"], ["", "0", "", "some PLY stuff", "\udcff"[:0]]):
+        path = file(tmp_path / "m.nvm", MODEL + tail, end)
+        [model] = read_nvm(path)
+        check_model(model)
+
+
+@pytest.mark.usefixtures("small_blocks")
+def test_all_known_variants_of_the_layout(tmp_path: Path) -> None:
+    text = "\n".join(
+        [
+            "\ufeffNVM_V3 FixedK 1000 512 1000.5 384 ",
+            " ",
+            "\t",
+            " 2  ",
+            "./db/7.jpg\t1000.0 1 0 0 0  2.0 0.0 -5.0 0.08 0 ",
+            "",
+            TURNED.replace(" ", "\t"),
+            "",
+            "",
+            "3 ",
+            *(f"  {point} \n" for point in POINTS),
+            "1",
+            "db/9.jpg 5 1 0 0 0 0 0 0 0 0",
+            "1",
+            "1 2 3 64.0 5 6 1 0 0 1 2",
+            "2",
+            "unregistered/1.jpg 0 0 0 0 0 0 0 0 0 0",
+            "unregistered/2.jpg 0 0 0 0 0 0 0 0 0 0",
+            "0",
+            "0",
+            "# what follows is not looked at: 1 2 three",
+        ]
+    )
+    path = tmp_path / "m.nvm"
+    path.write_bytes(text.encode() + b"\n\xff\x00\xfe")
+    first, second = read_nvm(path)
+    check_model(first)
+    assert second.names == ("db/9.jpg",)
+    assert second.points.rgb.tolist() == [[64, 5, 6]]
+    assert second.points.point_ids.tolist() == [0]
+    # no minus zero
+    assert np.signbit(second.k_colmap).tolist() == [False]
+
+    models = read_nvm(path, with_points=False)
+    assert [model.names for model in models] == [first.names, second.names]
+    assert all(len(model.points) == 0 for model in models)
+    assert np.array_equal(models[0].centers, first.centers)
+
+
+def test_a_file_of_cameras_alone_is_a_model(tmp_path: Path) -> None:
+    path = file(tmp_path / "m.nvm", ["1", CAMERA, "0", "0"])
+    [model] = read_nvm(path)
+    assert model.names == ("db/7.jpg",)
+    assert len(model.points) == 0
+
+
+def test_quaternions_are_normalised_or_refused(tmp_path: Path) -> None:
+    camera = "a.jpg 1 0.5003 -0.5 0.5 0.5 0 0 0 0 0"
+    [model] = read_nvm(file(tmp_path / "m.nvm", ["1", camera, "0"]))
+    assert np.linalg.norm(model.quat_wxyz[0]) == pytest.approx(1, abs=1e-15)
+    w, x, y, z = model.quat_wxyz[0]
+    assert w / x == pytest.approx(-0.5003 / 0.5, rel=1e-12)
+    assert (y, z) == (-x, -x)
+    path = file(tmp_path / "m.nvm", ["2", camera.replace("0.5003", "0.503"), CAMERA, "0"])
+    with pytest.raises(DataError, match=r"m\.nvm:4: .*not a unit quaternion"):
+        read_nvm(path)
+
+
+# ------------------------------------------------------------------------------- against kapture
+
+
+def import_with_kapture(nvm: Path, images: Path, output: Path) -> kapture.Kapture:
+    from tools.kapture_import_nvm import import_nvm
+
+    import_nvm(str(nvm), str(images), str(output), None, False, True, True, TransferAction.skip)
+    return kapture.io.csv.kapture_from_dir(str(output))
+
+
+def observed(data: kapture.Kapture, folder: Path) -> list[tuple[int, str, float, float]]:
+    """(point, image, x, y) of every observation."""
+    rows = []
+    for point in data.observations:
+        for image, keypoint in data.observations[point, "sift"]:
+            path = kapture.io.features.get_keypoints_fullpath("sift", str(folder), image)
+            keypoints = kapture.io.features.image_keypoints_from_file(path, np.float32, 2)
+            rows.append((point, image, *keypoints[keypoint].tolist()))
+    return sorted(rows)
+
+
+def check_against_kapture(models: list[NvmModel], data: kapture.Kapture, folder: Path) -> None:
+    """Poses, distortion, points and observations; kapture merges the models of a file."""
+    sensors = {name: (time, sensor) for time, sensor, name in kapture.flatten(data.records_camera)}
+    for model in models:
+        for index, name in enumerate(model.names):
+            camera = data.sensors[sensors[name][1]]
+            assert camera.camera_params[2] == model.focal_px[index]
+            assert camera.camera_params[5] == model.k_colmap[index]
+            theirs = data.trajectories[sensors[name]]
+            ours = model.cam_from_world(index)
+            # kapture keeps the length of the quaternion, which has six digits here
+            assert np.allclose(ours.quat_wxyz, theirs.r_raw, atol=1e-6)
+            assert np.allclose(ours.translation, theirs.t_raw, atol=1e-9)
+    merged = np.concatenate([np.hstack([m.points.xyz, m.points.rgb]) for m in models])
+    assert np.allclose(merged, data.points3d.as_array(), atol=1e-9)
+    first = 0
+    rows: set[tuple[Any, ...]] = set()
+    for model in models:
+        points = model.points
+        for point, image, (x, y) in zip(
+            points.point_ids, points.image_ids, points.xy_px.tolist(), strict=True
+        ):
+            rows.add((first + int(point), model.names[image], x, y))
+        first += len(points)
+    assert sorted(rows) == observed(data, folder)
+
+
+@pytest.mark.parametrize("name", ["aachen_cvpr2018_db.nvm", "aachen_two_parts.nvm"])
+def test_the_published_sample_reads_as_kapture_reads_it(
+    shared_data: Path, tmp_path: Path, name: str
+) -> None:
+    nvm = shared_data / SAMPLE / "3D-models" / name
+    models = read_nvm(nvm)
+    assert len(models) == (2 if "two_parts" in name else 1)
+    data = import_with_kapture(nvm, shared_data / SAMPLE / "images_upright", tmp_path)
+    check_against_kapture(models, data, tmp_path)
+
+
+def test_the_sample_has_the_poses_of_its_published_kapture(shared_data: Path) -> None:
+    [model] = read_nvm(shared_data / SAMPLE / "3D-models/aachen_cvpr2018_db.nvm")
+    twin = kapture.io.csv.kapture_from_dir(str(shared_data / SAMPLE / "kapture/training"))
+    by_name = {name: key for *key, name in kapture.flatten(twin.records_camera)}
+    assert model.k_colmap[0] == -0.0810989
+    assert set(by_name) == set(model.names)
+    for index, name in enumerate(model.names):
+        time, sensor = by_name[name]
+        pose = twin.trajectories[time, sensor]
+        assert np.allclose(model.cam_from_world(index).quat_wxyz, pose.r_raw, atol=1e-6)
+        assert np.allclose(model.cam_from_world(index).translation, pose.t_raw, atol=1e-9)
+        assert twin.sensors[sensor].camera_params[5] == model.k_colmap[index]
+
+
+def random_model(seed: int, num_images: int = 7, num_points: int = 60) -> NvmModel:
+    rng = np.random.default_rng(seed)
+    rotations = Rotation.random(num_images, random_state=seed).as_quat()
+    seen = rng.random((num_points, num_images)) < 0.4
+    point_ids, image_ids = np.nonzero(seen)
+    # an image sees a point twice, and features are not dense
+    point_ids, image_ids = np.r_[point_ids, point_ids[:1]], np.r_[image_ids, image_ids[:1]]
+    features = np.concatenate([rng.permutation(500)[: len(point_ids)]])
+    points = SparsePoints(
+        rng.normal(0, 1e3, (num_points, 3)),
+        rng.integers(0, 256, (num_points, 3)).astype(np.uint8),
+        point_ids.astype(np.int64),
+        image_ids.astype(np.int32),
+        features.astype(np.int32),
+        rng.uniform(0, 1e3, (len(features), 2)).astype(np.float32),
+    )
+    return NvmModel(
+        tuple(f"db/{i}.jpg" for i in rng.permutation(num_images)),
+        rng.uniform(500, 1000, num_images),
+        np.roll(rotations, 1, axis=1),
+        rng.normal(0, 1e3, (num_images, 3)),
+        rng.normal(0, 0.1, num_images),
+        points.sorted_by_point(),
+    )
+
+
+@pytest.mark.usefixtures("small_blocks")
+def test_a_model_comes_back_exactly(tmp_path: Path) -> None:
+    written = random_model(1)
+    write_nvm(tmp_path / "m.nvm", written)
+    [read] = read_nvm(tmp_path / "m.nvm")
+    assert read.names == written.names
+    for name in ("focal_px", "centers", "k_colmap"):
+        assert np.array_equal(getattr(read, name), getattr(written, name))
+    assert np.allclose(read.quat_wxyz, written.quat_wxyz, rtol=0, atol=1e-15)
+    assert equal_points(read.points, written.points)
+
+
+def test_what_we_write_kapture_reads(tmp_path: Path) -> None:
+    model = random_model(2)
+    write_nvm(tmp_path / "m.nvm", model)
+    # COLMAP's exporter leaves blanks in blank lines, which kapture does not take for blank
+    text = (tmp_path / "m.nvm").read_text()
+    assert text.startswith("NVM_V3 \n \n7  \n")
+    (tmp_path / "m.nvm").write_text(text.replace("\n \n", "\n\n"))
+    for name in model.names:
+        image = tmp_path / "images" / name
+        image.parent.mkdir(parents=True, exist_ok=True)
+        Image.new("L", (64, 48)).save(image)
+    data = import_with_kapture(tmp_path / "m.nvm", tmp_path / "images", tmp_path / "kapture")
+    check_against_kapture([model], data, tmp_path / "kapture")
+
+
+def test_names_with_blanks_cannot_be_written(tmp_path: Path) -> None:
+    model = random_model(3, 1, 1)
+    for name in ("a b.jpg", "a\tb", "", "a\n"):
+        wrong = NvmModel(
+            (name,), model.focal_px, model.quat_wxyz, model.centers, model.k_colmap, model.points
+        )
+        with pytest.raises(ValueError, match="blanks"):
+            write_nvm(tmp_path / "m.nvm", wrong)
+    assert list(tmp_path.iterdir()) == []
+
+
+# ------------------------------------------------------------------------------------ bad input
+
+
+@pytest.mark.parametrize(
+    ("line", "match"),
+    [
+        ("1 2 3 4 5", "got 5 fields"),
+        ("1 2 3 4 5 6 1 0 0 1", "expected 11 fields for 1 measurements, got 10"),
+        ("1 2 3 4 5 6 1 0 0 1 2 3", "expected 11 fields for 1 measurements, got 12"),
+        ("1 2 3 4 5 6 999999999999 0 0 1 2", "expected 4000000000003 fields"),
+        ("1 2 3 4 5 6 -1", "'-1' is not a whole number"),
+        ("nan 2 3 4 5 6 0", "coordinate 'nan' is not a finite number"),
+        ("1e999 2 3 4 5 6 0", "coordinate '1e999' is not a finite number"),
+        ("1 0x2 3 4 5 6 0", "coordinate '0x2' is not a finite number"),
+        ("1 2,5 3 4 5 6 0", "coordinate '2,5' is not a finite number"),
+        ("1 2 3 256 5 6 0", "a colour is not made of whole numbers"),
+        ("1 2 3 4 -5 6 0", "a colour is not made of whole numbers"),
+        ("1 2 3 4 5 6.5 0", "a colour is not made of whole numbers"),
+        ("1 2 3 4 5 6 1 2 0 1 2", "image index 2 is out of range, there are 2"),
+        ("1 2 3 4 5 6 1 -1 0 1 2", "image index '-1' is not a whole number"),
+        ("1 2 3 4 5 6 1 0 2147483648 1 2", "feature index 2147483648 is out of range"),
+        ("1 2 3 4 5 6 1 0 1.5 1 2", "feature index '1.5' is not a whole number"),
+        ("1 2 3 4 5 6 1 0 0 1_0 2", "image coordinate '1_0' is not a finite number"),
+        ("1 2 3 4 5 6 1 0 0 inf 2", "image coordinate 'inf' is not a finite number"),
+        ("1 2 3 4 5 6 1 0 0 2e38 2", "image coordinate '2e38' is out of range"),
+        ("1 2 3 4 5 6 \u0661", "is not a whole number"),
+        ("1 2 3\0 4 5 6 0", "is not a finite number"),
+    ],
+)
+@pytest.mark.usefixtures("small_blocks")
+def test_bad_points_name_file_and_line(tmp_path: Path, line: str, match: str) -> None:
+    good = POINTS * 4
+    lines = ["2", CAMERA, TURNED, "", "99", *good[:9], "", line, *good]
+    path = file(tmp_path / "m.nvm", lines)
+    with pytest.raises(DataError, match=match) as caught:
+        read_nvm(path)
+    assert str(caught.value).startswith(f"{path}:18: ")
+
+
+@pytest.mark.parametrize(
+    ("lines", "match"),
+    [
+        ([], r"m\.nvm: holds no model"),
+        (["0"], r"m\.nvm: holds no model"),
+        (["x"], r"m\.nvm:3: the number of cameras 'x' is not a whole number"),
+        (["-2"], r"m\.nvm:3: the number of cameras '-2' is not"),
+        (["2 2"], r"m\.nvm:3: expected 1 fields \(the number of cameras"),
+        (["2", CAMERA], r"m\.nvm:4: the file ends after 1 of 2 cameras"),
+        (["99999999999999999", CAMERA], r"ends after 1 of 99999999999999999 cameras"),
+        (["1", CAMERA], r"m\.nvm:4: the file ends where the number of points was expected"),
+        (["1", CAMERA, "2"], r"m\.nvm:5: the file ends after 0 of 2 points"),
+        (["1", CAMERA, "99999999999999999"], "ends after 0 of 99999999999999999 points"),
+        (["1", CAMERA, "x"], r"m\.nvm:5: the number of points 'x'"),
+        (["1", CAMERA, "1", "1 2 3 4 5 6 0", "1 2 3"], r"m\.nvm:7: expected 1 fields"),
+        (["1", CAMERA + " 7", "0"], r"m\.nvm:4: expected 11 fields .*, got 12"),
+        (["1", CAMERA.replace("1000.0", "f"), "0"], r"m\.nvm:4: camera parameter 'f'"),
+        (["1", CAMERA.replace("1000.0", "NaN"), "0"], r"m\.nvm:4: camera parameter 'NaN'"),
+        (["1", "../" + CAMERA, "0"], r"m\.nvm:4: .* leads out of its folder"),
+        (["1", "/" + CAMERA, "0"], r"m\.nvm:4: .* absolute path"),
+        (["1", "a\\b" + CAMERA, "0"], r"m\.nvm:4: .* backslash"),
+        (["2", CAMERA, "./" + CAMERA, "0"], r"m\.nvm:5: image 'db/7.jpg' is listed twice, .* 4"),
+    ],
+)
+def test_bad_structure_is_named(tmp_path: Path, lines: list[str], match: str) -> None:
+    path = file(tmp_path / "m.nvm", lines)
+    for with_points in (True, False):
+        with pytest.raises(DataError, match=match):
+            read_nvm(path, with_points=with_points)
+
+
+@pytest.mark.parametrize(
+    ("content", "match"),
+    [
+        (b"", "the first line must begin with NVM_V3"),
+        (b"\n\n", "the first line must begin with NVM_V3"),
+        (b"NVM_V3_R9T\n1\n", "the first line must begin with NVM_V3"),
+        (b"\x89PNG\r\n\x1a\n" + bytes(range(256)) * 40, "the first line must begin with NVM_V3"),
+        (b"NVM_V3 FixedK 1 2 3\n", "expected 6 fields"),
+        (b"NVM_V3 FixedX 1 2 3 4\n", "only FixedK"),
+        (b"NVM_V3 FixedK 1 2 3 x\n", "calibration 'x'"),
+        (b"NVM_V3\n1\n\xff.jpg 1 1 0 0 0 0 0 0 0 0\n0\n", "name is not UTF-8"),
+        (b"NVM_V3\n1\na\x01 1 1 0 0 0 0 0 0 0 0\n0\n", "control character"),
+    ],
+)
+def test_bad_content_is_named(tmp_path: Path, content: bytes, match: str) -> None:
+    path = tmp_path / "m.nvm"
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=match) as caught:
+        read_nvm(path)
+    assert str(caught.value).startswith(f"{path}:")
+
+
+def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"m\.nvm: file is missing"):
+        read_nvm(tmp_path / "m.nvm")
+    os.mkfifo(tmp_path / "m.nvm")
+    with pytest.raises(DataError, match=r"m\.nvm: not a plain file"):
+        read_nvm(tmp_path / "m.nvm")
+    with pytest.raises(DataError, match="not a plain file"):
+        read_nvm(tmp_path)
+
+
+@pytest.mark.usefixtures("small_blocks")
+def test_many_small_models_and_one_that_ends_within_a_block(tmp_path: Path) -> None:
+    lines = []
+    for k in range(40):
+        points = POINTS[2:] * (k % 5 + 1)
+        lines += ["1", f"{k}.jpg 1 1 0 0 0 0 0 0 0 0", str(len(points)), *points]
+    models = read_nvm(file(tmp_path / "m.nvm", lines))
+    assert [model.names for model in models] == [(f"{k}.jpg",) for k in range(40)]
+    assert [len(model.points) for model in models] == [k % 5 + 1 for k in range(40)]
+    # with one point less announced, the next line is no number of cameras
+    lines[2 + 4 * 0] = "0"
+    with pytest.raises(DataError, match=r"m\.nvm:6: expected 1 fields"):
+        read_nvm(file(tmp_path / "m.nvm", lines))

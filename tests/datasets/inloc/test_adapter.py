@@ -1,0 +1,379 @@
+"""InLoc's adapter on a small download made by hand: a scanner in a box, on two floors."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+from inloc_files import CENTRES, HEIGHT, SCANS, VIEWS, WIDTH, Floats, scanned, write_download
+from PIL import Image
+
+import megloc_kapture  # noqa: F401  before kapture
+from megloc_kapture.datasets.inloc.adapter import InLoc, InLocOptions
+from megloc_kapture.datasets.inloc.depth import depth_camera
+from megloc_kapture.datasets.official import OfficialDataset, write_official
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.challenge_tables import read_names
+from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.side_tables import read_groups, read_protocol
+from megloc_kapture.plugins import DATASETS, load_plugin
+from megloc_kapture.values import Camera
+
+
+@pytest.fixture(scope="module")
+def download(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_download(tmp_path_factory.mktemp("data") / "InLoc")
+
+
+@pytest.fixture
+def root(download: Path, tmp_path: Path) -> Path:
+    """A copy to be changed."""
+    return Path(shutil.copytree(download, tmp_path / "InLoc"))
+
+
+def imported(root: Path, output: Path, *, allow_missing: bool = False, **options: object) -> Path:
+    dataset = read(root, allow_missing=allow_missing, **options)
+    write_official(dataset, output, allow_missing=allow_missing)
+    return output
+
+
+def read(root: Path, *, allow_missing: bool = False, **options: object) -> OfficialDataset:
+    return InLoc(InLocOptions.model_validate(options)).read(root, allow_missing=allow_missing)
+
+
+def in_cutouts(mapping: Path, sensor_type: str) -> dict[str, tuple[Floats, object]]:
+    """By record: what its scan measured, in the sensor's frame, and COLMAP's camera, after kapture.
+
+    The poses are composed by kapture from what it reads.
+    """
+    import kapture
+    import pycolmap
+    from kapture.io.csv import kapture_from_dir
+
+    theirs = kapture_from_dir(str(mapping))
+    poses = kapture.rigs_remove(theirs.trajectories, theirs.rigs) if theirs.rigs else None
+    records = theirs.records_camera if sensor_type == "camera" else theirs.records_depth
+    found = {}
+    for timestamp, sensor_id, name in kapture.flatten(records):
+        model, width, height, *params = theirs.sensors[sensor_id].sensor_params
+        camera = pycolmap.Camera(
+            model=model, width=int(width), height=int(height), params=list(map(float, params))
+        )
+        *_, floor, _, file = name.split("/")
+        yaw, pitch = (int(part) for part in file.split(".")[0].split("_")[-2:])
+        rotation, translation = SCANS[floor]
+        in_floor = scanned(yaw, pitch).reshape(-1, 3) @ rotation.T + translation
+        pose = (poses or theirs.trajectories)[timestamp, sensor_id]
+        found[name] = pose.transform_points(in_floor).reshape(HEIGHT, WIDTH, 3), camera
+    return found
+
+
+@pytest.mark.parametrize("depth", [True, False])
+def test_points_are_seen_in_their_pixels(download: Path, tmp_path: Path, depth: bool) -> None:
+    output = imported(download, tmp_path / "out", depth=depth)
+    found = in_cutouts(output / "mapping", "camera")
+    assert sorted(found) == sorted(
+        f"database/cutouts/{floor}/024/DUC_cutout_024_{yaw}_{pitch}.jpg"
+        for floor in SCANS
+        for yaw, pitch in VIEWS
+    )
+    for points, camera in found.values():
+        seen = np.isfinite(points).all(axis=2)
+        assert seen.sum() == WIDTH * HEIGHT - 2
+        assert (points[seen][:, 2] > 0.5).all()
+        pixels = camera.img_from_cam(points[seen])  # type: ignore[attr-defined]
+        np.testing.assert_allclose(pixels, CENTRES[seen], atol=1e-6)
+
+
+@pytest.mark.parametrize("step", [1, 3, 64])
+def test_depth_maps_hold_the_measured_points(download: Path, tmp_path: Path, step: int) -> None:
+    output = imported(download, tmp_path / "out", depth_step=step)
+    found = in_cutouts(output / "mapping", "depth")
+    assert len(found) == 72
+    for name, (points, camera) in found.items():
+        kept = points[::step, ::step]
+        path = output / "mapping" / "sensors" / "records_data" / name
+        depth = np.frombuffer(path.read_bytes(), "<f4").reshape(kept.shape[:2])
+        assert (camera.width, camera.height) == depth.shape[::-1]  # type: ignore[attr-defined]
+        known = np.isfinite(kept).all(axis=2)
+        assert (depth[~known] == 0).all() and (~known).any()
+        np.testing.assert_allclose(depth[known], kept[known][:, 2], rtol=1e-6)
+        rows, columns = np.nonzero(known)
+        pixels = np.column_stack([columns, rows]) + 0.5
+        rays = np.column_stack([camera.cam_from_img(pixels), np.ones(len(rows))])  # type: ignore[attr-defined]
+        np.testing.assert_allclose(rays * depth[known][:, None], kept[known], atol=1e-5)
+
+
+def test_depth_cameras_count_the_centres_of_pixels() -> None:
+    camera = Camera("SIMPLE_PINHOLE", 1600, 1200, (1385.6406460551, 800.0, 600.0))
+    assert depth_camera(camera, 1) == camera
+    small = depth_camera(camera, 4)
+    assert (small.width, small.height) == (400, 300)
+    assert small.params == (1385.6406460551 / 4, 799.5 / 4 + 0.5, 599.5 / 4 + 0.5)
+    assert depth_camera(camera, 7).width == 229
+
+
+def test_cameras_are_those_of_the_paper(root: Path) -> None:
+    for name, size in (("IMG_0801.JPG", (4032, 3024)), ("IMG_0803.JPG", (3024, 4032))):
+        Image.new("L", size).save(root / "query" / "iphone7" / name, format="JPEG")
+    data = read(root).query
+    landscape = data.camera_of("query/iphone7/IMG_0801.JPG")
+    assert landscape == Camera("SIMPLE_PINHOLE", 4032, 3024, (3136.0, 2016.0, 1512.0))
+    upright = data.camera_of("query/iphone7/IMG_0803.JPG")
+    assert upright == Camera("SIMPLE_PINHOLE", 3024, 4032, (3136.0, 1512.0, 2016.0))
+    cutout = root / "database/cutouts/DUC1/024/DUC_cutout_024_0_0.jpg"
+    Image.new("L", (1600, 1200)).save(cutout)
+    camera = read(root).mapping.camera_of("database/cutouts/DUC1/024/DUC_cutout_024_0_0.jpg")
+    assert (camera.width, camera.height) == (1600, 1200)
+    np.testing.assert_allclose(camera.params, (1385.6406460551, 800, 600), rtol=1e-13)
+
+
+def test_queries_as_they_are_stored(download: Path, tmp_path: Path) -> None:
+    output = imported(download, tmp_path / "out")
+    query = KaptureFolder(output / "query")
+    query.validate(deep=True)
+    names = [f"query/iphone7/{n}" for n in ("IMG_0801.JPG", "IMG_0802.jpg", "IMG_0803.JPG")]
+    assert query.read().image_names() == names
+    assert not query.read().trajectories
+    turned = query.read().camera_of(names[1])
+    assert (turned.width, turned.height) == (64, 48)
+    assert len(query.read().sensors) == 2
+    dataset = read(download)
+    assert any("1 queries have an EXIF orientation" in remark for remark in dataset.remarks)
+    assert list(read_names(output / "megloc").items()) == [
+        (name, name.split("/")[-1]) for name in names
+    ]
+    for name in names:
+        link = output / "query" / "sensors" / "records_data" / name
+        assert link.resolve() == download / name
+        assert link.parent.is_symlink()
+
+
+def test_floors_are_frames_of_their_own(download: Path, tmp_path: Path) -> None:
+    output = imported(download, tmp_path / "out")
+    mapping = KaptureFolder(output / "mapping")
+    mapping.validate(deep=True)
+    groups = read_groups(output / "megloc")
+    for image in mapping.read().image_names():
+        floor = image.split("/")[2]
+        assert (groups[image].frame, groups[image].location) == (floor, f"{floor}/024")
+    assert {groups[i].frame for i in KaptureFolder(output / "query").read().image_names()} == {""}
+    protocol = read_protocol(output / "megloc")
+    assert protocol.dataset == "inloc"
+    assert protocol.thresholds == ((0.25, 10), (0.5, 10), (1, 10))
+    assert protocol.conditions == ("DUC1", "DUC2")
+    assert not (output / "query_gt").exists()
+
+
+def test_depth_sensors_stand_where_the_cameras_are(download: Path) -> None:
+    data = read(download).mapping
+    assert list(data.rigs) == ["cutout_40x30_rig"]
+    assert {device for _, device in data.trajectories} == {"cutout_40x30_rig"}
+    for (timestamp, sensor), _ in data.records_camera.items():
+        assert data.records_depth[timestamp, f"{sensor}_depth"].endswith(".depth")
+        assert data.device_from_world(timestamp, f"{sensor}_depth") == data.device_from_world(
+            timestamp, sensor
+        )
+    assert len({timestamp for timestamp, _ in data.records_camera}) == 72
+    assert not read(download, depth=False).mapping.rigs
+    assert not read(download, depth=False).mapping.records_depth
+
+
+def test_the_summary_compares_with_what_is_published(download: Path) -> None:
+    lines = [str(count) for count in read(download).summary]
+    text = "\n".join(lines)
+    assert "72  published: 4680, -4608" in text
+    assert "3  published: 356, -353" in text
+    assert "scans of DUC1" in text and "1  published: 50, -49" in text
+    with_all = "\n".join(map(str, read(download, distractor_floors=True).summary))
+    assert "published: 9972" in with_all
+
+
+def test_distractor_floors_are_imported_when_asked_for(root: Path) -> None:
+    cutouts, alignments = (root / "database" / part for part in ("cutouts", "alignments"))
+    shutil.copytree(cutouts / "DUC1", cutouts / "CSE3")
+    shutil.copytree(alignments / "DUC1", alignments / "CSE3")
+    for folder in (cutouts / "CSE3", alignments / "CSE3"):
+        for path in sorted(folder.rglob("DUC_*")):
+            path.rename(path.with_name(path.name.replace("DUC_", "cse_")))
+    assert len(read(root).mapping.records_camera) == 72
+    dataset = read(root, distractor_floors=True, allow_missing=True)
+    assert len(dataset.mapping.records_camera) == 108
+    name = "database/cutouts/CSE3/024/cse_cutout_024_30_-30.jpg"
+    assert dataset.groups[name].frame == "CSE3"
+    assert dataset.missing is not None
+    assert {file.name for file in dataset.missing.files} == {"CSE4", "CSE5"}
+
+
+def test_scans_known_to_be_wrong_are_left_out(root: Path) -> None:
+    (root / "database/alignments/DUC1/know_incorrect.txt").write_text("024\n")
+    dataset = read(root)
+    assert {group.frame for group in dataset.groups.values()} == {"DUC2", ""}
+    assert any("wrongly placed: scans DUC1/024" in remark for remark in dataset.remarks)
+
+
+@pytest.mark.parametrize(
+    ("moves", "place"),
+    [
+        ({"database": "dataset/database", "query": "dataset/query"}, "dataset/database/cutouts"),
+        ({"database/cutouts": "cutouts", "database/alignments": "alignments"}, "cutouts"),
+        ({"database/cutouts": "database/cutouts_imageonly"}, "database/cutouts_imageonly"),
+    ],
+)
+def test_redistributions_lie_otherwise(
+    root: Path, tmp_path: Path, moves: dict[str, str], place: str
+) -> None:
+    for old, new in moves.items():
+        (root / new).parent.mkdir(exist_ok=True)
+        (root / old).rename(root / new)
+    output = imported(root, tmp_path / "out")
+    mapping = KaptureFolder(output / "mapping")
+    name = "database/cutouts/DUC2/024/DUC_cutout_024_30_-30.jpg"
+    assert name in mapping.read().image_names()
+    assert mapping.image_path(name).resolve() == root / place / "/".join(name.split("/")[2:])
+    mapping.validate(deep=True)
+
+
+def test_what_is_missing_is_listed_and_refused(root: Path, tmp_path: Path) -> None:
+    cutouts = root / "database" / "cutouts"
+    (cutouts / "DUC1/024/DUC_cutout_024_0_0.jpg.mat").unlink()
+    (cutouts / "DUC1/024/DUC_cutout_024_30_0.jpg").unlink()
+    (root / "database/alignments/DUC2/transformations/DUC_trans_024.txt").unlink()
+    with pytest.raises(DataError, match="3 files are missing: .*--allow-missing") as caught:
+        imported(root, tmp_path / "refused")
+    assert "DUC_trans_024.txt" in str(caught.value)
+    missing = read(root).missing
+    assert missing is not None and {file.name for file in missing.files} == {
+        "DUC_cutout_024_0_0.jpg.mat",
+        "DUC_cutout_024_30_0.jpg",
+        "DUC_trans_024.txt",
+    }
+    assert not (tmp_path / "refused").exists()
+    output = imported(root, tmp_path / "out", allow_missing=True)
+    data = KaptureFolder(output / "mapping").read()
+    assert {name.split("/")[2] for name in data.image_names()} == {"DUC1"}
+    assert (len(data.records_camera), len(data.records_depth)) == (35, 34)
+    KaptureFolder(output / "mapping").validate(deep=True)
+
+
+def test_a_floor_that_is_missing(root: Path) -> None:
+    shutil.rmtree(root / "database" / "cutouts" / "DUC2")
+    dataset = read(root)
+    assert dataset.missing is not None
+    assert dataset.missing.files == [root / "database" / "cutouts" / "DUC2"]
+
+
+def test_the_download_without_points(root: Path, tmp_path: Path) -> None:
+    for path in root.rglob("*.mat"):
+        path.unlink()
+    with pytest.raises(DataError, match="without them is imported with the option depth = false"):
+        read(root)
+    output = imported(root, tmp_path / "out", depth=False)
+    assert len(KaptureFolder(output / "mapping").read().poses()) == 72
+
+
+def test_broken_points_name_their_file(root: Path, tmp_path: Path) -> None:
+    folder = root / "database/cutouts/DUC1/024"
+    points = folder / "DUC_cutout_024_30_0.jpg.mat"
+    content = points.read_bytes()
+    points.write_bytes(content[: len(content) // 2])
+    with pytest.raises(DataError, match=r"DUC_cutout_024_30_0\.jpg\.mat: .*ends too early"):
+        imported(root, tmp_path / "a")
+    scipy.io.savemat(points, {"XYZcut": np.zeros((2, 2, 3))}, appendmat=False)
+    with pytest.raises(DataError, match="XYZcut is 2x2x3, expected 30x40x3"):
+        imported(root, tmp_path / "b")
+    shutil.copy(folder / "DUC_cutout_024_60_0.jpg.mat", points)
+    with pytest.raises(DataError, match="px .median. from their pixels .* not the scan of this"):
+        imported(root, tmp_path / "c")
+    scipy.io.savemat(points, {"XYZcut": np.full((30, 40, 3), np.nan)}, appendmat=False)
+    imported(root, tmp_path / "d")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "match"),
+    [
+        ("DUC_cutout_024_0_0.jpg", "DUC_cutout_024_0.jpg", "is not named <BUILDING>_cutout"),
+        (
+            "DUC_cutout_024_0_0.jpg",
+            "DUC_cutout_025_0_0.jpg",
+            "scan 025, but lies in DUC1, scan 024",
+        ),
+        ("DUC_cutout_024_0_0.jpg", "cse_cutout_024_0_0.jpg", "cutout of cse, scan 024, but lies"),
+    ],
+)
+def test_images_that_lie_elsewhere_are_refused(root: Path, old: str, new: str, match: str) -> None:
+    folder = root / "database/cutouts/DUC1/024"
+    (folder / old).rename(folder / new)
+    with pytest.raises(DataError, match=match) as caught:
+        read(root)
+    assert str(caught.value).startswith(str(folder / new))
+
+
+def test_broken_images_and_names_are_refused(root: Path) -> None:
+    query = root / "query" / "iphone7" / "IMG_0804.JPG"
+    query.write_bytes(b"\xff\xd8 no image")
+    with pytest.raises(DataError, match=r"IMG_0804\.JPG: not an image"):
+        read(root)
+    query.rename(query.with_name("IMG 0804.JPG"))
+    with pytest.raises(DataError, match="no blanks, commas"):
+        read(root)
+
+
+def test_a_broken_transformation_names_file_and_line(root: Path) -> None:
+    path = root / "database/alignments/DUC1/transformations/DUC_trans_024.txt"
+    path.write_text(path.read_text().replace("0 0 0 1\n\nAfter", "0 0 0 1\nAfter") + "0\n")
+    with pytest.raises(DataError, match=r"DUC_trans_024\.txt:10: the matrix' last row is"):
+        read(root)
+
+
+def test_what_is_no_inloc_is_refused_quickly(tmp_path: Path, root: Path) -> None:
+    adapter = InLoc()
+    with pytest.raises(DataError, match="no such folder"):
+        adapter.check(tmp_path / "absent")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(DataError, match="database/cutouts/ is missing; InLoc lies as database"):
+        adapter.check(tmp_path / "empty")
+    adapter.check(root)
+    (root / "query").rename(root / "queries_elsewhere")
+    with pytest.raises(DataError, match="query/iphone7/ is missing"):
+        adapter.check(root)
+    shutil.rmtree(root / "database" / "alignments")
+    with pytest.raises(DataError, match="database/alignments/ is missing"):
+        adapter.check(root)
+    for floor in SCANS:
+        (root / "database/alignments").mkdir(exist_ok=True)
+        (root / "query/iphone7").mkdir(exist_ok=True, parents=True)
+        shutil.rmtree(root / "database/cutouts" / floor)
+    with pytest.raises(DataError, match="none of DUC1, DUC2 is there"):
+        adapter.check(root)
+
+
+def test_input_files_are_all_that_is_read(root: Path) -> None:
+    files = {path.relative_to(root).as_posix() for path in InLoc().input_files(root)}
+    assert len(files) == 2 * 72 + 2 + 3
+    assert "query/iphone7/IMG_0802.jpg" in files
+    without = set(InLoc(InLocOptions(depth=False)).input_files(root))
+    assert len(without) == 72 + 2 + 3
+    (root / "database/alignments/DUC1/know_incorrect.txt").write_text("024\n")
+    truth = root / "ground_truth" / "megloc"
+    truth.mkdir(parents=True)
+    (truth / "groups.csv").write_text("image, condition, frame, location, scored\n")
+    names = {path.name for path in InLoc().input_files(root)}
+    assert {"know_incorrect.txt", "groups.csv"} <= names
+
+
+def test_it_is_registered(root: Path) -> None:
+    adapter = load_plugin(DATASETS, "inloc", {"depth": False})
+    assert isinstance(adapter, InLoc)
+    assert adapter.name == "inloc" and not adapter.options.depth
+    assert not adapter.read(root).mapping.records_depth
+
+
+def test_large_depth_maps_are_announced(download: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert not any("depth maps take" in remark for remark in read(download).remarks)
+    monkeypatch.setattr("megloc_kapture.datasets.inloc.adapter._MANY_GIGABYTES", 1e-9)
+    assert any("depth_step = 8" in remark for remark in read(download, depth_step=2).remarks)
+    assert not any("depth maps take" in remark for remark in read(download, depth=False).remarks)

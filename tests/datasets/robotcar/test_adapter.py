@@ -1,0 +1,461 @@
+"""RobotCar Seasons: what its official layout becomes, on a small layout written by hand."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from robotcar_files import CAMERAS, QUERIES, REFERENCE, TEST, TRAIN, put, ts, write_layout
+
+from megloc_kapture.datasets.official import OfficialDataset, write_official
+from megloc_kapture.datasets.robotcar.adapter import RobotCar, RobotCarOptions
+from megloc_kapture.errors import DataError, MeglocError, OptionError, PluginError
+from megloc_kapture.io.challenge_tables import read_names
+from megloc_kapture.io.images import write_image
+from megloc_kapture.io.kapture_store import KaptureFolder, write_sensors
+from megloc_kapture.io.side_tables import read_groups, read_priors, read_protocol
+from megloc_kapture.plugins import DATASETS, DatasetAdapter, load_plugin
+from megloc_kapture.values import Camera, RigidTransform
+
+
+@pytest.fixture(scope="module")
+def official(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("robotcar") / "RobotCar-Seasons"
+    write_layout(root)
+    return root
+
+
+@pytest.fixture
+def root(official: Path, tmp_path: Path) -> Path:
+    """A copy to be broken."""
+    return Path(shutil.copytree(official, tmp_path / "root"))
+
+
+def read(root: Path, **options: object) -> OfficialDataset:
+    return RobotCar(RobotCarOptions(**options)).read(root)  # type: ignore[arg-type]
+
+
+def query_name(number: int, camera: str = "rear") -> str:
+    return f"{QUERIES[number][0]}/{camera}/{ts(number)}.jpg"
+
+
+def test_it_is_a_registered_plugin(official: Path) -> None:
+    adapter = load_plugin(DATASETS, "robotcar", {"version": 1})
+    assert isinstance(adapter, DatasetAdapter)
+    assert isinstance(adapter, RobotCar)
+    assert len(adapter.read(official).names) == 4
+    with pytest.raises(PluginError, match="queries"):
+        load_plugin(DATASETS, "robotcar", {"queries": "some"})
+    with pytest.raises(PluginError, match="train_as_map leaves nothing"):
+        load_plugin(DATASETS, "robotcar", {"queries": "train", "train_as_map": True})
+
+
+@pytest.mark.parametrize("model", ["auto", "merged", "individual"])
+def test_map(official: Path, model: str) -> None:
+    mapping = read(official, model=model).mapping
+    assert len(mapping.records_camera) == 9
+    for number in REFERENCE:
+        for k, camera in enumerate(CAMERAS):
+            name = f"overcast-reference/{camera}/{ts(number)}.jpg"
+            assert mapping.records_camera[ts(number), camera] == name
+            # not through the rig, whose left and right differ by two metres
+            pose = mapping.trajectories[ts(number), camera]
+            np.testing.assert_allclose(pose.center(), [number, k, 0.25], atol=1e-12)
+            np.testing.assert_allclose(pose.rotation_matrix(), np.diag([-1.0, -1, 1]), atol=1e-12)
+            expected = Camera("PINHOLE", 8, 6, (10.5, 10.0, 4.25, 3.5))
+            assert mapping.camera_of(name) == expected
+    assert {type(timestamp) for timestamp, _ in mapping.trajectories} == {int}
+
+
+def test_rig_is_the_inverse_of_the_extrinsics(official: Path) -> None:
+    dataset = read(official)
+    for data in (dataset.mapping, dataset.query):
+        assert list(data.rigs) == ["car"]
+        for camera, across in (("left", -1.0), ("rear", 0.0), ("right", 1.0)):
+            sensor_from_rig = data.rigs["car"][camera]
+            np.testing.assert_allclose(sensor_from_rig.center(), [across, 0.5, 2.0], atol=1e-12)
+            back = sensor_from_rig.rotation_matrix() @ [0.0, 0.0, -1.0]
+            np.testing.assert_allclose(back, [0.0, 0.0, 1.0], atol=1e-12)
+
+
+def test_version_2(official: Path) -> None:
+    dataset = read(official)
+    assert len(dataset.query.records_camera) == 12
+    assert not dataset.query.trajectories
+    assert dict(dataset.names) == {query_name(12): f"rear/{ts(12)}.png"}
+    truth = dataset.query_gt
+    assert truth is not None
+    poses = truth.poses()
+    assert sorted(poses) == sorted(query_name(n) for n in TRAIN)
+    # the file has the centre in its last column
+    np.testing.assert_allclose(poses[query_name(11)].center(), [11.0, 5.0, -2.0], atol=1e-12)
+    camera_x_in_world = poses[query_name(11)].inverse().rotation_matrix()[:, 0]
+    np.testing.assert_allclose(camera_x_in_world, [0.0, 1.0, 0.0], atol=1e-12)
+    scored = {name for name, group in dataset.groups.items() if group.scored}
+    assert scored == {query_name(n) for n in (*TRAIN, *TEST)}
+    assert {count.what: count.published for count in dataset.summary if count.found in (1, 2)} == {
+        "locations with queries": 49,
+        "training images with a pose": 1906,
+        "test images": 1872,
+        **{f"  dawn, {camera}": 483 for camera in CAMERAS},
+    } | {f"  {c}, {k}": n for c, n in (("night", 438), ("rain", 421)) for k in CAMERAS}
+
+
+def test_version_1(official: Path) -> None:
+    dataset = read(official, version=1)
+    # in the order of the lists, location by location
+    order = (11, 13, 12, 14)
+    assert list(dataset.names.items()) == [(query_name(n), f"rear/{ts(n)}.jpg") for n in order]
+    scored = {name for name, group in dataset.groups.items() if group.scored}
+    assert scored == set(dataset.names)
+    truth = dataset.query_gt
+    assert truth is not None and len(truth.poses()) == 2  # half of it is public all the same
+    for options in ({"train_as_map": True}, {"queries": "test"}):
+        with pytest.raises(OptionError, match="version 2"):
+            read(official, version=1, **options)
+
+
+def test_version_is_told_by_the_test_list(root: Path) -> None:
+    (root / "robotcar_v2_test.txt").unlink()
+    assert list(read(root).names.values())[0].endswith(".jpg")
+    (root / "robotcar_v2_train.txt").unlink()
+    dataset = read(root)
+    assert dataset.missing is not None and not dataset.missing.files
+    assert dataset.query_gt is not None and not dataset.query_gt.trajectories
+
+
+def test_conditions_locations_and_priors(official: Path) -> None:
+    dataset = read(official)
+    reference = dataset.groups[f"overcast-reference/left/{ts(3)}.jpg"]
+    assert (reference.condition, reference.location) == ("overcast-reference", "002/left")
+    query = dataset.groups[query_name(13, "right")]
+    assert (query.condition, query.location, query.scored) == ("night", "001/right", False)
+    assert dataset.priors[query_name(13, "right")] == ("001/right",)
+    assert dataset.priors.keys() == set(dataset.query.image_names())
+    protocol = dataset.protocol
+    assert protocol.thresholds == ((0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
+    assert set(protocol.pools["day-all"]) | set(protocol.pools["night-all"]) == set(
+        protocol.conditions
+    )
+    assert set(protocol.pools["night-all"]) == {"night", "night-rain"}
+
+
+def test_without_individual_models_the_camera_is_known(root: Path) -> None:
+    shutil.rmtree(root / "3D-models/individual/colmap_reconstructions")
+    dataset = read(root)
+    assert dataset.missing is not None and not dataset.missing.files
+    assert dataset.groups[f"overcast-reference/left/{ts(3)}.jpg"].location == "left"
+    assert dataset.priors[query_name(13, "right")] == ("right",)
+    assert any("location of 9 map images is not known" in remark for remark in dataset.remarks)
+
+
+def test_with_some_individual_models_both_are_permitted(root: Path) -> None:
+    shutil.rmtree(root / "3D-models/individual/colmap_reconstructions/002_aligned")
+    dataset = read(root)
+    assert dataset.priors[query_name(11)] == ("001/rear", "rear")
+    assert dataset.priors[query_name(12)] == ("rear",)
+    # where the poses come from them the location is simply not there
+    partial = RobotCar(RobotCarOptions(model="individual")).read(root)
+    assert len(partial.mapping.records_camera) == 6
+    assert partial.priors[query_name(12)] == ("002/rear",)
+    assert partial.missing is not None
+    with pytest.raises(DataError, match="002_aligned; --allow-missing"):
+        partial.missing.refuse()
+
+
+def test_a_query_of_two_locations(root: Path) -> None:
+    path = root / "3D-models/individual/queries_per_location/queries_location_002.txt"
+    path.write_text(f"{path.read_text()}\n{query_name(11)}\n{query_name(11)}\n")
+    dataset = read(root)
+    assert dataset.priors[query_name(11)] == ("001/rear", "002/rear")
+    assert len(dataset.query.records_camera) == 12
+
+
+def test_part_of_the_queries(official: Path) -> None:
+    for queries, numbers in (("train", TRAIN), ("test", TEST)):
+        dataset = read(official, queries=queries)
+        expected = {query_name(n, camera) for n in numbers for camera in CAMERAS}
+        assert set(dataset.query.image_names()) == expected == set(dataset.priors)
+        assert dataset.query_gt is not None
+        assert len(dataset.query_gt.poses()) == (2 if queries == "train" else 0)
+        assert len(dataset.names) == (0 if queries == "train" else 1)
+
+
+def test_training_images_join_the_map_only_when_asked(official: Path) -> None:
+    dataset = read(official, train_as_map=True)
+    assert len(dataset.mapping.records_camera) == 9 + 2
+    pose = dataset.mapping.cam_from_world(query_name(13))
+    assert pose is not None
+    np.testing.assert_allclose(pose.center(), [13.0, 5.0, -2.0], atol=1e-12)
+    assert dataset.groups[query_name(13)].location == "001/rear"
+    assert not dataset.groups[query_name(13)].scored
+    # nobody asks for what was taken at these moments
+    expected = {query_name(n, camera) for n in (12, 14) for camera in CAMERAS}
+    assert set(dataset.query.image_names()) == expected == set(dataset.priors)
+    assert dataset.query_gt is not None and not dataset.query_gt.poses()
+
+
+def test_what_is_written(official: Path, tmp_path: Path) -> None:
+    before = sorted(official.rglob("*"))
+    for place in ("a", "b"):
+        write_official(read(official), tmp_path / place)
+    files = sorted(p.relative_to(tmp_path / "a") for p in (tmp_path / "a").rglob("*.*"))
+    assert files
+    for file in files:
+        if (tmp_path / "a" / file).is_file():
+            assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+    out = tmp_path / "a"
+    assert (out / "mapping/sensors/records_data").readlink() == official.resolve() / "images"
+    for part in ("mapping", "query"):
+        folder = KaptureFolder(out / part)
+        folder.validate(deep=True)
+        assert all(folder.image_path(name).is_file() for name in folder.read().image_names())
+    assert read_names(out / "megloc") == {query_name(12): f"rear/{ts(12)}.png"}
+    assert len(read_groups(out / "megloc")) == 9 + 12
+    assert len(read_priors(out / "megloc")) == 12
+    assert read_protocol(out / "megloc").dataset == "robotcar"
+    assert sorted(official.rglob("*")) == before
+
+
+def test_truth_that_lies_beside_is_joined_with_the_public_one(root: Path) -> None:
+    data = read(root).query
+    for number in (11, 12):
+        for camera in CAMERAS:
+            data.trajectories[ts(number), camera] = RigidTransform.identity()
+    write_sensors(root / "ground_truth/query", data)
+    truth = read(root).query_gt
+    assert truth is not None
+    poses = truth.poses()
+    assert len(poses) == 6 + 1
+    assert poses[query_name(12)] == RigidTransform.identity()
+    # what is published counts more
+    np.testing.assert_allclose(poses[query_name(11)].center(), [11.0, 5.0, -2.0], atol=1e-12)
+
+
+def test_the_file_type_is_that_on_disk(root: Path) -> None:
+    for name in (f"overcast-reference/left/{ts(1)}", query_name(11)[:-4]):
+        write_image(root / f"images/{name}.png", np.full((6, 8, 3), 1, np.uint8))
+        (root / f"images/{name}.jpg").unlink()
+    dataset = read(root)
+    assert dataset.missing is not None and not dataset.missing.files
+    assert dataset.mapping.records_camera[ts(1), "left"].endswith(".png")
+    assert query_name(11)[:-4] + ".png" in dataset.query.image_names()
+
+
+def test_stray_files_do_not_matter(root: Path) -> None:
+    write_before = read(root)
+    put(root / "intrinsics/README.txt", "see the paper")
+    put(root / "extrinsics/.DS_Store", "\0")
+    put(root / "3D-models/individual/queries_per_location/notes.txt", "x")
+    put(root / "3D-models/individual/colmap_reconstructions/001_aligned.zip", "x")
+    put(root / "images/dawn.zip", "x")
+    put(root / "images/dawn/rear/Thumbs.db", "x")
+    write_image(root / "images/dawn/rear/5.jpg", np.zeros((6, 8, 3), np.uint8))
+    after = read(root)
+    assert after.mapping == write_before.mapping
+    assert after.query == write_before.query
+
+
+def test_every_file_that_counts_is_an_input(root: Path) -> None:
+    found = {str(path.relative_to(root)) for path in RobotCar().input_files(root)}
+    lists = {f"robotcar_v2_{name}.txt" for name in ("train", "test")}
+    assert lists | {"3D-models/all-merged/all.nvm"} <= found
+    everything = {str(p.relative_to(root)) for p in root.rglob("*") if p.is_file()}
+    assert found == everything
+    put(root / "3D-models/overcast-reference.db", "")
+    assert {str(path.relative_to(root)) for path in RobotCar().input_files(root)} == found
+    adapter = RobotCar(RobotCarOptions(reference_model=True))
+    assert root / "3D-models/overcast-reference.db" in set(adapter.input_files(root))
+    assert not any("descriptors" in remark for remark in adapter.read(root).remarks)
+    (root / "3D-models/overcast-reference.db").unlink()
+    assert any("overcast-reference.db, which is not" in r for r in adapter.read(root).remarks)
+    assert not any("descriptors" in remark for remark in RobotCar().read(root).remarks)
+
+
+def test_what_is_not_robotcar_is_refused_quickly(tmp_path: Path) -> None:
+    for place in (tmp_path, tmp_path / "nowhere"):
+        with pytest.raises(DataError, match="not RobotCar Seasons, no folder images and 3D-models"):
+            RobotCar().check(place)
+        with pytest.raises(DataError, match="not RobotCar Seasons"):
+            RobotCar().read(place, allow_missing=True)
+
+
+@pytest.mark.parametrize(
+    ("gone", "message", "map_images", "queries"),
+    [
+        ("robotcar_v2_train.txt", "robotcar_v2_train.txt", 9, 12),
+        ("robotcar_v2_test.txt", "robotcar_v2_test.txt", 9, 12),
+        ("intrinsics/left_intrinsics.txt", "intrinsics/left_intrinsics.txt", 6, 8),
+        ("extrinsics", "extrinsics/left_extrinsics.txt and 2 more in its folder", 9, 12),
+        ("images/night", f"images/night/left/{ts(13)}.jpg", 9, 9),
+        (f"images/overcast-reference/rear/{ts(2)}.jpg", f"rear/{ts(2)}.jpg", 8, 12),
+    ],
+)
+def test_missing_files(
+    root: Path, tmp_path: Path, gone: str, message: str, map_images: int, queries: int
+) -> None:
+    place = root / gone
+    if place.is_dir():
+        shutil.rmtree(place)
+    else:
+        place.unlink()
+    adapter = RobotCar(RobotCarOptions(version=2))
+    with pytest.raises(DataError) as caught:
+        write_official(adapter.read(root), tmp_path / "refused")
+    assert message in caught.value.message
+    assert "--allow-missing" in caught.value.message
+    assert not (tmp_path / "refused").exists()
+    dataset = adapter.read(root, allow_missing=True)
+    write_official(dataset, tmp_path / "out", allow_missing=True)
+    assert len(dataset.mapping.records_camera) == map_images
+    assert len(dataset.query.records_camera) == queries
+    KaptureFolder(tmp_path / "out/mapping").validate(deep=True)
+    tables = read_groups(tmp_path / "out/megloc")
+    assert tables.keys() == {*dataset.mapping.image_names(), *dataset.query.image_names()}
+
+
+@pytest.mark.parametrize("gone", ["3D-models/all-merged", "3D-models/individual", "images"])
+def test_what_cannot_be_done_without(root: Path, tmp_path: Path, gone: str) -> None:
+    shutil.rmtree(root / gone)
+    if gone == "images":
+        (root / gone).mkdir()
+    if gone == "3D-models/all-merged":  # then the individual models are taken
+        assert len(read(root).mapping.trajectories) == 9
+        shutil.rmtree(root / "3D-models/individual/colmap_reconstructions")
+    with pytest.raises(DataError, match="missing|queries_per_location"):
+        write_official(read(root), tmp_path / "out")
+    part = RobotCar().read(root, allow_missing=True)
+    if gone == "3D-models/individual":  # they name the queries; the map is there without them
+        assert not part.query.records_camera
+        write_official(part, tmp_path / "out", allow_missing=True)
+        return
+    with pytest.raises(DataError, match="is left to import"):
+        write_official(part, tmp_path / "out", allow_missing=True)
+
+
+def append(text: str) -> Callable[[str], str]:
+    return lambda content: f"{content.rstrip()}\n{text}\n"
+
+
+NVM, LISTS = "3D-models/all-merged/all.nvm", "3D-models/individual/queries_per_location"
+
+
+@pytest.mark.parametrize(
+    ("file", "change", "line", "message"),
+    [
+        ("robotcar_v2_test.txt", append("rear/5.png"), 2, "in no list of queries_per_location"),
+        ("robotcar_v2_test.txt", append(f"left/{ts(13)}.png"), 2, "expected 'rear' only"),
+        ("robotcar_v2_test.txt", append(f"rear/{ts(11)}.png"), 2, "is a training image too"),
+        ("robotcar_v2_test.txt", append(f"night/rear/{ts(14)}.png"), 2, "in no list"),
+        (
+            "robotcar_v2_train.txt",
+            append("dawn/rear/5.png 1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"),
+            3,
+            "in no list of queries_per_location",
+        ),
+        (f"{LISTS}/queries_location_002.txt", append("dawn/front/5.jpg"), 7, "camera 'front'"),
+        (
+            f"{LISTS}/queries_location_002.txt",
+            append(f"snow/rear/{ts(11)}.jpg"),
+            7,
+            "are of one camera and time",
+        ),
+        (NVM, lambda text: text.replace("/left/", "/front/"), None, "camera one of left, rear"),
+        (NVM, lambda text: text.replace("overcast-reference/", ""), None, "expected condition/"),
+        (NVM, lambda text: text.replace(str(ts(1)), f"0{ts(2)}"), None, "of one camera and time"),
+        (
+            NVM,
+            lambda text: text.replace(f"{ts(1)}.png", f"{ts(2)}.jpg"),
+            None,
+            "are one image",
+        ),
+        ("intrinsics/rear_intrinsics.txt", lambda text: text.replace("10.5", "-1"), None, "focal"),
+        ("extrinsics/rear_extrinsics.txt", lambda text: text[:-4], 4, "four numbers"),
+    ],
+)
+def test_what_is_wrong_is_named(
+    root: Path, file: str, change: Callable[[str], str], line: int | None, message: str
+) -> None:
+    path = root / file
+    path.write_text(change(path.read_text()))
+    with pytest.raises(DataError) as caught:
+        read(root)
+    assert message in caught.value.message
+    assert (caught.value.path, caught.value.line) == (path, line)
+    assert "\n" not in str(caught.value)
+
+
+def test_unlisted_images_are_left_out_where_that_is_allowed(root: Path) -> None:
+    for name in ("train", "test"):
+        path = root / f"robotcar_v2_{name}.txt"
+        path.write_text(path.read_text().replace(str(ts(11)), "5").replace(str(ts(12)), "6"))
+    dataset = RobotCar().read(root, allow_missing=True)
+    assert not dataset.names
+    assert dataset.query_gt is not None and len(dataset.query_gt.poses()) == 1
+    assert any(remark.startswith("2 images of version 2's lists") for remark in dataset.remarks)
+
+
+def test_an_image_that_is_none_is_named(root: Path) -> None:
+    path = root / f"images/overcast-reference/left/{ts(1)}.jpg"
+    path.write_text("a page that says 404")
+    with pytest.raises(DataError, match=f"{ts(1)}.jpg: not an image"):
+        read(root)
+
+
+def test_size_of_a_camera_without_images(root: Path) -> None:
+    shutil.rmtree(root / "images")
+    (root / "images").mkdir()
+    sensors = RobotCar().read(root, allow_missing=True).mapping.sensors
+    assert sensors["rear"].camera() == Camera("PINHOLE", 1024, 1024, (10.5, 10.0, 4.25, 3.5))
+
+
+TEXTS = [
+    "intrinsics/rear_intrinsics.txt",
+    "extrinsics/left_extrinsics.txt",
+    NVM,
+    "3D-models/individual/colmap_reconstructions/001_aligned/images.txt",
+    f"{LISTS}/queries_location_001.txt",
+    "robotcar_v2_train.txt",
+    "robotcar_v2_test.txt",
+]
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_mutated_layouts_are_imported_or_refused(
+    official: Path, tmp_path: Path, data: st.DataObject
+) -> None:
+    root = tmp_path / "mutated"
+    if not root.exists():
+        shutil.copytree(official, root)
+    file = data.draw(st.sampled_from(TEXTS))
+    original = (official / file).read_bytes()
+    content = bytearray(original)
+    for _ in range(data.draw(st.integers(1, 3))):
+        at = data.draw(st.integers(0, len(content)))
+        end = data.draw(st.integers(at, min(len(content), at + 40)))
+        content[at:end] = data.draw(
+            st.one_of(
+                st.binary(max_size=3),
+                st.sampled_from([b"../", b"/", b"nan", b"9" * 12, b"\r\n", b",", original[:30]]),
+            )
+        )
+    (root / file).write_bytes(bytes(content))
+    out = tmp_path / "out"
+    shutil.rmtree(out, ignore_errors=True)
+    try:
+        dataset = RobotCar().read(root, allow_missing=data.draw(st.booleans()))
+        write_official(dataset, out, allow_missing=True)
+    except MeglocError as error:
+        assert "\n" not in str(error)
+    else:
+        KaptureFolder(out / "mapping").validate()
+        assert set(read_names(out / "megloc")) <= set(dataset.query.image_names())
+    finally:
+        (root / file).write_bytes(original)
+    assert sorted(p.name for p in tmp_path.iterdir()) in (["mutated"], ["mutated", "out"])

@@ -1,0 +1,64 @@
+"""The rig that a model's poses show, noise and wrong poses among them."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from megloc_kapture.datasets.formats.robotcar_files import ImageKey
+from megloc_kapture.datasets.robotcar.images import middle_transform, rig_of_model
+from megloc_kapture.values import RigidTransform
+
+
+def transform(rotvec: np.ndarray, translation: np.ndarray) -> RigidTransform:
+    return RigidTransform.from_matrix(Rotation.from_rotvec(rotvec).as_matrix(), translation)
+
+
+RIG = {
+    "rear": RigidTransform.identity(),
+    "left": transform(np.array([0.1, 1.6, -0.05]), np.array([0.4, -0.1, 0.9])),
+    "right": transform(np.array([-0.1, -1.5, 0.1]), np.array([-0.5, 0.0, 1.0])),
+}
+
+
+def poses(moments: int, *, noise: float, wrong: int = 0) -> dict[ImageKey, RigidTransform]:
+    rng = np.random.default_rng(0)
+    found = {}
+    for moment in range(moments):
+        rear_from_world = transform(rng.normal(size=3), rng.normal(size=3) * 100)
+        for camera, sensor_from_rear in RIG.items():
+            off = transform(noise * rng.normal(size=3), noise * rng.normal(size=3))
+            if moment < wrong and camera == "left":
+                off = transform(rng.normal(size=3), 5 * rng.normal(size=3))
+            key = ImageKey("overcast-reference", camera, str(moment))
+            found[key] = off @ sensor_from_rear @ rear_from_world
+    return found
+
+
+def apart(a: RigidTransform, b: RigidTransform) -> tuple[float, float]:
+    between = a @ b.inverse()
+    angle = Rotation.from_matrix(between.rotation_matrix()).magnitude()
+    return float(angle), float(np.linalg.norm(between.translation))
+
+
+def test_exact_poses_give_the_rig_exactly() -> None:
+    found = rig_of_model(poses(12, noise=0.0))
+    assert set(found) == set(RIG)
+    assert max(max(apart(found[camera], RIG[camera])) for camera in RIG) < 1e-9
+
+
+def test_noise_averages_out_and_wrong_poses_have_no_say() -> None:
+    found = rig_of_model(poses(400, noise=0.01, wrong=60))
+    assert max(max(apart(found[camera], RIG[camera])) for camera in RIG) < 0.003
+
+
+def test_too_few_moments_say_nothing() -> None:
+    assert rig_of_model(poses(9, noise=0.0)) == {}
+    assert rig_of_model({}) == {}
+
+
+def test_quaternions_of_either_sign_are_one_rotation() -> None:
+    one = RIG["left"]
+    w, x, y, z = one.quat_wxyz
+    other = RigidTransform((-w, -x, -y, -z), one.translation)
+    assert max(apart(middle_transform([one, other, one, other]), one)) < 1e-12
