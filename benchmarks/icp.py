@@ -29,7 +29,7 @@ from scipy.spatial import cKDTree
 sys.path.append(str(Path(__file__).resolve().parent / "speed"))
 from timing import table  # noqa: E402
 
-from megloc_kapture.evaluation.pose_errors import PoseErrors, pose_errors  # noqa: E402
+from megloc_kapture.evaluation.metrics import PoseErrors, pose_errors  # noqa: E402
 from megloc_kapture.io.kapture_store import KaptureFolder  # noqa: E402
 from megloc_kapture.io.status_table import STATUS_FILE, read_status  # noqa: E402
 from megloc_kapture.pipeline.executors import single_threaded  # noqa: E402

@@ -29,7 +29,7 @@ import numpy as np
 import pandas as pd
 from scenes import SEEDED, errors_of, interval, megloc
 
-from megloc_kapture.evaluation.outputs import RECALL_JSON
+from megloc_kapture.evaluation.report.reports import RECALL_JSON
 from megloc_kapture.io.refinement_table import REFINEMENT_FILE, read_refinement
 
 sys.path.append(str(Path(__file__).resolve().parent / "speed"))

@@ -26,7 +26,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from megloc_kapture.evaluation.outputs import PER_QUERY_CSV
+from megloc_kapture.evaluation.report.reports import PER_QUERY_CSV
 
 sys.path.append(str(Path(__file__).resolve().parent / "speed"))
 from timing import table  # noqa: E402

@@ -20,7 +20,7 @@ from pathlib import Path
 from scenes import SEEDED, megloc  # which knows the way to timing
 from timing import table
 
-from megloc_kapture.evaluation.outputs import RECALL_JSON
+from megloc_kapture.evaluation.report.reports import RECALL_JSON
 
 Recalls = Mapping[str, tuple[float, ...]]  # of each condition at each threshold, percent
 

@@ -17,6 +17,7 @@ from megloc_kapture.values import Camera, Failure, LocalFeatures, Pose, RigidTra
 
 if TYPE_CHECKING:
     from megloc_kapture.api import Map, build_map, extract, match, open_map, run, solve_pose
+    from megloc_kapture.evaluation.evaluate import evaluate
     from megloc_kapture.pipeline.kapture_map import KaptureMap
     from megloc_kapture.pipeline.localizer import Localizer
     from megloc_kapture.pipeline.queries import Query
@@ -39,6 +40,7 @@ __all__ = [
     "Results",
     "RigidTransform",
     "build_map",
+    "evaluate",
     "extract",
     "match",
     "open_map",
@@ -54,6 +56,7 @@ _LAZY = {
     "Results": "megloc_kapture.pipeline.results",
     "Map": "megloc_kapture.api",
     "build_map": "megloc_kapture.api",
+    "evaluate": "megloc_kapture.evaluation.evaluate",
     "extract": "megloc_kapture.api",
     "match": "megloc_kapture.api",
     "open_map": "megloc_kapture.api",

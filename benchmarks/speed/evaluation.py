@@ -21,17 +21,14 @@ from typing import TypeVar
 import numpy as np
 from timing import Timed, table
 
-from megloc_kapture.evaluation.check.checking import check_submission
-from megloc_kapture.evaluation.check.reference import read_reference
-from megloc_kapture.evaluation.comparison import compare
-from megloc_kapture.evaluation.comparison_text import comparison_text
-from megloc_kapture.evaluation.folders import evaluate_results
-from megloc_kapture.evaluation.outputs import write_evaluation
-from megloc_kapture.evaluation.pose_file import write_pose_file
-from megloc_kapture.evaluation.protocols import protocol_of
-from megloc_kapture.evaluation.rules import read_rules
-from megloc_kapture.evaluation.surroundings import surroundings_of
-from megloc_kapture.evaluation.tables import recall_table
+from megloc_kapture.evaluation.check.reading import read_reference
+from megloc_kapture.evaluation.check.submission import check_submission
+from megloc_kapture.evaluation.evaluate import evaluate_results
+from megloc_kapture.evaluation.pose_files import write_pose_file
+from megloc_kapture.evaluation.protocols import benchmark_of, protocol_of
+from megloc_kapture.evaluation.report.reports import report_text, write_report
+from megloc_kapture.evaluation.results import context_of
+from megloc_kapture.evaluation.statistics import compare
 from megloc_kapture.geometry.poses import unstack_poses
 from megloc_kapture.io.challenge_tables import write_names
 from megloc_kapture.io.kapture_store import KaptureData, Sensor, write_sensors
@@ -139,7 +136,7 @@ def measure(workspace: Path, num_queries: int, num_map_images: int) -> list[Time
     """All steps."""
     steps: list[Timed] = []
     found, _ = generate(workspace, num_queries, num_map_images)
-    rules = read_rules(workspace / "megloc")
+    rules = benchmark_of(workspace / "megloc")
     poses, truth = workspace / "poses.txt", workspace / "query_gt"
     localized, worse = workspace / "localized", workspace / "worse"
     timed(steps, "write the pose file", lambda: write_pose_file(poses, found, names=rules.names))
@@ -153,23 +150,20 @@ def measure(workspace: Path, num_queries: int, num_map_images: int) -> list[Time
     timed(
         steps,
         "evaluate the pose file",
-        lambda: recall_table(evaluate_results([poses], truth, rules)[0]),
+        lambda: report_text(evaluate_results([poses], truth, rules)[0]),
     )
     (evaluation,) = timed(
         steps, "evaluate the kapture folder", lambda: evaluate_results([localized], truth, rules)
     )
-    around = surroundings_of(localized)
     timed(
         steps,
         "write tables and report",
-        lambda: write_evaluation(
-            workspace / "out", evaluation, map_poses=around.map_poses(), around=around
-        ),
+        lambda: write_report(workspace / "out", evaluation, contexts=[context_of(localized)]),
     )
     timed(
         steps,
         "evaluate and compare two folders",
-        lambda: comparison_text(compare(evaluate_results([localized, worse], truth, rules))),
+        lambda: report_text(compare(evaluate_results([localized, worse], truth, rules))),
     )
     return steps
 

@@ -33,8 +33,8 @@ class Check(Common):
 
     def run(self) -> int:
         """Run it; returns 2 where there are problems."""
-        from megloc_kapture.evaluation.check.checking import check_submission
-        from megloc_kapture.evaluation.check.reference import read_reference
+        from megloc_kapture.evaluation.check.reading import read_reference
+        from megloc_kapture.evaluation.check.submission import check_submission
         from megloc_kapture.io.side_tables import PROTOCOL_FILE, SIDE_TABLES
         from megloc_kapture.pipeline.datasets import TWIN_PREFIX
         from megloc_kapture.pipeline.submission import check_dataset, check_known
@@ -43,10 +43,10 @@ class Check(Common):
         check_known(self.dataset)
         if not self.file.exists():
             raise DataError("no such file", path=self.file)
-        place = self.data or self._workspace(console)
-        reference = None if place is None else read_reference(place)
-        if reference is not None and place is not None:
-            tables = place / SIDE_TABLES
+        data = self.data or self._workspace(console)
+        reference = None if data is None else read_reference(data)
+        if reference is not None and data is not None:
+            tables = data / SIDE_TABLES
             known = (tables / PROTOCOL_FILE).is_file()
             check_dataset(self.dataset, reference.protocol, tables=tables if known else None)
         report = check_submission(

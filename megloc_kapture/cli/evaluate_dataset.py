@@ -13,9 +13,13 @@ import tyro
 from megloc_kapture.cli.common import Choosing, Common, Force, Working
 from megloc_kapture.cli.console import Console
 from megloc_kapture.errors import OptionError
-from megloc_kapture.evaluation.outputs import RECALL_JSON, RECALL_TEXT, REPORT_HTML
-from megloc_kapture.evaluation.thresholds import Threshold
-from megloc_kapture.evaluation.without_truth_outputs import AGREEMENT_TEXT
+from megloc_kapture.evaluation.metrics import Threshold
+from megloc_kapture.evaluation.report.renderers import REPORT_HTML
+from megloc_kapture.evaluation.report.reports import (
+    AGREEMENT_TEXT,
+    RECALL_JSON,
+    RECALL_TEXT,
+)
 from megloc_kapture.io.status_table import STATUS_FILE, read_status
 from megloc_kapture.pipeline.ablation import (
     fresh_copy,

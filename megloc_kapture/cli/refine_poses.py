@@ -10,7 +10,7 @@ import tyro
 from megloc_kapture.cli.common import Force, Input, Linked, Output
 from megloc_kapture.cli.stage_command import StageCommand, restrictions_beside
 from megloc_kapture.errors import OptionError
-from megloc_kapture.evaluation.refined_poses import told_of_map
+from megloc_kapture.evaluation.report.refinement import consistency_sentence
 from megloc_kapture.io.consistency_table import CONSISTENCY_FILE, read_consistency
 from megloc_kapture.io.outputs import staged_output
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
@@ -76,5 +76,5 @@ class RefinePoses(Linked, StageCommand):
         )
         if (table := self.output / CONSISTENCY_FILE).is_file():
             for row in read_consistency(table):
-                console.result(told_of_map(row))
+                console.result(consistency_sentence(row))
         return 0

@@ -1,1 +1,1 @@
-"""How good poses are: errors, recall, pose files, report. Pure arrays in, models and files out."""
+"""Evaluation of poses: errors, recall, comparison, pose files and their check, reports."""

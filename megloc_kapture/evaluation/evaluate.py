@@ -1,195 +1,233 @@
-"""Compare estimated poses with true ones: the one entry to errors, recall and their books."""
+"""Evaluation of results on disk or in memory: against true poses, or without them."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Literal
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
+from megloc_kapture.errors import DataError
+from megloc_kapture.evaluation.metrics import Threshold
+from megloc_kapture.evaluation.protocols import Benchmark, benchmark_of
+from megloc_kapture.evaluation.results import (
+    Poses,
+    Result,
+    ResultContext,
+    context_of,
+    distinct_labels,
+    read_result,
+    result_in_memory,
+    side_tables_near,
+)
+from megloc_kapture.evaluation.scoring import Evaluation, evaluate_pairs, evaluate_poses
+from megloc_kapture.evaluation.without_truth import WithoutTruth, evaluate_without_truth
+from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.values import Failure, Pose, RigidTransform
 
-from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.evaluation.pose_errors import PoseErrors, pose_errors
-from megloc_kapture.evaluation.recall import RecallRow, recall_rows, row_members
-from megloc_kapture.evaluation.thresholds import DEFAULT_THRESHOLDS, Threshold
-from megloc_kapture.io.challenge_tables import RelocalizationPair
-from megloc_kapture.io.status_table import Fallback, QueryStatus
-from megloc_kapture.values import RigidTransform
-
-Outcome = Literal["localized", "fallback", "missing"]
-
-
-@dataclass(frozen=True, slots=True)
-class QueryResult:
-    """What became of one scored query.
-
-    Parameters
-    ----------
-    image, condition : the query and what it is reported under (``""``: nothing).
-    outcome : ``localized``, ``fallback`` (its pose is a guess) or ``missing`` (no pose).
-    reason : why it was not localized; empty for a localized query.
-    position_m, angle_deg : errors in metres and degrees, infinite without a pose.
-    num_matches, num_inliers : from the status table; None without one.
-    fallback : what kind of guess a fallback pose is.
-    candidates : map images the pose comes from, best first; from the status table.
-    """
-
-    image: str
-    condition: str
-    outcome: Outcome
-    reason: str
-    position_m: float
-    angle_deg: float
-    num_matches: int | None = None
-    num_inliers: int | None = None
-    fallback: Fallback = "none"
-    candidates: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Evaluation:
-    """Everything known about one result.
-
-    Parameters
-    ----------
-    label : what the result is called in tables.
-    thresholds : of the recall rows, in their order.
-    rows : recall per condition, pools, and ``"all"``, which is the last.
-    members : row name -> bool (N,), the queries it counts.
-    queries : every counted query, sorted by name.
-    errors : the same queries' errors as arrays.
-    truth, estimated : ``cam_from_world`` of the counted queries (estimated: those that have one).
-    without_truth : images that were estimated (or asked to be scored) but have no true pose;
-        sorted. They are reported, never counted.
-    not_scored : images with a true pose that the benchmark does not count; sorted.
-    truth_known_by : who knows the true poses that are not published; empty: said nowhere.
-    pairs : of MLAD's challenges, what a query is called in ``queries`` -> its pair; else empty.
-    by_center : None where the position error is the distance of the camera centres. Where it is
-        another (see :mod:`megloc_kapture.evaluation.relative`), the same queries' evaluation by
-        that distance.
-    """
-
-    label: str
-    thresholds: tuple[Threshold, ...]
-    rows: tuple[RecallRow, ...]
-    members: Mapping[str, NDArray[np.bool_]]
-    queries: tuple[QueryResult, ...]
-    errors: PoseErrors
-    truth: Mapping[str, RigidTransform]
-    estimated: Mapping[str, RigidTransform]
-    without_truth: tuple[str, ...]
-    not_scored: tuple[str, ...]
-    truth_known_by: str = ""
-    pairs: Mapping[str, RelocalizationPair] = field(default_factory=dict)
-    by_center: Evaluation | None = None
-
-    def row(self, name: str = "all") -> RecallRow:
-        """The recall row of a condition or pool; KeyError for an unknown name."""
-        for row in self.rows:
-            if row.name == name:
-                return row
-        raise KeyError(name)
-
-    def image(self, query: str) -> str:
-        """The image of a query, which in ``queries`` may be called by its pair."""
-        return self.pairs[query].query if query in self.pairs else query
+Localized = Path | str | Mapping[str, Pose | Failure] | Mapping[str, RigidTransform]
 
 
 def evaluate(
-    estimated: Mapping[str, RigidTransform],
-    truth: Mapping[str, RigidTransform],
+    estimated: Localized,
+    truth: Path | str | Poses,
     *,
-    conditions: Mapping[str, str] | None = None,
-    thresholds: Sequence[Threshold] = DEFAULT_THRESHOLDS,
-    scored: Collection[str] | None = None,
-    statuses: Mapping[str, QueryStatus] | None = None,
-    condition_order: Sequence[str] = (),
-    pools: Mapping[str, Sequence[str]] | None = None,
-    label: str = "",
-    errors: PoseErrors | None = None,
+    dataset: str | None = None,
+    side_tables: Path | str | None = None,
+    thresholds: Sequence[Threshold] | None = None,
+    mapping: Path | str | None = None,
+    label: str | None = None,
 ) -> Evaluation:
-    """Errors, recall and outcomes of ``estimated``.
+    """Evaluate poses against true ones, by a benchmark's rules.
 
-    The queries are the images of ``truth``, those of them that are in ``scored`` where it is
-    given. Every one of them stands in the denominator of recall, with or without a pose.
+    The result prints as the recall table with its confidence intervals; ``.html(path)`` writes the
+    report, ``.compare(other)`` tests the difference from another result, ``.to_pandas()`` is a
+    table of the queries.
 
     Parameters
     ----------
-    estimated, truth : ``cam_from_world`` by image name, in one frame, metres.
-    conditions : image -> condition; images may be absent from it.
-    scored : the images the benchmark counts; None counts all of ``truth``.
-    statuses : rows of ``status.csv``: reasons, inliers, and which poses are fallbacks.
-    condition_order, pools : see :func:`megloc_kapture.evaluation.recall.row_members`.
-    label : what to call this result.
-    errors : of exactly the counted queries, sorted by name, where they are measured in another
-        way than by camera centres and rotation angle.
+    estimated : a kapture folder with trajectories (and perhaps ``status.csv``), a pose file, or
+        image -> pose; poses in memory are ``cam_from_world`` in the frame of the truth, metres.
+    truth : a kapture folder, or image -> ``cam_from_world``.
+    dataset : whose thresholds, conditions and pools hold; by default those of the side tables.
+    side_tables : the workspace's ``megloc/`` folder: conditions, which images are scored, the
+        protocol, and the world a pose file has to be brought back from; found beside truth or
+        result by itself.
+    thresholds : instead of the protocol's.
+    mapping : kapture folder of the map, for MLAD's pairs and for the report's pictures; found in
+        the workspace of ``estimated`` by itself.
+    label : what the result is called in tables; by default its path.
 
     Raises
     ------
-    DataError : no scored query has a true pose, so that there is nothing to count.
-    OptionError : two rows of the table would bear one name, or there is no threshold.
+    DataError : something is missing or broken, or there is nothing to count.
+    OptionError : an unknown dataset.
     """
-    if not thresholds:
-        raise OptionError("at least one recall threshold is needed")
-    counted = tuple(sorted(n for n in truth if scored is None or n in scored))
-    if not counted:
-        raise DataError("no query with a true pose to count: is this the right ground truth?")
-    wanted = set(estimated) if scored is None else set(estimated) | set(scored)
-    if errors is None:
-        errors = pose_errors(estimated, truth, counted)
-    queries = tuple(
-        _query_result(name, position_m, angle_deg, conditions, statuses)
-        for name, position_m, angle_deg in zip(
-            counted, errors.position_m.tolist(), errors.angle_deg.tolist(), strict=True
+    benchmark = benchmark_beside([truth, estimated], side_tables=side_tables, dataset=dataset)
+    labels = None if label is None else [label]
+    return evaluate_results(
+        [estimated], truth, benchmark, thresholds=thresholds, mapping=mapping, labels=labels
+    )[0]
+
+
+def benchmark_beside(
+    beside: Sequence[object],
+    *,
+    side_tables: Path | str | None = None,
+    dataset: str | None = None,
+) -> Benchmark:
+    """The benchmark of side tables, by default of the first workspace that a path of ``beside``
+    lies in; see :func:`megloc_kapture.evaluation.protocols.benchmark_of`."""
+    for path in beside:
+        if isinstance(path, Path | str):
+            side_tables = side_tables or side_tables_near(path)
+    return benchmark_of(side_tables, dataset)
+
+
+def evaluate_results(
+    results: Sequence[Localized],
+    truth: Path | str | Poses,
+    benchmark: Benchmark,
+    *,
+    thresholds: Sequence[Threshold] | None = None,
+    mapping: Path | str | None = None,
+    labels: Sequence[str] | None = None,
+) -> list[Evaluation]:
+    """Evaluate several results against one truth, by one benchmark; in their order.
+
+    Where the benchmark has MLAD's pairs, these are what counts, by MLAD's metric.
+
+    Parameters
+    ----------
+    results, truth, thresholds, mapping : as in :func:`evaluate`.
+    labels : what the results are called; by default their paths, cut to what tells them apart.
+
+    Raises
+    ------
+    DataError : something is missing or broken, or there is nothing to count.
+    """
+    true_poses = truth if isinstance(truth, Mapping) else KaptureFolder(Path(truth)).read().poses()
+    contexts = [
+        ResultContext() if isinstance(source, Mapping) else context_of(source, mapping=mapping)
+        for source in results
+    ]
+    relative = benchmark.protocol.pose_file == "mlad" and bool(benchmark.pairs)
+    references = _references(contexts, benchmark, mapping) if relative else {}
+    limits = thresholds or benchmark.thresholds()
+    evaluations = []
+    for source, label, context in zip(results, labels or _labels(results), contexts, strict=True):
+        if isinstance(source, Mapping):
+            found = result_in_memory(source, label=label)
+        else:
+            found = read_result(
+                source, benchmark, images=true_poses, references=references, label=label
+            )
+        if relative:
+            evaluation = evaluate_pairs(
+                found.poses_of_pairs(benchmark.pairs),
+                true_poses,
+                benchmark.pairs,
+                references,
+                thresholds=limits,
+                statuses=found.statuses,
+                label=label,
+            )
+        else:
+            evaluation = _by_centers(found, true_poses, benchmark, limits)
+        known_by = benchmark.protocol.truth
+        evaluations.append(replace(evaluation, truth_known_by=known_by, context=context))
+    return evaluations
+
+
+def results_without_truth(
+    results: Sequence[Path | str],
+    benchmark: Benchmark,
+    *,
+    thresholds: Sequence[Threshold] | None = None,
+    mapping: Path | str | None = None,
+    map_poses: Poses | None = None,
+    labels: Sequence[str] | None = None,
+) -> WithoutTruth:
+    """Evaluate results without true poses.
+
+    The queries are those of the challenge's list; without one, those that the results are about.
+
+    Parameters
+    ----------
+    results : kapture folders or pose files, one or several.
+    mapping, labels : as in :func:`evaluate_results`.
+    map_poses : ``cam_from_world`` of the map's images; by default those of the first result that
+        has a map.
+
+    Raises
+    ------
+    DataError : something is missing or broken, or there is no query.
+    """
+    contexts = [context_of(source, mapping=mapping) for source in results]
+    if map_poses is None:
+        map_poses = next((poses for context in contexts if (poses := context.map_poses())), {})
+    known = {image for context in contexts for image in context.query_images()}
+    found = [
+        replace(
+            read_result(source, benchmark, images=known, references=map_poses, label=label),
+            context=context,
         )
-    )
-    members = row_members(
-        [query.condition for query in queries], order=condition_order, pools=pools
-    )
-    guessed = np.array([query.outcome == "fallback" for query in queries])
-    return Evaluation(
-        label=label,
-        thresholds=tuple(thresholds),
-        rows=recall_rows(errors, thresholds, members, fallback=guessed),
-        members=members,
-        queries=queries,
-        errors=errors,
-        truth={name: truth[name] for name in counted},
-        estimated={name: estimated[name] for name in counted if name in estimated},
-        without_truth=tuple(sorted(wanted - set(truth))),
-        not_scored=tuple(sorted(set(truth) - set(counted))),
+        for source, label, context in zip(
+            results, labels or _labels(results), contexts, strict=True
+        )
+    ]
+    queries = set(benchmark.names) or {pair.query for pair in benchmark.pairs}
+    if not queries:
+        of_results = {image for result in found for image in result.images}
+        queries = benchmark.scored(known | of_results)
+    return evaluate_without_truth(
+        found,
+        queries=sorted(queries),
+        conditions=benchmark.conditions(queries),
+        thresholds=thresholds or benchmark.thresholds(),
+        condition_order=benchmark.protocol.conditions,
+        pools=benchmark.protocol.pools,
+        map_poses=map_poses,
+        statement=benchmark.protocol.truth,
     )
 
 
-def _query_result(
-    image: str,
-    position_m: float,
-    angle_deg: float,
-    conditions: Mapping[str, str] | None,
-    statuses: Mapping[str, QueryStatus] | None,
-) -> QueryResult:
-    status = None if statuses is None else statuses.get(image)
-    outcome: Outcome = "localized"
-    reason = ""
-    fallback: Fallback = "none"
-    if not np.isfinite(position_m):
-        outcome = "missing"
-        reason = "no pose in the result" if status is None else status.reason
-        if status is not None and status.status == "localized":
-            reason = "status says localized, but the result has no pose"
-    elif status is not None and status.fallback != "none":
-        outcome = "fallback"
-        reason, fallback = status.reason, status.fallback
-    return QueryResult(
-        image=image,
-        condition="" if conditions is None else conditions.get(image, ""),
-        outcome=outcome,
-        reason=reason,
-        position_m=position_m,
-        angle_deg=angle_deg,
-        num_matches=None if status is None else status.num_matches,
-        num_inliers=None if status is None else status.num_inliers,
-        fallback=fallback,
-        candidates=() if status is None else status.candidates,
+def _labels(results: Sequence[Localized]) -> list[str]:
+    paths = [Path(source) for source in results if not isinstance(source, Mapping)]
+    if len(paths) == len(results):
+        return distinct_labels(paths)
+    return [
+        (f"result {number}" if results[1:] else "") if isinstance(source, Mapping) else str(source)
+        for number, source in enumerate(results, start=1)
+    ]
+
+
+def _by_centers(
+    result: Result, truth: Poses, benchmark: Benchmark, thresholds: Sequence[Threshold]
+) -> Evaluation:
+    known = {*truth, *result.poses}
+    return evaluate_poses(
+        result.poses,
+        truth,
+        conditions=benchmark.conditions(known),
+        thresholds=thresholds,
+        scored=benchmark.scored(known),
+        statuses=result.statuses,
+        condition_order=benchmark.protocol.conditions,
+        pools=benchmark.protocol.pools,
+        label=result.label,
+    )
+
+
+def _references(
+    contexts: Sequence[ResultContext], benchmark: Benchmark, mapping: Path | str | None
+) -> Poses:
+    """Poses of the reference keyframes: of the map that is given, or of a result's workspace."""
+    given = [] if mapping is None else [ResultContext(mapping=KaptureFolder(Path(mapping)))]
+    for context in (*given, *contexts):
+        poses = context.map_poses()
+        if poses:
+            return poses
+    raise DataError(
+        f"the {len(benchmark.pairs)} pairs to relocalize need the poses of their references, which "
+        "are the map's: give it with --map"
     )

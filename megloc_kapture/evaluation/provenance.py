@@ -1,4 +1,4 @@
-"""Where a pose file comes from, kept beside it: versions, options, counts; no dates."""
+"""Provenance of a pose file, kept beside it: versions, options, counts; no dates."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ def package_versions() -> dict[str, str]:
     return {package: version for package, version in found if version is not None}
 
 
-def provenance_path(place: Path | str) -> Path:
-    """Where it stands: ``x.txt.json`` beside a file ``x.txt``, ``x.json`` beside a folder ``x``."""
-    path = Path(place)
+def provenance_path(target: Path | str) -> Path:
+    """Path of the provenance: ``x.txt.json`` of a file ``x.txt``, ``x.json`` of a folder ``x``."""
+    path = Path(target)
     return path.with_name(f"{path.name}.json")
 
 
 def write_provenance(
-    place: Path | str,
+    target: Path | str,
     provenance: Mapping[str, Any],
     *,
     counts: Mapping[str, int],
@@ -59,8 +59,8 @@ def write_provenance(
 
     Parameters
     ----------
-    place : the pose file, or the folder of a challenge that takes several.
-    files : names of the pose files below the folder ``place``; None: it is a file.
+    target : the pose file, or the folder of a challenge that takes several.
+    files : names of the pose files below the folder ``target``; None: it is a file.
 
     Raises
     ------
@@ -68,8 +68,8 @@ def write_provenance(
     ValueError : an entry of ``provenance`` would replace one of ours, or is not JSON.
     OutputError : the file cannot be written.
     """
-    place = Path(place)
-    paths = {place.name: place} if files is None else {name: place / name for name in files}
+    target = Path(target)
+    paths = {target.name: target} if files is None else {name: target / name for name in files}
     ours: dict[str, Any] = {
         "files": {name: _sha256(path) for name, path in sorted(paths.items())},
         "versions": package_versions(),
@@ -78,7 +78,7 @@ def write_provenance(
     taken = sorted(ours.keys() & provenance.keys())
     if taken:
         raise ValueError(f"provenance entries are already ours: {', '.join(taken)}")
-    path = provenance_path(place)
+    path = provenance_path(target)
     write_json(path, ours | dict(provenance))
     return path
 

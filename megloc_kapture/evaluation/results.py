@@ -1,23 +1,160 @@
-"""Results as they lie on disk: a localized kapture, a pose file, the files of an MLAD challenge."""
+"""Results on disk (kapture folders, pose files) and the workspace data around them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.evaluation.mlad_file import read_mlad_file, timestamp_of
-from megloc_kapture.evaluation.pose_file import poses_by_image, read_pose_file
-from megloc_kapture.evaluation.rules import Rules
-from megloc_kapture.evaluation.surroundings import side_tables_near
+from megloc_kapture.evaluation.pose_files import (
+    poses_by_image,
+    read_mlad_file,
+    read_pose_file,
+    timestamp_of,
+)
+from megloc_kapture.evaluation.protocols import Benchmark
 from megloc_kapture.io.challenge_tables import RelocalizationPair
+from megloc_kapture.io.cluster_table import CLUSTERS_FILE, ClusterRow, read_clusters
+from megloc_kapture.io.consistency_table import (
+    CONSISTENCY_FILE,
+    ConsistencyRow,
+    read_consistency,
+)
 from megloc_kapture.io.kapture_store import KaptureFolder
-from megloc_kapture.io.side_tables import World, read_world
+from megloc_kapture.io.refinement_table import REFINEMENT_FILE, read_refinement
+from megloc_kapture.io.side_tables import PROTOCOL_FILE, SIDE_TABLES, World, read_groups, read_world
 from megloc_kapture.io.status_table import STATUS_FILE, QueryStatus, read_status
-from megloc_kapture.values import RigidTransform
+from megloc_kapture.stages.localized_folder import query_status
+from megloc_kapture.values import Failure, Pose, RefinementRow, RigidTransform
+
+# parts of a workspace; datasets and the pipeline write them
+# the map's own keypoints are what queries were matched with; before there is one, its images do
+_MAPS = ("map", "preprocessed/mapping", "mapping")
+_QUERY, _QUERY_MATCHES = "query", "matches/query"
+_QUERY_PYRAMID, _MAPPING_PYRAMID = "pyramid/query", "pyramid/mapping"
+_SENSORS = "sensors/sensors.txt"
+# images that were prepared for features, with masks; keypoints stand in their pixels
+_PREPARED, _ROLES, _MASKS = "preprocessed", ("mapping", "query"), "sensors/masks"
+
+
+@dataclass(frozen=True)
+class ResultContext:
+    """Kapture folders that a report can show something of; each may be absent.
+
+    Attributes
+    ----------
+    queries : images and cameras of the queries, their keypoints, their matches with the map.
+    mapping : images, cameras and poses of the map.
+    frames : map image or query -> its coordinate frame, where a dataset has several.
+    clusters : query -> the clusters of candidates it was tried in.
+    refinements : query -> what each step of refining its pose came to.
+    consistency : what the map's own images said of it, before poses were refined.
+    masked : folders whose images have masks, with the keypoints that were found in them.
+    """
+
+    queries: KaptureFolder | None = None
+    mapping: KaptureFolder | None = None
+    frames: Mapping[str, str] = field(default_factory=dict)
+    clusters: Mapping[str, Sequence[ClusterRow]] = field(default_factory=dict)
+    refinements: Mapping[str, Sequence[RefinementRow]] = field(default_factory=dict)
+    consistency: Sequence[ConsistencyRow] = ()
+    masked: Sequence[KaptureFolder] = ()
+
+    def map_poses(self) -> dict[str, RigidTransform]:
+        """``cam_from_world`` of the map's images; empty without a map.
+
+        Raises
+        ------
+        DataError : the map is broken.
+        """
+        return {} if self.mapping is None else self.mapping.read().poses()
+
+    def query_images(self) -> list[str]:
+        """Names of the queries; empty where they are not known.
+
+        Raises
+        ------
+        DataError : the folder is broken.
+        """
+        return [] if self.queries is None else self.queries.read().image_names()
+
+
+def workspace_of(result: Path | str) -> Path | None:
+    """The workspace that a result (``localized/``, or a file in ``submissions/``) lies in."""
+    for folder in Path(result).resolve().parents[:2]:
+        if (folder / SIDE_TABLES / PROTOCOL_FILE).is_file():
+            return folder
+    return None
+
+
+def side_tables_near(result: Path | str) -> Path | None:
+    """The side tables of the workspace a result lies in; None outside a workspace."""
+    workspace = workspace_of(result)
+    return None if workspace is None else workspace / SIDE_TABLES
+
+
+def context_of(result: Path | str, *, mapping: Path | str | None = None) -> ResultContext:
+    """Find what a report of ``result`` can show.
+
+    Parameters
+    ----------
+    result : a localized kapture folder or a pose file.
+    mapping : kapture folder of the map, where it is not the workspace's.
+
+    Raises
+    ------
+    DataError : broken side tables, or a broken table of clusters, of refinement or of consistency.
+    """
+    clusters = Path(result) / CLUSTERS_FILE
+    refinement = Path(result) / REFINEMENT_FILE
+    consistency = Path(result) / CONSISTENCY_FILE
+    workspace = workspace_of(result)
+    features = []
+    if workspace is not None:
+        # where pairs with few matches were tried again, those matches hold
+        pyramids = [workspace / name for name in (_QUERY_PYRAMID, _MAPPING_PYRAMID)]
+        there = [folder for folder in pyramids if folder.is_dir()]
+        features = [workspace, *there, workspace / _QUERY_MATCHES]
+    candidates = [Path(result)]
+    if workspace is not None:
+        # the keypoints stand in the images that features were extracted from
+        candidates = [workspace / _PREPARED / _QUERY, workspace / _QUERY, Path(result)]
+    queries = next((path for path in candidates if (path / _SENSORS).is_file()), None)
+    map_path = None if mapping is None else Path(mapping)
+    if map_path is None and workspace is not None:
+        maps = (workspace / name for name in _MAPS)
+        map_path = next((path for path in maps if (path / _SENSORS).is_file()), None)
+    groups = {} if workspace is None else read_groups(workspace / SIDE_TABLES)
+    return ResultContext(
+        queries=None if queries is None else KaptureFolder(queries, features_dirs=features),
+        mapping=None if map_path is None else KaptureFolder(map_path, features_dirs=features),
+        frames={image: group.frame for image, group in groups.items() if group.frame},
+        clusters=read_clusters(clusters) if clusters.is_file() else {},
+        refinements=_by_image(read_refinement(refinement)) if refinement.is_file() else {},
+        consistency=read_consistency(consistency) if consistency.is_file() else (),
+        masked=[] if workspace is None else _masked(workspace),
+    )
+
+
+def _by_image(rows: Iterable[RefinementRow]) -> dict[str, list[RefinementRow]]:
+    found: dict[str, list[RefinementRow]] = {}
+    for row in rows:
+        found.setdefault(row.image, []).append(row)
+    return found
+
+
+def _masked(workspace: Path) -> list[KaptureFolder]:
+    found = []
+    for role in _ROLES:
+        prepared = workspace / _PREPARED / role
+        folder = prepared if (prepared / _SENSORS).is_file() else workspace / role
+        if (folder / _MASKS).is_dir() and (folder / _SENSORS).is_file():
+            found.append(KaptureFolder(folder, features_dirs=[workspace]))
+    return found
+
 
 Poses = Mapping[str, RigidTransform]
 
@@ -34,6 +171,7 @@ class Result:
         only those that have one.
     statuses : rows of ``status.csv``; None without one.
     by_pair : of MLAD's pose files, the query's ``cam_from_world`` of each row; None of others.
+    context : what a report of it can show.
     """
 
     label: str
@@ -41,6 +179,7 @@ class Result:
     images: tuple[str, ...]
     statuses: Mapping[str, QueryStatus] | None = None
     by_pair: Mapping[RelocalizationPair, RigidTransform] | None = None
+    context: ResultContext = field(default_factory=ResultContext)
 
     def poses_of_pairs(
         self, pairs: Iterable[RelocalizationPair]
@@ -53,7 +192,7 @@ class Result:
 
 def read_result(
     source: Path | str,
-    rules: Rules,
+    benchmark: Benchmark,
     *,
     images: Iterable[str] = (),
     references: Poses | None = None,
@@ -63,8 +202,8 @@ def read_result(
 
     Parameters
     ----------
-    source : a localized kapture folder, a pose file, or (where the rules have MLAD's pairs) a pose
-        file of the MLAD challenges or a folder with several.
+    source : a localized kapture folder, a pose file, or (where the benchmark has MLAD's pairs) a
+        pose file of the MLAD challenges or a folder with several.
     images : those that the short names of a pose file may stand for.
     references : ``cam_from_world`` of the map's images, for MLAD's pose files.
 
@@ -73,47 +212,36 @@ def read_result(
     DataError : broken, or of another kind; names file and line.
     """
     path = Path(source)
-    if rules.protocol.pose_file == "mlad" and rules.pairs and not _is_kapture(path):
-        by_pair = _read_mlad(path, rules.pairs, references or {}, rules.world)
+    if benchmark.protocol.pose_file == "mlad" and benchmark.pairs and not _is_kapture(path):
+        by_pair = _read_mlad(path, benchmark.pairs, references or {}, benchmark.world)
         poses = {pair.query: pose for pair, pose in by_pair.items()}
         return Result(label, poses, tuple(sorted(poses)), by_pair=by_pair)
     if path.is_dir():
         data = KaptureFolder(path).read()
-        found = _in_frame_of(rules.world, data.poses(), path)
-        return Result(label, found, tuple(sorted(data.image_names())), load_statuses(path))
-    poses = load_poses(path, images=images, world=rules.world, names=rules.names)
+        found = _in_frame_of(benchmark.world, data.poses(), path)
+        statuses = path / STATUS_FILE
+        rows = read_status(statuses) if statuses.is_file() else None
+        return Result(label, found, tuple(sorted(data.image_names())), rows)
+    poses = poses_by_image(read_pose_file(path), images, benchmark.names)
+    if benchmark.world != World():
+        poses = {image: benchmark.world.pose_in_local(pose) for image, pose in poses.items()}
     return Result(label, poses, tuple(sorted(poses)))
 
 
-def load_poses(
-    source: Path | str,
-    *,
-    images: Iterable[str] = (),
-    world: World | None = None,
-    names: Mapping[str, str] | None = None,
-) -> dict[str, RigidTransform]:
-    """``cam_from_world`` by image, of a kapture folder or a pose file.
-
-    Parameters
-    ----------
-    images : the images that the short names of a pose file may stand for.
-    world : of the workspace; a pose file stands in the official frame and is brought to the local
-        one. A kapture folder is in the local frame already.
-    names : image -> its name in a pose file, by the challenge's list.
-    """
-    path = Path(source)
-    if path.is_dir():
-        return KaptureFolder(path).read().poses()
-    poses = poses_by_image(read_pose_file(path), images, names)
-    if world is None or world == World():
-        return poses
-    return {image: world.pose_in_local(pose) for image, pose in poses.items()}
-
-
-def load_statuses(result: Path | str) -> dict[str, QueryStatus] | None:
-    """The rows of ``status.csv`` in a result folder; None where there is none."""
-    path = Path(result) / STATUS_FILE
-    return read_status(path) if path.is_file() else None
+def result_in_memory(
+    estimated: Mapping[str, Pose | Failure] | Mapping[str, RigidTransform], *, label: str = ""
+) -> Result:
+    """A result of poses by image: what localizing gave, or ``cam_from_world`` alone."""
+    poses: dict[str, RigidTransform] = {}
+    statuses: dict[str, QueryStatus] = {}
+    for image, found in estimated.items():
+        if isinstance(found, RigidTransform):
+            poses[image] = found
+            continue
+        statuses[image] = query_status(image, found)
+        if isinstance(found, Pose):
+            poses[image] = found.cam_from_world
+    return Result(label, poses, tuple(sorted(estimated)), statuses or None)
 
 
 def distinct_labels(sources: Sequence[Path]) -> list[str]:
@@ -148,8 +276,8 @@ def _read_mlad(
 ) -> dict[RelocalizationPair, RigidTransform]:
     files = {pair.file for pair in pairs}
     if path.is_dir():
-        places = {file: path / file for file in sorted(files) if (path / file).is_file()}
-        if not places:
+        found_files = {file: path / file for file in sorted(files) if (path / file).is_file()}
+        if not found_files:
             raise DataError(
                 f"neither a kapture folder nor one with pose files ({min(files)})", path=path
             )
@@ -160,22 +288,26 @@ def _read_mlad(
                 f"{', '.join(sorted(files))}",
                 path=path,
             )
-        places = {path.name if path.name in files else min(files): path}
+        found_files = {path.name if path.name in files else min(files): path}
     found: dict[RelocalizationPair, RigidTransform] = {}
-    for file, place in places.items():
+    for file, pose_file in found_files.items():
         asked = {
             (timestamp_of(pair.reference), timestamp_of(pair.query)): pair
             for pair in pairs
             if pair.file == file
         }
-        for row in read_mlad_file(place):
+        for row in read_mlad_file(pose_file):
             pair = asked.get((row.reference, row.query))
             if pair is None:
-                raise DataError(f"pair {row.reference} {row.query} is not asked for", path=place)
+                raise DataError(
+                    f"pair {row.reference} {row.query} is not asked for", path=pose_file
+                )
             if row.query_from_reference is None:
-                raise DataError("has pairs without poses, as a relocalization file", path=place)
+                raise DataError("has pairs without poses, as a relocalization file", path=pose_file)
             if pair.reference not in references:
-                raise DataError(f"reference {pair.reference!r} has no pose in the map", path=place)
+                raise DataError(
+                    f"reference {pair.reference!r} has no pose in the map", path=pose_file
+                )
             pose = _in_local_units(row.query_from_reference, world.official_from_local.scale)
             found[pair] = pose @ references[pair.reference]
     return found

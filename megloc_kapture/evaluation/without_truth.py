@@ -1,41 +1,135 @@
-"""What can be known of results whose true poses nobody publishes.
-
-Three things: how many queries got a pose and from how many inliers; whether poses lie where
-retrieval looked; and whether two results agree. None of them is accuracy: results that share a
-mistake agree as well as right ones.
-"""
+"""Figures of results whose true poses nobody publishes."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import combinations
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.evaluation.evaluate import Outcome
-from megloc_kapture.evaluation.near_candidates import NearCandidates, near_candidates
-from megloc_kapture.evaluation.pose_errors import PoseErrors, pose_errors
-from megloc_kapture.evaluation.recall import RecallAt, recall_row, row_members
-from megloc_kapture.evaluation.results import Poses, Result
-from megloc_kapture.evaluation.thresholds import DEFAULT_THRESHOLDS, Threshold
+from megloc_kapture.evaluation.metrics import (
+    DEFAULT_THRESHOLDS,
+    PoseErrors,
+    RecallAt,
+    Threshold,
+    pose_errors,
+    recall_row,
+    row_members,
+)
+from megloc_kapture.evaluation.results import Poses, Result, ResultContext
+from megloc_kapture.evaluation.scoring import Outcome, Reported
+from megloc_kapture.geometry.poses import camera_centers, invert_quats, rotate, stack_poses
 from megloc_kapture.io.status_table import QueryStatus
+from megloc_kapture.values import RigidTransform
 
+if TYPE_CHECKING:
+    pass
+
+
+@dataclass(frozen=True, slots=True)
+class NearCandidates:
+    """Distances of a pose from the map images it was estimated from.
+
+    Parameters
+    ----------
+    first_m, first_deg : distance to the first candidate's camera centre, and the angle between
+        the two viewing directions.
+    nearest : the candidate whose centre is nearest.
+    nearest_m, nearest_deg : the same for it.
+    """
+
+    first_m: float
+    first_deg: float
+    nearest: str
+    nearest_m: float
+    nearest_deg: float
+
+
+def near_candidates(
+    poses: Poses,
+    statuses: Mapping[str, QueryStatus],
+    images: Sequence[str],
+    map_poses: Poses,
+) -> dict[str, NearCandidates]:
+    """Image -> the first and the nearest of its candidates that have a pose in the map.
+
+    Parameters
+    ----------
+    poses : ``cam_from_world`` of ``images`` at least.
+    statuses : rows of ``status.csv``, for the candidates; images may be absent.
+    images : whose candidates to look at; those without any are left out.
+    map_poses : ``cam_from_world`` of the map's images, in the same frame.
+    """
+    index_of = {name: index for index, name in enumerate(map_poses)}
+    known = {
+        image: [index_of[c] for c in statuses[image].candidates if c in index_of]
+        for image in images
+        if image in statuses
+    }
+    known = {image: candidates for image, candidates in known.items() if candidates}
+    if not known:
+        return {}
+    counts = np.array([len(candidates) for candidates in known.values()])
+    candidates = np.concatenate([np.array(c, dtype=np.int64) for c in known.values()])
+    centers, directions = _centers_and_directions([poses[image] for image in known])
+    map_centers, map_directions = _centers_and_directions(list(map_poses.values()))
+    owner = np.repeat(np.arange(len(known)), counts)
+    distance_m = np.linalg.norm(centers[owner] - map_centers[candidates], axis=1)
+    cosine = np.einsum("ij,ij->i", directions[owner], map_directions[candidates])
+    angle_deg = np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    names = list(map_poses)
+    found = {}
+    firsts = np.concatenate([[0], np.cumsum(counts)[:-1]]).tolist()
+    for image, first, count in zip(known, firsts, counts.tolist(), strict=True):
+        nearest = first + int(np.argmin(distance_m[first : first + count]))
+        found[image] = NearCandidates(
+            first_m=float(distance_m[first]),
+            first_deg=float(angle_deg[first]),
+            nearest=names[int(candidates[nearest])],
+            nearest_m=float(distance_m[nearest]),
+            nearest_deg=float(angle_deg[nearest]),
+        )
+    return found
+
+
+def _centers_and_directions(
+    poses: Sequence[RigidTransform],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Camera centres (N, 3) and unit viewing directions (N, 3) in the world."""
+    quats, translations = stack_poses(poses)
+    directions = rotate(invert_quats(quats), np.array([0.0, 0.0, 1.0]))
+    return camera_centers(quats, translations), directions
+
+
+CAUTION = (
+    "None of these figures is accuracy: retrieval may look in the wrong place, and results that "
+    "share a mistake agree."
+)
 PRIOR_DISTANCES_M = (5.0, 10.0, 25.0)
 PRIOR_ANGLE_DEG = 45.0
+_QUERY_COLUMNS = ("outcome", "num_matches", "num_inliers")
+_CANDIDATE_COLUMNS = {
+    "first_candidate_m": "first_m",
+    "first_candidate_deg": "first_deg",
+    "nearest_candidate": "nearest",
+    "nearest_candidate_m": "nearest_m",
+    "nearest_candidate_deg": "nearest_deg",
+}
 _QUARTILES = (0.25, 0.5, 0.75)
 
 
 @dataclass(frozen=True, slots=True)
 class QueryWithoutTruth:
-    """What became of one query.
+    """The outcome of one query.
 
     Parameters
     ----------
     image, condition, outcome, reason, num_matches, num_inliers, candidates : as in
-        :class:`megloc_kapture.evaluation.evaluate.QueryResult`.
+        :class:`megloc_kapture.evaluation.scoring.QueryResult`.
     near : None without an estimated pose, candidates, or their poses in the map.
     """
 
@@ -50,19 +144,28 @@ class QueryWithoutTruth:
 
 
 @dataclass(frozen=True, slots=True)
+class WithinDistance:
+    """Queries within a distance of their candidate, and their share of those compared."""
+
+    distance_m: float
+    num_within: int
+    share: float
+
+
+@dataclass(frozen=True, slots=True)
 class PriorAgreement:
-    """How close localized poses of a group lie to one of their candidates.
+    """Agreement of a group's localized poses with one of their candidates.
 
     Parameters
     ----------
     num_compared : localized queries with a candidate that has a pose in the map.
-    within : how many of these lie within 5, 10 and 25 m (``PRIOR_DISTANCES_M``).
+    within : how many of these lie within 5, 10 and 25 m.
     num_same_direction : how many look within 45 degrees of the candidate's direction.
     median_m, median_deg : of the distances and angles.
     """
 
     num_compared: int
-    within: tuple[int, ...]
+    within: tuple[WithinDistance, ...]
     num_same_direction: int
     median_m: float
     median_deg: float
@@ -74,9 +177,8 @@ class RowWithoutTruth:
 
     Parameters
     ----------
-    inliers : quartiles (25, 50, 75 %) over the localized queries; None where nothing says them.
-    first, nearest : agreement with the first and with the nearest candidate; None: no map, or no
-        candidates.
+    inliers_quartiles : 25, 50, 75 % over the localized queries; None where nothing says them.
+    first_candidate, nearest_candidate : agreement with them; None: no map, or no candidates.
     """
 
     name: str
@@ -84,9 +186,9 @@ class RowWithoutTruth:
     num_localized: int
     num_fallback: int
     num_missing: int
-    inliers: tuple[float, float, float] | None
-    first: PriorAgreement | None
-    nearest: PriorAgreement | None
+    inliers_quartiles: tuple[float, float, float] | None
+    first_candidate: PriorAgreement | None
+    nearest_candidate: PriorAgreement | None
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -97,6 +199,7 @@ class ResultWithoutTruth:
     rows: tuple[RowWithoutTruth, ...]
     queries: tuple[QueryWithoutTruth, ...]
     poses: Poses
+    context: ResultContext = field(default_factory=ResultContext)
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +228,7 @@ class AgreementRow:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class WithoutTruth:
+class WithoutTruth(Reported):
     """Everything that can be said.
 
     Parameters
@@ -142,6 +245,27 @@ class WithoutTruth:
     results: tuple[ResultWithoutTruth, ...]
     agreement: tuple[AgreementRow, ...]
     apart: tuple[PoseErrors, ...]
+
+    def per_query(self) -> dict[str, list[Any]]:
+        """Column -> one value per query; of several results they are called ``label: column``,
+        and the distances of their poses follow."""
+        columns: dict[str, list[Any]] = {}
+        for result in self.results:
+            before = f"{result.label}: " if self.results[1:] else ""
+            queries = result.queries
+            near = [query.near for query in queries]
+            columns["image"] = [query.image for query in queries]
+            columns["condition"] = [query.condition for query in queries]
+            for name in _QUERY_COLUMNS:
+                columns[before + name] = [getattr(query, name) for query in queries]
+            for name, attribute in _CANDIDATE_COLUMNS.items():
+                columns[before + name] = [getattr(one, attribute, None) for one in near]
+            columns[before + "reason"] = [query.reason for query in queries]
+        labels = [result.label for result in self.results]
+        for (first, second), apart in zip(combinations(labels, 2), self.apart, strict=True):
+            columns[f"{first} to {second}: position_m"] = apart.position_m.tolist()
+            columns[f"{first} to {second}: angle_deg"] = apart.angle_deg.tolist()
+        return columns
 
 
 def evaluate_without_truth(
@@ -161,7 +285,8 @@ def evaluate_without_truth(
     ----------
     results : in one frame.
     queries : every query that counts; by default all that any of the results is about.
-    conditions, condition_order, pools : as in :func:`megloc_kapture.evaluation.evaluate.evaluate`.
+    conditions, condition_order, pools : as in
+        :func:`megloc_kapture.evaluation.scoring.evaluate_poses`.
     thresholds : of the agreement between two results.
     map_poses : ``cam_from_world`` of the map's images, in the same frame.
     statement : who knows the true poses; empty: they were not given.
@@ -224,7 +349,7 @@ def _result(
         _row(name, [queries[index] for index in np.flatnonzero(chosen).tolist()])
         for name, chosen in members.items()
     )
-    return ResultWithoutTruth(result.label, rows, queries, result.poses)
+    return ResultWithoutTruth(result.label, rows, queries, result.poses, result.context)
 
 
 def _query(
@@ -238,21 +363,13 @@ def _query(
     if status is None:
         outcome: Outcome = "localized" if has_pose else "missing"
         return QueryWithoutTruth(image, condition, outcome, "" if has_pose else "no pose")
-    outcome = "missing"
-    reason = status.reason or "status says localized, but the result has no pose"
+    outcome, reason = "missing", status.reason
     if has_pose:
         outcome = "localized" if status.fallback == "none" else "fallback"
-        reason = status.reason
-    return QueryWithoutTruth(
-        image,
-        condition,
-        outcome,
-        reason,
-        status.num_matches,
-        status.num_inliers,
-        status.candidates,
-        near,
-    )
+    elif not reason:
+        reason = "status says localized, but the result has no pose"
+    counts = status.num_matches, status.num_inliers
+    return QueryWithoutTruth(image, condition, outcome, reason, *counts, status.candidates, near)
 
 
 def _row(name: str, queries: Sequence[QueryWithoutTruth]) -> RowWithoutTruth:
@@ -269,9 +386,9 @@ def _row(name: str, queries: Sequence[QueryWithoutTruth]) -> RowWithoutTruth:
         num_localized=len(localized),
         num_fallback=sum(query.outcome == "fallback" for query in queries),
         num_missing=sum(query.outcome == "missing" for query in queries),
-        inliers=quartiles,
-        first=_prior([(n.first_m, n.first_deg) for n in near]) if near else None,
-        nearest=_prior([(n.nearest_m, n.nearest_deg) for n in near]) if near else None,
+        inliers_quartiles=quartiles,
+        first_candidate=_prior([(n.first_m, n.first_deg) for n in near]) if near else None,
+        nearest_candidate=_prior([(n.nearest_m, n.nearest_deg) for n in near]) if near else None,
     )
 
 
@@ -279,7 +396,11 @@ def _prior(pairs: Sequence[tuple[float, float]]) -> PriorAgreement:
     distance_m, angle_deg = np.array(pairs).T
     return PriorAgreement(
         num_compared=len(pairs),
-        within=tuple(int((distance_m <= bound).sum()) for bound in PRIOR_DISTANCES_M),
+        within=tuple(
+            WithinDistance(bound, int(near.sum()), float(near.mean()))
+            for bound in PRIOR_DISTANCES_M
+            for near in [distance_m <= bound]
+        ),
         num_same_direction=int((angle_deg <= PRIOR_ANGLE_DEG).sum()),
         median_m=float(np.median(distance_m)),
         median_deg=float(np.median(angle_deg)),
@@ -287,7 +408,7 @@ def _prior(pairs: Sequence[tuple[float, float]]) -> PriorAgreement:
 
 
 def _apart(first: Poses, second: Poses, images: Sequence[str]) -> PoseErrors:
-    """How far two results' poses are apart; infinite where one of them has none."""
+    """Differences of two results' poses; infinite where one of them has none."""
     both = [index for index, image in enumerate(images) if image in first and image in second]
     shared = pose_errors(first, second, [images[index] for index in both])
     position_m, angle_deg = np.full(len(images), np.inf), np.full(len(images), np.inf)

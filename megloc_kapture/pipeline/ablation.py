@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from megloc_kapture.evaluation.outputs import RECALL_JSON
+from megloc_kapture.evaluation.report.reports import RECALL_JSON
 from megloc_kapture.io.atomic import output_error
 from megloc_kapture.io.csv_table import write_csv_table
 from megloc_kapture.io.links import hard_link

@@ -8,12 +8,11 @@ from typing import Any
 
 from megloc_kapture.datasets.kapture_folders import import_mapping
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.evaluation.folders import evaluate_folders, results_without_truth
-from megloc_kapture.evaluation.outputs import write_evaluation
+from megloc_kapture.evaluation.evaluate import evaluate, results_without_truth
+from megloc_kapture.evaluation.protocols import benchmark_of
 from megloc_kapture.evaluation.provenance import package_versions
-from megloc_kapture.evaluation.rules import read_rules
-from megloc_kapture.evaluation.surroundings import surroundings_of
-from megloc_kapture.evaluation.without_truth_outputs import write_without_truth
+from megloc_kapture.evaluation.report.reports import write_report
+from megloc_kapture.evaluation.results import context_of
 from megloc_kapture.io.kapture_store import KaptureFolder
 from megloc_kapture.io.side_tables import SIDE_TABLES, Protocol
 from megloc_kapture.pipeline.datasets import DatasetChoice, with_model
@@ -266,20 +265,22 @@ class Evaluate(_RunStage):
         label = f"{self._run.dataset}, {self._run.preset}"
         map_poses = work.folder(MAPPING).read().poses()
         provenance = self.settings() | {"versions": package_versions()}
-        around, output = surroundings_of(localized), work.out / EVALUATION
+        output = work.out / EVALUATION
         if not truth.is_dir():
             found = results_without_truth(
-                [localized], read_rules(tables), map_poses=map_poses, labels=[label]
+                [localized], benchmark_of(tables), map_poses=map_poses, labels=[label]
             )
-            write_without_truth(
-                output, found, map_poses=map_poses, provenance=provenance, around=[around]
-            )
+            write_report(output, found, map_poses=map_poses, provenance=provenance)
             return {"queries_with_truth": 0}
-        evaluation = evaluate_folders(
+        evaluation = evaluate(
             localized, truth, side_tables=tables, label=label, mapping=work.path(MAPPING)
         )
-        write_evaluation(
-            output, evaluation, map_poses=map_poses, provenance=provenance, around=around
+        write_report(
+            output,
+            evaluation,
+            map_poses=map_poses,
+            provenance=provenance,
+            contexts=[context_of(localized)],
         )
         row = evaluation.row()
         recall = {f"recall at {at.threshold}": round(at.recall, 4) for at in row.recall}

@@ -9,13 +9,13 @@ from typing import Any
 
 from megloc_kapture.datasets.kapture_folders import MAPPING, QUERY
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.evaluation.mlad_file import (
+from megloc_kapture.evaluation.pose_files import (
     RelativePose,
     format_mlad_file,
+    format_pose_file,
     relative_pose,
     timestamp_of,
 )
-from megloc_kapture.evaluation.pose_file import format_pose_file
 from megloc_kapture.evaluation.provenance import write_provenance
 from megloc_kapture.io.atomic import write_bytes
 from megloc_kapture.io.challenge_tables import (

@@ -8,17 +8,10 @@ from typing import Any
 
 import pytest
 
-from megloc_kapture.cli.check import Check
-from megloc_kapture.cli.main import COMMANDS
-from megloc_kapture.evaluation.pose_file import write_pose_file
+from megloc_kapture.evaluation.pose_files import write_pose_file
 from megloc_kapture.io.kapture_store import KaptureFolder, write_sensors
 from megloc_kapture.io.side_tables import Protocol, write_protocol
 from megloc_kapture.values import RigidTransform
-
-
-@pytest.fixture(autouse=True)
-def command(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(COMMANDS, "check", Check)
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from megloc_kapture.evaluation.pose_file import write_pose_file
+from megloc_kapture.evaluation.pose_files import write_pose_file
 from megloc_kapture.evaluation.protocols import protocol_of
 from megloc_kapture.io.kapture_store import KaptureData, Sensor, write_sensors
 from megloc_kapture.io.side_tables import ImageGroup, write_groups, write_protocol

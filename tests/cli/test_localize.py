@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from kapture.io.csv import kapture_from_dir
 
-from megloc_kapture.evaluation.folders import evaluate_folders
+from megloc_kapture.evaluation.evaluate import evaluate
 from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture_store import FeatureWriter, ImagePair, KaptureFolder, write_pairs
 from megloc_kapture.io.status_table import read_status
@@ -23,7 +23,7 @@ IMAGES = "training/gallery_light1_loop1/frames/rgb/camera_0/rgb_00"
 
 def medians(result: Path, truth: Path) -> tuple[float, float, float]:
     """Share of localized queries, and their median errors in metres and degrees."""
-    row = evaluate_folders(result, truth, side_tables=None).row()
+    row = evaluate(result, truth).row()
     assert row.median_position_m is not None and row.median_angle_deg is not None
     return row.num_localized / row.num_queries, row.median_position_m, row.median_angle_deg
 

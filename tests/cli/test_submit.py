@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from megloc_kapture.evaluation.pose_file import read_pose_file
+from megloc_kapture.evaluation.pose_files import read_pose_file
 from megloc_kapture.io.challenge_tables import RelocalizationPair, write_relocalization
 from megloc_kapture.io.kapture_store import KaptureFolder, write_sensors
 from megloc_kapture.io.side_tables import Protocol, write_protocol

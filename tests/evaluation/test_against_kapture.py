@@ -15,9 +15,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.evaluation.evaluate import evaluate
-from megloc_kapture.evaluation.folders import evaluate_folders
-from megloc_kapture.evaluation.pose_file import read_pose_file, write_pose_file
-from megloc_kapture.evaluation.thresholds import Threshold, thresholds_from_pairs
+from megloc_kapture.evaluation.metrics import Threshold, thresholds_from_pairs
+from megloc_kapture.evaluation.pose_files import read_pose_file, write_pose_file
+from megloc_kapture.evaluation.scoring import evaluate_poses
 from megloc_kapture.geometry.poses import rotation_angles_deg, stack_poses
 from megloc_kapture.io.kapture_store import KaptureFolder
 from megloc_kapture.values import RigidTransform
@@ -70,7 +70,7 @@ def assert_equal_figures(
     estimated: Poses, truth: Poses, bins: list[tuple[float, float]], oracle: Callable[..., Any]
 ) -> None:
     statistics, results = oracle(estimated, truth, bins)
-    found = evaluate(estimated, truth, thresholds=thresholds_from_pairs(bins))
+    found = evaluate_poses(estimated, truth, thresholds=thresholds_from_pairs(bins))
     row = found.row()
     assert row.num_queries == statistics.number_of_images
     assert row.num_localized == statistics.number_of_localized_positions
@@ -196,8 +196,8 @@ def test_folders_written_by_kapture_are_evaluated(
 ) -> None:
     truth = tmp_path / "query_gt"
     kapture.io.csv.kapture_to_dir(str(truth), kapture_of(world.truth, list(world.truth)))
-    found = evaluate_folders(localized, truth)
-    expected = evaluate(world.estimated, world.truth)
+    found = evaluate(localized, truth)
+    expected = evaluate_poses(world.estimated, world.truth)
     assert found.row().num_queries == 40
     np.testing.assert_allclose(
         found.errors.position_m, expected.errors.position_m, rtol=0, atol=1e-9
@@ -219,7 +219,7 @@ def test_equal_without_rotation(
     # thresholds that single queries meet exactly, to the last bit
     bounds = [float(position_m) for _, position_m, _ in results if np.isfinite(position_m)][:8]
     statistics, _ = figures_of_kapture(estimated, truth, [(bound, -1.0) for bound in bounds])
-    row = evaluate(
+    row = evaluate_poses(
         estimated, truth, thresholds=thresholds_from_pairs((bound, None) for bound in bounds)
     ).row()
     assert [at.num_within for at in row.recall] == [count for _, _, count in statistics.filled_bins]
@@ -237,6 +237,6 @@ def test_recall_is_the_share_that_kapture_prints(
     }
     statistics, _ = figures_of_kapture(estimated, truth, BINS)
     shares = [count / statistics.number_of_images for _, _, count in statistics.filled_bins]
-    row = evaluate(estimated, truth, thresholds=thresholds_from_pairs(BINS)).row()
+    row = evaluate_poses(estimated, truth, thresholds=thresholds_from_pairs(BINS)).row()
     assert [at.recall for at in row.recall] == pytest.approx(shares, abs=1e-9)
     assert all(at.low <= at.recall <= at.high for at in row.recall)

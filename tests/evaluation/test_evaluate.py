@@ -1,84 +1,118 @@
-"""evaluate(): who is counted, what became of each query, and the books that must balance."""
+"""The function for notebooks and scripts: poses in memory or on disk, and what it gives."""
 
 from __future__ import annotations
 
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pandas as pd
 import pytest
 
-from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.evaluation.evaluate import evaluate
-from megloc_kapture.io.status_table import QueryStatus
-from megloc_kapture.values import RigidTransform
+import megloc_kapture as megloc
+from megloc_kapture.errors import OptionError
+from megloc_kapture.evaluation.evaluate import evaluate, evaluate_results
+from megloc_kapture.evaluation.protocols import Benchmark
+from megloc_kapture.evaluation.report.reports import report_text, write_report
+from megloc_kapture.evaluation.statistics import over_seeds
+from megloc_kapture.io.status_table import write_status
+from megloc_kapture.values import Failure, Pose
 
-HERE = RigidTransform.identity()
+
+@pytest.fixture
+def result(world: Any, tmp_path: Path, kaptures: Callable[..., Path]) -> Path:
+    folder = kaptures(tmp_path / "localized", list(world.truth), world.estimated)
+    write_status(folder / "status.csv", world.statuses.values())
+    return folder
 
 
-def test_every_true_query_is_counted_once(world: Any) -> None:
-    evaluation = evaluate(
-        world.estimated, world.truth, conditions=world.conditions, statuses=world.statuses
+def test_it_prints_as_the_recall_table(world: Any, result: Path, tmp_path: Path) -> None:
+    found = megloc.evaluate(result, truth=world.truth)
+    assert str(found) + "\n" == report_text(found)
+    assert "95 % confidence intervals" in str(found) and str(result) in str(found)
+    found.html(tmp_path / "report.html")
+    assert "How large the errors are" in (tmp_path / "report.html").read_text()
+
+
+def test_poses_in_memory_are_those_on_disk(
+    world: Any, result: Path, tmp_path: Path, kaptures: Callable[..., Path]
+) -> None:
+    truth = kaptures(tmp_path / "query_gt", list(world.truth), world.truth)
+    on_disk = evaluate(result, truth)
+    in_memory = evaluate(world.estimated, world.truth)
+    np.testing.assert_array_equal(in_memory.errors.position_m, on_disk.errors.position_m)
+
+
+def test_what_localizing_gives_brings_reasons_and_inliers(world: Any) -> None:
+    first, second, third, *_ = sorted(world.estimated)
+    truth = {name: world.truth[name] for name in (first, second, third)}
+    found = evaluate(
+        {
+            first: Pose(world.estimated[first], 300, 120),
+            second: Failure("no matches", num_matches=7),
+        },
+        truth,
+        label="mine",
     )
-    assert [q.image for q in evaluation.queries] == sorted(world.truth)
-    assert evaluation.errors.names == tuple(sorted(world.truth))
-    row = evaluation.row()
-    outcomes = [query.outcome for query in evaluation.queries]
-    assert row.num_localized == outcomes.count("localized") == 32
-    assert row.num_fallback == outcomes.count("fallback") == 4
-    assert row.num_missing == outcomes.count("missing") == 4
-    assert evaluation.row("day").num_queries + evaluation.row("night").num_queries == 40
-    assert list(evaluation.estimated) == sorted(world.estimated)
-    with pytest.raises(KeyError):
-        evaluation.row("noon")
+    table = found.to_pandas()
+    assert table.loc[first, "num_inliers"] == 120 and table.loc[first, "outcome"] == "localized"
+    assert table.loc[second, "reason"] == "no matches" and table.loc[second, "num_matches"] == 7
+    assert table.loc[third, "outcome"] == "missing" and table.loc[third, "num_inliers"] is pd.NA
+    assert found.label == "mine"
 
 
-def test_images_without_truth_are_reported_and_not_counted() -> None:
-    evaluation = evaluate({"b": HERE, "x": HERE, "c": HERE}, {"a": HERE, "b": HERE})
-    assert evaluation.without_truth == ("c", "x")
-    assert evaluation.row().num_queries == 2
-    assert "x" not in evaluation.estimated
+def test_a_table_of_the_queries(world: Any, result: Path) -> None:
+    found = evaluate(result, world.truth)
+    table = found.to_pandas()
+    assert list(table.index) == sorted(world.truth)
+    at = found.row().recall[1]
+    within = (table["position_error_m"] <= at.threshold.position_m) & (
+        table["angle_error_deg"] <= at.threshold.angle_deg
+    )
+    assert within.mean() == at.recall
+    assert table["position_error_m"].median() == found.row().median_position_m
+    assert set(table["outcome"]) == {"localized", "fallback", "missing"}
 
 
-def test_only_scored_images_are_counted() -> None:
-    truth = {"a": HERE, "b": HERE, "c": HERE}
-    evaluation = evaluate({"a": HERE}, truth, scored={"a", "c", "unknown"})
-    assert [q.image for q in evaluation.queries] == ["a", "c"]
-    assert evaluation.not_scored == ("b",)
-    assert evaluation.without_truth == ("unknown",)
+def test_two_results_are_compared(world: Any, tmp_path: Path) -> None:
+    lost = sorted(world.estimated)[:12]
+    fewer = {name: pose for name, pose in world.estimated.items() if name not in lost}
+    all_of_them = evaluate(world.estimated, world.truth, label="all of them")
+    comparison = all_of_them.compare(evaluate(fewer, world.truth, label="fewer"))
+    assert "all of them finds" in " ".join(str(comparison).split())
+    table = comparison.to_pandas()
+    assert (table.loc[lost, "fewer: outcome"] == "missing").all()
+    comparison.html(tmp_path / "comparison.html")
+    assert "Is the difference real?" in (tmp_path / "comparison.html").read_text()
+    with pytest.raises(OptionError, match="two results are called 'all of them'"):
+        all_of_them.compare(all_of_them)
 
 
-def test_statuses_tell_fallback_and_reason() -> None:
-    statuses = {
-        "a": QueryStatus(image="a", status="localized", num_matches=9, num_inliers=5),
-        "b": QueryStatus(image="b", status="failed", reason="dark", fallback="retrieval"),
-        "c": QueryStatus(image="c", status="failed", reason="blurred"),
-        "d": QueryStatus(image="d", status="localized"),
-    }
-    truth = dict.fromkeys("abcde", HERE)
-    evaluation = evaluate({"a": HERE, "b": HERE}, truth, statuses=statuses)
-    assert [(q.outcome, q.reason, q.num_inliers) for q in evaluation.queries] == [
-        ("localized", "", 5),
-        ("fallback", "dark", 0),
-        ("missing", "blurred", 0),
-        ("missing", "status says localized, but the result has no pose", 0),
-        ("missing", "no pose in the result", None),
-    ]
+def test_results_without_a_label_are_told_apart(world: Any) -> None:
+    first, second = evaluate_results([world.estimated, {}], world.truth, Benchmark())
+    assert (first.label, second.label) == ("result 1", "result 2")
+    assert "+-" in str(over_seeds([first, second]))
 
 
-def test_nothing_to_count_is_an_error() -> None:
-    with pytest.raises(DataError, match="no query with a true pose"):
-        evaluate({"a": HERE}, {})
-    with pytest.raises(DataError, match="no query with a true pose"):
-        evaluate({}, {"a": HERE}, scored=set())
+def test_tables_in_python_are_those_of_the_files(world: Any, result: Path, tmp_path: Path) -> None:
+    found = evaluate(result, world.truth)
+    comparison = found.compare(evaluate({}, world.truth, label="nothing"))
+    for number, reported in enumerate((found, comparison)):
+        paths = write_report(tmp_path / str(number), reported)
+        # a missing pose is infinitely far in Python, and empty in the file
+        written = pd.read_csv(paths["per_query.csv"], keep_default_na=False, na_values=[""])
+        here = reported.to_pandas().reset_index().replace({np.inf: np.nan, "": np.nan})
+        pd.testing.assert_frame_equal(written, here, check_dtype=False)
 
 
-def test_no_threshold_is_an_error() -> None:
-    with pytest.raises(OptionError, match="threshold"):
-        evaluate({}, {"a": HERE}, thresholds=())
-
-
-def test_the_order_of_the_input_does_not_matter(world: Any) -> None:
-    backwards = dict(reversed(world.estimated.items()))
-    first = evaluate(world.estimated, world.truth)
-    second = evaluate(backwards, dict(reversed(world.truth.items())))
-    assert first.rows == second.rows
-    assert first.queries == second.queries
+def test_nothing_heavy_is_loaded_before_it_is_needed() -> None:
+    code = (
+        "import sys; import megloc_kapture.evaluation.evaluate as e; "
+        "import megloc_kapture.evaluation.report.reports; "
+        "print([m for m in ('pandas', 'matplotlib', 'torch', 'jinja2') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from megloc_kapture.errors import OptionError
-from megloc_kapture.evaluation.protocols import protocol_names, protocol_of
+from megloc_kapture.evaluation.protocols import PROTOCOLS, protocol_of
 from megloc_kapture.io.side_tables import Protocol, read_protocol, write_protocol
 
 
@@ -28,7 +28,7 @@ def test_pools_of_robotcar_hold_each_condition_once() -> None:
     assert len(protocol.pools["day-all"]) == 7
 
 
-@pytest.mark.parametrize("name", protocol_names())
+@pytest.mark.parametrize("name", PROTOCOLS)
 def test_every_protocol_survives_its_file(name: str, tmp_path: object) -> None:
     write_protocol(str(tmp_path), protocol_of(name))
     assert read_protocol(str(tmp_path)) == protocol_of(name)

@@ -1,4 +1,4 @@
-"""Results and rules from disk: labels, frames, names, conditions, what lies around a result."""
+"""Results on disk: kapture folders, pose files, side tables."""
 
 from __future__ import annotations
 
@@ -9,18 +9,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from megloc_kapture.evaluation.folders import evaluate_results
-from megloc_kapture.evaluation.pose_file import write_pose_file
-from megloc_kapture.evaluation.protocols import protocol_of
-from megloc_kapture.evaluation.results import distinct_labels, read_result
-from megloc_kapture.evaluation.rules import Rules, read_rules
-from megloc_kapture.evaluation.surroundings import (
+from megloc_kapture.errors import DataError
+from megloc_kapture.evaluation.evaluate import evaluate, evaluate_results
+from megloc_kapture.evaluation.metrics import Threshold
+from megloc_kapture.evaluation.pose_files import write_pose_file
+from megloc_kapture.evaluation.protocols import Benchmark, benchmark_of, protocol_of
+from megloc_kapture.evaluation.results import (
+    context_of,
+    distinct_labels,
+    read_result,
     side_tables_near,
-    surroundings_of,
     workspace_of,
 )
-from megloc_kapture.evaluation.thresholds import Threshold
 from megloc_kapture.io.challenge_tables import write_names
+from megloc_kapture.io.kapture_store import KaptureData, Sensor, write_sensors
 from megloc_kapture.io.side_tables import (
     ImageGroup,
     Protocol,
@@ -30,7 +32,8 @@ from megloc_kapture.io.side_tables import (
     write_protocol,
     write_world,
 )
-from megloc_kapture.values import RigidTransform
+from megloc_kapture.io.status_table import write_status
+from megloc_kapture.values import Camera, RigidTransform
 
 
 @pytest.mark.parametrize(
@@ -50,15 +53,15 @@ def test_labels_tell_results_apart(paths: list[str], labels: list[str]) -> None:
 
 
 def test_conditions_from_folders_where_no_table_has_them() -> None:
-    rules = Rules(protocol=protocol_of("robotcar"))
+    rules = Benchmark(protocol=protocol_of("robotcar"))
     images = ["night-rain/rear/1.jpg", "dawn/left/2.jpg", "left/3.jpg", "dawn/night/4.jpg"]
     assert rules.conditions(images) == {
         "night-rain/rear/1.jpg": "night-rain",
         "dawn/left/2.jpg": "dawn",
     }
     # a file called like a condition is none, and tables overrule folders
-    assert Rules(protocol=protocol_of("aachen")).conditions(["query/night"]) == {}
-    grouped = Rules(
+    assert Benchmark(protocol=protocol_of("aachen")).conditions(["query/night"]) == {}
+    grouped = Benchmark(
         protocol=protocol_of("aachen"), groups={"query/night/1.jpg": ImageGroup(condition="dusk")}
     )
     assert grouped.conditions(["query/night/1.jpg", "query/day/2.jpg"]) == {
@@ -69,10 +72,10 @@ def test_conditions_from_folders_where_no_table_has_them() -> None:
 def test_a_named_dataset_overrules_the_protocol_and_keeps_the_groups(tmp_path: Path) -> None:
     write_protocol(tmp_path, Protocol(dataset="mine", thresholds=((1.0, None),)))
     write_groups(tmp_path, {"a.jpg": ImageGroup(condition="day")})
-    assert read_rules(tmp_path).thresholds() == (Threshold(position_m=1.0),)
-    rules = read_rules(tmp_path, "inloc")
+    assert benchmark_of(tmp_path).thresholds() == (Threshold(position_m=1.0),)
+    rules = benchmark_of(tmp_path, "inloc")
     assert rules.protocol.dataset == "inloc" and "a.jpg" in rules.groups
-    assert read_rules().protocol == Protocol()
+    assert benchmark_of().protocol == Protocol()
 
 
 def test_workspaces_that_were_recentred_in_other_ways_are_brought_together(
@@ -96,14 +99,14 @@ def test_workspaces_that_were_recentred_in_other_ways_are_brought_together(
     there = kaptures(tmp_path / "two/localized", names, moved)
     write_pose_file(tmp_path / "poses.txt", official)
     found = evaluate_results(
-        [here, there, tmp_path / "poses.txt"], truth, read_rules(tmp_path / "one/megloc")
+        [here, there, tmp_path / "poses.txt"], truth, benchmark_of(tmp_path / "one/megloc")
     )
     for other in found[1:]:
         np.testing.assert_allclose(
             other.errors.position_m, found[0].errors.position_m, rtol=0, atol=1e-9
         )
     # the guard: in its own frame it is metres off
-    wrong = evaluate_results([kaptures(tmp_path / "lone", names, moved)], truth, Rules())
+    wrong = evaluate_results([kaptures(tmp_path / "lone", names, moved)], truth, Benchmark())
     assert np.median(wrong[0].errors.position_m) > 1.0
 
 
@@ -115,7 +118,7 @@ def test_the_challenges_names_are_read_back(
     write_names(tmp_path / "megloc", names)
     write_pose_file(tmp_path / "poses.txt", world.estimated, names=names)
     truth = kaptures(tmp_path / "query_gt", list(world.truth), world.truth)
-    rules = read_rules(tmp_path / "megloc")
+    rules = benchmark_of(tmp_path / "megloc")
     (found,) = evaluate_results([tmp_path / "poses.txt"], truth, rules)
     assert found.row().num_missing == 4 and found.without_truth == ()
     assert "RobotCar Seasons v2 publishes" in found.truth_known_by
@@ -126,7 +129,7 @@ def test_a_result_knows_all_its_queries(
 ) -> None:
     names = sorted(world.truth)
     folder = kaptures(tmp_path / "localized", names, world.estimated)
-    found = read_result(folder, Rules(), label="x")
+    found = read_result(folder, Benchmark(), label="x")
     assert found.images == tuple(names)
     assert len(found.poses) == 36 and found.statuses is None
 
@@ -139,14 +142,108 @@ def test_what_lies_around(tmp_path: Path, kaptures: Callable[..., Path]) -> None
     result = kaptures(workspace / "localized", ["q.jpg"], {})
     # not a workspace yet: the result itself is all there is
     assert workspace_of(result) is None and side_tables_near(result) is None
-    alone = surroundings_of(result)
+    alone = context_of(result)
     assert alone.query_images() == ["q.jpg"] and alone.map_poses() == {}
-    assert surroundings_of(result, mapping=workspace / "mapping").map_poses() == here
+    assert context_of(result, mapping=workspace / "mapping").map_poses() == here
     write_protocol(workspace / "megloc", Protocol())
     write_groups(workspace / "megloc", {"m.jpg": ImageGroup(frame="DUC1"), "q.jpg": ImageGroup()})
     assert side_tables_near(workspace / "submissions/poses.txt") == workspace / "megloc"
-    around = surroundings_of(workspace / "submissions/poses.txt")
+    around = context_of(workspace / "submissions/poses.txt")
     assert around.query_images() == ["q.jpg", "r.jpg"] and around.map_poses() == here
     assert around.frames == {"m.jpg": "DUC1"}
-    nothing = surroundings_of(tmp_path / "elsewhere/poses.txt")
+    nothing = context_of(tmp_path / "elsewhere/poses.txt")
     assert nothing.query_images() == [] and nothing.queries is None
+
+
+@pytest.fixture
+def truth(world: Any, tmp_path: Path, kaptures: Callable[..., Path]) -> Path:
+    return kaptures(tmp_path / "query_gt", list(world.truth), world.truth)
+
+
+@pytest.fixture
+def result(world: Any, tmp_path: Path, kaptures: Callable[..., Path]) -> Path:
+    folder = kaptures(tmp_path / "localized", list(world.truth), world.estimated)
+    write_status(folder / "status.csv", world.statuses.values())
+    return folder
+
+
+def test_statuses_and_side_tables_are_used(
+    world: Any, result: Path, truth: Path, tmp_path: Path
+) -> None:
+    unscored = sorted(world.truth)[0]
+    groups = {
+        name: ImageGroup(condition=condition, scored=name != unscored)
+        for name, condition in world.conditions.items()
+    }
+    write_groups(tmp_path, groups)
+    write_protocol(
+        tmp_path,
+        Protocol(
+            thresholds=((0.1, None),),
+            conditions=("night", "day"),
+            pools={"any light": ("day", "night")},
+        ),
+    )
+    evaluation = evaluate(result, truth, side_tables=tmp_path, label="x")
+    assert [row.name for row in evaluation.rows] == ["night", "day", "any light", "all"]
+    assert evaluation.thresholds == (Threshold(position_m=0.1),)
+    assert evaluation.not_scored == (unscored,)
+    assert evaluation.row().num_queries == 39
+    assert evaluation.row().num_fallback == 4
+    other = evaluate(result, truth, side_tables=tmp_path, thresholds=[Threshold(position_m=1.0)])
+    assert other.thresholds == (Threshold(position_m=1.0),)
+
+
+def test_without_side_tables(result: Path, truth: Path) -> None:
+    evaluation = evaluate(result, truth)
+    assert [row.name for row in evaluation.rows] == ["all"]
+    assert len(evaluation.thresholds) == 4
+
+
+def test_a_pose_file_gives_the_figures_of_its_folder(
+    world: Any, result: Path, truth: Path, tmp_path: Path
+) -> None:
+    pose_file = tmp_path / "poses.txt"
+    write_pose_file(pose_file, world.estimated, names="basename")
+    from_file, from_folder = evaluate(pose_file, truth), evaluate(result, truth)
+    np.testing.assert_array_equal(from_file.errors.position_m, from_folder.errors.position_m)
+    assert from_file.without_truth == ()
+
+
+def test_a_pose_file_in_the_official_frame_is_brought_back(
+    world: Any, truth: Path, tmp_path: Path
+) -> None:
+    similarity = SimilarityTransform(
+        quat_wxyz=(0.8, 0.0, 0.6, 0.0), translation=(4.1e6, 8.6e5, 4.7e6), scale=2.0
+    )
+    official = World(official_from_local=similarity)
+    write_world(tmp_path, official)
+    poses = {name: official.pose_in_official(pose) for name, pose in world.truth.items()}
+    write_pose_file(tmp_path / "poses.txt", poses)
+    evaluation = evaluate(tmp_path / "poses.txt", truth, side_tables=tmp_path)
+    assert evaluation.errors.position_m.max() < 1e-6
+    # the guard: left where it is, the file is thousands of kilometres off
+    assert evaluate(tmp_path / "poses.txt", truth).errors.position_m.min() > 1e6
+
+
+def test_rigs_are_resolved(tmp_path: Path, world: Any) -> None:
+    name = sorted(world.truth)[0]
+    offset = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.5, 0.0, 0.0))
+    camera = Sensor.from_camera(Camera("SIMPLE_PINHOLE", 640, 480, (500.0, 320.0, 240.0)))
+    data = KaptureData(
+        sensors={"left": camera},
+        rigs={"car": {"left": offset}},
+        trajectories={(3, "car"): offset.inverse() @ world.truth[name]},
+        records_camera={(3, "left"): name},
+        records_depth={},
+    )
+    write_sensors(tmp_path / "rig", data)
+    found = read_result(tmp_path / "rig", Benchmark()).poses
+    np.testing.assert_allclose(found[name].center(), world.truth[name].center(), atol=1e-9)
+
+
+def test_absent_results_are_named(truth: Path, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="nowhere"):
+        evaluate(tmp_path / "nowhere", truth)
+    with pytest.raises(DataError, match="nowhere"):
+        evaluate(truth, tmp_path / "nowhere")

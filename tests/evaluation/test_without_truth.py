@@ -14,15 +14,12 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.evaluation.folders import results_without_truth
-from megloc_kapture.evaluation.protocols import protocol_of
+from megloc_kapture.evaluation.evaluate import results_without_truth
+from megloc_kapture.evaluation.metrics import Threshold
+from megloc_kapture.evaluation.protocols import Benchmark, benchmark_of, protocol_of
+from megloc_kapture.evaluation.report.reports import render_report, report_text, write_report
 from megloc_kapture.evaluation.results import Result
-from megloc_kapture.evaluation.rules import Rules, read_rules
-from megloc_kapture.evaluation.thresholds import Threshold
 from megloc_kapture.evaluation.without_truth import WithoutTruth, evaluate_without_truth
-from megloc_kapture.evaluation.without_truth_outputs import write_without_truth
-from megloc_kapture.evaluation.without_truth_report import render_without_truth
-from megloc_kapture.evaluation.without_truth_text import without_truth_text
 from megloc_kapture.io.challenge_tables import write_names
 from megloc_kapture.io.side_tables import ImageGroup, write_groups, write_protocol
 from megloc_kapture.io.status_table import QueryStatus, write_status
@@ -99,10 +96,10 @@ def test_counts_and_inliers(found: WithoutTruth) -> None:
         1,
         1,
     )
-    assert whole.inliers == tuple(np.quantile([100, 20], (0.25, 0.5, 0.75)))
-    assert night.inliers is None and night.first is None
+    assert whole.inliers_quartiles == tuple(np.quantile([100, 20], (0.25, 0.5, 0.75)))
+    assert night.inliers_quartiles is None and night.first_candidate is None
     other = found.results[1].rows[-1]
-    assert (other.num_localized, other.num_missing, other.inliers) == (3, 1, None)
+    assert (other.num_localized, other.num_missing, other.inliers_quartiles) == (3, 1, None)
     assert [q.reason for q in found.results[0].queries] == ["", "", "dark", "no matches"]
 
 
@@ -117,13 +114,13 @@ def test_agreement_with_the_candidates(found: WithoutTruth) -> None:
     # the pose of a guess is its candidate's: that is no agreement
     assert guess.near is None
     whole = found.results[0].rows[-1]
-    assert whole.first is not None and whole.nearest is not None
-    assert whole.first.num_compared == 2
-    assert whole.first.within == (1, 1, 2)
-    assert whole.first.num_same_direction == 1
-    assert whole.first.median_m == pytest.approx(11.0)
-    assert whole.nearest.within == (2, 2, 2)
-    assert whole.nearest.num_same_direction == 2
+    assert whole.first_candidate is not None and whole.nearest_candidate is not None
+    assert whole.first_candidate.num_compared == 2
+    assert [at.num_within for at in whole.first_candidate.within] == [1, 1, 2]
+    assert whole.first_candidate.num_same_direction == 1
+    assert whole.first_candidate.median_m == pytest.approx(11.0)
+    assert [at.num_within for at in whole.nearest_candidate.within] == [2, 2, 2]
+    assert whole.nearest_candidate.num_same_direction == 2
 
 
 def test_agreement_of_two_results(found: WithoutTruth) -> None:
@@ -150,9 +147,9 @@ def test_a_result_agrees_with_itself(first: Result) -> None:
 def test_said_in_every_file(
     found: WithoutTruth, tmp_path: Path, page_of: Callable[[str], Any]
 ) -> None:
-    paths = write_without_truth(tmp_path, found, map_poses=MAP, provenance={"preset": "classic"})
+    paths = write_report(tmp_path, found, map_poses=MAP, provenance={"preset": "classic"})
     text = paths["agreement.txt"].read_text()
-    assert text == without_truth_text(found)
+    assert text == report_text(found)
     assert "No recall: Nobody tells." in text and "accuracy" in text
     assert "agreement of A and B" in text and "25.0 / 50.0" in text
     assert "Only A has a pose for 1 query, only B for 1." in text
@@ -179,23 +176,23 @@ def test_said_in_every_file(
 
 
 def test_the_same_bytes_each_time(found: WithoutTruth) -> None:
-    first = render_without_truth(found, map_poses=MAP)
-    assert render_without_truth(found, map_poses=MAP) == first
+    first = render_report(found, map_poses=MAP)
+    assert render_report(found, map_poses=MAP) == first
 
 
 def test_one_pose_file_alone(second: Result, page_of: Callable[[str], Any]) -> None:
     found = evaluate_without_truth([second])
-    text = without_truth_text(found)
+    text = report_text(found)
     assert "No true poses were given." in text
     assert "no map or no candidates are known" in text
     assert "agreement of" not in text
-    assert "Do they agree" not in page_of(render_without_truth(found)).text
+    assert "Do they agree" not in page_of(render_report(found)).text
 
 
 def test_no_pose_at_all(page_of: Callable[[str], Any]) -> None:
     found = evaluate_without_truth([Result("x", {}, ("a.jpg",))])
     assert found.results[0].rows[0].num_missing == 1
-    assert "Where they are" not in page_of(render_without_truth(found)).text
+    assert "Where they are" not in page_of(render_report(found)).text
 
 
 def test_nothing_to_say_is_refused(first: Result) -> None:
@@ -218,14 +215,14 @@ def test_from_a_workspace(first: Result, tmp_path: Path, kaptures: Callable[...,
     write_protocol(tables, protocol_of("aachen"))
     write_groups(tables, {name: ImageGroup(condition=c) for name, c in CONDITIONS.items()})
     write_names(tables, {name: name.replace("/", "_") for name in CONDITIONS})
-    rules = read_rules(tables)
+    rules = benchmark_of(tables)
     found = results_without_truth([workspace / "localized"], rules, map_poses=MAP)
     assert "visuallocalization.net keeps them" in found.statement
     # the challenge's list says which queries count
     assert [row.num_queries for row in found.results[0].rows] == [2, 2, 4]
-    assert found.results[0].rows[-1].first is not None
+    assert found.results[0].rows[-1].first_candidate is not None
     # without a list, all queries of the workspace do that are scored
     everything = results_without_truth(
-        [workspace / "localized"], Rules(protocol=rules.protocol, groups=rules.groups)
+        [workspace / "localized"], Benchmark(protocol=rules.protocol, groups=rules.groups)
     )
     assert everything.results[0].rows[-1].num_queries == 5

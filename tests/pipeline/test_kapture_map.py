@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.evaluation.folders import load_poses
-from megloc_kapture.evaluation.pose_errors import pose_errors
+from megloc_kapture.evaluation.metrics import pose_errors
 from megloc_kapture.geometry.cameras import project, shift_principal_point
 from megloc_kapture.io.kapture_store import FeatureWriter, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.localization.correspondences import observed_matches
@@ -89,7 +88,7 @@ def test_a_half_pixel_between_keypoints_and_intrinsics_is_found_and_undone(
 
 def residuals_px(opened: KaptureMap, queries: KaptureFolder, truth: Path) -> list[float]:
     """Of each query, the median distance of its matches from where its true pose puts them."""
-    poses, options, found = load_poses(truth), options_of_preset(), []
+    poses, options, found = KaptureFolder(truth).read().poses(), options_of_preset(), []
     (local_type,) = opened.keypoints
     stored = opened.keypoints[local_type]
     matcher, verify = (

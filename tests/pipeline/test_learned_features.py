@@ -10,7 +10,7 @@ import pytest
 
 from megloc_kapture import KaptureMap, Localizer
 from megloc_kapture.errors import OptionError
-from megloc_kapture.evaluation.pose_errors import pose_errors
+from megloc_kapture.evaluation.metrics import pose_errors
 from megloc_kapture.io.kapture_store import KaptureFolder
 from megloc_kapture.pipeline.datasets import choose_dataset
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation

@@ -14,7 +14,7 @@ import pytest
 import megloc_kapture
 from megloc_kapture import Camera, Failure, KaptureMap, Localizer, OptionError, Pose, Query
 from megloc_kapture.errors import DataError
-from megloc_kapture.evaluation.pose_errors import pose_errors
+from megloc_kapture.evaluation.metrics import pose_errors
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder
 from megloc_kapture.pipeline.presets import options_of_preset

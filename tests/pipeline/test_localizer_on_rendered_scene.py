@@ -10,7 +10,7 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from megloc_kapture import KaptureMap, Localizer, Pose, Query
-from megloc_kapture.evaluation.pose_errors import pose_errors
+from megloc_kapture.evaluation.metrics import pose_errors
 from megloc_kapture.io.kapture_store import KaptureFolder
 from megloc_kapture.pipeline.datasets import choose_dataset
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation

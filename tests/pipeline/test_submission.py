@@ -16,8 +16,7 @@ from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.evaluation.mlad_file import read_mlad_file
-from megloc_kapture.evaluation.pose_file import read_pose_file
+from megloc_kapture.evaluation.pose_files import read_mlad_file, read_pose_file
 from megloc_kapture.evaluation.protocols import protocol_of
 from megloc_kapture.io.challenge_tables import (
     RelocalizationPair,

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from megloc_kapture.evaluation.check.checking import check_submission
-from megloc_kapture.evaluation.check.reference import read_reference
+from megloc_kapture.evaluation.check.reading import read_reference
+from megloc_kapture.evaluation.check.submission import check_submission
 from megloc_kapture.pipeline.benchmarks import find_benchmark
 from megloc_kapture.pipeline.datasets import TWIN_PREFIX, choose_dataset, twin_of
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from megloc_kapture.evaluation.refined_poses import told_of_map
+from megloc_kapture.evaluation.report.refinement import consistency_sentence
 from megloc_kapture.io.consistency_table import CONSISTENCY_FILE, read_consistency
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture_store import KaptureFolder
@@ -101,7 +101,9 @@ def test_each_coordinate_frame_is_judged_by_itself(
     bad, good = read_consistency(out / CONSISTENCY_FILE)
     assert (bad.frame, bad.images, bad.contradicting) == ("bad", 6, 6)
     assert (good.frame, good.contradicting, good.reason) == ("good", 0, "")
-    assert told_of_map(good).startswith("sure in good is used; 6 map images held out move by 0.02")
+    assert consistency_sentence(good).startswith(
+        "sure in good is used; 6 map images held out move by 0.02"
+    )
     with ThreadPoolExecutor(2) as executor:
         refine_poses(
             *folders, tmp_path / "threads", options, restrictions=RESTRICTIONS, work=Work(executor)

@@ -18,7 +18,7 @@ import pytest
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, OptionError, OutputError, PluginError
-from megloc_kapture.evaluation.mask_pictures import SegmentedClasses
+from megloc_kapture.evaluation.report.masks import SegmentedClasses
 from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
 from megloc_kapture.io.depth_maps import read_depth_map
 from megloc_kapture.io.images import image_size, read_image_rgb, write_image

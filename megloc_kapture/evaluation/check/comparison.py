@@ -1,29 +1,32 @@
-"""Poses compared with the map's cameras: which classic mistake explains them, and which are far."""
+"""Poses compared with the map's cameras: the mistake that explains them, and those that are far."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.evaluation.check.explanation import (
-    MIN_POSES,
-    Explanation,
-    explain,
-    undecided,
+from megloc_kapture.evaluation.check.cameras import (
+    CameraSets,
+    Nearness,
+    Neighbourhood,
+    camera_sets,
+    storey_offset,
 )
 from megloc_kapture.evaluation.check.findings import Finding, plural, some
-from megloc_kapture.evaluation.check.heights import storey_offset
-from megloc_kapture.evaluation.check.neighbourhood import Nearness, Neighbourhood
-from megloc_kapture.evaluation.check.pools import Pools, pools_of
-from megloc_kapture.evaluation.check.readings import Reading, readings
-from megloc_kapture.evaluation.check.reference import MapCameras, Reference
-from megloc_kapture.evaluation.check.relative_readings import (
-    RelativeReading,
-    path_scores,
-    relative_readings,
+from megloc_kapture.evaluation.check.mistakes import (
+    MIN_POSES,
+    Hypothesis,
+    absolute_hypotheses,
+    explain,
+    relative_hypotheses,
+    restore_absolute,
+    restore_relative,
+    undecided,
 )
+from megloc_kapture.evaluation.check.reading import MapCameras, Reference
 from megloc_kapture.io.side_tables import World
 
 # a mistake of the whole file shows in this many of its poses
@@ -37,6 +40,35 @@ _MOST = 0.5
 _USUAL, _USUAL_EXTENTS = 4.0, 3.0
 
 
+def path_scores(
+    centers: NDArray[np.float64], times: NDArray[np.float64], scale: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Scores (N,) of each query's position between its neighbours in time: 0 is best.
+
+    The queries of a file come from one drive, and a wrong hypothesis throws each of them to another
+    side of its reference: the path gets ragged, which the distance to the map cannot show.
+
+    Parameters
+    ----------
+    centers : float64 (N, 3).
+    times : float64 (N,), of the queries, from any origin; queries of one time have no part in it.
+    scale : float64 (N,), the distance that counts.
+    """
+    order = np.argsort(times, kind="stable")
+    times, path = times[order], centers[order]
+    scores = np.zeros(len(order))
+    if len(order) < 3:
+        return scores
+    before, span = times[1:-1] - times[:-2], times[2:] - times[:-2]
+    usable = (before > 0) & (span > before)
+    share = np.where(usable, before, 0.0) / np.where(usable, span, 1.0)
+    between = path[:-2] + share[:, None] * (path[2:] - path[:-2])
+    with np.errstate(invalid="ignore", over="ignore"):
+        off = np.linalg.norm(path[1:-1] - between, axis=1)
+        scores[order[1:-1]] = np.where(usable, -np.log1p(off / scale[order][1:-1]), 0.0)
+    return scores
+
+
 def compare_poses(
     keys: Sequence[str],
     quats: NDArray[np.float64],
@@ -44,7 +76,7 @@ def compare_poses(
     queries: Sequence[str | None],
     reference: Reference,
 ) -> list[Finding]:
-    """What the map shows about the poses of a file (one per query, absolute).
+    """Findings about the poses of a file (one per query, absolute), compared with the map.
 
     Parameters
     ----------
@@ -53,52 +85,50 @@ def compare_poses(
     queries : per row its query, None where the name is unknown.
     reference : with cameras.
     """
-    cameras = reference.cameras
+    cameras, world = reference.cameras, reference.world
     if cameras is None or not len(keys):
         return []
     if len(cameras.images) < MIN_POSES:
         message = f"the map has {plural(len(cameras.images), 'camera')}: too few to compare with"
         return [Finding("note", "too-few", message)]
-    pools = pools_of(reference, queries)
-    hood = Neighbourhood(cameras, pools.members)
-    sample = _sample(len(keys))
-    tried = list(
-        readings(
-            frames=reference.world != World(),
-            floors=bool(pools.has_other[sample].mean() > _MOST),
-        )
-    )
+    sets = camera_sets(reference, cameras, queries)
+    hood = Neighbourhood(cameras, sets.members)
+    # spread evenly over the file: its conditions and drives all have a part in them
+    spread = np.linspace(0, len(keys) - 1, min(len(keys), _SAMPLE))
+    sample = np.unique(spread.round().astype(np.int64))
+    floors = bool(sets.has_other[sample].mean() > _MOST)
+    everything = np.arange(len(keys))
 
-    def look(reading: Reading, rows: NDArray[np.int64]) -> Nearness:
-        own = pools.own if reading.floor == "own" else pools.other
-        poses = reading.cam_from_local(quats[rows], translations[rows], reference.world)
+    def look(hypothesis: Hypothesis, rows: NDArray[np.int64], *, other: bool = False) -> Nearness:
+        poses = restore_absolute(hypothesis, quats[rows], translations[rows], world)
+        own = sets.other if other or "floor" in hypothesis else sets.own
         return hood.look(*poses, own[rows])
 
-    found = [look(reading, sample) for reading in tried]
-    scores = np.array([nearness.score for nearness in found])
-    fits = np.array([nearness.fits for nearness in found])
-    explanation = explain(scores, fits, [reading.mistakes for reading in tried])
-    if explanation is not None:
-        return [_explained(explanation, tried)]
-    findings = _doubts(scores, tried, len(keys))
-    everything = np.arange(len(keys))
-    as_is = look(Reading(), everything)
-    if pools.has_other.any():
-        other = look(Reading(floor="other"), everything)
-        findings += _other_floor(keys, as_is, other, pools)
-    elif len({reference.groups[i].frame for i in cameras.images if i in reference.groups}) > 1:
-        findings.append(
-            Finding(
-                "note",
-                "floor-unknown",
-                "which floor a query belongs to is not known here: a pose may be of the other one",
-            )
+    findings, explained = _explained(
+        absolute_hypotheses(frames=world != World(), floors=floors),
+        lambda hypothesis: look(hypothesis, sample),
+        len(keys),
+    )
+    if explained:
+        return findings
+    as_is = look(Hypothesis(), everything)
+    frames = {reference.groups[i].frame for i in cameras.images if i in reference.groups}
+    if sets.has_other.any():
+        findings += _other_floor(keys, as_is, look(Hypothesis(), everything, other=True), sets)
+    elif len(frames) > 1:
+        message = "which floor a query belongs to is not known here: a pose may be of the other one"
+        findings.append(Finding("note", "floor-unknown", message))
+    findings += _far(keys, as_is, world.unit)
+    unlike = (~as_is.fits & (as_is.distance <= as_is.near)).sum()
+    if len(keys) >= MIN_POSES and unlike > _MOST * len(keys):
+        message = (
+            f"{unlike} of {len(keys)} poses look where no map camera around them looks; they are "
+            "right only if the queries were taken so"
         )
-    _, centers = Reading().cam_from_local(quats, translations, reference.world)
-    findings += _far(keys, as_is, reference.world.unit)
-    findings += _unlike(as_is, len(keys))
-    if reference.world.unit == "m":
-        findings += _storeys(cameras, centers, pools)
+        findings.append(Finding("warning", "orientation", message))
+    if world.unit == "m":
+        _, centers = restore_absolute(Hypothesis(), quats, translations, world)
+        findings += _storeys(cameras, centers, sets)
     return findings
 
 
@@ -109,7 +139,7 @@ def compare_relative(
     pairs: Sequence[tuple[str, str | None]],
     reference: Reference,
 ) -> list[Finding]:
-    """What the map shows about the rows of an MLAD file.
+    """Findings about the rows of an MLAD file, compared with the map.
 
     Parameters
     ----------
@@ -125,92 +155,80 @@ def compare_relative(
     rows = np.array([i for i, (image, _) in enumerate(pairs) if image in position], dtype=np.int64)
     findings = []
     if len(rows) < len(keys):
-        left = len(keys) - len(rows)
-        message = f"{plural(left, 'row')} not compared: the map has no pose of the reference"
+        left = plural(len(keys) - len(rows), "row")
+        message = f"{left} not compared: the map has no pose of the reference"
         findings.append(Finding("note", "no-reference", message))
     if not len(rows):
         return findings
     where = np.array([position[pairs[i][0]] for i in rows])
     references = (cameras.quats[where], cameras.centers[where])
-    pools = pools_of(reference, [pairs[i][1] for i in rows])
-    hood = Neighbourhood(cameras, pools.members)
+    sets = camera_sets(reference, cameras, [pairs[i][1] for i in rows])
+    hood = Neighbourhood(cameras, sets.members)
     stamps = [int(keys[i].split(" ")[1]) for i in rows]
     times = np.array([float(stamp - min(stamps)) for stamp in stamps])
-    scale = _PATH_SCALE * hood.spacing[pools.own]
-    tried = list(relative_readings())
-    scores, fits, found = [], [], []
-    for reading in tried:
-        own = (quats[rows], translations[rows], references, reference.world)
-        poses = reading.cam_from_local(*own)
-        nearness = hood.look(*poses, pools.own)
-        scores.append(nearness.score + path_scores(poses[1], times, scale))
-        fits.append(nearness.fits)
-        found.append(nearness)
-    mistakes = [reading.mistakes for reading in tried]
-    explanation = explain(np.array(scores), np.array(fits), mistakes)
-    if explanation is not None:
-        return [*findings, _explained(explanation, tried)]
-    named = [keys[i] for i in rows]
-    findings += _doubts(np.array(scores), tried, len(rows))
-    return findings + _far(named, found[0], reference.world.unit)
+    scale = _PATH_SCALE * hood.spacing[sets.own]
+    quats, translations = quats[rows], translations[rows]
 
+    def look(hypothesis: Hypothesis) -> Nearness:
+        poses = restore_relative(hypothesis, quats, translations, references, reference.world)
+        found = hood.look(*poses, sets.own)
+        return replace(found, score=found.score + path_scores(poses[1], times, scale))
 
-def _sample(number: int) -> NDArray[np.int64]:
-    """Rows spread evenly over the file: its conditions and drives all have a part in them."""
-    return np.unique(np.linspace(0, number - 1, min(number, _SAMPLE)).round().astype(np.int64))
+    about_all, explained = _explained(relative_hypotheses(), look, len(rows))
+    findings += about_all
+    if explained:
+        return findings
+    return findings + _far([keys[i] for i in rows], look(Hypothesis()), reference.world.unit)
 
 
 def _explained(
-    explanation: Explanation, tried: Sequence[Reading] | Sequence[RelativeReading]
-) -> Finding:
-    reading = tried[explanation.reading]
-    message = (
-        f"{reading} (read so, {explanation.fitting:.0%} of the poses fit the map, as they stand "
-        f"{explanation.fitting_as_is:.0%})"
-    )
-    others = [str(tried[other]) for other in explanation.as_good]
-    if others:
-        shown = "; or: ".join(others[:3])
-        message += f"; what the map cannot tell from it: {shown}"
-        message += f", and {len(others) - 3} more readings" if len(others) > 3 else ""
-    return Finding("error", reading.kind, message)
-
-
-def _doubts(
-    scores: NDArray[np.float64],
-    tried: Sequence[Reading] | Sequence[RelativeReading],
-    number: int,
-) -> list[Finding]:
-    """What the comparison cannot rule out."""
+    hypotheses: Sequence[Hypothesis], look: Callable[[Hypothesis], Nearness], number: int
+) -> tuple[list[Finding], bool]:
+    """The mistake that explains the file, or what cannot be ruled out; and whether one does."""
+    found = [look(hypothesis) for hypothesis in hypotheses]
+    scores = np.array([nearness.score for nearness in found])
+    fits = np.array([nearness.fits for nearness in found])
+    explanation = explain(scores, fits, [hypothesis.cost for hypothesis in hypotheses])
+    if explanation is not None:
+        best = hypotheses[explanation.best]
+        message = (
+            f"{best} (read so, {explanation.fitting:.0%} of the poses fit the map, as they stand "
+            f"{explanation.fitting_as_is:.0%})"
+        )
+        others = [str(hypotheses[other]) for other in explanation.as_good]
+        if others:
+            message += f"; what the map cannot tell from it: {'; or: '.join(others[:3])}"
+            message += f", and {len(others) - 3} more readings" if len(others) > 3 else ""
+        return [Finding("error", best.kind, message)], True
     if number < MIN_POSES:
         message = f"{plural(number, 'pose')}: too few to tell whether they are all wrong in one way"
-        return [Finding("note", "too-few", message)]
-    simple = [i for i in range(len(tried)) if i == 0 or tried[i].mistakes == 1]
-    open_ones = [tried[simple[i]].kind for i in undecided(scores[simple])]
-    if not open_ones:
-        return []
+        return [Finding("note", "too-few", message)], False
+    simple = [i for i, hypothesis in enumerate(hypotheses) if hypothesis.cost <= 1]
+    kinds = [hypotheses[simple[i]].kind for i in undecided(scores[simple])]
+    if not kinds:
+        return [], False
     message = (
         "the map's cameras do not rule out every mistake; the poses fit as well when they are "
-        f"taken for: {', '.join(open_ones)}"
+        f"taken for: {', '.join(kinds)}"
     )
-    return [Finding("note", "undecided", message)]
+    return [Finding("note", "undecided", message)], False
 
 
 def _other_floor(
-    keys: Sequence[str], own: Nearness, other: Nearness, pools: Pools
+    keys: Sequence[str], own: Nearness, other: Nearness, sets: CameraSets
 ) -> list[Finding]:
     with np.errstate(invalid="ignore"):
         better = np.nan_to_num(other.score - own.score) > _OTHER_FLOOR_GAIN
-    wrong = np.flatnonzero(pools.has_other & better & other.fits & ~own.fits).tolist()
+    wrong = np.flatnonzero(sets.has_other & better & other.fits & ~own.fits).tolist()
     if not wrong:
         return []
     names = tuple(keys[i] for i in wrong)
     first = wrong[0]
-    most = len(wrong) > _MOST * pools.has_other.sum()
+    most = len(wrong) > _MOST * sets.has_other.sum()
     message = (
         f"{plural(len(wrong), 'pose')} on the wrong floor: {some(names)}; {keys[first]} fits the "
-        f"cameras of {pools.labels[pools.other[first]]}, and its query belongs to "
-        f"{pools.labels[pools.own[first]]}"
+        f"cameras of {sets.labels[sets.other[first]]}, and its query belongs to "
+        f"{sets.labels[sets.own[first]]}"
     )
     return [Finding("error" if most else "warning", "floor", message, names=names)]
 
@@ -235,34 +253,20 @@ def _far(keys: Sequence[str], nearness: Nearness, unit: str) -> list[Finding]:
     return [Finding("warning", "far", message, names=names)]
 
 
-def _unlike(nearness: Nearness, number: int) -> list[Finding]:
-    unlike = (~nearness.fits & (nearness.distance <= nearness.near)).sum()
-    if number < MIN_POSES or unlike <= _MOST * number:
-        return []
-    message = (
-        f"{unlike} of {number} poses look where no map camera around them looks; they are right "
-        "only if the queries were taken so"
-    )
-    return [Finding("warning", "orientation", message)]
-
-
-def _storeys(cameras: MapCameras, centers: NDArray[np.float64], pools: Pools) -> list[Finding]:
+def _storeys(cameras: MapCameras, centers: NDArray[np.float64], sets: CameraSets) -> list[Finding]:
     findings = []
-    for number, members in enumerate(pools.members):
-        rows = pools.own == number
+    for number, (members, label) in enumerate(zip(sets.members, sets.labels, strict=True)):
+        rows = sets.own == number
         if rows.sum() < MIN_POSES:
             continue
-        part = MapCameras(
-            tuple(cameras.images[i] for i in members),
-            cameras.quats[members],
-            cameras.centers[members],
-        )
-        offset = storey_offset(part, centers[rows])
+        # without names, which heights do not need
+        own = MapCameras((), cameras.quats[members], cameras.centers[members])
+        offset = storey_offset(own, centers[rows])
         if offset is not None:
-            of = f" of {pools.labels[number]}" if pools.labels[number] else ""
             message = (
                 f"most poses stand {abs(offset):.1f} m {'above' if offset > 0 else 'below'} the "
-                f"map's cameras{of} around them: another storey, or heights from another zero"
+                f"map's cameras{f' of {label}' if label else ''} around them: another storey, or "
+                "heights from another zero"
             )
             findings.append(Finding("error", "height", message))
     return findings

@@ -1,9 +1,10 @@
-"""What a check finds: problems, each with a severity, and how they are told."""
+"""Findings of a check: problems, each with a severity, and their text."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 # error: the server would refuse the file, or its figures would be wrong as a whole; warning: single
@@ -62,7 +63,7 @@ class CheckReport:
 
     @property
     def has_problems(self) -> bool:
-        """Whether anything found is an error."""
+        """True where anything found is an error."""
         return any(finding.severity == "error" for finding in self.findings)
 
     @property
@@ -75,16 +76,15 @@ class CheckReport:
 
     def lines(self) -> list[str]:
         """The report as text, a problem per line; the last line is the outcome."""
-        shown: list[str] = []
-        by_kind: dict[tuple[str, str], int] = {}
+        shown = []
+        counts: Counter[tuple[str, str]] = Counter()
         for finding in self.sorted_findings:
-            key = (finding.severity, finding.kind)
-            by_kind[key] = by_kind.get(key, 0) + 1
-            if by_kind[key] <= _SHOWN_OF_A_KIND:
+            counts[finding.severity, finding.kind] += 1
+            if counts[finding.severity, finding.kind] <= _SHOWN_OF_A_KIND:
                 shown.append(str(finding))
         shown += [
             f"{severity}: {count - _SHOWN_OF_A_KIND} more of kind {kind!r}; --json lists all"
-            for (severity, kind), count in by_kind.items()
+            for (severity, kind), count in counts.items()
             if count > _SHOWN_OF_A_KIND
         ]
         of = "" if self.expected is None else f" of {self.expected} queries"
@@ -103,17 +103,7 @@ class CheckReport:
             "poses": self.poses,
             "expected": self.expected,
             "ok": not self.has_problems,
-            "findings": [
-                {
-                    "severity": f.severity,
-                    "kind": f.kind,
-                    "message": f.message,
-                    "file": f.file or None,
-                    "line": f.line,
-                    "names": list(f.names),
-                }
-                for f in self.sorted_findings
-            ],
+            "findings": [{**asdict(f), "file": f.file or None} for f in self.sorted_findings],
         }
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.evaluation.check.reference import MapCameras, Reference, read_reference
+from megloc_kapture.evaluation.check.reading import MapCameras, Reference, read_reference
 from megloc_kapture.geometry.poses import camera_centers, stack_poses
 from megloc_kapture.io.kapture_store import KaptureFolder
 from megloc_kapture.io.side_tables import ImageGroup
@@ -52,7 +52,7 @@ class Scene:
             for query, frame in zip(queries, self.query_frames, strict=False)
         }
         return Reference(
-            place="import",
+            folder="import",
             groups=groups,
             expected={name: name for name in queries},
             queries=frozenset(queries),

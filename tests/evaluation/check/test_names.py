@@ -1,28 +1,39 @@
-"""Names of a pose file against the challenge's list: what is wrong with them is told."""
+"""Names and pairs of a pose file against those of the challenge: what is wrong is told."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import pytest
 
 from megloc_kapture.evaluation.check.findings import Finding
-from megloc_kapture.evaluation.check.names import (
-    NamedRows,
+from megloc_kapture.evaluation.check.reading import Reference
+from megloc_kapture.evaluation.check.submission import (
     check_shape,
     match_names,
+    match_pairs,
 )
 from megloc_kapture.io.side_tables import ImageGroup
 
 ROBOTCAR = {
     f"rear/{100 + i}.jpg": f"{c}/rear/{100 + i}.jpg" for i, c in enumerate(["dawn", "night"] * 3)
 }
+
+
 CAMERAS = [
     image.replace("/rear/", f"/{side}/")
     for image in ROBOTCAR.values()
     for side in ("left", "rear", "right")
 ]
+
+
 AACHEN = {f"IMG_{i}.jpg": f"query/day/nexus4/IMG_{i}.jpg" for i in range(5)}
+
+
+class NamedRows(NamedTuple):
+    images: Mapping[str, str]
+    findings: list[Finding]
 
 
 def match(
@@ -37,17 +48,17 @@ def match(
     named: dict[str, int] = {}
     for line, name in enumerate(names, start=1):
         named.setdefault(name, line)
-    return match_names(
-        named,
-        expected,
-        queries=queries or list(expected.values()),
+    reference = Reference(
+        folder="import",
+        expected=expected,
+        queries=frozenset(queries or expected.values()),
         groups=groups or {},
         listed=listed,
-        dataset=dataset,
     )
+    return NamedRows(*match_names(named, reference, dataset))
 
 
-def told(found: NamedRows) -> list[tuple[str, str]]:
+def kinds_of(found: NamedRows) -> list[tuple[str, str]]:
     return [(finding.severity, finding.kind) for finding in found.findings]
 
 
@@ -147,26 +158,26 @@ def test_a_condition_that_is_missing_as_a_whole() -> None:
 
 def test_nothing_of_the_list() -> None:
     found = match(["x.jpg"], AACHEN)
-    assert told(found) == [("error", "unknown"), ("error", "missing")]
-    assert told(match([], AACHEN)) == [("error", "missing")]
+    assert kinds_of(found) == [("error", "unknown"), ("error", "missing")]
+    assert kinds_of(match([], AACHEN)) == [("error", "missing")]
 
 
 def test_one_query_under_two_names() -> None:
     found = match([*AACHEN, "query/day/nexus4/IMG_3.jpg"], AACHEN)
-    assert told(found) == [("error", "name-path"), ("error", "duplicate")]
+    assert kinds_of(found) == [("error", "name-path"), ("error", "duplicate")]
     double = found.findings[1]
     assert double.line == 6 and "IMG_3.jpg (line 4)" in double.message
 
 
 def test_order_is_a_note_and_only_where_there_is_one() -> None:
     backwards = list(AACHEN)[::-1]
-    assert told(match(backwards, AACHEN)) == [("note", "order")]
+    assert kinds_of(match(backwards, AACHEN)) == [("note", "order")]
     assert not match(backwards, AACHEN, listed=False).findings
 
 
 def test_a_stem_that_several_names_share_is_unknown() -> None:
     expected = {"a/1.jpg": "a/1.jpg", "b/1.jpg": "b/1.jpg"}
-    assert told(match(["1.jpg"], expected))[0] == ("error", "unknown")
+    assert kinds_of(match(["1.jpg"], expected))[0] == ("error", "unknown")
     assert match(["b/1.png"], expected).images == {"b/1.png": "b/1.jpg"}
 
 
@@ -189,3 +200,20 @@ def test_what_names_alone_show(dataset: str, name: str, kind: str) -> None:
 )
 def test_names_that_look_right(dataset: str, name: str) -> None:
     assert not check_shape({name: 1}, dataset)
+
+
+PAIRS = ["1 10", "2 20", "3 30"]
+
+
+def test_pairs() -> None:
+    assert match_pairs({"1 10": 1, "2 20": 2, "3 30": 3}, PAIRS) == (False, [])
+    swapped, findings = match_pairs({"10 1": 1, "20 2": 2, "30 3": 3}, PAIRS)
+    assert swapped and [f.kind for f in findings] == ["swapped"]
+    swapped, findings = match_pairs({"3 30": 1, "1 10": 2, "2 30": 3}, PAIRS)
+    assert not swapped
+    assert [(f.severity, f.kind, f.line) for f in findings] == [
+        ("error", "unknown", 3),
+        ("error", "missing", None),
+        ("note", "order", None),
+    ]
+    assert findings[1].names == ("2 20",)

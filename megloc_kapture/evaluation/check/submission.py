@@ -1,0 +1,373 @@
+"""The check of one submission: its rows, its names or pairs, its poses."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.evaluation.check.comparison import compare_poses, compare_relative
+from megloc_kapture.evaluation.check.findings import CheckReport, Finding, Severity, plural, some
+from megloc_kapture.evaluation.check.reading import Reference, Rows, read_rows
+from megloc_kapture.io.challenge_tables import RelocalizationPair
+from megloc_kapture.io.side_tables import ImageGroup
+
+_MLAD_DATASETS = ("4seasons",)
+# datasets whose server is known to take either of two endings
+_ENDINGS_DO_NOT_MATTER = ("robotcar",)
+# whether names hold a folder, and their endings
+_SHAPES: dict[str, tuple[bool, tuple[str, ...]]] = {
+    "aachen": (False, (".jpg",)),
+    "inloc": (False, (".JPG",)),
+    "robotcar": (True, (".jpg", ".png")),
+}
+_FOLDERS_SAID = {
+    "": "",
+    "name-folder": "without the folder before them",
+    "name-path": "with more of the path than the list",
+    "name-folders": "with other folders than the list",
+}
+_OTHER_FOLDERS = "name-folders"
+
+
+def check_submission(
+    path: Path, *, dataset: str, reference: Reference | None = None
+) -> CheckReport:
+    """Check a pose file, or an MLAD challenge's folder of pose files, ours or foreign.
+
+    Parameters
+    ----------
+    dataset : whose rules hold, by its name without ``synthetic-``.
+    reference : the imported dataset; None: only what the file alone can show is checked.
+
+    Raises
+    ------
+    DataError : the file cannot be read, is no text, or is a folder where a file is asked for.
+    """
+    mlad = dataset in _MLAD_DATASETS
+    if reference is not None:
+        mlad = reference.protocol.pose_file == "mlad"
+    poses, expected, findings = (_check_mlad if mlad else _check_file)(path, dataset, reference)
+    return CheckReport(
+        dataset=dataset,
+        file=str(path),
+        reference="" if reference is None else reference.folder,
+        poses=poses,
+        expected=expected,
+        findings=tuple(findings),
+    )
+
+
+def _check_file(
+    path: Path, dataset: str, reference: Reference | None
+) -> tuple[int, int | None, list[Finding]]:
+    """Poses, queries that count, and findings of a file of absolute poses."""
+    if path.is_dir():
+        raise DataError("a folder; the pose file of this challenge is one file", path=path)
+    rows = read_rows(path, "ltvl")
+    findings = _empty(rows)
+    expected: int | None = None
+    images: Mapping[str, str] = {}
+    if reference is None or not reference.expected:
+        findings += [*check_shape(rows.named, dataset), _not_checked("names", reference)]
+    else:
+        expected = len(reference.expected)
+        images, of_names = match_names(rows.named, reference, dataset)
+        findings += of_names
+    if reference is None or reference.cameras is None:
+        findings.append(_not_checked("poses", reference))
+    else:
+        queries = [images.get(key) for key in rows.keys]
+        # what is wrong with the whole file is told first
+        findings[:0] = compare_poses(rows.keys, rows.quats, rows.translations, queries, reference)
+    return len(rows.keys), expected, _in_file(path.name, [*findings, *rows.findings])
+
+
+def _check_mlad(
+    path: Path, dataset: str, reference: Reference | None
+) -> tuple[int, int | None, list[Finding]]:
+    """Poses, pairs that are asked for, and findings of the files of an MLAD challenge."""
+    wanted: dict[str, list[RelocalizationPair]] = {}
+    for pair in () if reference is None else reference.relocalization:
+        wanted.setdefault(pair.file, []).append(pair)
+    findings: list[Finding] = []
+    if path.is_dir():
+        there = {str(p.relative_to(path)): p for p in sorted(path.rglob("*.txt"))}
+        files = {name: there[name] for name in wanted if name in there} if wanted else there
+        absent = [name for name in wanted if name not in there]
+        others = [name for name in there if name not in files]
+        if absent:
+            message = f"{plural(len(absent), 'file')} missing: {some(absent)}"
+            findings.append(Finding("error", "missing-file", message, names=tuple(absent)))
+        if others:
+            message = f"{plural(len(others), 'file')} that no relocalization file asks for"
+            message += f": {some(others)}"
+            findings.append(Finding("warning", "unknown-file", message, names=tuple(others)))
+        if not files and not absent:
+            raise DataError("there is no pose file (*.txt) in the folder", path=path)
+    else:
+        fitting = [own for own in wanted if PurePosixPath(own).name == path.name]
+        if wanted and not fitting:
+            message = f"the file must be called as its relocalization file is: {some(wanted)}"
+            findings.append(Finding("error", "file-name", message))
+            fitting = list(wanted) if len(wanted) == 1 else []
+        files = {fitting[0] if len(fitting) == 1 else path.name: path}
+    poses = 0
+    for name, file in files.items():
+        rows = read_rows(file, "mlad")
+        poses += len(rows.keys)
+        of_pairs = _check_pairs(rows, wanted.get(name), reference)
+        findings += _in_file(name, [*rows.findings, *_empty(rows), *of_pairs])
+    if not wanted:
+        findings.append(_not_checked("pairs", reference))
+    if reference is None or reference.cameras is None:
+        findings.append(_not_checked("poses", reference))
+    return poses, sum(map(len, wanted.values())) if wanted else None, findings
+
+
+def _check_pairs(
+    rows: Rows, pairs: Sequence[RelocalizationPair] | None, reference: Reference | None
+) -> list[Finding]:
+    findings: list[Finding] = []
+    images: dict[str, tuple[str, str | None]] = {}
+    swapped = False
+    if pairs is not None:
+        for pair in pairs:
+            stems = (PurePosixPath(image).stem for image in (pair.reference, pair.query))
+            images[" ".join(stems)] = (pair.reference, pair.query)
+        swapped, findings = match_pairs(rows.named, images)
+    # a dummy is no pose, and says nothing about how the others are meant
+    is_dummy = (abs(abs(rows.quats) - [0, 0, 0, 1]).max(axis=1) < 1e-12) & ~rows.translations.any(1)
+    if is_dummy.any():
+        dummies = tuple(key for key, dummy in zip(rows.keys, is_dummy, strict=True) if dummy)
+        message = f"{plural(len(dummies), 'row')} hold the identity, a dummy that is no pose"
+        findings.append(Finding("note", "dummies", f"{message}: {some(dummies)}", names=dummies))
+    if reference is None or reference.cameras is None or swapped:
+        return findings
+    by_stem = {PurePosixPath(image).stem: image for image in reference.cameras.images}
+    keys = [key for key, dummy in zip(rows.keys, is_dummy, strict=True) if not dummy]
+    named = [images.get(key, (by_stem.get(key.split(" ")[0], ""), None)) for key in keys]
+    poses = rows.quats[~is_dummy], rows.translations[~is_dummy]
+    return findings + compare_relative(keys, *poses, named, reference)
+
+
+def match_pairs(named: Mapping[str, int], expected: Collection[str]) -> tuple[bool, list[Finding]]:
+    """Compare the rows of an MLAD file with the pairs that are asked for.
+
+    Parameters
+    ----------
+    named : keys (two timestamps with a blank between) -> line.
+    expected : the keys of the relocalization file, in its order.
+
+    Returns
+    -------
+    Whether the two timestamps are swapped, and what is wrong.
+    """
+    wanted = dict.fromkeys(expected)
+    unknown = [key for key in named if key not in wanted]
+    turned = [key for key in unknown if " ".join(reversed(key.split(" "))) in wanted]
+    if len(turned) > 0.5 * len(named):
+        message = (
+            f"the two timestamps are swapped in {plural(len(turned), 'row')}: the reference "
+            "stands first, then the query"
+        )
+        return True, [Finding("error", "swapped", message, names=tuple(turned))]
+    findings = [
+        Finding("error", "unknown", f"pair {key} is not asked for", line=named[key], names=(key,))
+        for key in unknown
+    ]
+    missing = tuple(key for key in wanted if key not in named)
+    if missing:
+        message = (
+            f"{len(missing)} of {len(wanted)} pairs have no row, and every one is asked for: "
+            f"{some(missing)}"
+        )
+        findings.append(Finding("error", "missing", message, names=missing))
+    return False, findings + _order(named, wanted, "relocalization file")
+
+
+def match_names(
+    named: Mapping[str, int], reference: Reference, dataset: str
+) -> tuple[Mapping[str, str], list[Finding]]:
+    """Find the query that each name of a file stands for.
+
+    Parameters
+    ----------
+    named : names of the file -> line.
+    reference : its ``expected`` names, and the queries that are not scored.
+
+    Returns
+    -------
+    Name -> the query, also where the name is wrong in a way that can be told; and findings about
+    unknown, wrong, missing and double names.
+    """
+    expected = reference.expected
+    by_stem = _by_stem(expected)
+    unscored = _by_stem(sorted(set(reference.queries or ()) - set(expected.values())))
+    images: dict[str, str] = {}
+    # kind and words of a difference -> names and the right ones
+    wrong: dict[tuple[str, str], list[tuple[str, str]]] = {}
+    not_scored, findings = [], []
+    for name, line in named.items():
+        if name in expected:
+            images[name] = expected[name]
+            continue
+        found = _closest(name, by_stem.get(_stem(name), ()))
+        elsewhere = found is None or found[1][0] == _OTHER_FOLDERS
+        if elsewhere and _ends_alike(name, unscored.get(_stem(name), ())):
+            not_scored.append(name)
+        elif found is not None:
+            wrong.setdefault(found[1], []).append((name, found[0]))
+            images[name] = expected[found[0]]
+        else:
+            message = f"{name} is no name of the list"
+            findings.append(Finding("error", "unknown", message, line=line, names=(name,)))
+    for (kind, said), pairs in wrong.items():
+        message = f"{plural(len(pairs), 'name')} {said}: {pairs[0][0]} should be {pairs[0][1]}"
+        severity: Severity = "error"
+        if kind == "name-ending" and dataset in _ENDINGS_DO_NOT_MATTER:
+            severity = "warning"
+            message += " (the server is said to take either)"
+        elif len(pairs) == len(named):
+            message += "; the server finds none of them, and every figure is zero"
+        findings.append(Finding(severity, kind, message, names=tuple(name for name, _ in pairs)))
+    if not_scored:
+        message = (
+            f"{plural(len(not_scored), 'row')} of images that are not scored and will be ignored: "
+            f"{some(not_scored)}"
+        )
+        findings.append(Finding("note", "not-scored", message, names=tuple(not_scored)))
+    first: dict[str, str] = {}
+    for name, image in images.items():
+        other = first.setdefault(image, name)
+        if other != name:
+            message = f"{name} and {other} (line {named[other]}) are the same query"
+            names = (other, name)
+            findings.append(Finding("error", "duplicate", message, line=named[name], names=names))
+    findings += _missing_names(expected, set(images.values()), reference.groups)
+    if reference.listed:
+        findings += _order(named, expected, "challenge's list")
+    return images, findings
+
+
+def check_shape(named: Iterable[str], dataset: str) -> list[Finding]:
+    """Findings that the names alone can show, where there is no list to compare with."""
+    if dataset not in _SHAPES:
+        return []
+    with_folder, endings = _SHAPES[dataset]
+    findings = []
+    flat = tuple(name for name in named if ("/" in name) != with_folder)
+    if flat:
+        kind, problem = "name-path", "with a folder"
+        advice = "the server looks for the last part of the path alone"
+        if with_folder:
+            kind, problem = "name-folder", "without the camera's folder"
+            advice = "the server looks for rear/..., and finds none of them"
+        message = f"{plural(len(flat), 'name')} {problem}: {some(flat)}; {advice}"
+        findings.append(Finding("error", kind, message, names=flat))
+    others = tuple(name for name in named if not name.endswith(endings))
+    if others:
+        names = plural(len(others), "name")
+        message = f"{names} not ending in {' or '.join(endings)}: {some(others)}"
+        findings.append(Finding("error", "name-ending", message, names=others))
+    return findings
+
+
+def _missing_names(
+    expected: Mapping[str, str], given: Collection[str], groups: Mapping[str, ImageGroup]
+) -> list[Finding]:
+    """Queries without a row, and the conditions of which there is none at all."""
+    missing = tuple(name for name, image in expected.items() if image not in given)
+    if not missing:
+        return []
+    if len(missing) == len(expected):
+        message = f"none of the {plural(len(expected), 'name')} of the list is in the file"
+        return [Finding("error", "missing", message, names=missing)]
+    conditions = {groups.get(image, ImageGroup()).condition for image in expected.values()}
+    there = {groups.get(image, ImageGroup()).condition for image in given}
+    message = (
+        f"{len(missing)} of {len(expected)} queries have no row, and count as not localized: "
+        f"{some(missing)}"
+    )
+    if empty := sorted(conditions - there - {""}):
+        message += f"; there is no row at all of condition {', '.join(empty)}"
+    return [Finding("warning", "missing", message, names=missing)]
+
+
+def _order(named: Iterable[str], expected: Iterable[str], of: str) -> list[Finding]:
+    """A note where the names that are expected do not stand in the expected order."""
+    position = {name: number for number, name in enumerate(expected)}
+    found = [position[name] for name in named if name in position]
+    if found == sorted(found):
+        return []
+    return [Finding("note", "order", f"the rows are not in the order of the {of}")]
+
+
+def _closest(name: str, candidates: Sequence[str]) -> tuple[str, tuple[str, str]] | None:
+    """The name of the list that ``name`` was meant to be, of those with its stem, and kind and
+    words of the difference; None: unclear."""
+    compared = [(right, _difference(name, right)) for right in candidates]
+    likely = [pair for pair in compared if pair[1][0] != _OTHER_FOLDERS]
+    return next((group[0] for group in (likely, compared) if len(group) == 1), None)
+
+
+def _difference(name: str, right: str) -> tuple[str, str]:
+    """Kind and words of how a name differs from the one it should be."""
+    given, wanted = PurePosixPath(name), PurePosixPath(right)
+    own = tuple(part for part in given.parts[:-1] if part != "/")
+    other = wanted.parts[:-1]
+    folders = ""
+    if own != other:
+        folders = _OTHER_FOLDERS
+        if other[len(other) - len(own) :] == own:
+            folders = "name-folder"
+        elif own[len(own) - len(other) :] == other:
+            folders = "name-path"
+    elif "/".join((*own, given.name)) != name:
+        folders = "name-path"  # "./x.jpg", "/x.jpg"
+    kinds, said = [folders], [_FOLDERS_SAID[folders]]
+    if given.suffix.lower() != wanted.suffix.lower():
+        kinds.append("name-ending")
+        said.append(f"ending in {given.suffix!r} instead of {wanted.suffix!r}")
+    elif given.name != wanted.name:
+        kinds.append("name-letters")
+        said.append("with other upper and lower case letters")
+    return next(filter(None, kinds), "name-letters"), " and ".join(filter(None, said))
+
+
+def _ends_alike(name: str, images: Iterable[str]) -> bool:
+    """True where ``name`` is the last parts of one of ``images``, whatever its ending."""
+    own = _without_ending(name)
+    return any(_without_ending(image)[-len(own) :] == own for image in images)
+
+
+def _without_ending(name: str) -> tuple[str, ...]:
+    path = PurePosixPath(name)
+    return (*path.parts[:-1], path.stem)
+
+
+def _by_stem(names: Iterable[str]) -> dict[str, list[str]]:
+    found: dict[str, list[str]] = {}
+    for name in names:
+        found.setdefault(_stem(name), []).append(name)
+    return found
+
+
+def _stem(name: str) -> str:
+    return PurePosixPath(name).stem.lower()
+
+
+def _empty(rows: Rows) -> list[Finding]:
+    return [] if rows.named else [Finding("error", "empty", "there is no pose in the file")]
+
+
+def _not_checked(things: str, reference: Reference | None) -> Finding:
+    why = "no imported dataset to compare with; give one with --data"
+    if reference is not None:
+        why = f"{reference.folder} does not have what they are compared with"
+    return Finding("note", "not-checked", f"the {things} are not checked: {why}")
+
+
+def _in_file(name: str, findings: Iterable[Finding]) -> list[Finding]:
+    return [replace(finding, file=name) for finding in findings]

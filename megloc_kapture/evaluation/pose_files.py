@@ -1,0 +1,329 @@
+"""Pose files: the text formats that challenges take, and their numbers checked.
+
+visuallocalization.net (LTVL) has one line ``name qw qx qy qz tx ty tz`` per query. The pose is
+``cam_from_world`` and ``t`` its translation, not the camera centre. Single spaces, no header, every
+line ended by a newline; a query without a pose has no line.
+
+The MLAD challenges (4Seasons) have ``src_ts tgt_ts tx ty tz qx qy qz qw`` per pair. The pose is
+``query_from_reference`` of the rectified left cameras: ``x_query = R x_ref + t``. The translation
+stands first and the quaternion's w last, unlike everywhere else here. A file has the name of the
+relocalization file it answers, and every pair of that one; the relocalization file has the same
+rows without poses, or, for training recordings, with the true ones.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.atomic import write_bytes
+from megloc_kapture.io.kapture_data import FLOAT_PATTERN
+from megloc_kapture.io.side_tables import MAX_QUATERNION_NORM_ERROR, PoseFileNames
+from megloc_kapture.io.text import read_text
+from megloc_kapture.values import RigidTransform
+
+COLUMNS = "name qw qx qy qz tx ty tz"
+
+# how images are called: by a rule, or by a table in the order of the challenge's list
+Names = PoseFileNames | Mapping[str, str]
+
+
+def names_in_pose_file(images: Iterable[str], names: Names) -> dict[str, str]:
+    """Image -> the name it bears in a pose file, in the order of the file.
+
+    By a rule that is the order of the names; by a table (image -> name) the table's, and images
+    that are not in it have no name.
+
+    Raises
+    ------
+    DataError : two images would bear one name (names both), or a name holds white space, which
+        the format cannot express.
+    """
+    if isinstance(names, str):
+        called = {i: i if names == "full" else i.rsplit("/", 1)[-1] for i in sorted(set(images))}
+        _check_names(called)
+        return dict(sorted(called.items(), key=lambda item: item[1]))
+    wanted = set(images)
+    called = {image: name for image, name in names.items() if image in wanted}
+    _check_names(called)
+    return called
+
+
+def _check_names(names: Mapping[str, str]) -> None:
+    bearer: dict[str, str] = {}
+    for image, name in names.items():
+        if not name or name.split() != [name]:
+            raise DataError(f"image {image!r}: a pose file cannot hold the name {name!r}")
+        if name in bearer:
+            raise DataError(
+                f"images {bearer[name]!r} and {image!r} would both be called {name!r} in the pose "
+                "file; use full names"
+            )
+        bearer[name] = image
+
+
+def format_pose_file(poses: Mapping[str, RigidTransform], *, names: Names = "full") -> str:
+    """The text of a pose file.
+
+    Numbers have the fewest digits that read back to the same float64, so nothing is lost.
+
+    Parameters
+    ----------
+    poses : image -> ``cam_from_world``.
+    names : a rule, and the rows are sorted by name; or the challenge's list as image -> name, and
+        the rows stand in its order: images that are not in it are left out.
+
+    Raises
+    ------
+    DataError : see :func:`names_in_pose_file`; or a pose that is not finite or whose quaternion
+        is off unit length by 1e-3 or more (names the image).
+    """
+    lines = []
+    for image, name in names_in_pose_file(poses, names).items():
+        pose = checked_pose(poses[image].quat_wxyz, poses[image].translation, f"image {image!r}")
+        numbers = " ".join(repr(float(v)) for v in (*pose.quat_wxyz, *pose.translation))
+        lines.append(f"{name} {numbers}\n")
+    return "".join(lines)
+
+
+def write_pose_file(
+    path: Path | str, poses: Mapping[str, RigidTransform], *, names: Names = "full"
+) -> None:
+    """Write a pose file atomically; see :func:`format_pose_file`.
+
+    Raises
+    ------
+    DataError : a pose or name that must not be handed in.
+    OutputError : the file cannot be written.
+    """
+    write_bytes(path, format_pose_file(poses, names=names).encode("utf-8"))
+
+
+def read_pose_file(path: Path | str) -> dict[str, RigidTransform]:
+    """Read a pose file, ours or foreign: name -> ``cam_from_world``, in the file's order.
+
+    Runs of spaces, tabs and CRLF line ends are taken; empty lines are passed over.
+
+    Raises
+    ------
+    DataError : not eight columns, a number that is none or not finite, a quaternion off unit
+        length by 1e-3 or more (below, it is normalised), a name given twice, or a last line
+        that is not ended: it may be cut short. Names file and line.
+    """
+    text = read_text(path)
+    lines = text.split("\n")
+    if lines.pop() != "":
+        raise DataError(
+            "the last line is not ended, so the file may be cut short; add a newline if it is not",
+            path=path,
+            line=len(lines) + 1,
+        )
+    poses: dict[str, RigidTransform] = {}
+    for number, line in enumerate(lines, start=1):
+        fields = line.split()
+        if not fields:
+            continue
+        if len(fields) != 8:
+            raise DataError(
+                f"{len(fields)} columns instead of 8 ({COLUMNS})", path=path, line=number
+            )
+        name = fields[0]
+        if name in poses:
+            raise DataError(f"{name!r} is given twice", path=path, line=number)
+        try:
+            qw, qx, qy, qz, tx, ty, tz = (parse_number(field) for field in fields[1:])
+            poses[name] = checked_pose((qw, qx, qy, qz), (tx, ty, tz), repr(name))
+        except DataError as error:
+            raise DataError(error.message, path=path, line=number) from error
+    return poses
+
+
+def poses_by_image(
+    poses: Mapping[str, RigidTransform],
+    images: Iterable[str],
+    names: Mapping[str, str] | None = None,
+) -> dict[str, RigidTransform]:
+    """Give the poses of a pose file the names that ``images`` bear in kapture.
+
+    A name of the challenge's list becomes its image. Of the others, one that is an image stays;
+    one that is the last part of exactly one image's path becomes that image; any other stays as it
+    is, unknown, for the evaluation to report.
+
+    Parameters
+    ----------
+    names : the challenge's list, image -> name in the pose file.
+
+    Raises
+    ------
+    DataError : a name fits several images, or two names fit one.
+    """
+    known = set(images)
+    by_basename: dict[str, list[str]] = {}
+    for image in sorted(known):
+        by_basename.setdefault(image.rsplit("/", 1)[-1], []).append(image)
+    listed = {name: image for image, name in (names or {}).items()}
+    renamed: dict[str, RigidTransform] = {}
+    for name, pose in poses.items():
+        fitting = [name] if name in known else by_basename.get(name, [name])
+        if name in listed:
+            fitting = [listed[name]]
+        if len(fitting) > 1:
+            raise DataError(f"{name!r} may be {fitting[0]!r} or {fitting[1]!r}; use full names")
+        if fitting[0] in renamed:
+            raise DataError(f"the pose file names image {fitting[0]!r} in two ways")
+        renamed[fitting[0]] = pose
+    return renamed
+
+
+def parse_number(text: str) -> float:
+    """A decimal number; "nan" and the like become one that :func:`checked_pose` refuses.
+
+    Raises
+    ------
+    DataError : anything else that Python would take ("1_0", digits of other scripts) or not take.
+    """
+    if FLOAT_PATTERN.fullmatch(text):
+        return float(text)
+    if text.lower().lstrip("+-") in ("nan", "inf", "infinity"):
+        return math.nan
+    raise DataError(f"{text!r} is not a number")
+
+
+def checked_pose(
+    quat_wxyz: tuple[float, float, float, float],
+    translation: tuple[float, float, float],
+    whose: str,
+) -> RigidTransform:
+    """The pose with a unit quaternion; one that is unit to rounding keeps its very digits.
+
+    Raises
+    ------
+    DataError : not finite, or a quaternion off unit length by 1e-3 or more; names ``whose``.
+    """
+    if not all(math.isfinite(v) for v in (*quat_wxyz, *translation)):
+        raise DataError(f"{whose}: the pose is not finite")
+    norm = math.sqrt(sum(q * q for q in quat_wxyz))
+    if not abs(norm - 1.0) < MAX_QUATERNION_NORM_ERROR:
+        raise DataError(f"{whose}: quaternion of length {norm:g}, not 1")
+    if abs(norm - 1.0) > 1e-12:
+        w, x, y, z = (q / norm for q in quat_wxyz)
+        quat_wxyz = (w, x, y, z)
+    return RigidTransform(quat_wxyz, translation)
+
+
+MLAD_COLUMNS = "src_ts tgt_ts tx ty tz qx qy qz qw"
+# as an int it must be written again as it is, so there is no leading zero
+_TIMESTAMP = re.compile("0|[1-9][0-9]{0,29}")
+
+
+@dataclass(frozen=True, slots=True)
+class RelativePose:
+    """One row: a pair of keyframes by their timestamps, and the pose where the row has one."""
+
+    reference: int
+    query: int
+    query_from_reference: RigidTransform | None = None
+
+
+def timestamp_of(image: str) -> int:
+    """The timestamp that an image of 4Seasons is named after (``.../1600000000000000000.png``).
+
+    Raises
+    ------
+    DataError : the name is no timestamp.
+    """
+    stem = PurePosixPath(image).stem
+    if not _TIMESTAMP.fullmatch(stem):
+        raise DataError(f"image {image!r} is not named after a timestamp, as MLAD's rows need")
+    return int(stem)
+
+
+def relative_pose(
+    query_from_world: RigidTransform, reference_from_world: RigidTransform, *, scale: float = 1.0
+) -> RigidTransform:
+    """``query_from_reference`` of two cameras; ``scale`` is metres per unit of the world."""
+    # taken in the local frame: from ECEF, millions of metres would have to cancel
+    pose = query_from_world @ reference_from_world.inverse()
+    if scale == 1.0:
+        return pose
+    x, y, z = (float(v) for v in scale * np.array(pose.translation))
+    return RigidTransform(pose.quat_wxyz, (x, y, z))
+
+
+def format_mlad_file(rows: Iterable[RelativePose]) -> str:
+    """The text of a pose file, in the order of ``rows``.
+
+    Numbers have the fewest digits that read back to the same float64.
+
+    Raises
+    ------
+    DataError : a row without a pose (every row needs one), a pose that is not finite or whose
+        quaternion is off unit length by 1e-3 or more.
+    """
+    lines = []
+    for row in rows:
+        pair = f"{row.reference} {row.query}"
+        if row.query_from_reference is None:
+            raise DataError(f"pair {pair} has no pose; MLAD wants every row")
+        given = row.query_from_reference
+        pose = checked_pose(given.quat_wxyz, given.translation, f"pair {pair}")
+        qw, *vector = pose.quat_wxyz
+        lines.append(" ".join([pair, *(repr(float(v)) for v in (*pose.translation, *vector, qw))]))
+    return "".join(f"{line}\n" for line in lines)
+
+
+def read_mlad_file(path: Path | str) -> list[RelativePose]:
+    """Read a pose file or a relocalization file, ours or foreign, in its order.
+
+    Runs of spaces, tabs and CRLF line ends are taken; empty lines are passed over. The last line
+    may be without its end, as common tools write it.
+
+    Raises
+    ------
+    DataError : not nine columns (or two, in every row: a list of pairs), a timestamp or number
+        that is none, a pose that is not finite, a quaternion off unit length by 1e-3 or more, a
+        pair given twice. Names file and line.
+    """
+    rows: list[RelativePose] = []
+    known: set[tuple[int, int]] = set()
+    columns = 0
+    for number, line in enumerate(read_text(path).split("\n"), start=1):
+        fields = line.split()
+        if not fields:
+            continue
+        columns = columns or (2 if len(fields) == 2 else 9)
+        try:
+            row = _row(fields, columns)
+        except DataError as error:
+            raise DataError(error.message, path=path, line=number) from error
+        pair = (row.reference, row.query)
+        if pair in known:
+            raise DataError(f"pair {pair[0]} {pair[1]} is given twice", path=path, line=number)
+        known.add(pair)
+        rows.append(row)
+    return rows
+
+
+def parse_timestamp(text: str) -> int:
+    """A timestamp; raises DataError for anything that is not a whole number in plain digits."""
+    if not _TIMESTAMP.fullmatch(text):
+        raise DataError(f"{text!r} is not a timestamp (a whole number)")
+    return int(text)
+
+
+def _row(fields: list[str], columns: int) -> RelativePose:
+    if len(fields) != columns:
+        wanted = "9 (" + MLAD_COLUMNS + ")" if columns == 9 else "2, as in the rows before"
+        raise DataError(f"{len(fields)} columns instead of {wanted}")
+    reference, query = (parse_timestamp(field) for field in fields[:2])
+    if columns == 2:
+        return RelativePose(reference, query)
+    tx, ty, tz, qx, qy, qz, qw = (parse_number(field) for field in fields[2:])
+    pose = checked_pose((qw, qx, qy, qz), (tx, ty, tz), f"pair {reference} {query}")
+    return RelativePose(reference, query, pose)

@@ -1,0 +1,1 @@
+"""Reports: one document model, rendered as text, JSON, CSV and HTML."""

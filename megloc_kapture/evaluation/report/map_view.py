@@ -1,0 +1,265 @@
+"""Cameras from above as inline SVG: the map, truth and estimates, errors as lines."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+from matplotlib.collections import LineCollection
+from numpy.typing import NDArray
+
+from megloc_kapture.evaluation.report.document import Block, Figure, Heading, Paragraph
+from megloc_kapture.evaluation.report.figures import (
+    MISS,
+    MUTED,
+    RASTER_ABOVE,
+    styled_figure,
+    to_svg,
+)
+from megloc_kapture.evaluation.scoring import Evaluation
+from megloc_kapture.evaluation.without_truth import ResultWithoutTruth
+from megloc_kapture.geometry.poses import camera_centers, invert_quats, rotate, stack_poses
+from megloc_kapture.values import RigidTransform
+
+# below this length of the mean "down" of unit vectors, cameras agree on no vertical
+_MIN_AGREEMENT = 0.5
+# a vertical this close to a world axis is that axis: labels can then say x, y and z
+_AXIS_COSINE = float(np.cos(np.deg2rad(15.0)))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class TopView:
+    """Two directions of the world spanning the ground, seen from above.
+
+    Parameters
+    ----------
+    right, up : float64 (3,), what points right and up on the page; orthonormal.
+    labels : what to write at the two axes, without unit.
+    """
+
+    right: NDArray[np.float64]
+    up: NDArray[np.float64]
+    labels: tuple[str, str]
+
+    def project(self, centers: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points (N, 3) of the world on the page (N, 2)."""
+        return np.stack([centers @ self.right, centers @ self.up], axis=1)
+
+
+def top_view(quats_wxyz: NDArray[np.float64], centers: NDArray[np.float64]) -> TopView:
+    """Look down on cameras ``cam_from_world`` (N, 4) with centres (N, 3), N at least 1.
+
+    Vertical is the mean direction in which the cameras' images point down, for people hold
+    cameras upright; where the cameras do not agree on one, it is the direction in which their
+    centres spread least. A vertical close to a world axis is taken to be that axis.
+    """
+    down = rotate(invert_quats(quats_wxyz), np.array([0.0, 1.0, 0.0])).mean(axis=0)
+    length = float(np.linalg.norm(down))
+    spread = centers - centers.mean(axis=0)
+    axes = np.linalg.svd(spread, full_matrices=True)[2] if len(centers) <= 3 else _axes(spread)
+    upward = -down / length if length >= _MIN_AGREEMENT else _signed(axes[2])
+    nearest = int(np.argmax(np.abs(upward)))
+    if abs(upward[nearest]) >= _AXIS_COSINE:
+        return _along_axes(nearest, positive=bool(upward[nearest] > 0))
+    right = axes[0] - (axes[0] @ upward) * upward
+    if np.linalg.norm(right) < 1e-6:  # the cameras stand on one vertical line
+        right = np.eye(3)[int(np.argmin(np.abs(upward)))]
+        right = right - (right @ upward) * upward
+    right = _signed(right / np.linalg.norm(right))
+    return TopView(right, np.cross(upward, right), ("along the map", "across the map"))
+
+
+def _axes(spread: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Principal directions (3, 3) as rows, widest first."""
+    return np.asarray(np.linalg.eigh(spread.T @ spread)[1].T[::-1], dtype=np.float64)
+
+
+def _signed(direction: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The same line with its largest component positive, for a reproducible page."""
+    return direction if direction[int(np.argmax(np.abs(direction)))] > 0 else -direction
+
+
+def _along_axes(vertical: int, *, positive: bool) -> TopView:
+    """The page spanned by the two other world axes, not mirrored."""
+    first, second = ((1, 2), (2, 0), (0, 1))[vertical]
+    names = "xyz"
+    if not positive:  # seen from the other side: swap to keep the page right-handed
+        first, second = second, first
+    world = np.eye(3)
+    return TopView(world[first], world[second], (names[first], names[second]))
+
+
+Poses = Mapping[str, RigidTransform]
+
+
+@dataclass(frozen=True, slots=True)
+class DrawnQuery:
+    """One query in the view.
+
+    Parameters
+    ----------
+    anchor : where its line starts: the true pose; without truth, that of its first candidate.
+    estimate : its pose; None: it has none.
+    guessed : whether that is a fallback.
+    """
+
+    anchor: RigidTransform | None
+    estimate: RigidTransform | None
+    guessed: bool = False
+
+
+def views_of_evaluation(
+    evaluation: Evaluation,
+    map_poses: Poses | None = None,
+    frames: Mapping[str, str] | None = None,
+    *,
+    prefix: str = "above",
+) -> list[Block]:
+    """The views of a result, one per coordinate frame; see :func:`views_from_above`."""
+    drawn = {
+        query.image: DrawnQuery(
+            evaluation.truth[query.image],
+            evaluation.estimated.get(query.image),
+            query.outcome == "fallback",
+        )
+        for query in evaluation.queries
+    }
+    of_query = {
+        query.image: (frames or {}).get(evaluation.image(query.image), query.condition)
+        for query in evaluation.queries
+    }
+    return views_from_above(drawn, map_poses or {}, {**(frames or {}), **of_query}, prefix=prefix)
+
+
+def views_without_truth(
+    result: ResultWithoutTruth,
+    map_poses: Poses,
+    frames: Mapping[str, str] | None = None,
+    *,
+    prefix: str = "above",
+) -> list[Block]:
+    """The views of a result without truth; lines lead from the first candidate to the pose."""
+    drawn, of_query = {}, dict(frames or {})
+    for query in result.queries:
+        first = next((c for c in query.candidates if c in map_poses), "")
+        drawn[query.image] = DrawnQuery(
+            map_poses.get(first), result.poses.get(query.image), query.outcome == "fallback"
+        )
+        # a pose stands in the frame of the images it was estimated from
+        if first in of_query:
+            of_query[query.image] = of_query[first]
+    if not any(one.estimate for one in drawn.values()):
+        return []
+    return views_from_above(drawn, map_poses, of_query, prefix=prefix, with_truth=False)
+
+
+def views_from_above(
+    drawn: Mapping[str, DrawnQuery],
+    map_poses: Poses,
+    frames: Mapping[str, str],
+    *,
+    prefix: str = "above",
+    with_truth: bool = True,
+) -> list[Block]:
+    """Draw queries among the map's cameras, each coordinate frame on a page of its own.
+
+    Parameters
+    ----------
+    frames : image -> frame, of queries and map images; queries of a frame without map images are
+        drawn on the page of all that have none.
+    prefix : of the figures' ids, different for each call on one HTML page.
+    """
+    of_map = {image: frames.get(image, "") for image in map_poses}
+    known = set(of_map.values()) or {""}
+    of_query = {image: frames.get(image, "") for image in drawn}
+    of_query = {i: frame if frame in known else min(known) for i, frame in of_query.items()}
+    blocks: list[Block] = []
+    for number, frame in enumerate(sorted(known)):
+        mine = [one for image, one in drawn.items() if of_query[image] == frame]
+        if not mine:
+            continue
+        mapped = [pose for image, pose in map_poses.items() if of_map[image] == frame]
+        name = prefix if len(known) == 1 else f"{prefix}{number}"
+        svg, num_outside = _draw(mine, mapped, name, with_truth=with_truth)
+        if len(known) > 1 and frame:
+            blocks.append(Heading(frame))
+        if num_outside:
+            lie = "estimate lies" if num_outside == 1 else "estimates lie"
+            blocks.append(Paragraph(f"{num_outside} {lie} outside the page."))
+        blocks.append(Figure(Markup(svg)))
+    return blocks
+
+
+def _draw(
+    drawn: list[DrawnQuery], map_poses: list[RigidTransform], prefix: str, *, with_truth: bool
+) -> tuple[str, int]:
+    """The figure, and how many estimates lie outside its page.
+
+    The page spans the map and the truth (without truth, and without a map, the estimates).
+    """
+    anchors = [one.anchor for one in drawn if one.anchor is not None]
+    estimates = [one.estimate for one in drawn if one.estimate is not None]
+    spanning = map_poses + (anchors if with_truth else []) or estimates
+    quats, translations = stack_poses(spanning)
+    view = top_view(quats, camera_centers(quats, translations))
+
+    def seen(poses: list[RigidTransform]) -> NDArray[np.float64]:
+        return view.project(camera_centers(*stack_poses(poses)))
+
+    low, high = _page(seen(spanning))
+    guessed = np.array([one.guessed for one in drawn if one.estimate is not None], dtype=bool)
+    estimated = seen(estimates)
+    outside = ~((estimated >= low) & (estimated <= high)).all(axis=1)
+    joined = [one for one in drawn if one.anchor is not None and one.estimate is not None]
+    starts = seen([one.anchor for one in joined if one.anchor is not None])
+    ends = seen([one.estimate for one in joined if one.estimate is not None])
+    lines = np.stack([starts, ends], axis=1)
+    # in a crowd dots are smaller, and pixels
+    number = len(map_poses) + len(drawn)
+    shrink, raster = float(np.clip(np.sqrt(800 / max(number, 1)), 0.3, 1.0)), number > RASTER_ABOVE
+
+    def dots(points: NDArray[np.float64], label: str, size: float, **look: Any) -> None:
+        look = {"linewidths": 1.3 * shrink, "rasterized": raster} | look
+        axes.scatter(points[:, 0], points[:, 1], s=size * shrink, label=label, **look)
+
+    width, height = (high - low).tolist()
+    with styled_figure(10.5, float(np.clip(10.0 * height / width, 3.0, 6.5)) + 0.6) as figure:
+        axes = figure.subplots()
+        if map_poses:
+            dots(seen(map_poses), "map cameras", 10, c="#b8c4d0")
+        axes.add_collection(
+            LineCollection(
+                list(lines),
+                colors=MISS if with_truth else MUTED,
+                linewidths=max(shrink, 0.5),
+                alpha=0.3 if raster else 0.8,
+                rasterized=raster,
+            )
+        )
+        if with_truth:
+            found = [one.anchor for one in drawn if one.anchor and one.estimate is not None]
+            lost = [one.anchor for one in drawn if one.anchor and one.estimate is None]
+            dots(seen(found), "truth", 26, facecolors="none", edgecolors="#009e73")
+        dots(estimated[~guessed], "estimated", 7, c="#0072b2", linewidths=0)
+        if guessed.any():
+            dots(estimated[guessed], "fallback pose", 20, c=MISS, marker="x")
+        if with_truth and lost:
+            dots(seen(lost), "truth, no pose", 30, c=MISS, marker="+")
+        axes.set_aspect("equal")
+        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+        axes.set(xlabel=f"{view.labels[0]} (m)", ylabel=f"{view.labels[1]} (m)")
+        figure.legend(loc="outside lower center", ncols=5, fontsize=8)
+        return to_svg(figure, prefix), int(outside.sum())
+
+
+def _page(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Lower left and upper right corner around points (N, 2), with a margin; never flat."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    size = max(float((high - low).max()), 1.0)
+    # a path walked straight ahead would leave a page without height
+    half = np.maximum((high - low) / 2, 0.12 * size) + 0.06 * size
+    center = (low + high) / 2
+    return center - half, center + half

@@ -1,0 +1,301 @@
+"""Reports of results: their text, JSON, CSV tables and page as one document each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from megloc_kapture.evaluation.metrics import ALL
+from megloc_kapture.evaluation.report import tables
+from megloc_kapture.evaluation.report.document import (
+    Block,
+    Document,
+    Items,
+    Paragraph,
+    Section,
+)
+from megloc_kapture.evaluation.report.renderers import render_html, render_text, write_document
+from megloc_kapture.evaluation.report.wording import (
+    INTERVALS,
+    agreement_sentence,
+    bounds,
+    comparison_sentences,
+    criterion,
+    method_sentence,
+    notes,
+    retrieval_note,
+)
+from megloc_kapture.evaluation.results import ResultContext
+from megloc_kapture.evaluation.scoring import Evaluation
+from megloc_kapture.evaluation.statistics import Comparison, MedianDifference, PairedTest, Seeds
+from megloc_kapture.evaluation.without_truth import (
+    CAUTION,
+    ResultWithoutTruth,
+    WithoutTruth,
+)
+from megloc_kapture.values import RigidTransform
+
+RECALL_JSON, RECALL_TEXT = "recall.json", "recall.txt"
+AGREEMENT_TEXT = "agreement.txt"
+PER_QUERY_CSV, DIFFERENCES_CSV = "per_query.csv", "differences.csv"
+
+AnyReported = Evaluation | Comparison | Seeds | WithoutTruth
+Poses = Mapping[str, RigidTransform]
+
+
+def report_text(reported: AnyReported) -> str:
+    """The report as plain text, ASCII but for labels, ended by a newline."""
+    return render_text(_text_sections(reported))
+
+
+def report_of(
+    reported: AnyReported,
+    *,
+    map_poses: Poses | None = None,
+    provenance: Mapping[str, Any] | None = None,
+    contexts: Sequence[ResultContext] | None = None,
+) -> Document:
+    """The report of one result, of several, of runs with seeds, or of results without truth.
+
+    Parameters
+    ----------
+    map_poses : ``cam_from_world`` of the map's images, for the view from above; by default those
+        of the first context that has a map.
+    provenance : options, preset, inputs: plain JSON data, shown at the end with the versions.
+    contexts : images, masks and matches of each result, by default those it brings along.
+
+    Raises
+    ------
+    DataError : a map is broken.
+    """
+    # matplotlib loads with them, which those who want the text need not wait for
+    from megloc_kapture.evaluation.report import pages
+
+    results = _results(reported)
+    labels = [result.label for result in results]
+    if contexts is None:
+        contexts = [result.context for result in results]
+    if map_poses is None:
+        map_poses = next((poses for context in contexts if (poses := context.map_poses())), {})
+    if isinstance(reported, Evaluation):
+        title = reported.label or "Evaluation"
+        page = pages.evaluation_page(reported, map_poses, contexts[0])
+    elif isinstance(reported, Comparison):
+        title = " and ".join(labels)
+        page = pages.comparison_page(reported, map_poses, contexts)
+    elif isinstance(reported, Seeds):
+        title = f"{len(labels)} runs of one method"
+        page = pages.seeds_page(reported, map_poses, contexts)
+    else:
+        title = " and ".join(labels) or "Without truth"
+        page = pages.without_truth_page(reported, map_poses, contexts)
+    csv_tables = {PER_QUERY_CSV: reported.per_query()}
+    if isinstance(reported, Comparison):
+        csv_tables[DIFFERENCES_CSV] = reported.differences()
+    return Document(
+        name="agreement" if isinstance(reported, WithoutTruth) else "recall",
+        title=title,
+        text=_text_sections(reported),
+        page=page,
+        data=report_data(reported),
+        tables=csv_tables,
+        provenance=provenance or {},
+    )
+
+
+def write_report(folder: Path | str, reported: AnyReported, **options: Any) -> dict[str, Path]:
+    """Write the report's files, each atomically; returns name -> path.
+
+    With truth these are recall.json, recall.txt, per_query.csv and report.html, of a comparison
+    also differences.csv; without truth agreement.json and agreement.txt take the place of recall's.
+
+    Parameters
+    ----------
+    options : as of :func:`report_of`.
+
+    Raises
+    ------
+    DataError : a map is broken.
+    OutputError : a file cannot be written.
+    """
+    return write_document(folder, report_of(reported, **options))
+
+
+def render_report(reported: AnyReported, **options: Any) -> str:
+    """The page alone; the same arguments give the same text. ``options`` as :func:`report_of`."""
+    return render_html(report_of(reported, **options))
+
+
+def report_data(reported: AnyReported) -> dict[str, Any]:
+    """The data of the report's JSON; see :class:`Document`."""
+    if isinstance(reported, Evaluation):
+        return _recall_data(reported)
+    if isinstance(reported, WithoutTruth):
+        return _without_truth_data(reported)
+    results = [_recall_data(evaluation) for evaluation in reported.evaluations]
+    if isinstance(reported, Seeds):
+        return {"results": results, "seeds": _seeds_data(reported)}
+    return {"results": results, "comparison": _comparison_data(reported)}
+
+
+def _results(reported: AnyReported) -> Sequence[Evaluation] | Sequence[ResultWithoutTruth]:
+    if isinstance(reported, Evaluation):
+        return (reported,)
+    return reported.results if isinstance(reported, WithoutTruth) else reported.evaluations
+
+
+def _text_sections(reported: AnyReported) -> tuple[Section, ...]:
+    if isinstance(reported, Evaluation):
+        label = (_lines(_line(reported.label)),) if reported.label else ()
+        return (*label, *_recall_sections([reported]), *_note_sections([reported]))
+    if isinstance(reported, Comparison):
+        return (
+            *_recall_sections(reported.evaluations),
+            _lines(Items(tuple(comparison_sentences(reported)))),
+            _lines(Paragraph(method_sentence(reported))),
+            *_note_sections(reported.evaluations),
+        )
+    return _seeds_text(reported) if isinstance(reported, Seeds) else _without_truth_text(reported)
+
+
+def _recall_sections(evaluations: Sequence[Evaluation]) -> list[Section]:
+    by_center = [e.by_center for e in evaluations if e.by_center is not None]
+    sections = [
+        _lines(
+            _line(f"recall (%) at {bounds(evaluations[0].thresholds)}"),
+            Paragraph(criterion(evaluations[0])),
+        ),
+        _lines(tables.recall_table(evaluations)),
+    ]
+    if len(by_center) == len(evaluations):
+        sections.append(_lines(_line("the same by the distance of the camera centres")))
+        sections.append(_lines(tables.recall_table(by_center)))
+    intervals = tables.interval_table(evaluations)
+    return [*sections, _lines(_line(f"{INTERVALS}, (%)"), intervals)]
+
+
+def _note_sections(evaluations: Sequence[Evaluation]) -> list[Section]:
+    return [
+        _lines(Paragraph(f"Note{f' on {e.label}' if evaluations[1:] else ''}: {note}."))
+        for e in evaluations
+        for note in notes(e)
+    ]
+
+
+def _seeds_text(seeds: Seeds) -> tuple[Section, ...]:
+    first = seeds.evaluations[0]
+    labels = [evaluation.label for evaluation in seeds.evaluations]
+    at = bounds(first.thresholds)
+    return (
+        _lines(_line(f"{len(labels)} runs of one method: {', '.join(labels)}")),
+        _lines(
+            _line(f"recall (%) at {at}, mean +- standard deviation of a run"),
+            Paragraph(criterion(first)),
+        ),
+        _lines(tables.seeds_table(seeds)),
+        _lines(_line("smallest and largest of the runs (%)"), tables.seed_ranges(seeds)),
+        _lines(
+            _line("queries found by all / by some / by none of the runs"),
+            tables.found_table(seeds),
+        ),
+    )
+
+
+def _without_truth_text(found: WithoutTruth) -> tuple[Section, ...]:
+    sections = [_lines(Paragraph(f"No recall: {found.statement}"), Paragraph(CAUTION))]
+    for result in found.results:
+        sections.append(_lines(_line(result.label)))
+        sections.append(_lines(tables.result_table(result), Paragraph(retrieval_note(result))))
+    for pair in dict.fromkeys((row.first, row.second) for row in found.agreement):
+        rows = [row for row in found.agreement if (row.first, row.second) == pair]
+        whole = next(row for row in rows if row.name == ALL)
+        first, second = (found.results[index].label for index in pair)
+        told = (
+            "% of all queries where both have a pose and the two are at most "
+            f"{bounds(found.thresholds)} apart"
+        )
+        sections += [
+            _lines(Paragraph(f"agreement of {first} and {second}"), Paragraph(told)),
+            _lines(
+                tables.agreement_table(found, rows), Paragraph(agreement_sentence(whole, found))
+            ),
+        ]
+    return tuple(sections)
+
+
+def _lines(*blocks: Block) -> Section:
+    return Section(blocks)
+
+
+def _line(text: str) -> Paragraph:
+    return Paragraph(text, wrap=False)
+
+
+def _recall_data(evaluation: Evaluation) -> dict[str, Any]:
+    by_center = evaluation.by_center
+    return {
+        "label": evaluation.label,
+        "criterion": criterion(evaluation),
+        "thresholds": evaluation.thresholds,
+        "rows": evaluation.rows,
+        "notes": notes(evaluation),
+        "without_truth": evaluation.without_truth,
+        "not_scored": evaluation.not_scored,
+        **({} if by_center is None else {"rows_by_center": by_center.rows}),
+    }
+
+
+def _comparison_data(comparison: Comparison) -> dict[str, Any]:
+    labels = [evaluation.label for evaluation in comparison.evaluations]
+
+    def named(test: PairedTest | MedianDifference) -> dict[str, Any]:
+        pair = {"first": labels[test.first], "second": labels[test.second]}
+        return {**asdict(test), **pair, "real": test.is_real}
+
+    return {
+        "method": method_sentence(comparison),
+        "sentences": [sentence for sentence, _ in comparison_sentences(comparison)],
+        "tests": [named(test) for test in comparison.tests],
+        "tests_by_condition": [named(test) for test in comparison.tests_by_row],
+        "medians": [named(median) for median in comparison.medians],
+    }
+
+
+def _seeds_data(seeds: Seeds) -> list[dict[str, Any]]:
+    return [
+        {
+            "name": row.name,
+            "num_queries": row.num_queries,
+            "num_localized": asdict(row.num_localized),
+            "recall": [
+                {
+                    "threshold": at.threshold,
+                    **asdict(at.recall),
+                    "found_always": at.always,
+                    "found_sometimes": at.sometimes,
+                    "found_never": at.never,
+                }
+                for at in row.recall
+            ],
+            "median_position_m": asdict(row.median_position_m),
+        }
+        for row in seeds.rows
+    ]
+
+
+def _without_truth_data(found: WithoutTruth) -> dict[str, Any]:
+    labels = [result.label for result in found.results]
+    return {
+        "statement": found.statement,
+        "caution": CAUTION,
+        "results": [
+            {"label": result.label, "rows": [asdict(row) for row in result.rows]}
+            for result in found.results
+        ],
+        "agreement": [
+            {**asdict(row), "first": labels[row.first], "second": labels[row.second]}
+            for row in found.agreement
+        ],
+    }

@@ -1,0 +1,255 @@
+"""Figures as words, and the notes and sentences of reports.
+
+Recall is printed in the style of papers: ``89.8 / 96.1 / 99.4``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from megloc_kapture.evaluation.metrics import ALL, RecallAt, Threshold
+from megloc_kapture.evaluation.scoring import Evaluation
+from megloc_kapture.evaluation.statistics import (
+    NUM_RESAMPLES,
+    SIGNIFICANCE,
+    Comparison,
+    MedianDifference,
+    PairedTest,
+    Spread,
+)
+from megloc_kapture.evaluation.without_truth import (
+    PRIOR_ANGLE_DEG,
+    AgreementRow,
+    ResultWithoutTruth,
+    WithoutTruth,
+)
+
+INTERVALS = "95 % confidence intervals of recall, queries taken as independent"
+_NO_CONDITION = "(no condition)"
+_MAX_NAME_WIDTH = 19
+_NAMES_SHOWN = 5
+_FALLBACK_POSES = {
+    "retrieval": "of the best retrieved image",
+    "rig": "that another camera of the rig gives them",
+}
+
+
+def format_percent(share: float) -> str:
+    """A share as papers print it: percent with one decimal."""
+    return f"{100.0 * share:.1f}"
+
+
+def format_share(count: int, total: int) -> str:
+    """A part of a whole in percent; ``-`` of nothing."""
+    return format_percent(count / total) if total else "-"
+
+
+def format_metres(position_m: float) -> str:
+    """Metres down to a tenth of a millimetre where that is small, to a centimetre where not."""
+    return f"{position_m:.4f}" if position_m < 1 else f"{position_m:.2f}"
+
+
+def format_degrees(angle_deg: float) -> str:
+    """Degrees to a thousandth below 1, to a hundredth above."""
+    return f"{angle_deg:.3f}" if angle_deg < 1 else f"{angle_deg:.2f}"
+
+
+def format_median(position_m: float, angle_deg: float) -> str:
+    """Two medians in one cell; ``inf`` where most queries have no pose."""
+    if not math.isfinite(position_m):
+        return "inf"
+    return f"{format_metres(position_m)}, {format_degrees(angle_deg)}"
+
+
+def format_interval(at: RecallAt) -> str:
+    """The confidence interval of a recall in percent: ``87.5-91.8``."""
+    return f"{format_percent(at.low)}-{format_percent(at.high)}"
+
+
+def format_p(p_value: float) -> str:
+    """A p-value with as many digits as mean something."""
+    return "p < 0.001" if p_value < 0.001 else f"p = {p_value:.2g}"
+
+
+def format_spread(spread: Spread, *, percent: bool = False) -> str:
+    """``89.8 +- 0.3``; ``inf`` where a run has no such figure."""
+    if not math.isfinite(spread.mean):
+        return "inf"
+    form = format_percent if percent else format_metres
+    return f"{form(spread.mean)} +- {form(spread.deviation)}"
+
+
+def counted(number: int, one: str, many: str) -> str:
+    """A number and the right form of its noun."""
+    return f"{number} {one if number == 1 else many}"
+
+
+def display_name(name: str) -> str:
+    """A row's name, with a stand-in for the queries that have no condition."""
+    return name or _NO_CONDITION
+
+
+def shortened(name: str, width: int = _MAX_NAME_WIDTH) -> str:
+    """A name that leaves room for the other columns: names differ at either end."""
+    if len(name) <= width:
+        return name
+    half = (width - 3) // 2
+    return f"{name[:half]}...{name[-half:]}"
+
+
+def bounds(thresholds: Sequence[Threshold]) -> str:
+    """All thresholds, as a heading has them."""
+    return " / ".join(str(threshold) for threshold in thresholds)
+
+
+def criterion(evaluation: Evaluation) -> str:
+    """The rule by which recall is counted, in one sentence."""
+    with_angles = any(threshold.angle_deg is not None for threshold in evaluation.thresholds)
+    errors = "Both errors" if with_angles else "Position error"
+    if evaluation.by_center is not None:
+        errors = "Error of the translation relative to the given reference"
+    return f"{errors} at or below (<=) the threshold; a query without a pose counts as a miss."
+
+
+def notes(evaluation: Evaluation) -> list[str]:
+    """Sentences a reader needs beside the table: fallbacks, images without truth, no overlap."""
+    row = evaluation.row()
+    said = []
+    kinds = {query.fallback for query in evaluation.queries} - {"none"}
+    if row.num_fallback:
+        whose = " or the one ".join(_FALLBACK_POSES[kind] for kind in sorted(kinds))
+        said.append(
+            f"{counted(row.num_fallback, 'query', 'queries')} could not be localized and "
+            f"{_verb(row.num_fallback, 'bears', 'bear')} the pose {whose} "
+            "instead; recall and the median of all count it as any pose"
+        )
+    if row.num_missing == row.num_queries:
+        said.append("no query has a pose")
+    missing = evaluation.without_truth
+    if missing:
+        shown = ", ".join(missing[:_NAMES_SHOWN]) + (", ..." if missing[_NAMES_SHOWN:] else "")
+        said.append(
+            f"{counted(len(missing), 'image has', 'images have')} no true pose and "
+            f"{_verb(len(missing), 'is', 'are')} not counted: {shown}"
+        )
+        if evaluation.truth_known_by:
+            said.append(evaluation.truth_known_by.rstrip("."))
+        if not evaluation.estimated and row.num_missing == row.num_queries:
+            said.append("no estimated image is in the ground truth: do the names agree?")
+    if evaluation.not_scored:
+        said.append(
+            f"{counted(len(evaluation.not_scored), 'image', 'images')} with a true pose "
+            f"{_verb(len(evaluation.not_scored), 'is', 'are')} not scored by this benchmark"
+        )
+    return said
+
+
+def retrieval_note(result: ResultWithoutTruth) -> str:
+    """The legend of :func:`result_table`, or that there is no retrieval to agree with."""
+    first = result.rows[-1].first_candidate
+    if first is None:
+        return (
+            "no map or no candidates are known, so nothing is said about agreement with retrieval"
+        )
+    return (
+        "first, nearest: the candidate map image that is ranked first, or lies nearest to the "
+        f"pose; facing: % that look within {PRIOR_ANGLE_DEG:g} degrees of the first; "
+        f"of {counted(first.num_compared, 'localized query', 'localized queries')} with candidates"
+    )
+
+
+def agreement_sentence(row: AgreementRow, found: WithoutTruth) -> str:
+    """Numbers of queries with a pose in one of two results only."""
+    if not row.num_only_first and not row.num_only_second:
+        return "The same queries have a pose in both."
+    first, second = found.results[row.first].label, found.results[row.second].label
+    return (
+        f"Only {first} has a pose for {counted(row.num_only_first, 'query', 'queries')}, "
+        f"only {second} for {row.num_only_second}."
+    )
+
+
+def threshold_sentence(test: PairedTest, labels: Sequence[str]) -> str:
+    """Queries that one of two results finds and the other misses, and whether that is chance."""
+    first, second = labels[test.first], labels[test.second]
+    where = f"At {test.threshold}"
+    if test.row != ALL:
+        where = f"{display_name(test.row)}, at {test.threshold}"
+    only_first, only_second = len(test.only_first), len(test.only_second)
+    if not only_first and not only_second:
+        if not test.both:
+            return f"{where} neither {first} nor {second} finds a query."
+        return f"{where} {first} and {second} find the same {_queries(test.both)}."
+    return (
+        f"{where} {first} finds {_queries(only_first)} that {second} misses and {second} finds "
+        f"{only_second or 'none'} that {first} misses: {_verdict(test)}."
+    )
+
+
+def median_sentence(difference: MedianDifference, labels: Sequence[str]) -> str:
+    """The medians of two results, and whether they differ by more than chance."""
+    pair = (labels[difference.first], labels[difference.second])
+    medians = (difference.first_m, difference.second_m)
+    lost = [label for label, value in zip(pair, medians, strict=True) if math.isinf(value)]
+    if lost:
+        return f"Most queries of {' and of '.join(lost)} have no pose, so there is no median."
+    apart = medians[0] - medians[1]
+    verdict = "the difference is real" if difference.is_real else "the difference could be chance"
+    interval = f"{_signed(difference.low_m)} to {_signed(difference.high_m)}"
+    return (
+        f"The median position error is {format_metres(medians[0])} m for {pair[0]} and "
+        f"{format_metres(medians[1])} m for {pair[1]}: {_signed(apart)} m, 95 % interval "
+        f"{interval} m; {verdict}."
+    )
+
+
+def comparison_sentences(comparison: Comparison) -> list[tuple[str, bool]]:
+    """All that is to say of all queries together, then what is real in single conditions; each
+    sentence with whether it tells of a real difference."""
+    labels = [evaluation.label for evaluation in comparison.evaluations]
+    said = [(threshold_sentence(test, labels), test.is_real) for test in comparison.tests]
+    said += [(median_sentence(median, labels), median.is_real) for median in comparison.medians]
+    real = [test for test in comparison.tests_by_row if test.is_real]
+    said += [(threshold_sentence(test, labels), True) for test in real]
+    if comparison.tests_by_row and not real:
+        said.append(("In no single condition can a difference be told from chance.", False))
+    return said
+
+
+def method_sentence(comparison: Comparison) -> str:
+    """The method of the tests, in two sentences."""
+    text = (
+        "Exact McNemar test on the same queries, taken as independent, two-sided; real: p at or "
+        f"below {SIGNIFICANCE:g}"
+    )
+    families = [f"{len(comparison.tests)} tests of all queries"]
+    if comparison.tests_by_row:
+        families.append(f"{len(comparison.tests_by_row)} of the conditions")
+    if len(comparison.tests) > 1 or comparison.tests_by_row:
+        text += f", after Holm's correction (for the {' and for the '.join(families)})"
+    return f"{text}. Intervals of medians: {NUM_RESAMPLES} resamples of the queries."
+
+
+def _verdict(test: PairedTest) -> str:
+    p = format_p(test.p_adjusted)
+    if test.is_real:
+        return f"the difference is real ({p})"
+    # the most uneven split of so few would not do either
+    if 2.0 * 0.5 ** (len(test.only_first) + len(test.only_second)) > SIGNIFICANCE:
+        return f"too few queries differ to tell it from chance ({p})"
+    return f"the difference could be chance ({p})"
+
+
+def _queries(number: int) -> str:
+    return "no query" if number == 0 else counted(number, "query", "queries")
+
+
+def _signed(metres: float) -> str:
+    if math.isinf(metres):
+        return "-inf" if metres < 0 else "+inf"
+    return f"{'-' if metres < 0 else '+'}{format_metres(abs(metres))}"
+
+
+def _verb(number: int, one: str, many: str) -> str:
+    return one if number == 1 else many

@@ -1,0 +1,421 @@
+"""One result against true poses: errors, outcomes, recall; by camera centres or by MLAD's metric.
+
+The MLAD challenges hand out pairs of a reference and a query and score ``|t - t_true|`` of
+``query_from_reference``, without the rotation. That length mixes the error of the camera's centre
+with the error of its rotation times the distance of the two cameras, so the distance of the
+centres is reported beside it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Any, Literal, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.evaluation.metrics import (
+    DEFAULT_THRESHOLDS,
+    PoseErrors,
+    RecallRow,
+    Threshold,
+    pose_errors,
+    recall_rows,
+    row_members,
+)
+from megloc_kapture.evaluation.results import ResultContext
+from megloc_kapture.geometry.poses import compose, invert, stack_poses
+from megloc_kapture.io.atomic import write_bytes
+from megloc_kapture.io.challenge_tables import RelocalizationPair
+from megloc_kapture.io.status_table import Fallback, QueryStatus
+from megloc_kapture.values import RigidTransform
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+    from megloc_kapture.evaluation.report.reports import AnyReported
+    from megloc_kapture.evaluation.statistics import Comparison
+
+Outcome = Literal["localized", "fallback", "missing"]
+
+
+@dataclass(frozen=True, slots=True)
+class QueryResult:
+    """The outcome of one scored query.
+
+    Parameters
+    ----------
+    image, condition : the query and what it is reported under (``""``: nothing).
+    outcome : ``localized``, ``fallback`` (its pose is a guess) or ``missing`` (no pose).
+    reason : why it was not localized; empty for a localized query.
+    position_m, angle_deg : errors in metres and degrees, infinite without a pose.
+    num_matches, num_inliers : from the status table; None without one.
+    fallback : what kind of guess a fallback pose is.
+    candidates : map images the pose comes from, best first; from the status table.
+    """
+
+    image: str
+    condition: str
+    outcome: Outcome
+    reason: str
+    position_m: float
+    angle_deg: float
+    num_matches: int | None = None
+    num_inliers: int | None = None
+    fallback: Fallback = "none"
+    candidates: tuple[str, ...] = ()
+
+
+class Reported:
+    """A result, or several, that a report can be made of; prints as its tables."""
+
+    __slots__ = ()
+
+    def per_query(self) -> dict[str, list[Any]]:
+        """Column -> one value per query, as in ``per_query.csv``."""
+        raise NotImplementedError
+
+    def __str__(self) -> str:
+        from megloc_kapture.evaluation.report.reports import report_text
+
+        # of this class there are the four kinds that reports know
+        return report_text(cast("AnyReported", self)).removesuffix("\n")
+
+    def html(self, path: Path | str) -> None:
+        """Write the report as an HTML page.
+
+        Raises
+        ------
+        DataError : the map that the context of a result knows is broken.
+        OutputError : the file cannot be written.
+        """
+        from megloc_kapture.evaluation.report.reports import render_report
+
+        write_bytes(path, render_report(cast("AnyReported", self)).encode("utf-8"))
+
+    def to_pandas(self) -> DataFrame:
+        """One row per query, by image, with the columns of ``per_query.csv``.
+
+        Errors are in metres and degrees, and infinite where a query has no pose: they lie beyond
+        every threshold, and raise a median instead of leaving it. Counts that may be unknown are
+        pandas' nullable integers.
+        """
+        import pandas as pd  # only those who ask for it wait for it
+
+        columns = {
+            name: pd.array(values, dtype="Int64") if "num_" in name else values
+            for name, values in self.per_query().items()
+        }
+        return pd.DataFrame(columns).set_index("image")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Evaluation(Reported):
+    """Everything known about one result.
+
+    Parameters
+    ----------
+    label : what the result is called in tables.
+    thresholds : of the recall rows, in their order.
+    rows : recall per condition, pools, and ``"all"``, which is the last.
+    members : row name -> bool (N,), the queries it counts.
+    queries : every counted query, sorted by name.
+    errors : the same queries' errors as arrays.
+    truth, estimated : ``cam_from_world`` of the counted queries (estimated: those that have one).
+    without_truth : images that were estimated (or asked to be scored) but have no true pose;
+        sorted. They are reported, never counted.
+    not_scored : images with a true pose that the benchmark does not count; sorted.
+    truth_known_by : who knows the true poses that are not published; empty: said nowhere.
+    pairs : of MLAD's challenges, what a query is called in ``queries`` -> its pair; else empty.
+    by_center : None where the position error is the distance of the camera centres. Where it is
+        another (see :mod:`megloc_kapture.evaluation.scoring`), the same queries' evaluation by
+        that distance.
+    """
+
+    label: str
+    thresholds: tuple[Threshold, ...]
+    rows: tuple[RecallRow, ...]
+    members: Mapping[str, NDArray[np.bool_]]
+    queries: tuple[QueryResult, ...]
+    errors: PoseErrors
+    truth: Mapping[str, RigidTransform]
+    estimated: Mapping[str, RigidTransform]
+    without_truth: tuple[str, ...]
+    not_scored: tuple[str, ...]
+    truth_known_by: str = ""
+    pairs: Mapping[str, RelocalizationPair] = field(default_factory=dict)
+    by_center: Evaluation | None = None
+    context: ResultContext = field(default_factory=ResultContext)
+
+    def compare(self, *others: Evaluation) -> Comparison:
+        """Test the differences from results on the same queries, which need other labels.
+
+        Raises
+        ------
+        OptionError : two results of one label, or not of the same queries and thresholds.
+        """
+        from megloc_kapture.evaluation.statistics import compare
+
+        return compare([self, *others])
+
+    def per_query(self) -> dict[str, list[Any]]:
+        """Column -> one value per query; of MLAD's pairs the position error is the translation's
+        relative to the reference."""
+        columns = query_columns(self.queries)
+        if self.by_center is not None:
+            columns["reference"] = [self.pairs[query.image].reference for query in self.queries]
+            columns["center_error_m"] = [query.position_m for query in self.by_center.queries]
+        return columns
+
+    def row(self, name: str = "all") -> RecallRow:
+        """The recall row of a condition or pool; KeyError for an unknown name."""
+        for row in self.rows:
+            if row.name == name:
+                return row
+        raise KeyError(name)
+
+    def image(self, query: str) -> str:
+        """The image of a query, which in ``queries`` may be called by its pair."""
+        return self.pairs[query].query if query in self.pairs else query
+
+
+def query_columns(queries: Sequence[QueryResult]) -> dict[str, list[Any]]:
+    """Column -> one value per query, as tables of queries have them."""
+    return {
+        "image": [query.image for query in queries],
+        "condition": [query.condition for query in queries],
+        "outcome": [query.outcome for query in queries],
+        "position_error_m": [query.position_m for query in queries],
+        "angle_error_deg": [query.angle_deg for query in queries],
+        "num_matches": [query.num_matches for query in queries],
+        "num_inliers": [query.num_inliers for query in queries],
+        "reason": [query.reason for query in queries],
+    }
+
+
+def evaluate_poses(
+    estimated: Mapping[str, RigidTransform],
+    truth: Mapping[str, RigidTransform],
+    *,
+    conditions: Mapping[str, str] | None = None,
+    thresholds: Sequence[Threshold] = DEFAULT_THRESHOLDS,
+    scored: Collection[str] | None = None,
+    statuses: Mapping[str, QueryStatus] | None = None,
+    condition_order: Sequence[str] = (),
+    pools: Mapping[str, Sequence[str]] | None = None,
+    label: str = "",
+    errors: PoseErrors | None = None,
+) -> Evaluation:
+    """Errors, recall and outcomes of ``estimated``.
+
+    The queries are the images of ``truth``, those of them that are in ``scored`` where it is
+    given. Every one of them stands in the denominator of recall, with or without a pose.
+
+    Parameters
+    ----------
+    estimated, truth : ``cam_from_world`` by image name, in one frame, metres.
+    conditions : image -> condition; images may be absent from it.
+    scored : the images the benchmark counts; None counts all of ``truth``.
+    statuses : rows of ``status.csv``: reasons, inliers, and which poses are fallbacks.
+    condition_order, pools : see :func:`megloc_kapture.evaluation.metrics.row_members`.
+    label : what to call this result.
+    errors : of exactly the counted queries, sorted by name, where they are measured in another
+        way than by camera centres and rotation angle.
+
+    Raises
+    ------
+    DataError : no scored query has a true pose, so that there is nothing to count.
+    OptionError : two rows of the table would bear one name, or there is no threshold.
+    """
+    if not thresholds:
+        raise OptionError("at least one recall threshold is needed")
+    counted = tuple(sorted(n for n in truth if scored is None or n in scored))
+    if not counted:
+        raise DataError("no query with a true pose to count: is this the right ground truth?")
+    wanted = set(estimated) if scored is None else set(estimated) | set(scored)
+    if errors is None:
+        errors = pose_errors(estimated, truth, counted)
+    queries = tuple(
+        _query_result(name, position_m, angle_deg, conditions, statuses)
+        for name, position_m, angle_deg in zip(
+            counted, errors.position_m.tolist(), errors.angle_deg.tolist(), strict=True
+        )
+    )
+    members = row_members(
+        [query.condition for query in queries], order=condition_order, pools=pools
+    )
+    guessed = np.array([query.outcome == "fallback" for query in queries])
+    return Evaluation(
+        label=label,
+        thresholds=tuple(thresholds),
+        rows=recall_rows(errors, thresholds, members, fallback=guessed),
+        members=members,
+        queries=queries,
+        errors=errors,
+        truth={name: truth[name] for name in counted},
+        estimated={name: estimated[name] for name in counted if name in estimated},
+        without_truth=tuple(sorted(wanted - set(truth))),
+        not_scored=tuple(sorted(set(truth) - set(counted))),
+    )
+
+
+def _query_result(
+    image: str,
+    position_m: float,
+    angle_deg: float,
+    conditions: Mapping[str, str] | None,
+    statuses: Mapping[str, QueryStatus] | None,
+) -> QueryResult:
+    status = None if statuses is None else statuses.get(image)
+    outcome: Outcome = "localized"
+    reason = ""
+    fallback: Fallback = "none"
+    if not np.isfinite(position_m):
+        outcome = "missing"
+        reason = "no pose in the result" if status is None else status.reason
+        if status is not None and status.status == "localized":
+            reason = "status says localized, but the result has no pose"
+    elif status is not None and status.fallback != "none":
+        outcome = "fallback"
+        reason, fallback = status.reason, status.fallback
+    return QueryResult(
+        image=image,
+        condition="" if conditions is None else conditions.get(image, ""),
+        outcome=outcome,
+        reason=reason,
+        position_m=position_m,
+        angle_deg=angle_deg,
+        num_matches=None if status is None else status.num_matches,
+        num_inliers=None if status is None else status.num_inliers,
+        fallback=fallback,
+        candidates=() if status is None else status.candidates,
+    )
+
+
+def relative_translation_errors(
+    estimated: tuple[NDArray[np.float64], NDArray[np.float64]],
+    truth: tuple[NDArray[np.float64], NDArray[np.float64]],
+    references: tuple[NDArray[np.float64], NDArray[np.float64]],
+) -> NDArray[np.float64]:
+    """``|t - t_true|`` (N,) of ``query_from_reference``, in metres.
+
+    Parameters
+    ----------
+    estimated, truth, references : ``cam_from_world`` of the queries, and of the reference each is
+        paired with, in one frame: quaternions (N, 4), w first, and translations (N, 3).
+    """
+    world_from_reference = invert(*references)
+    _, found = compose(*estimated, *world_from_reference)
+    _, true = compose(*truth, *world_from_reference)
+    return np.asarray(np.linalg.norm(found - true, axis=1), dtype=np.float64)
+
+
+def pair_names(pairs: Sequence[RelocalizationPair]) -> list[str]:
+    """Names of the pairs in tables: the query; with file and reference where one query
+    stands in several pairs."""
+    times = Counter(pair.query for pair in pairs)
+    return [
+        pair.query if times[pair.query] == 1 else f"{pair.query} from {pair.reference}, {pair.file}"
+        for pair in pairs
+    ]
+
+
+def evaluate_pairs(
+    estimated: Mapping[RelocalizationPair, RigidTransform],
+    truth: Mapping[str, RigidTransform],
+    pairs: Sequence[RelocalizationPair],
+    references: Mapping[str, RigidTransform],
+    *,
+    thresholds: Sequence[Threshold],
+    scored: Collection[str] | None = None,
+    statuses: Mapping[str, QueryStatus] | None = None,
+    label: str = "",
+) -> Evaluation:
+    """Evaluate by MLAD's metric: every pair counts once, and each file is a condition.
+
+    Parameters
+    ----------
+    estimated : ``cam_from_world`` of a pair's query; pairs may be absent.
+    truth : ``cam_from_world`` of queries by image name, in the same frame, metres.
+    pairs : what the challenge asks for.
+    references : ``cam_from_world`` of the reference images, in the same frame.
+    scored : the images that count; pairs of others are left out.
+    statuses : rows of ``status.csv`` by image.
+
+    Returns
+    -------
+    The errors' position is the relative translation's; ``by_center`` has the distances of the
+    centres. Pairs whose query has no true pose are named in ``without_truth``.
+
+    Raises
+    ------
+    DataError : a reference has no pose, a pair is listed twice, or no pair can be counted.
+    OptionError : there is no threshold.
+    """
+    absent = next((pair for pair in pairs if pair.reference not in references), None)
+    if absent is not None:
+        raise DataError(f"reference {absent.reference!r} of {absent.file!r} has no pose in the map")
+    named = dict(zip(pair_names(pairs), pairs, strict=True))
+    if len(named) != len(pairs):
+        raise DataError("a pair of reference and query is listed twice in one file")
+    called = _conditions(dict.fromkeys(pair.file for pair in pairs))
+    asked = {n: p for n, p in named.items() if scored is None or p.query in scored}
+    by_center = evaluate_poses(
+        {n: estimated[p] for n, p in asked.items() if p in estimated},
+        {n: truth[p.query] for n, p in asked.items() if p.query in truth},
+        conditions={n: called[p.file] for n, p in asked.items()} if len(called) > 1 else None,
+        thresholds=thresholds,
+        scored=asked.keys(),
+        statuses=_statuses_of_pairs(asked, statuses),
+        condition_order=list(called.values()),
+        label=label,
+    )
+    names = by_center.errors.names
+    found = by_center.errors.has_pose
+    posed = [name for name, has in zip(names, found, strict=True) if has]
+    position_m = np.full(len(names), np.inf)
+    position_m[found] = relative_translation_errors(
+        stack_poses(estimated[named[name]] for name in posed),
+        stack_poses(truth[named[name].query] for name in posed),
+        stack_poses(references[named[name].reference] for name in posed),
+    )
+    relative = evaluate_poses(
+        by_center.estimated,
+        by_center.truth,
+        conditions={query.image: query.condition for query in by_center.queries},
+        thresholds=thresholds,
+        statuses=_statuses_of_pairs(asked, statuses),
+        condition_order=list(by_center.members),
+        label=label,
+        errors=PoseErrors(names, position_m, by_center.errors.angle_deg),
+    )
+    return replace(
+        relative,
+        without_truth=by_center.without_truth,
+        pairs={name: asked[name] for name in names},
+        by_center=by_center,
+    )
+
+
+def _conditions(files: Iterable[str]) -> dict[str, str]:
+    """Relocalization file -> what it is called as a condition: the recording it is about."""
+    whole = {file: PurePosixPath(file).stem for file in files}
+    short = {}
+    for file, stem in whole.items():
+        target = stem.rsplit("_to_", 1)[-1]
+        for prefix in ("relocalizationFile_", "reloc_", "recording_"):
+            target = target.removeprefix(prefix)
+        short[file] = target
+    return short if len(set(short.values())) == len(short) else whole
+
+
+def _statuses_of_pairs(
+    asked: Mapping[str, RelocalizationPair], statuses: Mapping[str, QueryStatus] | None
+) -> dict[str, QueryStatus] | None:
+    if statuses is None:
+        return None
+    return {name: statuses[p.query] for name, p in asked.items() if p.query in statuses}

@@ -1,0 +1,279 @@
+"""Every classic mistake is named, in real scenes and made ones; right files pass."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from megloc_kapture.evaluation.check.comparison import path_scores
+from megloc_kapture.evaluation.check.findings import CheckReport, Finding
+from megloc_kapture.evaluation.check.reading import Reference
+from megloc_kapture.evaluation.check.submission import check_submission
+from megloc_kapture.io.side_tables import ImageGroup, SimilarityTransform, World
+
+CLASSIC = {
+    "inverted": ("inverted",),
+    "centre": ("centre",),
+    "xyzw": ("xyzw",),
+    "axes": ("axes",),
+}
+# what tools of other fields hand out: camera-to-world with OpenGL's axes, scipy's quaternions
+COMBINED = {
+    "inverted+axes": ("inverted", "axes"),
+    "xyzw+inverted": ("xyzw", "inverted"),
+    "xyzw+axes": ("xyzw", "axes"),
+    "xyzw+inverted+axes": ("xyzw", "inverted", "axes"),
+    "world-axes": ("world-axes",),
+}
+MADE = ("street", "table", "city", "floors")
+
+Check = Callable[..., CheckReport]
+
+
+@pytest.fixture
+def check(tmp_path: Path) -> Check:
+    def run(lines: Sequence[str], reference: Reference | None) -> CheckReport:
+        path = tmp_path / "poses.txt"
+        path.write_text("".join(lines))
+        return check_submission(path, dataset="kapture", reference=reference)
+
+    return run
+
+
+def only_error(report: CheckReport) -> Finding:
+    errors = [finding for finding in report.findings if finding.severity == "error"]
+    assert len(errors) == 1, report.lines()
+    return errors[0]
+
+
+@pytest.mark.parametrize(
+    "name", ["fountain_p11", "herzjesu_p25", "herzjesu_wide", "redkitchen_rgbd"]
+)
+def test_real_scenes_pass(real_scene: Any, pose_lines: Any, check: Check, name: str) -> None:
+    scene = real_scene(name)
+    report = check(pose_lines(scene), scene.reference())
+    assert not report.has_problems and report.lines()[-1].endswith("no problem found")
+    assert {finding.kind for finding in report.findings} <= {"undecided"}
+
+
+@pytest.mark.parametrize("mistake", [*CLASSIC, *COMBINED])
+@pytest.mark.parametrize("name", ["fountain_p11", "herzjesu_p25", "herzjesu_wide"])
+def test_mistakes_in_real_scenes(
+    real_scene: Any, pose_lines: Any, check: Check, name: str, mistake: str
+) -> None:
+    scene = real_scene(name)
+    lines = pose_lines(scene, (CLASSIC | COMBINED)[mistake])
+    assert only_error(check(lines, scene.reference())).kind == mistake
+
+
+@pytest.mark.parametrize("mistake", CLASSIC)
+def test_mistakes_where_cameras_hardly_turn(
+    real_scene: Any, pose_lines: Any, check: Check, mistake: str
+) -> None:
+    # a rotation near the identity is near its inverse: what cannot be told apart is said
+    scene = real_scene("redkitchen_rgbd")
+    error = only_error(check(pose_lines(scene, CLASSIC[mistake]), scene.reference()))
+    if mistake in ("inverted", "centre"):
+        assert error.kind in ("inverted", "centre")
+        assert "inverted" in error.message and "centre stands" in error.message
+        assert "cannot tell" in error.message
+    else:
+        assert error.kind == mistake
+
+
+@pytest.mark.parametrize("mess", [False, True], ids=["clean", "messy"])
+@pytest.mark.parametrize("name", MADE)
+def test_made_scenes_pass(
+    make_scene: Any, pose_lines: Any, check: Check, name: str, mess: bool
+) -> None:
+    scene = whole = make_scene(name)
+    if mess:
+        scene = scene.disturbed(wrong=0.2, noise=0.05 * scene.size**0.5, angle_deg=5)
+    report = check(pose_lines(scene), whole.reference())
+    assert not report.has_problems, report.lines()
+    told = {finding.kind: finding.severity for finding in report.findings}
+    assert told == ({"far": "warning", "missing": "warning"} if mess else {})
+
+
+@pytest.mark.parametrize("mess", [False, True], ids=["clean", "messy"])
+@pytest.mark.parametrize("mistake", [*CLASSIC, *COMBINED])
+@pytest.mark.parametrize("name", MADE)
+def test_mistakes_in_made_scenes(
+    make_scene: Any, pose_lines: Any, check: Check, name: str, mistake: str, mess: bool
+) -> None:
+    scene = whole = make_scene(name)
+    if mess:
+        scene = scene.disturbed(wrong=0.2, noise=0.05 * scene.size**0.5, angle_deg=5)
+    lines = pose_lines(scene, (CLASSIC | COMBINED)[mistake])
+    error = only_error(check(lines, whole.reference()))
+    assert error.kind == mistake, error
+    if mistake == "world-axes" and not mess:
+        assert "its x, y, z are the map's x, z, -y" in error.message
+
+
+def test_poses_in_the_local_frame(make_scene: Any, pose_lines: Any, check: Check) -> None:
+    scene = make_scene("street")
+    origin = scene.map_centers.mean(axis=0)
+    local = replace(scene, map_centers=scene.map_centers - origin)
+    world = World(official_from_local=SimilarityTransform(translation=tuple(origin.tolist())))
+    reference = replace(local.reference(), world=world)
+    assert not check(pose_lines(scene), reference).has_problems
+    forgotten = pose_lines(replace(scene, centers=scene.centers - origin))
+    error = only_error(check(forgotten, reference))
+    assert error.kind == "frame" and "offset of world.json" in error.message
+
+
+def test_a_whole_file_on_the_other_floor(make_scene: Any, pose_lines: Any, check: Check) -> None:
+    scene = make_scene("floors")
+    lines = pose_lines(scene)
+    first = [line.split(" ", 1)[1] for line in lines]
+    swapped = [
+        f"{name} {pose}"
+        for name, pose in zip(scene.query_names(), [*first[30:], *first[:30]], strict=True)
+    ]
+    error = only_error(check(swapped, scene.reference()))
+    assert error.kind == "floor" and "another floor" in error.message
+
+
+def test_some_poses_on_the_other_floor(make_scene: Any, pose_lines: Any, check: Check) -> None:
+    scene = make_scene("floors")
+    lines = pose_lines(scene)
+    lines[3] = f"{scene.query_names()[3]} {lines[40].split(' ', 1)[1]}"
+    report = check(lines, scene.reference())
+    assert not report.has_problems
+    floor, far = sorted(report.findings, key=lambda finding: finding.kind, reverse=True)
+    assert floor.severity == "warning" and floor.names == ("q/00003.jpg",)
+    assert "fits the cameras of F2, and its query belongs to F1" in floor.message
+    assert far.names == floor.names
+
+
+def test_floors_that_nobody_knows(make_scene: Any, pose_lines: Any, check: Check) -> None:
+    scene = replace(make_scene("floors"), query_frames=())
+    report = check(pose_lines(scene), scene.reference())
+    assert [finding.kind for finding in report.findings] == ["floor-unknown"]
+
+
+@pytest.mark.parametrize("storeys", [1, -1])
+def test_heights_a_storey_off(make_scene: Any, pose_lines: Any, check: Check, storeys: int) -> None:
+    scene = make_scene("floors")
+    shifted = replace(scene, centers=scene.centers + [0, 0, 3.5 * storeys])
+    errors = [f for f in check(pose_lines(shifted), scene.reference()).findings]
+    assert {error.kind for error in errors} == {"height"}
+    side = "above" if storeys > 0 else "below"
+    told = rf"most poses stand 3\.[456] m {side} the map's cameras of F1"
+    assert re.search(told, errors[0].message)
+    # half a metre is how people hold cameras
+    held = replace(scene, centers=scene.centers + [0, 0, 0.5 * storeys])
+    assert not check(pose_lines(held), scene.reference()).findings
+
+
+def test_single_poses_far_from_everything(make_scene: Any, pose_lines: Any, check: Check) -> None:
+    scene = make_scene("city")
+    centers = scene.centers.copy()
+    centers[5] += [0, 2000, 0]
+    centers[9] += [0, 900, 0]
+    report = check(pose_lines(replace(scene, centers=centers)), scene.reference())
+    (finding,) = report.findings
+    assert (finding.severity, finding.kind) == ("warning", "far")
+    assert finding.names == ("q/00005.jpg", "q/00009.jpg")
+    assert not report.has_problems
+
+
+def test_a_pose_far_from_what_its_prior_permits(
+    make_scene: Any, pose_lines: Any, check: Check
+) -> None:
+    scene = make_scene("street")
+    reference = scene.reference()
+    y = scene.map_centers[:, 1] - scene.map_centers[:, 1].min()
+    images = reference.cameras.images
+    groups = {
+        image: ImageGroup(location="south" if at < 300 else "north")
+        for image, at in zip(images, y, strict=True)
+    }
+    own = scene.centers[:, 1] - scene.map_centers[:, 1].min()
+    priors = {
+        query: ("south" if at < 300 else "north",)
+        for query, at in zip(scene.query_names(), own, strict=True)
+    }
+    right = replace(reference, groups=groups, priors=priors)
+    assert not check(pose_lines(scene), right).findings
+    strayed = int(np.argmin(own))
+    priors[scene.query_names()[strayed]] = ("north",)
+    report = check(pose_lines(scene), replace(right, priors=priors))
+    assert [finding.kind for finding in report.findings] == ["far"]
+    assert report.findings[0].names == (scene.query_names()[strayed],)
+
+
+def test_poses_in_a_frame_that_nothing_explains(
+    make_scene: Any, pose_lines: Any, check: Check
+) -> None:
+    scene = make_scene("city")
+    moved = replace(scene, centers=scene.centers + [5000.0, 300.0, 0.0])
+    error = only_error(check(pose_lines(moved), scene.reference()))
+    assert error.kind == "far" and "another frame, or another scale" in error.message
+
+
+def test_cameras_that_look_elsewhere_are_a_warning(
+    make_scene: Any, pose_lines: Any, check: Check
+) -> None:
+    # sideways from a map that looks back: unusual, and right if they were taken so
+    scene = make_scene("street")
+    rear = slice(300, 600)
+    aside = replace(
+        scene,
+        map_rotations=scene.map_rotations[rear],
+        map_centers=scene.map_centers[rear],
+        rotations=np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]]) @ scene.rotations,
+    )
+    report = check(pose_lines(aside), aside.reference())
+    assert not report.has_problems
+    assert "orientation" in {finding.kind for finding in report.findings}
+
+
+def test_too_few_poses_to_tell(make_scene: Any, pose_lines: Any, check: Check) -> None:
+    scene = make_scene("city")
+    report = check(pose_lines(scene, ("inverted",))[:2], scene.reference())
+    assert "too-few" in {finding.kind for finding in report.findings}
+    whole = pose_lines(scene, ("inverted",))[:5]
+    assert only_error(check(whole, scene.reference())).kind == "inverted"
+
+
+def test_too_few_cameras_to_compare_with(make_scene: Any, pose_lines: Any, check: Check) -> None:
+    scene = make_scene("city")
+    small = replace(scene, map_rotations=scene.map_rotations[:2], map_centers=scene.map_centers[:2])
+    report = check(pose_lines(scene, ("inverted",)), small.reference())
+    (note,) = report.findings
+    assert note.severity == "note" and "the map has 2 cameras" in note.message
+
+
+def test_numbers_that_overflow_are_far(make_scene: Any, pose_lines: Any, check: Check) -> None:
+    scene = make_scene("table")
+    lines = pose_lines(scene)
+    lines[2] = f"{scene.query_names()[2]} 1 0 0 0 1e308 -1e308 1e308\n"
+    report = check(lines, scene.reference())
+    assert [(f.severity, f.kind, f.names) for f in report.findings] == [
+        ("warning", "far", (scene.query_names()[2],))
+    ]
+
+
+def test_a_straight_path_is_best_in_any_order() -> None:
+    times = np.array([3.0, 0.0, 1.0, 7.0])
+    centers = times[:, None] * [1.0, -2.0, 0.5]
+    np.testing.assert_allclose(path_scores(centers, times, np.ones(4)), 0.0, atol=1e-12)
+    centers[2] += [0.0, 0.0, 3.0]
+    scores = path_scores(centers, times, np.full(4, 2.0))
+    # the ends have no neighbours on both sides
+    np.testing.assert_allclose(scores[[1, 2, 3]], [0.0, -np.log1p(1.5), 0.0])
+    assert scores[0] < 0
+
+
+def test_equal_times_and_few_rows_say_nothing() -> None:
+    centers = np.random.default_rng(0).normal(size=(4, 3))
+    assert not path_scores(centers, np.zeros(4), np.ones(4)).any()
+    assert not path_scores(centers[:2], np.arange(2.0), np.ones(2)).any()

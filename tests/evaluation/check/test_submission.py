@@ -1,0 +1,267 @@
+"""Whole checks: files alone, MLAD's files and folders, and how they are told."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.evaluation.check.findings import CheckReport, Finding
+from megloc_kapture.evaluation.check.reading import MapCameras, Reference, read_reference
+from megloc_kapture.evaluation.check.submission import (
+    check_submission,
+)
+from megloc_kapture.io.challenge_tables import RelocalizationPair
+from megloc_kapture.io.side_tables import Protocol
+
+START = 1_600_000_000_000_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """A reference recording and a query recording along one road, and the pairs asked for."""
+
+    reference: Reference
+    rotations: np.ndarray  # query_from_reference
+    translations: np.ndarray
+    stamps: list[str]
+
+    def lines(self, mistake: str = "") -> list[str]:
+        rotations, translations = self.rotations, self.translations
+        if mistake in ("inverted", "centre"):
+            translations = -np.einsum("nji,nj->ni", rotations, translations)
+        if mistake == "inverted":
+            rotations = rotations.transpose(0, 2, 1)
+        quats = Rotation.from_matrix(rotations).as_quat()
+        if mistake == "wxyz":
+            quats = np.roll(quats, 1, axis=1)
+        return [
+            " ".join([pair, *(repr(float(v)) for v in (*t, *q))]) + "\n"
+            for pair, t, q in zip(self.stamps, translations, quats, strict=True)
+        ]
+
+
+def drive(number: int = 120) -> Drive:
+    """Along a bend; the query drives in the other lane, its references some metres before it."""
+    rng = np.random.default_rng(0)
+    along = np.arange(0, 500, 1.0)
+
+    def cameras(at: np.ndarray, side: float) -> tuple[np.ndarray, np.ndarray]:
+        heading = at / 120
+        forward = np.stack([np.cos(heading), np.sin(heading), 0 * at], axis=1)
+        down = np.tile([0.0, 0.0, -1.0], (len(at), 1))
+        rotations = np.stack([np.cross(down, forward), down, forward], axis=1)
+        path = 120 * np.stack([np.sin(heading), 1 - np.cos(heading), 0 * at], axis=1)
+        return rotations, path + side * rotations[:, 0]
+
+    map_rotations, map_centers = cameras(along, 0.0)
+    chosen = np.sort(rng.choice(np.arange(20, 480), number, replace=False))
+    references = np.clip(chosen + rng.integers(-6, 7, number), 0, 499)
+    rotations, centers = cameras(chosen.astype(float), 2.0)
+    relative = rotations @ map_rotations[references].transpose(0, 2, 1)
+    translations = np.einsum("nij,nj->ni", rotations, map_centers[references] - centers)
+    images = tuple(f"ref/cam0/{START + 10**8 * i}.png" for i in range(500))
+    queries = [f"query/cam0/{START + 10**15 + 10**8 * int(i)}.png" for i in chosen]
+    quats = np.roll(Rotation.from_matrix(map_rotations).as_quat(), 1, axis=1)
+    pairs = [
+        RelocalizationPair("reloc_a_to_b.txt", images[r], q)
+        for r, q in zip(references, queries, strict=True)
+    ]
+    reference = Reference(
+        folder="import",
+        protocol=Protocol(dataset="4seasons", pose_file="mlad"),
+        queries=frozenset(queries),
+        relocalization=pairs,
+        cameras=MapCameras(images, quats, map_centers),
+    )
+    stamps = [f"{Path(p.reference).stem} {Path(p.query).stem}" for p in pairs]
+    return Drive(reference, relative, translations, stamps)
+
+
+DRIVE = drive()
+Check = Callable[..., CheckReport]
+
+
+@pytest.fixture
+def check(tmp_path: Path) -> Check:
+    def run(
+        lines: Sequence[str],
+        reference: Reference | None = DRIVE.reference,
+        name: str = "reloc_a_to_b.txt",
+        dataset: str = "4seasons",
+    ) -> CheckReport:
+        (tmp_path / name).write_text("".join(lines))
+        return check_submission(tmp_path / name, dataset=dataset, reference=reference)
+
+    return run
+
+
+def told(report: CheckReport) -> list[tuple[str, str]]:
+    return [(finding.severity, finding.kind) for finding in report.sorted_findings]
+
+
+def test_a_right_mlad_file(check: Check) -> None:
+    report = check(DRIVE.lines())
+    assert report.findings == () and (report.poses, report.expected) == (120, 120)
+    assert report.lines() == ["120 poses of 120 queries: no problem found"]
+
+
+@pytest.mark.parametrize("mistake", ["inverted", "wxyz"])
+def test_mistakes_of_mlad_files(check: Check, mistake: str) -> None:
+    (error,) = check(DRIVE.lines(mistake)).findings
+    assert error.severity == "error" and error.kind == mistake
+
+
+def test_a_centre_in_an_mlad_file_is_hard_to_tell_from_an_inverse(check: Check) -> None:
+    # between keyframes some metres apart a car hardly turns
+    (error,) = check(DRIVE.lines("centre")).findings
+    assert "centre stands where the translation belongs" in error.message
+
+
+def test_absolute_poses_in_an_mlad_file(check: Check) -> None:
+    cameras = DRIVE.reference.cameras
+    assert cameras is not None
+    quats = Rotation.from_quat(np.roll(cameras.quats, -1, axis=1))
+    translations = -quats.apply(cameras.centers)
+    chosen = [
+        DRIVE.reference.cameras.images.index(p.reference) for p in DRIVE.reference.relocalization
+    ]
+    rows = [
+        f"{pair} {' '.join(repr(float(v)) for v in (*translations[i], *quats.as_quat()[i]))}\n"
+        for pair, i in zip(DRIVE.stamps, chosen, strict=True)
+    ]
+    (error,) = check(rows).findings
+    assert error.kind == "absolute"
+
+
+def test_rows_of_an_mlad_file(check: Check) -> None:
+    lines = DRIVE.lines()
+    missing = check(lines[1:])
+    assert told(missing) == [("error", "missing")] and missing.has_problems
+    swapped = [" ".join([b, a, rest]) for a, b, rest in (line.split(" ", 2) for line in lines)]
+    assert told(check(swapped)) == [("error", "swapped")]
+    assert told(check(lines[::-1])) == [("note", "order")]
+
+
+def test_dummies_are_noted_and_prove_nothing(check: Check) -> None:
+    lines = DRIVE.lines()
+    lines[3:9] = [f"{pair} 0 0 0 0 0 0 1\n" for pair in DRIVE.stamps[3:9]]
+    report = check(lines)
+    assert told(report) == [("note", "dummies")] and len(report.findings[0].names) == 6
+    allowed = check([f"{pair} 0 0 0 0 0 0 1\n" for pair in DRIVE.stamps])
+    assert told(allowed) == [("note", "dummies")]
+
+
+def test_few_rows_leave_doubts(check: Check) -> None:
+    few = replace(DRIVE.reference, relocalization=DRIVE.reference.relocalization[:12])
+    report = check(DRIVE.lines()[:12], few)
+    assert told(report) in ([], [("note", "undecided")])
+    assert told(check(DRIVE.lines("wxyz")[:12], few)) == [("error", "wxyz")]
+
+
+def test_a_folder_of_mlad_files(tmp_path: Path, check: Check) -> None:
+    pairs = [replace(p, file="second.txt") for p in DRIVE.reference.relocalization[60:]]
+    both = replace(DRIVE.reference, relocalization=[*DRIVE.reference.relocalization[:60], *pairs])
+    folder = tmp_path / "submission"
+    folder.mkdir()
+    (folder / "reloc_a_to_b.txt").write_text("".join(DRIVE.lines()[:60]))
+    report = check_submission(folder, dataset="4seasons", reference=both)
+    assert told(report) == [("error", "missing-file")]
+    (folder / "second.txt").write_text("".join(DRIVE.lines()[60:]))
+    report = check_submission(folder, dataset="4seasons", reference=both)
+    assert not report.findings and report.poses == 120
+    (folder / "third.txt").write_text("")
+    report = check_submission(folder, dataset="4seasons", reference=both)
+    assert told(report) == [("warning", "unknown-file")]
+    (folder / "second.txt").write_text("1 2 3\n")
+    report = check_submission(folder, dataset="4seasons", reference=both)
+    assert "error: second.txt:1: 3 columns instead of 9" in "\n".join(report.lines())
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    with pytest.raises(DataError, match="no pose file"):
+        check_submission(empty, dataset="4seasons")
+
+
+def test_the_name_of_an_mlad_file(check: Check) -> None:
+    report = check(DRIVE.lines(), name="mine.txt")
+    assert told(report) == [("error", "file-name")]
+    assert "reloc_a_to_b.txt" in report.findings[0].message
+
+
+def test_a_file_alone(check: Check) -> None:
+    report = check(DRIVE.lines(), None)
+    assert told(report) == [("note", "not-checked")] * 2 and not report.has_problems
+    report = check(["a.jpg 1 0 0 0 0 0 0\n"], None, dataset="robotcar")
+    assert told(report) == [("error", "name-folder"), *[("note", "not-checked")] * 2]
+    assert "give one with --data" in report.lines()[1]
+
+
+def test_an_import_without_a_map(check: Check) -> None:
+    report = check(DRIVE.lines(), replace(DRIVE.reference, cameras=None))
+    assert told(report) == [("note", "not-checked")]
+
+
+@pytest.mark.parametrize("content", ["", "\n\n"])
+def test_empty_files(check: Check, content: str) -> None:
+    assert ("error", "empty") in told(check([content]))
+    assert ("error", "empty") in told(check([content], None, dataset="kapture"))
+
+
+def test_what_cannot_be_read(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="cannot read"):
+        check_submission(tmp_path / "absent.txt", dataset="kapture")
+    with pytest.raises(DataError, match="one file"):
+        check_submission(tmp_path, dataset="kapture")
+    with pytest.raises(DataError, match="no imported dataset"):
+        read_reference(tmp_path)
+
+
+def test_reports_are_short_as_text_and_whole_as_json() -> None:
+    findings = tuple(
+        Finding("error", "columns", f"broken {line}", file="x.txt", line=line)
+        for line in range(30, 0, -1)
+    )
+    note = Finding("note", "order", "in another order", file="x.txt")
+    warning = Finding("warning", "far", "far away", file="x.txt", names=("a", "b"))
+    report = CheckReport(
+        dataset="aachen",
+        file="x.txt",
+        reference="",
+        poses=5,
+        expected=None,
+        findings=(note, *findings, warning),
+    )
+    lines = report.lines()
+    assert lines[0] == "error: x.txt:1: broken 1" and lines[9] == "error: x.txt:10: broken 10"
+    assert lines[10:] == [
+        "warning: x.txt: far away",
+        "note: x.txt: in another order",
+        "error: 20 more of kind 'columns'; --json lists all",
+        "5 poses: 30 problems found, 1 warning",
+    ]
+    content = json.loads(json.dumps(report.to_json()))
+    assert content["ok"] is False and len(content["findings"]) == 32
+    assert content["findings"][0]["line"] == 1 and content["findings"][30]["names"] == ["a", "b"]
+
+
+@given(st.binary(max_size=60), st.integers(0, 4000))
+def test_random_damage_never_crashes(
+    tmp_path_factory: pytest.TempPathFactory, junk: bytes, place: int
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "reloc_a_to_b.txt"
+    good = "".join(DRIVE.lines()[:20]).encode()
+    path.write_bytes(good[:place] + junk + good[place:])
+    try:
+        report = check_submission(path, dataset="4seasons", reference=DRIVE.reference)
+    except DataError as error:
+        assert str(path) in str(error) and "\n" not in str(error)
+    else:
+        assert report.lines() and json.dumps(report.to_json(), allow_nan=False)

@@ -1,0 +1,310 @@
+"""Reports of one result and of several: text, files and page."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import pytest
+
+from megloc_kapture.errors import OutputError
+from megloc_kapture.evaluation.report.pages import query_table
+from megloc_kapture.evaluation.report.queries import disputed_queries, worst_queries
+from megloc_kapture.evaluation.report.reports import render_report, report_text, write_report
+from megloc_kapture.evaluation.scoring import Evaluation, evaluate_poses
+from megloc_kapture.evaluation.statistics import Comparison, compare, over_seeds
+from megloc_kapture.io.status_table import QueryStatus
+from megloc_kapture.values import RigidTransform
+
+HERE = RigidTransform.identity()
+
+
+def evaluation_of(world: Any) -> Evaluation:
+    return evaluate_poses(
+        world.estimated,
+        world.truth,
+        conditions=world.conditions,
+        statuses=world.statuses,
+        label="a <b>bold</b> & daring result",
+    )
+
+
+def test_well_formed_and_self_contained(world: Any, page_of: Any) -> None:
+    page = page_of(render_report(evaluation_of(world), map_poses=world.mapped))
+    assert page.ids and page.references
+
+
+def test_says_what_the_table_says(world: Any, page_of: Any) -> None:
+    evaluation = evaluation_of(world)
+    text = page_of(render_report(evaluation)).text
+    row = evaluation.row()
+    assert "32 of 40 queries localized, 4 more with a fallback pose, 4 without a pose" in text
+    for at in row.recall:
+        assert f"{100 * at.recall:.1f}" in text
+    for query in evaluation.queries:
+        assert query.image in text
+    assert "6 inliers, 12 needed" in text
+
+
+def test_names_are_escaped(world: Any, page_of: Any) -> None:
+    evil = '"><script>alert(1)</script>'
+    name = f"query/{evil}.jpg"
+    world.truth[name] = HERE
+    world.conditions = {n: "<i>day & $night$" for n in world.truth}
+    world.statuses[name] = QueryStatus(image=name, status="failed", reason=f"why {evil}")
+    evaluation = evaluation_of(world)
+    html = render_report(evaluation, provenance={"root": f"/data/{evil}"})
+    assert "<script" not in html
+    assert "<i>day" not in html
+    assert "<b>bold" not in html
+    text = page_of(html).text
+    assert name in text
+    assert f"why {evil}" in text
+
+
+def test_the_steps_of_the_paper_come_first(world: Any, page_of: Any) -> None:
+    steps = [
+        {"name": "ASLFeat", "on": True, "why": "preset megloc"},
+        {"name": "poses refined by ICP", "on": False, "why": "<no> depth"},
+    ]
+    html = render_report(evaluation_of(world), provenance={"preset": "megloc", "steps": steps})
+    text = page_of(html).text
+    assert "Steps of the paper: 1 of 2 are on" in text
+    assert text.index("ASLFeat") < text.index("poses refined by ICP") < text.index("Recall")
+    assert "<no> depth" in text and "<no>" not in html
+    assert "steps" not in html.partition("<pre>")[2]  # not once more at the end
+    assert "Steps of the paper" not in render_report(evaluation_of(world))
+
+
+def test_same_bytes_each_time_and_no_date(world: Any) -> None:
+    evaluation = evaluation_of(world)
+    options = {"preset": "classic"}
+    first = render_report(evaluation, map_poses=world.mapped, provenance=options)
+    assert render_report(evaluation, map_poses=world.mapped, provenance=options) == first
+    assert "dc:date" not in first
+
+
+def test_a_users_matplotlib_settings_change_nothing_and_are_kept(world: Any) -> None:
+    evaluation = evaluation_of(world)
+    first = render_report(evaluation)
+    with matplotlib.rc_context({"font.size": 30, "axes.linewidth": 5, "xtick.direction": "in"}):
+        assert render_report(evaluation) == first
+        assert matplotlib.rcParams["font.size"] == 30
+
+
+def test_queries_stand_the_worst_first(world: Any) -> None:
+    evaluation = evaluation_of(world)
+    table, num_hidden = query_table(evaluation)
+    cells = {own.heading: own.cells for own in table.columns}
+    images = [cell.text for cell in cells["image"]]
+    by_image = {query.image: query for query in evaluation.queries}
+    errors = [by_image[image].position_m for image in images]
+    assert errors == sorted(errors, reverse=True) and num_hidden == 0
+    missing = [image for image in images if by_image[image].outcome == "missing"]
+    assert missing == sorted(missing) == images[:4]
+    assert [cell.text for cell in cells["outcome"][:4]] == ["no pose"] * 4
+    assert str(cells["met"][0].page).count("○") == 4
+    assert cells["met"][-1].page == "●●●●"
+
+
+def test_a_single_query_without_status_condition_or_map(page_of: Any) -> None:
+    text = page_of(render_report(evaluate_poses({"a.jpg": HERE}, {"a.jpg": HERE}))).text
+    assert "1 of 1 queries localized." in text
+    assert "Error against inliers" not in text
+
+
+def test_nothing_localized(page_of: Any) -> None:
+    text = page_of(render_report(evaluate_poses({}, {"a": HERE, "b": HERE}))).text
+    assert "0 of 2 queries localized, 2 without a pose." in text
+    assert "median: most lack a pose" in text
+
+
+def test_estimates_off_the_page_are_counted(world: Any) -> None:
+    name = next(name for name in world.estimated if world.statuses[name].status == "localized")
+    world.estimated[name] = RigidTransform((1.0, 0.0, 0.0, 0.0), (-1e6, 0.0, 0.0))
+    evaluation = evaluation_of(world)
+    page = render_report(evaluation, map_poses=world.mapped)
+    assert "1 estimate lies outside the page." in page
+
+
+def test_many_queries_stay_a_small_page(worlds: Any) -> None:
+    evaluation = evaluation_of(worlds(num_queries=4000))
+    html = render_report(evaluation)
+    assert "3500 better ones are left out here" in " ".join(html.split())
+    assert len(html) < 3_000_000
+    assert render_report(evaluation) == html  # here the dots are pixels
+
+
+def test_files(world: Any, tmp_path: Path) -> None:
+    evaluation = evaluation_of(world)
+    paths = write_report(tmp_path / "evaluation", evaluation, map_poses=world.mapped)
+    assert sorted(path.name for path in (tmp_path / "evaluation").iterdir()) == sorted(paths)
+    assert paths["recall.txt"].read_text() == report_text(evaluation)
+    summary = json.loads(paths["recall.json"].read_text())
+    assert summary["label"] == evaluation.label
+    assert [row["name"] for row in summary["rows"]] == ["day", "night", "all"]
+    whole = summary["rows"][-1]
+    for at in whole["recall"]:
+        assert at["recall"] == at["num_within"] / whole["num_queries"]
+    assert whole["num_fallback"] == 4
+    with paths["per_query.csv"].open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["image"] for row in rows] == sorted(world.truth)
+    for row, position_m in zip(rows, evaluation.errors.position_m, strict=True):
+        if row["outcome"] == "missing":
+            assert row["position_error_m"] == "" and position_m == np.inf
+        else:
+            assert float(row["position_error_m"]) == position_m
+
+
+def test_files_are_the_same_each_time(world: Any, tmp_path: Path) -> None:
+    evaluation = evaluation_of(world)
+    first = write_report(tmp_path / "1", evaluation)
+    second = write_report(tmp_path / "2", evaluation)
+    for name, path in first.items():
+        assert path.read_bytes() == second[name].read_bytes()
+
+
+def test_an_unwritable_folder_is_named(world: Any, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="file"):
+        write_report(tmp_path / "file", evaluation_of(world))
+
+
+@pytest.fixture
+def results(worlds: Callable[..., Any]) -> list[Evaluation]:
+    """Two results on one truth; the second has lost the first eight poses of the day."""
+    world = worlds(num_queries=60)
+    options = {"conditions": world.conditions, "statuses": world.statuses}
+    lost = sorted(n for n in world.estimated if world.conditions[n] == "day")[:8]
+    fewer = {name: pose for name, pose in world.estimated.items() if name not in lost}
+    return [
+        evaluate_poses(world.estimated, world.truth, label="all of them", **options),
+        evaluate_poses(fewer, world.truth, label="fewer", **options),
+    ]
+
+
+def test_text(results: list[Evaluation]) -> None:
+    text = report_text(compare(results))
+    assert text.isascii() and max(map(len, text.splitlines())) <= 100
+    for evaluation in results:
+        for row in evaluation.rows:
+            recall = " / ".join(f"{100 * at.recall:.1f}" for at in row.recall)
+            assert f"{evaluation.label:11s}" in text and recall in text
+    flat = " ".join(text.split())
+    assert "all of them finds 8 queries that fewer misses" in flat
+    assert "the difference is real (p = 0." in flat
+    assert "Note on fewer:" in flat
+
+
+def test_long_labels_are_cut_in_the_table_only(results: list[Evaluation]) -> None:
+    long = [replace(e, label=f"/data/runs/{e.label}/{'x' * 40}/localized") for e in results]
+    lines = report_text(compare(long)).splitlines()
+    table = lines[: lines.index("", 4)]
+    assert max(map(len, table)) <= 112
+    assert any("/data/run...localized" in line for line in table)
+
+
+def test_files_of_a_comparison(
+    results: list[Evaluation], tmp_path: Path, page_of: Callable[..., Any]
+) -> None:
+    comparison = compare(results)
+    paths = write_report(tmp_path / "out", comparison)
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(paths)
+    assert paths["recall.txt"].read_text() == report_text(comparison)
+    summary = json.loads(paths["recall.json"].read_text())
+    assert [result["label"] for result in summary["results"]] == ["all of them", "fewer"]
+    tests = summary["comparison"]["tests"]
+    assert len(tests) == 4 and len(summary["comparison"]["tests_by_condition"]) == 8
+    test = tests[-1]
+    assert (test["first"], test["second"], test["row"]) == ("all of them", "fewer", "all")
+    assert len(test["only_first"]) == 8 and test["only_second"] == []
+    assert len(summary["comparison"]["sentences"]) >= 5
+    with paths["per_query.csv"].open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["image"] for row in rows] == list(results[0].errors.names)
+    lost = test["only_first"][0]
+    (row,) = [row for row in rows if row["image"] == lost]
+    assert (row["all of them: outcome"], row["fewer: outcome"]) == ("localized", "missing")
+    assert row["fewer: position_error_m"] == ""
+    index = results[0].errors.names.index(lost)
+    assert float(row["all of them: position_error_m"]) == results[0].errors.position_m[index]
+    with paths["differences.csv"].open(newline="") as file:
+        listed = list(csv.DictReader(file))
+    assert len(listed) == sum(len(t.only_first) + len(t.only_second) for t in comparison.tests)
+    assert {row["found_by"] for row in listed} == {"all of them"}
+    page = page_of(paths["report.html"].read_text())
+    for sentence in summary["comparison"]["sentences"]:
+        assert sentence in page.text
+
+
+def test_the_page_is_the_same_each_time(
+    results: list[Evaluation], worlds: Callable[..., Any]
+) -> None:
+    comparison = compare(results)
+    first = render_report(comparison, map_poses=worlds().mapped)
+    assert render_report(comparison, map_poses=worlds().mapped) == first
+
+
+def test_labels_are_escaped(results: list[Evaluation], page_of: Callable[..., Any]) -> None:
+    evil = replace(results[1], label="<script>alert('$x$')</script>")
+    page = page_of(render_report(compare([results[0], evil])))
+    assert evil.label in page.text
+
+
+def test_seeds_files(
+    results: list[Evaluation], tmp_path: Path, page_of: Callable[..., Any]
+) -> None:
+    paths = write_report(tmp_path, over_seeds(results))
+    summary = json.loads(paths["recall.json"].read_text())
+    assert [row["name"] for row in summary["seeds"]] == ["day", "night", "all"]
+    recalls = [result["rows"][-1]["recall"][1]["recall"] for result in summary["results"]]
+    found = summary["seeds"][-1]["recall"][1]
+    assert found["mean"] == pytest.approx(np.mean(recalls))
+    assert found["deviation"] == pytest.approx(np.std(recalls, ddof=1))
+    assert summary["seeds"][-1]["recall"][-1]["found_sometimes"] == 8
+    assert "comparison" not in summary
+    text = page_of(paths["report.html"].read_text()).text
+    assert "2 runs of one method" in text and "Is the difference real" not in text
+
+
+def test_disputed_queries_come_first(results: list[Evaluation]) -> None:
+    found = disputed_queries(results, number=10)
+    assert len({chosen.name for _, chosen in found}) == 10
+    lost = set(compare(results).tests[-1].only_first)
+    # two thirds of the places are for what the results disagree about
+    assert sum(chosen.name in lost for _, chosen in found) == 7
+    worse, chosen = found[0]
+    assert worse == 1 and chosen.name in lost
+    assert chosen.facts[1].startswith("fewer: no pose")
+
+
+def test_worst_queries_are_not_all_without_a_pose(worlds: Callable[..., Any]) -> None:
+    world = worlds(num_queries=40)
+    posed = dict(sorted(world.estimated.items())[:12])
+    evaluation = evaluate_poses(posed, world.truth, statuses=world.statuses)
+    chosen = worst_queries(evaluation, number=10)
+    with_pose = [one.name for one in chosen if one.name in posed]
+    assert len(chosen) == 10 and len(with_pose) == 5
+    worst = sorted(
+        posed, key=lambda n: -evaluation.errors.position_m[evaluation.errors.names.index(n)]
+    )
+    assert with_pose == worst[:5]
+    # where nothing is lost, all places are for errors
+    whole = evaluate_poses(world.truth, world.truth)
+    assert len(worst_queries(whole, number=10)) == 10
+    few = evaluate_poses({}, dict(list(world.truth.items())[:3]))
+    assert len(worst_queries(few, number=10)) == 3
+
+
+def test_medians_stand_in_the_comparison(results: list[Evaluation]) -> None:
+    comparison: Comparison = compare(results)
+    (median,) = comparison.medians
+    assert median.first_m == results[0].row().median_position_m
+    assert median.low_m <= median.first_m - median.second_m <= median.high_m

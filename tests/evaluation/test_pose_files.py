@@ -1,0 +1,354 @@
+"""Pose files of visuallocalization.net and of the MLAD challenges."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from megloc_kapture.errors import DataError, OutputError
+from megloc_kapture.evaluation.pose_files import (
+    RelativePose,
+    format_mlad_file,
+    format_pose_file,
+    names_in_pose_file,
+    poses_by_image,
+    read_mlad_file,
+    read_pose_file,
+    relative_pose,
+    timestamp_of,
+    write_pose_file,
+)
+from megloc_kapture.values import RigidTransform
+
+HERE = RigidTransform.identity()
+GOOD = "a.jpg 1 0 0 0 1.5 -0.2 3\n"
+GOOD_PAIR = "100 205 1.5 -0.2 3 0.8 0 0 0.6\n"
+
+
+def unit(values: list[float]) -> tuple[float, float, float, float]:
+    w, x, y, z = (np.array(values) / np.linalg.norm(values)).tolist()
+    return w, x, y, z
+
+
+finite = st.floats(-1e7, 1e7)
+quats = (
+    st.lists(st.floats(-1, 1), min_size=4, max_size=4)
+    .filter(lambda q: np.linalg.norm(q) > 1e-3)
+    .map(unit)
+)
+poses = st.builds(RigidTransform, quats, st.tuples(finite, finite, finite))
+names = st.text(
+    st.characters(exclude_categories=["Cc", "Cs", "Z"], codec="utf-8"), min_size=1, max_size=10
+).filter(lambda name: name.split() == [name])
+
+
+@given(st.dictionaries(names, poses, max_size=6))
+def test_every_bit_reads_back(
+    tmp_path_factory: pytest.TempPathFactory, written: dict[str, RigidTransform]
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "round_trip.txt"
+    write_pose_file(path, written)
+    assert read_pose_file(path) == written
+    assert list(read_pose_file(path)) == sorted(written)
+
+
+def test_what_a_server_reads() -> None:
+    pose = RigidTransform((1.0, 0.0, 0.0, 0.0), (1.5, -0.2, 3.0))
+    third = RigidTransform((0.5, 0.5, -0.5, 0.5), (1 / 3, -2e-17, 1e6))
+    assert format_pose_file({"q/b.jpg": third, "q/a.jpg": pose}, names="basename") == (
+        "a.jpg 1.0 0.0 0.0 0.0 1.5 -0.2 3.0\n"
+        "b.jpg 0.5 0.5 -0.5 0.5 0.3333333333333333 -2e-17 1000000.0\n"
+    )
+
+
+def test_a_list_names_the_rows_and_orders_them() -> None:
+    listed = {"night/rear/2.jpg": "rear/2.png", "dawn/rear/1.jpg": "rear/1.png", "x.jpg": "x.png"}
+    given_poses = dict.fromkeys(["dawn/rear/1.jpg", "night/rear/2.jpg", "dawn/left/1.jpg"], HERE)
+    text = format_pose_file(given_poses, names=listed)
+    assert [line.split()[0] for line in text.splitlines()] == ["rear/2.png", "rear/1.png"]
+
+
+def test_a_list_that_calls_two_images_alike_is_refused() -> None:
+    with pytest.raises(DataError, match=r"a/1\.jpg.*b/1\.jpg.*'1\.jpg'"):
+        names_in_pose_file(["a/1.jpg", "b/1.jpg"], {"a/1.jpg": "1.jpg", "b/1.jpg": "1.jpg"})
+    with pytest.raises(DataError, match="cannot hold"):
+        names_in_pose_file(["a"], {"a": "a b"})
+
+
+def test_no_poses_make_an_empty_file(tmp_path: Path) -> None:
+    write_pose_file(tmp_path / "poses.txt", {})
+    assert (tmp_path / "poses.txt").read_bytes() == b""
+    assert read_pose_file(tmp_path / "poses.txt") == {}
+
+
+def test_basenames_that_collide_are_refused_by_both_names() -> None:
+    images = ["query/day/1.jpg", "query/night/1.jpg"]
+    with pytest.raises(DataError, match=r"query/day/1\.jpg.*query/night/1\.jpg"):
+        names_in_pose_file(images, "basename")
+    assert names_in_pose_file(images, "full") == {image: image for image in images}
+
+
+@pytest.mark.parametrize("image", ["a b.jpg", "a\tb.jpg", " a.jpg", "folder/", "a\u00a0b.jpg"])
+def test_names_the_format_cannot_hold(image: str) -> None:
+    with pytest.raises(DataError, match="cannot hold"):
+        names_in_pose_file([image], "basename")
+
+
+@pytest.mark.parametrize(
+    ("pose", "words"),
+    [
+        (RigidTransform((1.0, 0.0, 0.0, 0.0), (math.nan, 0.0, 0.0)), "not finite"),
+        (RigidTransform((1.0, 0.0, 0.0, 0.0), (0.0, math.inf, 0.0)), "not finite"),
+        (RigidTransform((math.nan, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), "not finite"),
+        (RigidTransform((0.9, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), "length 0.9"),
+    ],
+)
+def test_a_pose_that_must_not_be_handed_in(
+    tmp_path: Path, pose: RigidTransform, words: str
+) -> None:
+    with pytest.raises(DataError, match=words):
+        write_pose_file(tmp_path / "poses.txt", {"good.jpg": HERE, "bad.jpg": pose})
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "a.jpg\t1  0 0 0 1.5 -0.2 3 \r\n",
+        "\ufeffa.jpg 1 0 0 0 1.5 -0.2 3\n",
+        "\n\na.jpg 1e0 0 0 0 1.5 -.2 +3\n\n",
+        "a.jpg 1.0009 0 0 0 1.5 -0.2 3\n",
+    ],
+    ids=["tabs and crlf", "byte order mark", "empty lines", "slightly off unit length"],
+)
+def test_foreign_habits_are_taken(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "poses.txt"
+    path.write_text(text, encoding="utf-8", newline="")
+    assert read_pose_file(path) == {"a.jpg": RigidTransform((1.0, 0.0, 0.0, 0.0), (1.5, -0.2, 3.0))}
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("b.jpg 1 0 0 0 1.5 -0.2", "7 columns instead of 8"),
+        ("b.jpg 1 0 0 0 1.5 -0.2 3 4", "9 columns instead of 8"),
+        ("# name qw qx qy qz tx ty tz", "9 columns"),
+        ("b.jpg, 1, 0, 0, 0, 1.5, -0.2, 3", "is not a number"),
+        ("b.jpg 1 0 0 0 1.5 -0.2 x", "is not a number"),
+        ("b.jpg 1 0 0 0 1_5 -0.2 3", "is not a number"),
+        ("b.jpg 1 0 0 0 ١ -0.2 3", "'١' is not a number"),
+        ("b.jpg 1 0 0 0 nan -0.2 3", "not finite"),
+        ("b.jpg 1 0 0 0 1e999 -0.2 3", "not finite"),
+        ("b.jpg 1 0 0 0 inf -0.2 3", "not finite"),
+        ("b.jpg nan 0 0 0 1 -0.2 3", "not finite"),
+        ("b.jpg 1 1 0 0 1 -0.2 3", "length 1.414"),
+        ("b.jpg 0 0 0 0 1 -0.2 3", "length 0"),
+        ("b.jpg 1.0011 0 0 0 1 -0.2 3", "length 1.0011"),
+        ("a.jpg 1 0 0 0 1 -0.2 3", "given twice"),
+    ],
+)
+def test_broken_lines_are_named(tmp_path: Path, line: str, words: str) -> None:
+    path = tmp_path / "poses.txt"
+    path.write_text(f"{GOOD}\n{line}\n")
+    with pytest.raises(DataError, match=words) as caught:
+        read_pose_file(path)
+    assert caught.value.line == 3
+    assert str(caught.value).startswith(f"{path}:3: ")
+
+
+def test_a_file_cut_short_is_not_read(tmp_path: Path) -> None:
+    path = tmp_path / "poses.txt"
+    path.write_text(GOOD + "b.jpg 1 0 0 0 1.5 -0.2 3.14")
+    with pytest.raises(DataError, match="cut short") as caught:
+        read_pose_file(path)
+    assert caught.value.line == 2
+
+
+def test_a_file_that_is_no_text(tmp_path: Path) -> None:
+    path = tmp_path / "poses.txt"
+    path.write_bytes(GOOD.encode() + b"\xff\xfe\n")
+    with pytest.raises(DataError, match="UTF-8") as caught:
+        read_pose_file(path)
+    assert caught.value.line == 2
+    with pytest.raises(DataError, match="cannot read"):
+        read_pose_file(tmp_path / "absent.txt")
+    with pytest.raises(DataError, match="cannot read"):
+        read_pose_file(tmp_path)
+
+
+@given(st.binary(max_size=60), st.integers(0, len(GOOD)))
+def test_random_damage_never_crashes(
+    tmp_path_factory: pytest.TempPathFactory, junk: bytes, place: int
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "damaged.txt"
+    good = 2 * GOOD.encode()
+    path.write_bytes(good[:place] + junk + good[place:])
+    try:
+        found = read_pose_file(path)
+    except DataError as error:
+        assert str(path) in str(error)
+        assert "\n" not in str(error)
+    else:
+        assert all(np.isfinite(pose.translation).all() for pose in found.values())
+
+
+def test_an_unwritable_place_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="file"):
+        write_pose_file(tmp_path / "file" / "poses.txt", {"a.jpg": HERE})
+
+
+def test_short_names_find_their_images() -> None:
+    images = ["q/day/1.jpg", "q/day/2.jpg", "q/night/2.jpg"]
+    found = poses_by_image({"1.jpg": HERE, "q/day/2.jpg": HERE, "9.jpg": HERE}, images)
+    assert list(found) == ["q/day/1.jpg", "q/day/2.jpg", "9.jpg"]
+    with pytest.raises(DataError, match="may be 'q/day/2.jpg' or 'q/night/2.jpg'"):
+        poses_by_image({"2.jpg": HERE}, images)
+    with pytest.raises(DataError, match="in two ways"):
+        poses_by_image({"1.jpg": HERE, "q/day/1.jpg": HERE}, images)
+
+
+def test_names_of_a_list_find_their_images() -> None:
+    listed = {"dawn/rear/1.jpg": "rear/1.png", "dusk/rear/2.jpg": "rear/2.png"}
+    found = poses_by_image({"rear/1.png": HERE, "dusk/rear/2.jpg": HERE}, listed, listed)
+    assert list(found) == ["dawn/rear/1.jpg", "dusk/rear/2.jpg"]
+    with pytest.raises(DataError, match="in two ways"):
+        poses_by_image({"rear/1.png": HERE, "dawn/rear/1.jpg": HERE}, listed, listed)
+
+
+stamps = st.integers(0, 10**19)
+rows = st.lists(
+    st.builds(RelativePose, stamps, stamps, poses),
+    max_size=5,
+    unique_by=lambda row: (row.reference, row.query),
+)
+
+
+@given(rows)
+def test_every_bit_of_pairs_reads_back(
+    tmp_path_factory: pytest.TempPathFactory, written: list[RelativePose]
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "mlad_round_trip.txt"
+    path.write_text(format_mlad_file(written))
+    assert read_mlad_file(path) == written
+
+
+def test_the_columns_of_the_challenge() -> None:
+    pose = RigidTransform((0.6, 0.8, 0.0, 0.0), (1.5, -0.2, 3.0))
+    text = format_mlad_file([RelativePose(1602074877390449152, 5, pose)])
+    assert text == "1602074877390449152 5 1.5 -0.2 3.0 0.8 0.0 0.0 0.6\n"
+
+
+def test_relative_poses_are_query_from_reference() -> None:
+    rng = np.random.default_rng(0)
+    turns = Rotation.random(2, random_state=0)
+    centers = rng.normal(size=(2, 3)) * 1e3
+    query, reference = (
+        RigidTransform.from_matrix(turn.as_matrix(), -turn.apply(center))
+        for turn, center in zip(turns, centers, strict=True)
+    )
+    found = relative_pose(query, reference)
+    point = rng.normal(size=(1, 3)) * 1e3
+    np.testing.assert_allclose(found.apply(reference.apply(point)), query.apply(point), atol=1e-9)
+    scaled = relative_pose(query, reference, scale=2.5)
+    assert scaled.quat_wxyz == found.quat_wxyz
+    np.testing.assert_allclose(scaled.translation, 2.5 * np.array(found.translation))
+
+
+@pytest.mark.parametrize("end", ["\n", ""])
+def test_lists_of_pairs(tmp_path: Path, end: str) -> None:
+    path = tmp_path / "pairs.txt"
+    path.write_bytes(b"1600000000000000000 1600000000000000001\r\n\r\n3\t4" + end.encode())
+    assert read_mlad_file(path) == [
+        RelativePose(1600000000000000000, 1600000000000000001),
+        RelativePose(3, 4),
+    ]
+
+
+def test_true_poses_of_training_files_without_a_last_line_end(tmp_path: Path) -> None:
+    path = tmp_path / "poses.txt"
+    path.write_text(GOOD_PAIR + "100 206 0 0 0 0 0 0 1")
+    first, second = read_mlad_file(path)
+    assert first.query_from_reference == RigidTransform((0.6, 0.8, 0.0, 0.0), (1.5, -0.2, 3.0))
+    assert second == RelativePose(100, 206, HERE)
+
+
+def test_an_empty_file_has_no_rows(tmp_path: Path) -> None:
+    (tmp_path / "poses.txt").write_text(format_mlad_file([]))
+    assert (tmp_path / "poses.txt").read_bytes() == b""
+    assert read_mlad_file(tmp_path / "poses.txt") == []
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("100 205", "2 columns instead of 9"),
+        ("100 206 0 0 0 0 0 0", "8 columns instead of 9 .src_ts tgt_ts tx"),
+        ("100 206 0 0 0 0 0 0 1 1", "10 columns"),
+        ("# src tgt", "3 columns"),
+        ("100 206 0 0 0 0 0 0 x", "'x' is not a number"),
+        ("100 206 0 0 0 0 0 0 1_0", "'1_0' is not a number"),
+        ("100 206 0 0 nan 0 0 0 1", "pair 100 206: the pose is not finite"),
+        ("100 206 0 0 0 0 0 0.1 1", "length 1.00499"),
+        ("100 206 0 0 0 0 0 0 0", "length 0"),
+        ("1e2 206 0 0 0 0 0 0 1", "'1e2' is not a timestamp"),
+        ("0100 206 0 0 0 0 0 0 1", "not a timestamp"),
+        ("-100 206 0 0 0 0 0 0 1", "not a timestamp"),
+        ("100 205 0 0 0 0 0 0 1", "pair 100 205 is given twice"),
+    ],
+)
+def test_broken_pairs_are_named(tmp_path: Path, line: str, words: str) -> None:
+    path = tmp_path / "poses.txt"
+    path.write_text(f"{GOOD_PAIR}\n{line}\n")
+    with pytest.raises(DataError, match=words) as caught:
+        read_mlad_file(path)
+    assert caught.value.line == 3 and str(caught.value).startswith(f"{path}:3: ")
+
+
+def test_a_pose_among_pairs(tmp_path: Path) -> None:
+    path = tmp_path / "pairs.txt"
+    path.write_text("1 2\n" + GOOD_PAIR)
+    with pytest.raises(DataError, match="9 columns instead of 2, as in the rows before"):
+        read_mlad_file(path)
+
+
+@pytest.mark.parametrize(
+    ("row", "words"),
+    [
+        (RelativePose(1, 2), "pair 1 2 has no pose; MLAD wants every row"),
+        (RelativePose(1, 2, RigidTransform((1, 0, 0, 0), (math.inf, 0, 0))), "not finite"),
+        (RelativePose(1, 2, RigidTransform((0.9, 0, 0, 0), (0, 0, 0))), "length 0.9"),
+    ],
+)
+def test_rows_that_must_not_be_handed_in(row: RelativePose, words: str) -> None:
+    with pytest.raises(DataError, match=words):
+        format_mlad_file([RelativePose(1, 1, HERE), row])
+
+
+def test_timestamps_are_the_names_of_images() -> None:
+    assert timestamp_of("rec/cam0/1602074877390449152.png") == 1602074877390449152
+    for name in ("a/frame_1.png", "0100.png", "1.5.png", "-5.png", "a/.png"):
+        with pytest.raises(DataError, match="not named after a timestamp"):
+            timestamp_of(name)
+
+
+@given(st.binary(max_size=60), st.integers(0, 2 * len(GOOD_PAIR)))
+def test_random_damage_of_pairs_never_crashes(
+    tmp_path_factory: pytest.TempPathFactory, junk: bytes, place: int
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "mlad_damaged.txt"
+    good = (GOOD_PAIR + GOOD_PAIR.replace("205", "206")).encode()
+    path.write_bytes(good[:place] + junk + good[place:])
+    try:
+        found = read_mlad_file(path)
+    except DataError as error:
+        assert str(path) in str(error) and "\n" not in str(error)
+    else:
+        given_poses = [row.query_from_reference for row in found if row.query_from_reference]
+        assert all(np.isfinite(pose.translation).all() for pose in given_poses)

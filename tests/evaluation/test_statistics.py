@@ -1,0 +1,252 @@
+"""Paired tests of results, and the spread over seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from megloc_kapture.errors import OptionError
+from megloc_kapture.evaluation.metrics import Threshold
+from megloc_kapture.evaluation.report.reports import report_text
+from megloc_kapture.evaluation.report.wording import format_spread
+from megloc_kapture.evaluation.scoring import Evaluation, evaluate_poses
+from megloc_kapture.evaluation.statistics import (
+    compare,
+    difference_interval,
+    holm,
+    mcnemar,
+    over_seeds,
+    resampled_medians,
+)
+from megloc_kapture.values import RigidTransform
+
+HERE = RigidTransform.identity()
+METRE = Threshold(position_m=1.0)
+
+
+def moved(metres: float) -> RigidTransform:
+    return RigidTransform((1.0, 0.0, 0.0, 0.0), (metres, 0.0, 0.0))
+
+
+def result(label: str, errors_m: Sequence[float], **options: Any) -> Evaluation:
+    """A result whose queries are off by these metres; infinite: no pose."""
+    names = [f"{i:04d}.jpg" for i in range(len(errors_m))]
+    estimated = {n: moved(e) for n, e in zip(names, errors_m, strict=True) if np.isfinite(e)}
+    options = {"thresholds": [METRE]} | options
+    return evaluate_poses(estimated, dict.fromkeys(names, HERE), label=label, **options)
+
+
+# two-sided probabilities of the sign test as printed in statistical tables (n, smaller count)
+SIGN_TEST = [
+    (5, 0, 0.0625),
+    (6, 0, 0.0312),
+    (8, 0, 0.0078),
+    (8, 1, 0.0703),
+    (10, 1, 0.0215),
+    (15, 3, 0.0352),
+    (20, 5, 0.0414),
+    (25, 7, 0.0433),
+    (25, 8, 0.1078),
+]
+
+
+@pytest.mark.parametrize(("number", "fewer", "printed"), SIGN_TEST)
+def test_the_tables_of_the_sign_test(number: int, fewer: int, printed: float) -> None:
+    assert mcnemar(fewer, number - fewer) == pytest.approx(printed, abs=5.1e-5)
+    assert mcnemar(number - fewer, fewer) == pytest.approx(printed, abs=5.1e-5)
+
+
+@given(st.integers(0, 400), st.integers(0, 400))
+def test_equal_to_scipys_binomial_test(only_first: int, only_second: int) -> None:
+    ours = float(mcnemar(only_first, only_second))
+    if only_first + only_second == 0:
+        assert ours == 1.0
+        return
+    theirs = stats.binomtest(only_first, only_first + only_second, 0.5).pvalue
+    assert ours == pytest.approx(theirs, rel=1e-9)
+
+
+def test_holm_by_hand() -> None:
+    # smallest times 4, then 3, 2, 1, never falling, never above 1
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert holm([0.6, 0.9]).tolist() == [1.0, 1.0]
+    assert holm([0.02]).tolist() == [0.02]
+    assert holm([]).tolist() == []
+
+
+def test_who_finds_what() -> None:
+    first = result("A", [0.1, 0.1, 0.1, 5.0, np.inf, 0.1])
+    second = result("B", [0.1, 5.0, np.inf, 0.1, np.inf, 0.2])
+    (test,) = compare([first, second]).tests
+    assert test.only_first == ("0001.jpg", "0002.jpg")
+    assert test.only_second == ("0003.jpg",)
+    assert (test.both, test.neither) == (2, 1)
+    assert test.p_value == test.p_adjusted == 1.0
+    assert not test.is_real
+
+
+def test_a_large_paired_difference_is_real_although_intervals_overlap() -> None:
+    rng = np.random.default_rng(0)
+    errors = np.where(rng.random(200) < 0.8, 0.1, 9.0)
+    worse = errors.copy()
+    worse[np.flatnonzero(errors < 1)[:12]] = 9.0
+    better, other = result("A", errors.tolist()), result("B", worse.tolist())
+    (test,) = compare([better, other]).tests
+    assert test.is_real
+    assert test.p_value == pytest.approx(2 * 0.5**12)
+    assert other.row().recall[0].high > better.row().recall[0].low
+
+
+def test_every_threshold_pair_and_row_is_tested_and_corrected() -> None:
+    rng = np.random.default_rng(1)
+    names = [f"{i:04d}.jpg" for i in range(60)]
+    options = {
+        "thresholds": [METRE, Threshold(position_m=5.0, angle_deg=10.0)],
+        "conditions": {name: ("day", "night")[i % 2] for i, name in enumerate(names)},
+        "pools": {"both": ("day", "night")},
+    }
+    results = [result(x, (10 ** rng.normal(0, 1, 60)).tolist(), **options) for x in "ABC"]
+    found = compare(results)
+    assert len(found.tests) == 3 * 2
+    assert len(found.tests_by_row) == 3 * 2 * 3
+    assert {test.row for test in found.tests_by_row} == {"day", "night", "both"}
+    for family in (found.tests, found.tests_by_row):
+        expected = holm([test.p_value for test in family])
+        assert [test.p_adjusted for test in family] == pytest.approx(expected.tolist())
+    for test in found.tests_by_row:
+        size = {"day": 30, "night": 30, "both": 60}[test.row]
+        listed = len(test.only_first) + len(test.only_second)
+        assert listed + test.both + test.neither == size
+    day = set(found.tests_by_row[0].only_first)
+    assert all(options["conditions"][name] == "day" for name in day)
+    assert [(m.first, m.second) for m in found.medians] == [(0, 1), (0, 2), (1, 2)]
+
+
+def test_equal_methods_raise_no_more_false_alarms_than_said() -> None:
+    # results share how hard a query is, and differ by chance only; three thresholds each
+    rng = np.random.default_rng(11)
+    thresholds = [Threshold(position_m=m) for m in (0.25, 0.5, 5.0)]
+    num_runs = 200
+    alarms = 0
+    for _ in range(num_runs):
+        hardness = rng.normal(-0.6, 0.8, 120)
+        pair = [
+            result(x, (10 ** (hardness + rng.normal(0, 0.4, 120))).tolist(), thresholds=thresholds)
+            for x in "AB"
+        ]
+        alarms += any(test.is_real for test in compare(pair).tests)
+    assert alarms / num_runs <= 0.05 + 3 * np.sqrt(0.05 * 0.95 / num_runs)
+
+
+def test_the_interval_of_a_median_difference_covers_the_true_one() -> None:
+    rng = np.random.default_rng(3)
+    num_runs, held = 200, 0
+    # log-normal errors: medians 0.1 and 0.13
+    for _ in range(num_runs):
+        shared = rng.normal(0, 0.7, 90)
+        first = 0.10 * np.exp(shared + rng.normal(0, 0.5, 90))
+        second = 0.13 * np.exp(shared + rng.normal(0, 0.5, 90))
+        low, high = difference_interval(resampled_medians(first), resampled_medians(second))
+        held += low <= -0.03 <= high
+    assert 0.95 - 3.5 * np.sqrt(0.05 * 0.95 / num_runs) <= held / num_runs < 1.0
+
+
+def test_medians_with_missing_poses() -> None:
+    values = np.array([0.1] * 40 + [np.inf] * 60)
+    medians = resampled_medians(values)
+    assert np.isinf(np.median(medians)) and np.isfinite(medians.min())
+    assert difference_interval(medians, medians) == (0.0, 0.0)
+    low, high = difference_interval(resampled_medians(np.full(100, 0.1)), medians)
+    assert low == -np.inf and high <= 0.0
+    # as many as fit at a time, and one by one: the same positions are drawn
+    assert resampled_medians(np.arange(5.0)).shape == (2000,)
+
+
+def test_median_of_resamples_is_numpys() -> None:
+    values = np.random.default_rng(2).exponential(size=31)
+    drawn = np.random.default_rng(0).integers(31, size=(2000, 31))
+    np.testing.assert_array_equal(resampled_medians(values), np.median(values[drawn], axis=1))
+    even = np.random.default_rng(2).exponential(size=30)
+    drawn = np.random.default_rng(0).integers(30, size=(2000, 30))
+    np.testing.assert_allclose(resampled_medians(even), np.median(even[drawn], axis=1), rtol=1e-15)
+
+
+def test_what_does_not_belong_together_is_refused() -> None:
+    first = result("A", [0.1, 0.2])
+    with pytest.raises(OptionError, match="at least two"):
+        compare([first])
+    with pytest.raises(OptionError, match="two results are called 'A'"):
+        compare([first, result("A", [0.1, 0.3])])
+    with pytest.raises(OptionError, match="A and B have different thresholds"):
+        compare([first, result("B", [0.1, 0.3], thresholds=[Threshold(position_m=2.0)])])
+    with pytest.raises(OptionError, match="A and B count different queries"):
+        compare([first, result("B", [0.1, 0.3, 0.2])])
+    with pytest.raises(OptionError, match="A and B have different conditions"):
+        compare([first, result("B", [0.1, 0.3], conditions={"0000.jpg": "night"})])
+
+
+THRESHOLDS = [Threshold(position_m=0.25), Threshold(position_m=1.0)]
+
+
+def run(label: str, errors_m: list[float]) -> Evaluation:
+    names = [f"{i}.jpg" for i in range(len(errors_m))]
+    estimated = {
+        name: RigidTransform((1.0, 0.0, 0.0, 0.0), (error, 0.0, 0.0))
+        for name, error in zip(names, errors_m, strict=True)
+        if np.isfinite(error)
+    }
+    return evaluate_poses(
+        estimated,
+        dict.fromkeys(names, RigidTransform.identity()),
+        conditions={name: ("day", "night")[int(name[0]) % 2] for name in names},
+        thresholds=THRESHOLDS,
+        label=label,
+    )
+
+
+def test_mean_deviation_and_stability() -> None:
+    runs = [
+        run("seed 1", [0.1, 0.1, 0.1, 2.0]),
+        run("seed 2", [0.1, 0.5, 0.1, np.inf]),
+        run("seed 3", [0.1, 0.1, 0.5, 0.1]),
+    ]
+    seeds = over_seeds(runs)
+    assert [row.name for row in seeds.rows] == ["day", "night", "all"]
+    whole = seeds.rows[-1]
+    recalls = [0.75, 0.5, 0.75]
+    at = whole.recall[0]
+    assert at.recall.mean == pytest.approx(np.mean(recalls))
+    assert at.recall.deviation == pytest.approx(np.std(recalls, ddof=1))
+    assert (at.recall.smallest, at.recall.largest) == (0.5, 0.75)
+    assert (at.always, at.sometimes, at.never) == (1, 3, 0)
+    assert (whole.recall[1].always, whole.recall[1].sometimes) == (3, 1)
+    assert whole.num_localized.mean == pytest.approx(11 / 3)
+    day = seeds.rows[0].recall[0]
+    assert day.recall.mean == pytest.approx((1 + 1 + 0.5) / 3)
+
+
+def test_a_run_without_median() -> None:
+    seeds = over_seeds([run("1", [np.inf, np.inf]), run("2", [0.1, 0.2])])
+    spread = seeds.rows[-1].median_position_m
+    assert np.isinf(spread.mean) and spread.smallest == pytest.approx(0.15)
+    assert format_spread(spread) == "inf"
+    assert "inf" in report_text(seeds)
+
+
+def test_as_text() -> None:
+    text = report_text(over_seeds([run("a", [0.1, 0.1]), run("b", [0.1, 0.5])]))
+    assert text.startswith("2 runs of one method: a, b\n")
+    assert "75.0 +- 35.4 / 100.0 +- 0.0" in text
+    assert "0.25 m  1 / 1 / 0\n" in text
+    assert max(map(len, text.splitlines())) <= 100 and text.isascii()
+
+
+def test_one_run_is_none() -> None:
+    with pytest.raises(OptionError, match="at least two"):
+        over_seeds([run("a", [0.1])])
