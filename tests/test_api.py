@@ -73,6 +73,18 @@ def test_a_folder_is_localized_when_it_is_asked_for(
         results.save(tmp_path / "mine")
 
 
+def test_results_are_evaluated_as_they_are(built: megloc.Map, scene: Path, tmp_path: Path) -> None:
+    results = built.localize(scene / "query")
+    found = megloc.evaluate(results, truth=scene / "query_gt")
+    assert "recall (%)" in str(found) and found.row().recall[0].recall == 1.0
+    results.save(tmp_path / "saved")
+    again = megloc.evaluate(tmp_path / "saved", truth=scene / "query_gt")
+    assert list(again.to_pandas().index) == list(results)
+    columns = ["position_error_m", "angle_error_deg"]
+    difference = found.to_pandas()[columns] - again.to_pandas()[columns]
+    assert np.abs(difference.to_numpy()).max() < 1e-9
+
+
 def test_the_command_writes_the_same_bytes(built: megloc.Map, scene: Path, tmp_path: Path) -> None:
     changes = [part for key, value in SMALL.items() for part in ("--set", f"{key}={value}")]
     place = built.kapture_map.folder.root
