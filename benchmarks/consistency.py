@@ -23,8 +23,12 @@ from scenes import errors_of, megloc
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.datasets.formats.inloc_files import read_transformation, write_transformation
-from megloc_kapture.io.consistency_table import CONSISTENCY_FILE, read_consistency
-from megloc_kapture.io.refinement_table import REFINEMENT_FILE, read_refinement
+from megloc_kapture.io.tables import (
+    CONSISTENCY_FILE,
+    REFINEMENT_FILE,
+    read_consistency,
+    read_refinement,
+)
 from megloc_kapture.values import RigidTransform
 
 sys.path.append(str(Path(__file__).resolve().parent / "speed"))

@@ -38,9 +38,8 @@ from megloc_kapture.datasets.synthetic.render import (
 from megloc_kapture.datasets.synthetic.shots import Shot, noise_seed
 from megloc_kapture.datasets.synthetic.studio import draw_shots
 from megloc_kapture.datasets.synthetic.views import View
-from megloc_kapture.io.depth_maps import write_depth_map
-from megloc_kapture.io.images import write_image
-from megloc_kapture.io.kapture_store import KaptureData, Sensor, write_sensors
+from megloc_kapture.io.images import write_depth_map, write_image
+from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
 from megloc_kapture.values import RigidTransform
 
 ROOMS = 10

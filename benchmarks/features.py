@@ -32,7 +32,7 @@ from scenes import SEEDED, THRESHOLDS  # which knows the way to timing
 from timing import table
 
 from megloc_kapture.io.images import read_image_rgb
-from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.values import ImageFeatures

@@ -30,8 +30,8 @@ sys.path.append(str(Path(__file__).resolve().parent / "speed"))
 from timing import table  # noqa: E402
 
 from megloc_kapture.evaluation.metrics import PoseErrors, pose_errors  # noqa: E402
-from megloc_kapture.io.kapture_store import KaptureFolder  # noqa: E402
-from megloc_kapture.io.status_table import STATUS_FILE, read_status  # noqa: E402
+from megloc_kapture.io.kapture import KaptureFolder  # noqa: E402
+from megloc_kapture.io.tables import STATUS_FILE, read_status  # noqa: E402
 from megloc_kapture.pipeline.executors import single_threaded  # noqa: E402
 from megloc_kapture.plugins import DepthView, PoseRefinement  # noqa: E402
 from megloc_kapture.refinement.depth_cloud import DepthCloudOptions, depth_cloud  # noqa: E402

@@ -32,8 +32,8 @@ from timing import table  # noqa: E402
 
 from megloc_kapture.geometry.cameras import bearing_rays, project, px_from_cam  # noqa: E402
 from megloc_kapture.io.colmap import MapImage, TriangulationOptions, triangulate  # noqa: E402
-from megloc_kapture.io.depth_maps import read_depth_map  # noqa: E402
-from megloc_kapture.io.kapture_store import (  # noqa: E402
+from megloc_kapture.io.images import read_depth_map  # noqa: E402
+from megloc_kapture.io.kapture import (  # noqa: E402
     FeatureConfig,
     FeatureWriter,
     KaptureData,
@@ -45,7 +45,7 @@ from megloc_kapture.io.kapture_store import (  # noqa: E402
     write_points3d,
     write_sensors,
 )
-from megloc_kapture.io.point_covariances import read_point_covariances  # noqa: E402
+from megloc_kapture.io.kapture.points import read_point_covariances  # noqa: E402
 from megloc_kapture.localization.absolute_pose import absolute_pose  # noqa: E402
 from megloc_kapture.matching.verification import (  # noqa: E402
     KnownPoseOptions,

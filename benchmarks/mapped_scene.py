@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.io.kapture_store import KaptureFolder, read_pairs
-from megloc_kapture.io.side_tables import SIDE_TABLES
+from megloc_kapture.io.dataset_tables import SIDE_TABLES
+from megloc_kapture.io.kapture import KaptureFolder, read_pairs
 from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions
 from megloc_kapture.localization.cluster_poses import (
     QueryView,

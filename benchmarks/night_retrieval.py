@@ -31,7 +31,7 @@ from retrieval_truth import MIN_OVERLAP, recalls, twin_overlaps
 from megloc_kapture.errors import DataError
 from megloc_kapture.features.vlad import VladOptions
 from megloc_kapture.io.images import read_image_rgb
-from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder, MatchesReader
+from megloc_kapture.io.kapture import ImagePair, KaptureFolder, MatchesReader
 from megloc_kapture.matching.verification import TwoViewOptions
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
 from megloc_kapture.pipeline.presets import options_of_preset

@@ -30,7 +30,7 @@ import pandas as pd
 from scenes import SEEDED, errors_of, interval, megloc
 
 from megloc_kapture.evaluation.report.reports import RECALL_JSON
-from megloc_kapture.io.refinement_table import REFINEMENT_FILE, read_refinement
+from megloc_kapture.io.tables import REFINEMENT_FILE, read_refinement
 
 sys.path.append(str(Path(__file__).resolve().parent / "speed"))
 from timing import table  # noqa: E402

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.io.crc32c import crc32c
+from megloc_kapture.io.weights.tensorflow import crc32c
 
 Arrays = Mapping[str, NDArray[np.float32]]
 
@@ -43,8 +43,8 @@ def write_saved_model(path: Path, folder: str, variables: Arrays) -> None:
 def tensorflow_checkpoint(variables: Arrays) -> tuple[bytes, bytes]:
     """Index and data of a TensorFlow checkpoint: a sorted string table of one block.
 
-    The format is that which :mod:`megloc_kapture.io.tensor_bundle` describes; every key is written
-    whole.
+    The format is that which :mod:`megloc_kapture.io.weights.tensorflow` describes; every key is
+    written whole.
     """
     data, rows = io.BytesIO(), [(b"", b"\x08\x01")]
     for name in sorted(variables):

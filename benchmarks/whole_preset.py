@@ -44,8 +44,8 @@ from whole_preset_scene import (
 )
 from whole_preset_weights import write_random_weights
 
-from megloc_kapture.io.kapture_store import KaptureFolder, read_pairs
-from megloc_kapture.io.status_table import STATUS_FILE, read_status
+from megloc_kapture.io.kapture import KaptureFolder, read_pairs
+from megloc_kapture.io.tables import STATUS_FILE, read_status
 
 sys.path.append(str(Path(__file__).resolve().parent / "speed"))
 from timing import table, timed_command  # noqa: E402

@@ -20,7 +20,7 @@ from kapture.io.features import (
     image_matches_from_file,
 )
 
-from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, write_sensors
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
 from megloc_kapture.pipeline.manifests import read_manifest
 
 # path of the artefact -> what is in it, in words; raises where it cannot be read

@@ -24,11 +24,10 @@ from megloc_kapture.datasets.synthetic.writing import (
     query_data,
     write_side_tables,
 )
-from megloc_kapture.io.depth_maps import write_depth_map
-from megloc_kapture.io.images import write_image
-from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, Sensor, write_sensors
-from megloc_kapture.io.links import link_images
-from megloc_kapture.io.status_table import STATUS_FILE, QueryStatus, write_status
+from megloc_kapture.io.files import link_images
+from megloc_kapture.io.images import write_depth_map, write_image
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
+from megloc_kapture.io.tables import STATUS_FILE, QueryStatus, write_status
 from megloc_kapture.values import RigidTransform
 
 _STEP_M = 0.3  # to the side, between the images of a stop

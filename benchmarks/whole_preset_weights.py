@@ -29,7 +29,7 @@ from tensorflow_checkpoints import write_saved_model, write_tensorflow_checkpoin
 from torch import nn
 
 from megloc_kapture.io.weights import UNVERIFIED
-from megloc_kapture.io.weights_registry import registry
+from megloc_kapture.io.weights.registry import registry
 from megloc_kapture.nets.apgem import ApGemNet
 from megloc_kapture.nets.aslfeat import AslFeatNet
 from megloc_kapture.nets.deeplabv3plus import DeepLabV3Plus

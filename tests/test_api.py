@@ -13,7 +13,7 @@ import pytest
 import megloc_kapture as megloc
 from megloc_kapture.cli.main import main
 from megloc_kapture.io.images import read_image_rgb
-from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.kapture import KaptureFolder
 
 SMALL = {
     "local_features.options.max_keypoints": 800,

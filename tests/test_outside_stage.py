@@ -14,7 +14,7 @@ import pytest
 
 from megloc_kapture.cli.main import main
 from megloc_kapture.errors import OptionError, PluginError
-from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.datasets import choose_dataset
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
 from megloc_kapture.pipeline.plan import all_kept, run_plan

@@ -30,10 +30,9 @@ from megloc_kapture.evaluation.report.reports import report_text, write_report
 from megloc_kapture.evaluation.results import context_of
 from megloc_kapture.evaluation.statistics import compare
 from megloc_kapture.geometry.poses import unstack_poses
-from megloc_kapture.io.challenge_tables import write_names
-from megloc_kapture.io.kapture_store import KaptureData, Sensor, write_sensors
-from megloc_kapture.io.side_tables import ImageGroup, write_groups, write_protocol
-from megloc_kapture.io.status_table import STATUS_FILE, QueryStatus, write_status
+from megloc_kapture.io.dataset_tables import ImageGroup, write_groups, write_names, write_protocol
+from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
+from megloc_kapture.io.tables import STATUS_FILE, QueryStatus, write_status
 from megloc_kapture.values import Camera, RigidTransform
 
 CANDIDATES = 20

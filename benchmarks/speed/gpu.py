@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from megloc_kapture.io.images import read_image_rgb
-from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS, load_plugin
 from megloc_kapture.values import ImageFeatures, LocalFeatures
 

@@ -35,7 +35,7 @@ from street import (
 )
 
 from megloc_kapture.geometry.cameras import project
-from megloc_kapture.io.kapture_store import (
+from megloc_kapture.io.kapture import (
     FeatureConfig,
     FeatureWriter,
     KaptureData,

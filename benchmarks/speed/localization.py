@@ -45,6 +45,7 @@ from typing import Any  # noqa: E402
 
 import numpy as np  # noqa: E402
 import poselib  # noqa: E402
+from kloc_tools import shims, tool_scripts  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
 from street import (  # noqa: E402
     CAMERA,
@@ -59,8 +60,7 @@ from timing import table  # noqa: E402
 
 from megloc_kapture.errors import OptionError  # noqa: E402
 from megloc_kapture.geometry.cameras import project  # noqa: E402
-from megloc_kapture.io.kapture_localization import shims, tool_scripts  # noqa: E402
-from megloc_kapture.io.kapture_store import (  # noqa: E402
+from megloc_kapture.io.kapture import (  # noqa: E402
     FeatureConfig,
     FeatureWriter,
     ImagePair,

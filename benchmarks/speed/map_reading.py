@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from megloc_kapture.io.kapture_store import (
+from megloc_kapture.io.kapture import (
     KaptureFolder,
     Observations,
     write_observations,
@@ -73,7 +73,8 @@ def read_ours(folder: Path) -> tuple[float, float, np.ndarray[Any, Any], Observa
 COMPILE = """
 import sys
 from pathlib import Path
-from megloc_kapture.io.kapture_points import read_observations, read_points3d
+from megloc_kapture.io.kapture.observations import read_observations
+from megloc_kapture.io.kapture.points import read_points3d
 root = Path(sys.argv[1]) / "reconstruction"
 read_points3d(root / "points3d.txt", large_bytes=0)
 read_observations(root / "observations.txt", large_bytes=0)

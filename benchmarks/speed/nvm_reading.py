@@ -30,7 +30,7 @@ import numpy as np
 from PIL import Image
 from timing import table
 
-from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder
 from megloc_kapture.values import Camera
 
 WIDTH, HEIGHT = 1024, 1024
@@ -45,7 +45,7 @@ from pathlib import Path
 import numpy as np
 from megloc_kapture.datasets.formats.nvm import read_nvm
 from megloc_kapture.datasets.reference_map import write_reference_map
-from megloc_kapture.io.kapture_store import KaptureData, Sensor
+from megloc_kapture.io.kapture import KaptureData, Sensor
 from megloc_kapture.values import Camera
 
 start, start_cpu = time.perf_counter(), time.process_time()

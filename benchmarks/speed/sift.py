@@ -25,7 +25,7 @@ from timing import table
 from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
 from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.io.images import read_image_rgb
-from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.matching.nearest_neighbours import match_nearest
 from megloc_kapture.matching.verification import ray_slopes, sampson_error_px
 

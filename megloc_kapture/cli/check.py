@@ -35,7 +35,7 @@ class Check(Common):
         """Run it; returns 2 where there are problems."""
         from megloc_kapture.evaluation.check.reading import read_reference
         from megloc_kapture.evaluation.check.submission import check_submission
-        from megloc_kapture.io.side_tables import PROTOCOL_FILE, SIDE_TABLES
+        from megloc_kapture.io.dataset_tables import PROTOCOL_FILE, SIDE_TABLES
         from megloc_kapture.pipeline.datasets import TWIN_PREFIX
         from megloc_kapture.pipeline.submission import check_dataset, check_known
 

@@ -11,8 +11,8 @@ import tyro
 
 from megloc_kapture.cli.console import Console, configure_logging
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.kapture_store import KaptureFolder
-from megloc_kapture.io.side_tables import PROTOCOL_FILE, SIDE_TABLES
+from megloc_kapture.io.dataset_tables import PROTOCOL_FILE, SIDE_TABLES
+from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.executors import ExecutorKind
 
 Input = Annotated[Path, tyro.conf.arg(aliases=["-i"])]

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from megloc_kapture.cli.common import Common, Force, Output, Working
 from megloc_kapture.errors import OptionError
-from megloc_kapture.io.outputs import staged_output
+from megloc_kapture.io.files import staged_output
 from megloc_kapture.pipeline.datasets import (
     KAPTURE,
     SUMMARY_FILE,

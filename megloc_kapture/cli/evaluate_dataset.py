@@ -20,7 +20,7 @@ from megloc_kapture.evaluation.report.reports import (
     RECALL_JSON,
     RECALL_TEXT,
 )
-from megloc_kapture.io.status_table import STATUS_FILE, read_status
+from megloc_kapture.io.tables import STATUS_FILE, read_status
 from megloc_kapture.pipeline.ablation import (
     fresh_copy,
     outcome,

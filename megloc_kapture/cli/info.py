@@ -14,8 +14,8 @@ from megloc_kapture.cli.common import Common, Reading, existing
 from megloc_kapture.cli.console import Console
 from megloc_kapture.cli.refine_map import report_lines
 from megloc_kapture.errors import MeglocError
-from megloc_kapture.io.kapture_store import KaptureFolder
-from megloc_kapture.io.point_covariances import read_point_covariances
+from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.kapture.points import read_point_covariances
 from megloc_kapture.mapping.uncertainty import point_deviations
 from megloc_kapture.pipeline.kapture_map import KaptureMap, MapKeypoints, PixelOriginChoice
 from megloc_kapture.plugins import LOCAL_FEATURES, PluginChoice, load_plugin

@@ -13,8 +13,8 @@ import tyro
 
 from megloc_kapture.cli.common import Choosing, Common, Force, Input, Output, Reading, existing
 from megloc_kapture.errors import OptionError
-from megloc_kapture.io.kapture_store import KaptureFolder, read_pairs
-from megloc_kapture.io.outputs import staged_output
+from megloc_kapture.io.files import staged_output
+from megloc_kapture.io.kapture import KaptureFolder, read_pairs
 from megloc_kapture.pipeline.executors import available_cores
 from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
 from megloc_kapture.pipeline.localizer import Localizer

@@ -12,9 +12,7 @@ from pydantic import ValidationError
 
 from megloc_kapture.cli.common import Common, Force, Input, Linked, Output, Working, existing
 from megloc_kapture.errors import OptionError
-from megloc_kapture.io.atomic import replace_directory
-from megloc_kapture.io.json_model import first_problem
-from megloc_kapture.io.outputs import staged_output
+from megloc_kapture.io.files import first_problem, replace_directory, staged_output
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
 from megloc_kapture.pipeline.presets import assigned
 from megloc_kapture.stages.preprocessing import PreprocessingOptions, preprocess_images

@@ -16,7 +16,7 @@ from megloc_kapture.cli.stage_command import (
     restrictions_beside,
 )
 from megloc_kapture.errors import OptionError
-from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder, write_pairs
+from megloc_kapture.io.kapture import ImagePair, KaptureFolder, write_pairs
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.retrieval.fusion import FusionMethod
 from megloc_kapture.stages.candidates import Retrieval

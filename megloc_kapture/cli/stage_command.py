@@ -11,8 +11,8 @@ from typing import ClassVar
 
 from megloc_kapture.cli.common import Choosing, Common, Working, side_tables_beside
 from megloc_kapture.errors import OptionError
-from megloc_kapture.io.kapture_store import KaptureFolder
-from megloc_kapture.io.outputs import staged_output
+from megloc_kapture.io.files import staged_output
+from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, options_of_preset
 from megloc_kapture.stages.options import PipelineOptions

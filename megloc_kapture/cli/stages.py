@@ -12,8 +12,8 @@ import tyro
 from megloc_kapture.cli.common import Force, Input, Linked, Output, Reading
 from megloc_kapture.cli.stage_command import StageCommand, only_type
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder, read_pairs
-from megloc_kapture.io.outputs import staged_output
+from megloc_kapture.io.files import staged_output
+from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs
 from megloc_kapture.pipeline.executors import available_cores
 from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS, load_plugin
 from megloc_kapture.stages.local_features import extract_local_features

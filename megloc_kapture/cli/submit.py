@@ -31,7 +31,7 @@ class Submit(Common):
 
     def run(self) -> int:
         """Run it."""
-        from megloc_kapture.io.side_tables import Protocol, read_protocol
+        from megloc_kapture.io.dataset_tables import Protocol, read_protocol
         from megloc_kapture.pipeline.submission import (
             check_dataset,
             workspace_provenance,

@@ -15,17 +15,18 @@ from megloc_kapture.errors import MeglocError, OptionError, OutputError
 from megloc_kapture.io.weights import (
     MissingWeightsError,
     WeightsFile,
+    add_weights,
+    convert_weights,
     describe,
+    files_of,
     how_to_get,
-    places,
+    prove,
     read_weights,
     sha256_of,
     weights_folder,
 )
-from megloc_kapture.io.weights_adding import add_weights, prove
-from megloc_kapture.io.weights_conversion import convert_weights
-from megloc_kapture.io.weights_fetch import fetch
-from megloc_kapture.io.weights_registry import PublishedFile, Weights, lookup, registry
+from megloc_kapture.io.weights.fetch import fetch
+from megloc_kapture.io.weights.registry import PublishedFile, Weights, lookup, registry
 
 WRONG_FILES = 2
 
@@ -196,7 +197,7 @@ def _wrong(console: Console, weights: Weights) -> int:
     """Print the state of each file of a network; the number that are wrong."""
     wrong = 0
     try:
-        paths = list(places(weights))
+        paths = list(files_of(weights))
         if not paths:
             raise MissingWeightsError(how_to_get(weights))
     except MeglocError as error:
@@ -221,7 +222,7 @@ def _trust(file: WeightsFile) -> str:
 
 def _state(weights: Weights) -> str:
     try:
-        return "there" if next(places(weights), None) else "missing"
+        return "there" if next(files_of(weights), None) else "missing"
     except MeglocError:
         return "wrong"
 
@@ -238,7 +239,7 @@ def _row(weights: Weights) -> tuple[str, ...]:
 
 def _is_there(weights: Weights, file: PublishedFile) -> bool:
     try:
-        return any(describe(weights.name, path).published == file for path in places(weights))
+        return any(describe(weights.name, path).published == file for path in files_of(weights))
     except MeglocError:
         return False
 

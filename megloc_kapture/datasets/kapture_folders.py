@@ -7,36 +7,33 @@ from dataclasses import replace
 from pathlib import Path
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.atomic import output_error
-from megloc_kapture.io.challenge_tables import (
-    NAMES_FILE,
-    RELOCALIZATION_FILE,
-    read_names,
-    read_relocalization,
-    write_names,
-    write_relocalization,
-)
-from megloc_kapture.io.images import image_size
-from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, write_sensors
-from megloc_kapture.io.links import link_images
-from megloc_kapture.io.paths import check_relative
-from megloc_kapture.io.side_tables import (
+from megloc_kapture.io.dataset_tables import (
     GROUPS_FILE,
+    NAMES_FILE,
     PRIORS_FILE,
     PROTOCOL_FILE,
+    RELOCALIZATION_FILE,
     SIDE_TABLES,
     WORLD_FILE,
     ImageGroup,
     Protocol,
     read_groups,
+    read_names,
     read_priors,
     read_protocol,
+    read_relocalization,
     read_world,
     write_groups,
+    write_names,
     write_priors,
     write_protocol,
+    write_relocalization,
     write_world,
 )
+from megloc_kapture.io.files import link_images, output_error
+from megloc_kapture.io.images import image_size
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
+from megloc_kapture.io.paths import check_relative
 
 MAPPING, QUERY, QUERY_GT = "mapping", "query", "query_gt"
 

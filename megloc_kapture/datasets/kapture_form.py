@@ -16,7 +16,7 @@ from pathlib import Path
 from megloc_kapture.datasets.kapture_folders import MAPPING, check_image
 from megloc_kapture.datasets.official import Missing
 from megloc_kapture.errors import OptionError
-from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import Camera, RigidTransform
 
 SENSORS = "sensors/sensors.txt"

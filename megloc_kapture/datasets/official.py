@@ -14,24 +14,22 @@ from pathlib import Path, PurePosixPath
 from megloc_kapture.datasets.kapture_folders import MAPPING, QUERY, QUERY_GT
 from megloc_kapture.datasets.reference_map import ReferenceModel, write_reference_map
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.challenge_tables import (
-    RelocalizationPair,
-    write_names,
-    write_relocalization,
-)
-from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, write_sensors
-from megloc_kapture.io.links import link_records
-from megloc_kapture.io.side_tables import (
+from megloc_kapture.io.dataset_tables import (
     SIDE_TABLES,
     ImageGroup,
     Protocol,
+    RelocalizationPair,
     World,
     read_groups,
     write_groups,
+    write_names,
     write_priors,
     write_protocol,
+    write_relocalization,
     write_world,
 )
+from megloc_kapture.io.files import link_records
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
 from megloc_kapture.values import Options, RigidTransform
 
 GROUND_TRUTH = "ground_truth"

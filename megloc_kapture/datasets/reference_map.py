@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from megloc_kapture.datasets.formats.colmap_database import ColmapDatabase
 from megloc_kapture.datasets.formats.sparse_points import SparsePoints, image_order
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.kapture_store import (
+from megloc_kapture.io.files import link_records
+from megloc_kapture.io.kapture import (
     FeatureConfig,
     FeatureWriter,
     KaptureData,
@@ -22,7 +23,6 @@ from megloc_kapture.io.kapture_store import (
     write_points3d,
     write_sensors,
 )
-from megloc_kapture.io.links import link_records
 
 _KEYPOINTS = FeatureConfig("SIFT", np.dtype(np.float32), 2)
 # a database of another model has its features elsewhere; this one's differ by printed digits
@@ -67,7 +67,7 @@ def write_reference_map(
     ----------
     output : the kapture folder to write.
     data : sensors, records and poses of the images.
-    links : folders of images, see :func:`~megloc_kapture.io.links.link_records`.
+    links : folders of images, see :func:`~megloc_kapture.io.files.link_records`.
     image_names : name in ``data`` of each image of the model, in its order.
     points : of the model; ``image_ids`` count in ``image_names``.
     keypoints_type : the type name of keypoints and descriptors.

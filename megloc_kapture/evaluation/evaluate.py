@@ -21,7 +21,7 @@ from megloc_kapture.evaluation.results import (
 )
 from megloc_kapture.evaluation.scoring import Evaluation, evaluate_pairs, evaluate_poses
 from megloc_kapture.evaluation.without_truth import WithoutTruth, evaluate_without_truth
-from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import Failure, Pose, RigidTransform
 
 Localized = Path | str | Mapping[str, Pose | Failure] | Mapping[str, RigidTransform]

@@ -12,7 +12,7 @@ from pydantic import BeforeValidator, Field, PlainSerializer
 
 from megloc_kapture.errors import OptionError
 from megloc_kapture.geometry.poses import invert, rotation_angles_deg, stack_poses
-from megloc_kapture.io.side_tables import Protocol
+from megloc_kapture.io.dataset_tables import Protocol
 from megloc_kapture.values import Options, RigidTransform
 
 

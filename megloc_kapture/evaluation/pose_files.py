@@ -22,10 +22,9 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.atomic import write_bytes
-from megloc_kapture.io.kapture_data import FLOAT_PATTERN
-from megloc_kapture.io.side_tables import MAX_QUATERNION_NORM_ERROR, PoseFileNames
-from megloc_kapture.io.text import read_text
+from megloc_kapture.io.dataset_tables import MAX_QUATERNION_NORM_ERROR, PoseFileNames
+from megloc_kapture.io.files import read_text, write_bytes
+from megloc_kapture.io.kapture.text import FLOAT_PATTERN
 from megloc_kapture.values import RigidTransform
 
 COLUMNS = "name qw qx qy qz tx ty tz"

@@ -8,17 +8,15 @@ from pathlib import Path, PurePosixPath
 
 from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.metrics import Threshold, thresholds_from_pairs
-from megloc_kapture.io.challenge_tables import (
-    RelocalizationPair,
-    read_names,
-    read_relocalization,
-)
-from megloc_kapture.io.side_tables import (
+from megloc_kapture.io.dataset_tables import (
     ImageGroup,
     Protocol,
+    RelocalizationPair,
     World,
     read_groups,
+    read_names,
     read_protocol,
+    read_relocalization,
     read_world,
 )
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.json_model import write_json
+from megloc_kapture.io.files import write_json
 
 # what can change a pose or a figure of the report
 _PACKAGES = (

@@ -16,17 +16,28 @@ from megloc_kapture.evaluation.pose_files import (
     timestamp_of,
 )
 from megloc_kapture.evaluation.protocols import Benchmark
-from megloc_kapture.io.challenge_tables import RelocalizationPair
-from megloc_kapture.io.cluster_table import CLUSTERS_FILE, ClusterRow, read_clusters
-from megloc_kapture.io.consistency_table import (
-    CONSISTENCY_FILE,
-    ConsistencyRow,
-    read_consistency,
+from megloc_kapture.io.dataset_tables import (
+    PROTOCOL_FILE,
+    SIDE_TABLES,
+    RelocalizationPair,
+    World,
+    read_groups,
+    read_world,
 )
-from megloc_kapture.io.kapture_store import KaptureFolder
-from megloc_kapture.io.refinement_table import REFINEMENT_FILE, read_refinement
-from megloc_kapture.io.side_tables import PROTOCOL_FILE, SIDE_TABLES, World, read_groups, read_world
-from megloc_kapture.io.status_table import STATUS_FILE, QueryStatus, read_status
+from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.tables import (
+    CLUSTERS_FILE,
+    CONSISTENCY_FILE,
+    REFINEMENT_FILE,
+    STATUS_FILE,
+    ClusterRow,
+    ConsistencyRow,
+    QueryStatus,
+    read_clusters,
+    read_consistency,
+    read_refinement,
+    read_status,
+)
 from megloc_kapture.stages.localized_folder import query_status
 from megloc_kapture.values import Failure, Pose, RefinementRow, RigidTransform
 

@@ -29,9 +29,9 @@ from megloc_kapture.evaluation.metrics import (
 )
 from megloc_kapture.evaluation.results import ResultContext
 from megloc_kapture.geometry.poses import compose, invert, stack_poses
-from megloc_kapture.io.atomic import write_bytes
-from megloc_kapture.io.challenge_tables import RelocalizationPair
-from megloc_kapture.io.status_table import Fallback, QueryStatus
+from megloc_kapture.io.dataset_tables import RelocalizationPair
+from megloc_kapture.io.files import write_bytes
+from megloc_kapture.io.tables import Fallback, QueryStatus
 from megloc_kapture.values import RigidTransform
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ from megloc_kapture.evaluation.metrics import (
 from megloc_kapture.evaluation.results import Poses, Result, ResultContext
 from megloc_kapture.evaluation.scoring import Outcome, Reported
 from megloc_kapture.geometry.poses import camera_centers, invert_quats, rotate, stack_poses
-from megloc_kapture.io.status_table import QueryStatus
+from megloc_kapture.io.tables import QueryStatus
 from megloc_kapture.values import RigidTransform
 
 if TYPE_CHECKING:

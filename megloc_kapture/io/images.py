@@ -1,8 +1,4 @@
-"""Images as arrays: read, measured and written the same way everywhere.
-
-Pixels are taken as stored. An EXIF orientation is ignored on purpose: a camera's intrinsics refer
-to the stored pixels, and a rotated image would not fit them any more.
-"""
+"""Images and depth maps as arrays: read, measured and written the same way everywhere."""
 
 from __future__ import annotations
 
@@ -10,9 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.atomic import write_bytes
+from megloc_kapture.io.files import read_content, write_bytes
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -85,7 +82,7 @@ def write_image(path: Path | str, image: NDArray[np.uint8], *, jpeg_quality: int
 def image_as_read_back(
     image: NDArray[np.uint8], name: str, *, jpeg_quality: int = 95
 ) -> NDArray[np.uint8]:
-    """What reading gives of an image after :func:`write_image`: uint8 (H, W, 3) RGB.
+    """The image that reading gives after :func:`write_image`: uint8 (H, W, 3) RGB.
 
     Parameters
     ----------
@@ -164,3 +161,34 @@ def _check_complete(path: Path, content: bytes) -> None:
             image.load()
     except Exception as error:  # pillow raises many kinds on broken data
         raise DataError(f"not an image, or truncated ({error})", path=path) from error
+
+
+def read_depth_map(path: Path | str, *, width: int, height: int) -> NDArray[np.float32]:
+    """Read a depth map as float32 (H, W) in metres; the size is its depth sensor's.
+
+    Raises
+    ------
+    DataError : missing, or of another size (truncated).
+    """
+    path = Path(path)
+    content = read_content(path)
+    expected = 4 * width * height
+    if len(content) != expected:
+        raise DataError(
+            f"{len(content)} bytes, but {width}x{height} float32 take {expected}", path=path
+        )
+    return np.frombuffer(content, dtype="<f4").astype(np.float32).reshape(height, width)
+
+
+def write_depth_map(path: Path | str, depth_m: ArrayLike) -> None:
+    """Write a depth map (H, W) in metres, atomically.
+
+    Raises
+    ------
+    ValueError : not a two-dimensional array.
+    OutputError : cannot be written.
+    """
+    pixels = np.asarray(depth_m, dtype="<f4")
+    if pixels.ndim != 2:
+        raise ValueError(f"expected a depth map of shape (H, W), got {pixels.shape}")
+    write_bytes(path, np.ascontiguousarray(pixels).tobytes())

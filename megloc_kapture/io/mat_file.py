@@ -11,6 +11,7 @@ Format: MathWorks, MAT-File Format, chapter 1, level 5.
 
 from __future__ import annotations
 
+import contextlib
 import io
 import math
 import struct
@@ -23,8 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.atomic import write_bytes
-from megloc_kapture.io.kapture_csv import read_content
+from megloc_kapture.io.files import read_content, write_bytes
 
 MatValue: TypeAlias = "NDArray[Any] | str | list[MatValue] | dict[str, MatValue] | None"
 """Numbers (MATLAB's shape), text, a cell or an array of structs, one struct; None: not read."""
@@ -78,7 +78,7 @@ def read_mat(content: bytes, where: str) -> dict[str, MatValue]:
     order = _byte_order(content, where)
     found: dict[str, MatValue] = {}
     for offset, kind, body in _variables(content, order, where):
-        with _Named(where, offset):
+        with _variable_at(offset, where):
             if kind == _COMPRESSED:
                 kind, body, _ = _element(_unpacked(body, order), 0, order)
             if kind == _MATRIX:
@@ -100,11 +100,11 @@ def read_mat_array(path: Path | str, name: str) -> NDArray[np.float64]:
         numbers; names the file, and the byte where the variable begins.
     """
     path = Path(path)
-    content = read_content(path, text=False)
+    content = read_content(path)
     order = _byte_order(content, path)
     names = []
     for offset, kind, body in _variables(content, order, path):
-        with _Named(path, offset):
+        with _variable_at(offset, path):
             if kind not in (_MATRIX, _COMPRESSED):
                 raise _BrokenError(f"data type {kind}, not an array")
             head = _head(body if kind == _MATRIX else _first_bytes(body), order)
@@ -140,21 +140,16 @@ def write_mat_arrays(path: Path | str, arrays: Mapping[str, NDArray[Any]]) -> No
     write_bytes(path, text + out.getvalue()[len(text) :])
 
 
-class _Named:
-    """Context of one variable: what is wrong with its bytes becomes a DataError that names it."""
-
-    def __init__(self, where: Path | str, offset: int) -> None:
-        self._where, self._offset = where, offset
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, _BrokenError | struct.error | UnicodeDecodeError | zlib.error):
-            raise DataError(
-                f"not a MAT file that can be read: {error}, in the variable at byte {self._offset}",
-                path=self._where,
-            ) from error
+@contextlib.contextmanager
+def _variable_at(offset: int, where: Path | str) -> Iterator[None]:
+    """A DataError that names the variable, of all that may be wrong with its bytes."""
+    try:
+        yield
+    except (_BrokenError, struct.error, UnicodeDecodeError, zlib.error) as error:
+        raise DataError(
+            f"not a MAT file that can be read: {error}, in the variable at byte {offset}",
+            path=where,
+        ) from error
 
 
 def _byte_order(content: bytes, where: Path | str) -> str:
@@ -183,7 +178,7 @@ def _variables(
     at, view = _HEADER, memoryview(content)
     while at < len(content):
         offset = at
-        with _Named(where, offset):
+        with _variable_at(offset, where):
             kind, body, at = _element(view, at, order)
         yield offset, kind, body
 

@@ -16,7 +16,7 @@ Roots = Path | tuple[Path, ...]
 
 
 def has_control_characters(text: str) -> bool:
-    """Whether a text has characters that no name or line of text should have (NUL, tab, ...)."""
+    """True for a text with characters that no name or line should have (NUL, tab, ...)."""
     if text.isprintable():
         return False
     return any(ord(c) < 32 or ord(c) == 127 or 0xD800 <= ord(c) <= 0xDFFF for c in text)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from megloc_kapture.io.atomic import atomic_write
+from megloc_kapture.io.files import atomic_write
 
 _TYPE_NAMES = {"<f8": "double", "<f4": "float", "|u1": "uchar"}
 

@@ -2,7 +2,7 @@
 
 A ResNet, generalized-mean pooling with a learnt power, a fully connected layer, unit length. What
 comes beside the trunk and this head is read from the checkpoint where it is known there, under
-names of our own, see :mod:`megloc_kapture.io.apgem_checkpoint`.
+names of our own, see :mod:`megloc_kapture.io.weights.apgem`.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ def apgem_from(tensors: Mapping[str, torch.Tensor], where: str) -> ApGemNet:
 
     Parameters
     ----------
-    tensors : as :func:`megloc_kapture.io.checkpoints.read_checkpoint` gives them.
+    tensors : as :func:`megloc_kapture.io.weights.containers.read_checkpoint` gives them.
     where : the file, for messages.
 
     Raises

@@ -10,9 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from megloc_kapture.evaluation.report.reports import RECALL_JSON
-from megloc_kapture.io.atomic import output_error
 from megloc_kapture.io.csv_table import write_csv_table
-from megloc_kapture.io.links import hard_link
+from megloc_kapture.io.files import hard_link, output_error
 from megloc_kapture.pipeline.manifests import read_manifest
 from megloc_kapture.pipeline.workspace import LOCK, PARTIAL, Workspace
 from megloc_kapture.stages.layout import EVALUATION

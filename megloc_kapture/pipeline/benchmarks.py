@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import Field, ValidationError, field_validator
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.side_tables import Protocol
+from megloc_kapture.io.dataset_tables import Protocol
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, PRESETS
 from megloc_kapture.values import Options
 

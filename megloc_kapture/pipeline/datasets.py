@@ -23,9 +23,9 @@ from megloc_kapture.datasets.kapture_folders import (
 from megloc_kapture.datasets.official import OfficialDataset, write_official
 from megloc_kapture.errors import OptionError, PluginError
 from megloc_kapture.evaluation.protocols import TWIN_PREFIX
-from megloc_kapture.io.atomic import write_bytes
-from megloc_kapture.io.kapture_store import KaptureFolder
-from megloc_kapture.io.side_tables import SIDE_TABLES, Protocol
+from megloc_kapture.io.dataset_tables import SIDE_TABLES, Protocol
+from megloc_kapture.io.files import write_bytes
+from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.plugins import DATASETS, DatasetAdapter, load_plugin, plugin_names
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Options

@@ -13,8 +13,8 @@ from megloc_kapture.evaluation.protocols import benchmark_of
 from megloc_kapture.evaluation.provenance import package_versions
 from megloc_kapture.evaluation.report.reports import write_report
 from megloc_kapture.evaluation.results import context_of
-from megloc_kapture.io.kapture_store import KaptureFolder
-from megloc_kapture.io.side_tables import SIDE_TABLES, Protocol
+from megloc_kapture.io.dataset_tables import SIDE_TABLES, Protocol
+from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.datasets import DatasetChoice, with_model
 from megloc_kapture.pipeline.missing_weights import check_weights
 from megloc_kapture.pipeline.run import Run

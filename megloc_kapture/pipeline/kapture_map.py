@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.geometry.cameras import shift_principal_point
-from megloc_kapture.io.kapture_store import FeatureReader, KaptureFolder
-from megloc_kapture.io.side_tables import PROTOCOL_FILE, SIDE_TABLES
-from megloc_kapture.io.weights_registry import registry
+from megloc_kapture.io.dataset_tables import PROTOCOL_FILE, SIDE_TABLES
+from megloc_kapture.io.kapture import FeatureReader, KaptureFolder
+from megloc_kapture.io.weights.registry import registry
 from megloc_kapture.localization.map_index import MapIndex
 from megloc_kapture.mapping.pixel_origin import (
     ObservedImage,

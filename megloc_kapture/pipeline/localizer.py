@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.localization.cluster_poses import (
     ImageMatches,
     QueryView,

@@ -17,7 +17,7 @@ from typing import Any
 from pydantic import Field
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.json_model import read_json_model
+from megloc_kapture.io.files import read_json_model
 from megloc_kapture.values import Options
 
 _CHUNK_BYTES = 1 << 20

@@ -11,8 +11,7 @@ from typing import Any, Literal
 
 from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.provenance import package_versions
-from megloc_kapture.io.atomic import write_bytes
-from megloc_kapture.io.json_model import write_json_model
+from megloc_kapture.io.files import write_bytes, write_json_model
 from megloc_kapture.pipeline.manifests import FileHashes, Manifest, fingerprint, read_manifest
 from megloc_kapture.pipeline.workspace import HASHES, Workspace
 from megloc_kapture.stages.stage import Stage, StageWork, is_below

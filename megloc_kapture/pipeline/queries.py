@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.datasets.kapture_folders import check_image
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.kapture_store import FeatureReader, KaptureFolder
+from megloc_kapture.io.kapture import FeatureReader, KaptureFolder
 from megloc_kapture.matching.guided_pyramid import base_type, pyramid_type
 from megloc_kapture.pipeline.kapture_map import KaptureMap, check_lengths
 from megloc_kapture.plugins import DepthView

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.io.kapture_store import KaptureFolder
-from megloc_kapture.io.outputs import staged_output
+from megloc_kapture.io.files import staged_output
+from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.queries import KaptureQueries
 from megloc_kapture.stages.layout import LOCALIZED

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from megloc_kapture.errors import OptionError
-from megloc_kapture.io.side_tables import SIDE_TABLES, read_protocol
+from megloc_kapture.io.dataset_tables import SIDE_TABLES, read_protocol
 from megloc_kapture.pipeline.benchmarks import BenchmarkFile, find_benchmark, read_benchmark
 from megloc_kapture.pipeline.datasets import TWIN_PREFIX, DatasetChoice, choose_dataset, has_model
 from megloc_kapture.pipeline.paper_steps import (

@@ -17,24 +17,22 @@ from megloc_kapture.evaluation.pose_files import (
     timestamp_of,
 )
 from megloc_kapture.evaluation.provenance import write_provenance
-from megloc_kapture.io.atomic import write_bytes
-from megloc_kapture.io.challenge_tables import (
-    RELOCALIZATION_FILE,
-    read_names,
-    read_relocalization,
-)
-from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder
-from megloc_kapture.io.paths import safe_join
-from megloc_kapture.io.side_tables import (
+from megloc_kapture.io.dataset_tables import (
     PROTOCOL_FILE,
+    RELOCALIZATION_FILE,
     ImageGroup,
     Protocol,
     World,
     read_groups,
+    read_names,
     read_protocol,
+    read_relocalization,
     read_world,
 )
-from megloc_kapture.io.status_table import STATUS_FILE, QueryStatus, read_status
+from megloc_kapture.io.files import write_bytes
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder
+from megloc_kapture.io.paths import safe_join
+from megloc_kapture.io.tables import STATUS_FILE, QueryStatus, read_status
 from megloc_kapture.pipeline.datasets import KAPTURE, SYNTHETIC, TWIN_PREFIX, dataset_names
 from megloc_kapture.pipeline.manifests import read_manifest
 from megloc_kapture.stages import rig_siblings

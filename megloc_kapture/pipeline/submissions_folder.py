@@ -10,8 +10,7 @@ from pathlib import Path
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.provenance import provenance_path
-from megloc_kapture.io.atomic import write_bytes
-from megloc_kapture.io.json_model import write_json
+from megloc_kapture.io.files import write_bytes, write_json
 
 FOLDER = "submissions"
 

@@ -11,9 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from megloc_kapture.errors import OutputError
-from megloc_kapture.io.atomic import output_error, replace_directory
-from megloc_kapture.io.kapture_store import KaptureFolder
-from megloc_kapture.io.outputs import claim_folder
+from megloc_kapture.io.files import claim_folder, output_error, replace_directory
+from megloc_kapture.io.kapture import KaptureFolder
 
 PARTIAL = ".partial"
 LOCK = ".lock"

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.global_vectors import KaptureVectors
-from megloc_kapture.io.kapture_store import FeatureReader, KaptureFolder
+from megloc_kapture.io.kapture import FeatureReader, KaptureFolder
+from megloc_kapture.io.kapture.vectors import KaptureVectors
 from megloc_kapture.retrieval.blocks import VectorSource, as_blocks, common_length
 from megloc_kapture.retrieval.diversity import DiversityOptions, diversified
 from megloc_kapture.retrieval.fusion import FusionOptions

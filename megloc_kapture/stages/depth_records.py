@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from megloc_kapture.io.kapture_store import KaptureData
+from megloc_kapture.io.kapture import KaptureData
 from megloc_kapture.values import Camera, RigidTransform
 
 

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.kapture_store import (
+from megloc_kapture.io.files import link_images
+from megloc_kapture.io.kapture import (
     FeatureWriter,
     KaptureFolder,
     Observations,
@@ -22,7 +23,6 @@ from megloc_kapture.io.kapture_store import (
     write_points3d,
     write_sensors,
 )
-from megloc_kapture.io.links import link_images
 from megloc_kapture.stages.found_again import rows_at_their_places
 from megloc_kapture.stages.triangulation import copy_features
 

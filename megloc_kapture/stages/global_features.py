@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, PluginError
-from megloc_kapture.io.kapture_store import FeatureConfig, FeatureWriter, KaptureFolder
+from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
 from megloc_kapture.plugins import GlobalFeatureExtractor
 from megloc_kapture.stages.global_vlad import extract_vlad
 from megloc_kapture.stages.layout import FEATURES, GLOBAL_FEATURES, LOCAL_FEATURES, REFERENCE

@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError
 from megloc_kapture.features.pca_whitening import PcaWhitening
 from megloc_kapture.features.vlad import VladOptions, Vocabulary, aggregate, train_vlad
-from megloc_kapture.io.atomic import write_bytes
-from megloc_kapture.io.json_model import read_json_model, write_json_model
-from megloc_kapture.io.kapture_store import FeatureConfig, FeatureWriter, KaptureFolder
+from megloc_kapture.io.files import read_json_model, write_bytes, write_json_model
+from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
 from megloc_kapture.stages.work import HERE, FolderSpec, Work, ordered_map
 from megloc_kapture.values import Options
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.plugins import PluginChoice
 from megloc_kapture.preprocessing.fixed_masks import FixedMask
 from megloc_kapture.preprocessing.unchanging_region import UnchangingRegion

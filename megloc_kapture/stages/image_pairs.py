@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.kapture_store import (
+from megloc_kapture.io.dataset_tables import SIDE_TABLES
+from megloc_kapture.io.kapture import (
     ImagePair,
     KaptureData,
     KaptureFolder,
     write_pairs,
 )
-from megloc_kapture.io.side_tables import SIDE_TABLES
 from megloc_kapture.mapping.frustum_overlap import frustum_overlap
 from megloc_kapture.mapping.pairs import exhaustive_pairs
 from megloc_kapture.mapping.pairs_by_covisibility import (

@@ -15,15 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.depth_maps import read_depth_map
-from megloc_kapture.io.kapture_store import (
+from megloc_kapture.io.files import link_images
+from megloc_kapture.io.images import read_depth_map
+from megloc_kapture.io.kapture import (
     KaptureFolder,
     Observations,
     write_observations,
     write_points3d,
     write_sensors,
 )
-from megloc_kapture.io.links import link_images
 from megloc_kapture.mapping.lifting import LiftingOptions, lift_keypoints
 from megloc_kapture.stages.depth_records import DepthRecord, depth_records
 from megloc_kapture.stages.triangulation import copy_features

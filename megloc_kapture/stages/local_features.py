@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, PluginError
 from megloc_kapture.io.images import read_image_rgb
-from megloc_kapture.io.kapture_store import FeatureConfig, FeatureWriter, KaptureFolder
-from megloc_kapture.io.mask_counts import write_mask_counts
+from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
+from megloc_kapture.io.tables import write_mask_counts
 from megloc_kapture.plugins import LocalFeatureExtractor
 from megloc_kapture.preprocessing.mask_margin import with_margin
 from megloc_kapture.stages.given_map import has_descriptors

@@ -5,16 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from megloc_kapture.io.cluster_table import CLUSTERS_FILE, write_clusters
 from megloc_kapture.io.csv_table import write_csv_table
-from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, write_sensors
-from megloc_kapture.io.links import link_images
-from megloc_kapture.io.refinement_table import (
+from megloc_kapture.io.files import link_images
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
+from megloc_kapture.io.tables import (
+    CLUSTERS_FILE,
     REFINEMENT_FILE,
+    STATUS_FILE,
+    Fallback,
+    QueryStatus,
     refinement_text,
+    write_clusters,
     write_refinement,
+    write_status,
 )
-from megloc_kapture.io.status_table import STATUS_FILE, Fallback, QueryStatus, write_status
 from megloc_kapture.stages.rig_siblings import poses_through_rig
 from megloc_kapture.values import Failure, Pose, RigidTransform
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
-from megloc_kapture.io.consistency_table import ConsistencyRow
+from megloc_kapture.io.tables import ConsistencyRow
 from megloc_kapture.refinement.consistency import (
     Consistency,
     Displacement,

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.stages.given_map import given_map, given_type, has_descriptors, join_maps
 from megloc_kapture.stages.layout import (
     FEATURES,

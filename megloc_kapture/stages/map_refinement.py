@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.depth_maps import read_depth_map
-from megloc_kapture.io.json_model import write_json_model
-from megloc_kapture.io.kapture_store import (
+from megloc_kapture.io.files import link_images, write_json_model
+from megloc_kapture.io.images import read_depth_map
+from megloc_kapture.io.kapture import (
     FeatureReader,
     KaptureData,
     KaptureFolder,
@@ -29,9 +29,8 @@ from megloc_kapture.io.kapture_store import (
     write_points3d,
     write_sensors,
 )
-from megloc_kapture.io.links import link_images
+from megloc_kapture.io.kapture.points import write_point_covariances
 from megloc_kapture.io.ply import write_ply
-from megloc_kapture.io.point_covariances import write_point_covariances
 from megloc_kapture.mapping.depth_verification import (
     DepthVerificationOptions,
     contradicted_by_depth,

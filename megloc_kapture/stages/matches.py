@@ -18,14 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.geometry.cameras import bearing_rays
-from megloc_kapture.io.kapture_store import (
+from megloc_kapture.io.kapture import (
     FeatureReader,
     ImagePair,
     KaptureFolder,
     MatchesWriter,
     read_pairs,
 )
-from megloc_kapture.io.match_counts import PairCount, write_match_counts
+from megloc_kapture.io.tables import PairCount, write_match_counts
 from megloc_kapture.matching.verification import (
     KnownPoseOptions,
     TwoViewOptions,

@@ -15,18 +15,22 @@ from pydantic import Field
 
 from megloc_kapture.errors import PluginError
 from megloc_kapture.geometry.poses import movement
-from megloc_kapture.io.cluster_table import CLUSTERS_FILE
-from megloc_kapture.io.consistency_table import CONSISTENCY_FILE, write_consistency
 from megloc_kapture.io.csv_table import write_csv_table
-from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, write_sensors
-from megloc_kapture.io.links import link_images
-from megloc_kapture.io.refinement_table import (
+from megloc_kapture.io.dataset_tables import SIDE_TABLES
+from megloc_kapture.io.files import link_images
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
+from megloc_kapture.io.tables import (
+    CLUSTERS_FILE,
+    CONSISTENCY_FILE,
     REFINEMENT_FILE,
+    STATUS_FILE,
+    QueryStatus,
+    read_status,
     refinement_text,
+    write_consistency,
     write_refinement,
+    write_status,
 )
-from megloc_kapture.io.side_tables import SIDE_TABLES
-from megloc_kapture.io.status_table import STATUS_FILE, QueryStatus, read_status, write_status
 from megloc_kapture.plugins import (
     POSE_REFINERS,
     PluginChoice,

@@ -14,11 +14,15 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
 from megloc_kapture.errors import DataError, OptionError, OutputError
-from megloc_kapture.io.atomic import output_error
+from megloc_kapture.io.files import (
+    link_file,
+    link_records,
+    output_error,
+    write_json,
+    write_json_model,
+)
 from megloc_kapture.io.images import WRITABLE_SUFFIXES
-from megloc_kapture.io.json_model import write_json, write_json_model
-from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, Sensor, write_sensors
-from megloc_kapture.io.links import link_file, link_records
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.plugins import SEGMENTERS, Segmenter, load_plugin
 from megloc_kapture.preprocessing.frame_plan import FrameOptions, FramePlan, plan_frame
 from megloc_kapture.preprocessing.unchanging_region import UnchangingRegion

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
-from megloc_kapture.io.json_model import read_json_model
-from megloc_kapture.io.kapture_store import KaptureData, Sensor
+from megloc_kapture.io.files import read_json_model
+from megloc_kapture.io.kapture import KaptureData, Sensor
 from megloc_kapture.preprocessing.frame_plan import FramePlan
 from megloc_kapture.preprocessing.pixel_map import PixelMap
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
+from megloc_kapture.io.files import link_file
 from megloc_kapture.io.images import image_as_read_back, image_size, write_image
-from megloc_kapture.io.links import link_file
 from megloc_kapture.preprocessing.frame_plan import FramePlan
 from megloc_kapture.preprocessing.frames import processed_image, processed_mask, reached_region
 from megloc_kapture.stages.class_masks import ClassMasks

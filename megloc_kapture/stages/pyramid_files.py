@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from megloc_kapture.geometry.image_variants import ImageVariant
-from megloc_kapture.io.atomic import output_error
-from megloc_kapture.io.kapture_features import SUFFIX, feature_folder
-from megloc_kapture.io.kapture_store import FeatureReader, FeatureWriter
-from megloc_kapture.io.links import hard_link
+from megloc_kapture.io.files import hard_link, output_error
+from megloc_kapture.io.kapture import FeatureReader, FeatureWriter
+from megloc_kapture.io.kapture.features import SUFFIX, feature_folder
 from megloc_kapture.matching.guided_pyramid import VariantMatches, pyramid_type
 
 

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.csv_table import write_csv_table
-from megloc_kapture.io.kapture_features import feature_folder
-from megloc_kapture.io.kapture_store import KaptureFolder, MatchesReader, MatchesWriter
+from megloc_kapture.io.kapture import KaptureFolder, MatchesReader, MatchesWriter
+from megloc_kapture.io.kapture.features import feature_folder
 from megloc_kapture.matching.guided_pyramid import pyramid_type
 from megloc_kapture.matching.keypoint_union import KeypointUnion
 from megloc_kapture.matching.pyramid_combination import Combined, Tried, combine

@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder, read_pairs
-from megloc_kapture.io.side_tables import SIDE_TABLES
-from megloc_kapture.io.status_table import Fallback
+from megloc_kapture.io.dataset_tables import SIDE_TABLES
+from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs
+from megloc_kapture.io.tables import Fallback
 from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions
 from megloc_kapture.localization.cluster_poses import (
     ClusterLocalization,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from megloc_kapture.io.kapture_store import KaptureData
+from megloc_kapture.io.kapture import KaptureData
 from megloc_kapture.values import RigidTransform
 
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.depth_maps import read_depth_map
-from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.images import read_depth_map
+from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.plugins import DepthView
 from megloc_kapture.stages.depth_records import DepthRecord, depth_records
 from megloc_kapture.stages.local_features import read_image_of, read_mask

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder, read_pairs, write_pairs
-from megloc_kapture.io.match_counts import read_match_counts
+from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs, write_pairs
+from megloc_kapture.io.tables import read_match_counts
 from megloc_kapture.retrieval.coverage import most_covering
 from megloc_kapture.stages.layout import (
     FEATURES,

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.io.side_tables import ImageGroup, read_groups, read_priors
+from megloc_kapture.io.dataset_tables import ImageGroup, read_groups, read_priors
 
 
 @dataclass(frozen=True, eq=False)

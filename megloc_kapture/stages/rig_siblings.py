@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from megloc_kapture.io.kapture_store import KaptureData
+from megloc_kapture.io.kapture import KaptureData
 from megloc_kapture.values import Pose, RigidTransform
 
 

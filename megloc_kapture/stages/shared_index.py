@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.atomic import atomic_write, output_error, write_bytes
-from megloc_kapture.io.kapture_store import KaptureFolder, Observations
-from megloc_kapture.io.point_covariances import read_point_covariances
+from megloc_kapture.io.files import atomic_write, output_error, write_bytes
+from megloc_kapture.io.kapture import KaptureFolder, Observations
+from megloc_kapture.io.kapture.points import read_point_covariances
 from megloc_kapture.localization.map_index import MapIndex
 
 _IMAGES = "images.json"

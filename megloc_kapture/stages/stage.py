@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, cast
 
-from megloc_kapture.io.kapture_store import KaptureFolder
-from megloc_kapture.io.side_tables import SIDE_TABLES
+from megloc_kapture.io.dataset_tables import SIDE_TABLES
+from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.plugins import weights_of
 from megloc_kapture.stages.layout import Layout
 from megloc_kapture.stages.restrictions import Restrictions

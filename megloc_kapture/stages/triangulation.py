@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.colmap import MapImage, TriangulationOptions, triangulate
-from megloc_kapture.io.kapture_features import SUFFIX, ArrayKind
-from megloc_kapture.io.kapture_store import (
+from megloc_kapture.io.files import hard_link, link_images
+from megloc_kapture.io.kapture import (
     FeatureReader,
     FeatureWriter,
     ImagePair,
@@ -22,7 +22,7 @@ from megloc_kapture.io.kapture_store import (
     write_points3d,
     write_sensors,
 )
-from megloc_kapture.io.links import hard_link, link_images
+from megloc_kapture.io.kapture.features import SUFFIX, ArrayKind
 
 
 def triangulate_map(

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from megloc_kapture.evaluation.pose_files import write_pose_file
-from megloc_kapture.io.kapture_store import KaptureFolder, write_sensors
-from megloc_kapture.io.side_tables import Protocol, write_protocol
+from megloc_kapture.io.dataset_tables import Protocol, write_protocol
+from megloc_kapture.io.kapture import KaptureFolder, write_sensors
 from megloc_kapture.values import RigidTransform
 
 

@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from megloc_kapture.io.depth_maps import write_depth_map
-from megloc_kapture.io.images import write_image
-from megloc_kapture.io.kapture_store import KaptureFolder, Sensor, read_pairs, write_sensors
-from megloc_kapture.io.status_table import read_status
+from megloc_kapture.io.images import write_depth_map, write_image
+from megloc_kapture.io.kapture import KaptureFolder, Sensor, read_pairs, write_sensors
+from megloc_kapture.io.tables import read_status
 from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.values import RigidTransform
 

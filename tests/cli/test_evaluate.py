@@ -11,9 +11,9 @@ import pytest
 
 from megloc_kapture.evaluation.pose_files import write_pose_file
 from megloc_kapture.evaluation.protocols import protocol_of
-from megloc_kapture.io.kapture_store import KaptureData, Sensor, write_sensors
-from megloc_kapture.io.side_tables import ImageGroup, write_groups, write_protocol
-from megloc_kapture.io.status_table import QueryStatus, write_status
+from megloc_kapture.io.dataset_tables import ImageGroup, write_groups, write_protocol
+from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
+from megloc_kapture.io.tables import QueryStatus, write_status
 from megloc_kapture.values import Camera, RigidTransform
 
 NUM_QUERIES = 40

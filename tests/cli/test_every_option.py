@@ -16,7 +16,7 @@ import pytest
 from corner import write_scene
 
 from megloc_kapture.io.images import write_image
-from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, Sensor, write_sensors
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.plugins import PluginChoice
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.values import Camera, Options, RigidTransform

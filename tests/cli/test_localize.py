@@ -15,8 +15,8 @@ from kapture.io.csv import kapture_from_dir
 
 from megloc_kapture.evaluation.evaluate import evaluate
 from megloc_kapture.io.images import write_image
-from megloc_kapture.io.kapture_store import FeatureWriter, ImagePair, KaptureFolder, write_pairs
-from megloc_kapture.io.status_table import read_status
+from megloc_kapture.io.kapture import FeatureWriter, ImagePair, KaptureFolder, write_pairs
+from megloc_kapture.io.tables import read_status
 
 IMAGES = "training/gallery_light1_loop1/frames/rgb/camera_0/rgb_00"
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from kapture.io.csv import kapture_from_dir
 
-from megloc_kapture.io.kapture_store import KaptureFolder
-from megloc_kapture.io.point_covariances import read_point_covariances
+from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.kapture.points import read_point_covariances
 
 
 def rows_of(text: str) -> dict[str, tuple[int, int]]:

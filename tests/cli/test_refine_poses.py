@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from megloc_kapture.io.kapture_store import KaptureFolder
-from megloc_kapture.io.status_table import read_status
+from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.tables import read_status
 
 INLINE = ("--executor", "inline")
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from megloc_kapture.io.kapture_store import KaptureFolder, read_pairs
-from megloc_kapture.io.match_counts import read_match_counts
+from megloc_kapture.io.kapture import KaptureFolder, read_pairs
+from megloc_kapture.io.tables import read_match_counts
 
 Contents = Callable[[Path], dict[str, bytes]]
 

@@ -10,10 +10,14 @@ from typing import Any
 import pytest
 
 from megloc_kapture.evaluation.pose_files import read_pose_file
-from megloc_kapture.io.challenge_tables import RelocalizationPair, write_relocalization
-from megloc_kapture.io.kapture_store import KaptureFolder, write_sensors
-from megloc_kapture.io.side_tables import Protocol, write_protocol
-from megloc_kapture.io.status_table import QueryStatus, write_status
+from megloc_kapture.io.dataset_tables import (
+    Protocol,
+    RelocalizationPair,
+    write_protocol,
+    write_relocalization,
+)
+from megloc_kapture.io.kapture import KaptureFolder, write_sensors
+from megloc_kapture.io.tables import QueryStatus, write_status
 
 
 @pytest.fixture

@@ -15,9 +15,9 @@ from typing import Any
 import pytest
 import torch
 
-from megloc_kapture.io import weights_registry
+from megloc_kapture.io.weights import registry as weights_registry
 
-BUNDLE = Path(__file__).parents[1] / "io" / "data" / "tensor_bundle"
+BUNDLE = Path(__file__).parents[1] / "io" / "weights" / "data" / "tensor_bundle"
 
 
 def saved(value: float) -> bytes:

@@ -15,29 +15,27 @@ from megloc_kapture.datasets.kapture_folders import (
     prefixed,
 )
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.challenge_tables import (
-    RelocalizationPair,
-    read_names,
-    read_relocalization,
-    write_names,
-    write_relocalization,
-)
-from megloc_kapture.io.images import write_image
-from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, Sensor, write_sensors
-from megloc_kapture.io.side_tables import (
+from megloc_kapture.io.dataset_tables import (
     ImageGroup,
     Protocol,
+    RelocalizationPair,
     SimilarityTransform,
     World,
     read_groups,
+    read_names,
     read_priors,
     read_protocol,
+    read_relocalization,
     read_world,
     write_groups,
+    write_names,
     write_priors,
     write_protocol,
+    write_relocalization,
     write_world,
 )
+from megloc_kapture.io.images import write_image
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.values import Camera, RigidTransform
 
 CAMERA = Camera("SIMPLE_PINHOLE", 8, 6, (10.0, 4.0, 3.0))

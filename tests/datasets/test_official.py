@@ -18,23 +18,21 @@ from megloc_kapture.datasets.official import (
     write_official,
 )
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.challenge_tables import (
-    RelocalizationPair,
-    read_names,
-    read_relocalization,
-)
-from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, Sensor, write_sensors
-from megloc_kapture.io.side_tables import (
+from megloc_kapture.io.dataset_tables import (
     ImageGroup,
     Protocol,
+    RelocalizationPair,
     SimilarityTransform,
     World,
     read_groups,
+    read_names,
     read_priors,
     read_protocol,
+    read_relocalization,
     read_world,
     write_groups,
 )
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.values import Camera, RigidTransform
 
 CAMERA = Sensor.from_camera(Camera("SIMPLE_PINHOLE", 100, 80, (90.0, 50.0, 40.0)))

@@ -15,7 +15,7 @@ from kapture.converter.colmap.database import COLMAPDatabase
 from megloc_kapture.datasets.formats.sparse_points import SparsePoints
 from megloc_kapture.datasets.reference_map import write_reference_map
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, Sensor
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor
 from megloc_kapture.values import Camera, RigidTransform
 
 # as a model lists them: not sorted, and one image that was not imported

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from megloc_kapture.io.kapture_store import KaptureData, Sensor, write_sensors
-from megloc_kapture.io.status_table import QueryStatus
+from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
+from megloc_kapture.io.tables import QueryStatus
 from megloc_kapture.values import Camera, RigidTransform
 
 VOID_ELEMENTS = {"meta", "br", "img"}

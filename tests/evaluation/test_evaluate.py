@@ -18,7 +18,7 @@ from megloc_kapture.evaluation.evaluate import evaluate, evaluate_results
 from megloc_kapture.evaluation.protocols import Benchmark
 from megloc_kapture.evaluation.report.reports import report_text, write_report
 from megloc_kapture.evaluation.statistics import over_seeds
-from megloc_kapture.io.status_table import write_status
+from megloc_kapture.io.tables import write_status
 from megloc_kapture.values import Failure, Pose
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.protocols import PROTOCOLS, protocol_of
-from megloc_kapture.io.side_tables import Protocol, read_protocol, write_protocol
+from megloc_kapture.io.dataset_tables import Protocol, read_protocol, write_protocol
 
 
 def test_thresholds_of_the_challenges() -> None:

@@ -21,18 +21,18 @@ from megloc_kapture.evaluation.results import (
     side_tables_near,
     workspace_of,
 )
-from megloc_kapture.io.challenge_tables import write_names
-from megloc_kapture.io.kapture_store import KaptureData, Sensor, write_sensors
-from megloc_kapture.io.side_tables import (
+from megloc_kapture.io.dataset_tables import (
     ImageGroup,
     Protocol,
     SimilarityTransform,
     World,
     write_groups,
+    write_names,
     write_protocol,
     write_world,
 )
-from megloc_kapture.io.status_table import write_status
+from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
+from megloc_kapture.io.tables import write_status
 from megloc_kapture.values import Camera, RigidTransform
 
 

@@ -22,9 +22,12 @@ from megloc_kapture.evaluation.scoring import (
     relative_translation_errors,
 )
 from megloc_kapture.geometry.poses import stack_poses
-from megloc_kapture.io.challenge_tables import RelocalizationPair, write_relocalization
-from megloc_kapture.io.side_tables import write_protocol
-from megloc_kapture.io.status_table import QueryStatus
+from megloc_kapture.io.dataset_tables import (
+    RelocalizationPair,
+    write_protocol,
+    write_relocalization,
+)
+from megloc_kapture.io.tables import QueryStatus
 from megloc_kapture.values import RigidTransform
 
 HERE = RigidTransform.identity()

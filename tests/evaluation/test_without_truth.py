@@ -20,9 +20,8 @@ from megloc_kapture.evaluation.protocols import Benchmark, benchmark_of, protoco
 from megloc_kapture.evaluation.report.reports import render_report, report_text, write_report
 from megloc_kapture.evaluation.results import Result
 from megloc_kapture.evaluation.without_truth import WithoutTruth, evaluate_without_truth
-from megloc_kapture.io.challenge_tables import write_names
-from megloc_kapture.io.side_tables import ImageGroup, write_groups, write_protocol
-from megloc_kapture.io.status_table import QueryStatus, write_status
+from megloc_kapture.io.dataset_tables import ImageGroup, write_groups, write_names, write_protocol
+from megloc_kapture.io.tables import QueryStatus, write_status
 from megloc_kapture.values import RigidTransform
 
 THRESHOLDS = [Threshold(position_m=0.25, angle_deg=2.0), Threshold(position_m=5.0, angle_deg=10.0)]

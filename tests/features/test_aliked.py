@@ -17,7 +17,7 @@ from megloc_kapture.features import aliked
 from megloc_kapture.features.aliked import Aliked, AlikedOptions
 from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.io.images import read_image_rgb
-from megloc_kapture.io.kapture_folder import KaptureFolder
+from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.matching.nearest_neighbours import match_nearest
 from megloc_kapture.matching.verification import ray_slopes, sampson_error_px
 from megloc_kapture.values import LocalFeatures

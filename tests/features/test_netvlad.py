@@ -16,8 +16,7 @@ from scipy.io import savemat
 from megloc_kapture.errors import DataError
 from megloc_kapture.features import netvlad
 from megloc_kapture.features.netvlad import NetVlad, NetVladOptions
-from megloc_kapture.io.weights import MissingWeightsError
-from megloc_kapture.io.weights_conversion import convert_weights
+from megloc_kapture.io.weights import MissingWeightsError, convert_weights
 from megloc_kapture.nets.vgg import Vgg16Features
 from megloc_kapture.plugins import GlobalFeatureExtractor, weights_of
 

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from megloc_kapture.errors import DataError
 from megloc_kapture.features.r2d2 import R2D2, R2D2Options
 from megloc_kapture.io.images import read_image_rgb
-from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import LocalFeatures
 
 Image = NDArray[np.uint8]

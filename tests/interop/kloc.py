@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import kapture
+import kloc_tools
 import pytest
 from kapture.algo.pose_operations import world_pose_transform_distance
 from kapture.io.csv import kapture_from_dir
@@ -21,8 +22,7 @@ needs_kapture_localization = pytest.mark.skipif(
 
 def kloc(tool: str, *arguments: str | Path) -> str:
     """Run one of kapture-localization's tools through the adapter; returns what it printed."""
-    module = ["-m", "megloc_kapture.io.kapture_localization", tool]
-    return _run([sys.executable, *module, *map(str, arguments)])
+    return _run([sys.executable, kloc_tools.__file__, tool, *map(str, arguments)])
 
 
 def kapture_tool(tool: str, *arguments: str | Path) -> str:

@@ -10,7 +10,7 @@ import pytest
 from kapture.io.csv import kapture_from_dir
 from kloc import kapture_tool
 
-from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.kapture import KaptureFolder
 
 pytestmark = pytest.mark.slow
 

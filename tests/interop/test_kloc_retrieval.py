@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from kloc import kloc, needs_kapture_localization
 
-from megloc_kapture.io.global_vectors import KaptureVectors
-from megloc_kapture.io.kapture_store import KaptureFolder, read_pairs
+from megloc_kapture.io.kapture import KaptureFolder, read_pairs
+from megloc_kapture.io.kapture.vectors import KaptureVectors
 from megloc_kapture.retrieval.search import rank_by_similarity
 from megloc_kapture.stages.candidates import QueryPairsOptions, Retrieval
 from megloc_kapture.stages.image_pairs import pair_queries

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.features.xfeat import XFeat, XFeatOptions
 from megloc_kapture.io.images import read_image_rgb
-from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.weights import find_weights, read_weights
 from megloc_kapture.matching.learned_pairs import normalised_points
 from megloc_kapture.matching.lighterglue import LighterGlue, LighterGlueOptions

@@ -12,7 +12,7 @@ from PIL import Image
 from torch.nn import functional
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.weights_registry import lookup
+from megloc_kapture.io.weights.registry import lookup
 from megloc_kapture.nets import megaloc
 from megloc_kapture.nets.dinov2 import DinoV2
 from megloc_kapture.nets.megaloc import MegaLocNet, megaloc_from, squared

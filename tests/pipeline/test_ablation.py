@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from megloc_kapture.io.status_table import read_status
+from megloc_kapture.io.tables import read_status
 from megloc_kapture.pipeline.ablation import (
     fresh_copy,
     outcome,

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.side_tables import Protocol
+from megloc_kapture.io.dataset_tables import Protocol
 from megloc_kapture.pipeline.benchmarks import BenchmarkFile, find_benchmark, read_benchmark
 from megloc_kapture.pipeline.datasets import TWIN_PREFIX, choose_dataset, dataset_names
 from megloc_kapture.pipeline.presets import PRESETS, options_of_preset

@@ -12,13 +12,12 @@ from corner import write_scene
 
 from megloc_kapture import KaptureMap, Localizer, Pose
 from megloc_kapture.cli.main import main
-from megloc_kapture.io.kapture_store import (
+from megloc_kapture.io.kapture import (
     KaptureData,
     KaptureFolder,
     write_sensors,
 )
-from megloc_kapture.io.refinement_table import read_refinement
-from megloc_kapture.io.status_table import read_status
+from megloc_kapture.io.tables import read_refinement, read_status
 from megloc_kapture.pipeline.datasets import choose_dataset
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
 from megloc_kapture.pipeline.executors import single_threaded

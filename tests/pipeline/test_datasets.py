@@ -9,8 +9,8 @@ import pytest
 
 from megloc_kapture.datasets.official import Count, DatasetCard, Missing, OfficialDataset
 from megloc_kapture.errors import DataError, OptionError, PluginError
-from megloc_kapture.io.kapture_store import KaptureData, Sensor
-from megloc_kapture.io.side_tables import Protocol, read_protocol
+from megloc_kapture.io.dataset_tables import Protocol, read_protocol
+from megloc_kapture.io.kapture import KaptureData, Sensor
 from megloc_kapture.pipeline.datasets import (
     SUMMARY_FILE,
     DatasetChoice,

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from megloc_kapture.errors import OptionError
-from megloc_kapture.io.kapture_store import KaptureFolder, read_pairs
+from megloc_kapture.io.kapture import KaptureFolder, read_pairs
 from megloc_kapture.pipeline.datasets import choose_dataset, twin_of
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
 from megloc_kapture.pipeline.executors import open_executor, single_threaded

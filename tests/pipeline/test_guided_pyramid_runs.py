@@ -14,7 +14,7 @@ from megloc_kapture import Camera, KaptureMap, Localizer
 from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.metrics import pose_errors
 from megloc_kapture.io.images import read_image_rgb, write_image
-from megloc_kapture.io.kapture_store import KaptureFolder, Sensor, write_sensors
+from megloc_kapture.io.kapture import KaptureFolder, Sensor, write_sensors
 from megloc_kapture.pipeline.datasets import choose_dataset
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
 from megloc_kapture.pipeline.plan import StageReport, run_plan

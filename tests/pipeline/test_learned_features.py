@@ -11,7 +11,7 @@ import pytest
 from megloc_kapture import KaptureMap, Localizer
 from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.metrics import pose_errors
-from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.datasets import choose_dataset
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
 from megloc_kapture.pipeline.plan import run_plan

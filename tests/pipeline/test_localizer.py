@@ -16,7 +16,7 @@ from megloc_kapture import Camera, Failure, KaptureMap, Localizer, OptionError, 
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.metrics import pose_errors
 from megloc_kapture.io.images import read_image_rgb
-from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.values import LocalFeatures, RigidTransform

@@ -11,7 +11,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from megloc_kapture import KaptureMap, Localizer, Pose, Query
 from megloc_kapture.evaluation.metrics import pose_errors
-from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.datasets import choose_dataset
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
 from megloc_kapture.pipeline.plan import run_plan

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.json_model import write_json_model
+from megloc_kapture.io.files import write_json_model
 from megloc_kapture.pipeline.manifests import FileHashes, Manifest, fingerprint, read_manifest
 
 scalars = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text()

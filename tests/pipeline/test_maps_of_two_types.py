@@ -11,13 +11,13 @@ from kapture.io.csv import kapture_from_dir
 
 from megloc_kapture import KaptureMap, Localizer, Pose
 from megloc_kapture.cli.main import main
-from megloc_kapture.io.kapture_store import (
+from megloc_kapture.io.kapture import (
     KaptureFolder,
     Observations,
     write_observations,
     write_points3d,
 )
-from megloc_kapture.io.status_table import read_status
+from megloc_kapture.io.tables import read_status
 from megloc_kapture.pipeline.datasets import choose_dataset
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
 from megloc_kapture.pipeline.executors import single_threaded

@@ -18,8 +18,8 @@ from megloc_kapture.datasets.synthetic.robotcar_shots import (
 from megloc_kapture.datasets.synthetic.shots import Shot
 from megloc_kapture.datasets.synthetic.truth_masks import on_bonnet, on_movers
 from megloc_kapture.io.images import write_image
-from megloc_kapture.io.kapture_store import KaptureFolder
-from megloc_kapture.io.mask_counts import read_mask_counts
+from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.tables import read_mask_counts
 from megloc_kapture.pipeline.benchmarks import find_benchmark
 from megloc_kapture.pipeline.datasets import TWIN_PREFIX, choose_dataset, twin_of
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation

@@ -11,8 +11,8 @@ import torch
 
 from megloc_kapture import KaptureMap, Localizer
 from megloc_kapture.errors import OptionError
-from megloc_kapture.io.kapture_store import KaptureFolder, read_pairs
-from megloc_kapture.io.match_counts import read_match_counts
+from megloc_kapture.io.kapture import KaptureFolder, read_pairs
+from megloc_kapture.io.tables import read_match_counts
 from megloc_kapture.io.weights import MissingWeightsError
 from megloc_kapture.nets.eigenplaces import EigenPlacesNet
 from megloc_kapture.pipeline.datasets import choose_dataset

@@ -18,23 +18,21 @@ from scipy.spatial.transform import Rotation
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.evaluation.pose_files import read_mlad_file, read_pose_file
 from megloc_kapture.evaluation.protocols import protocol_of
-from megloc_kapture.io.challenge_tables import (
-    RelocalizationPair,
-    write_names,
-    write_relocalization,
-)
-from megloc_kapture.io.json_model import write_json_model
-from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, Sensor, write_sensors
-from megloc_kapture.io.side_tables import (
+from megloc_kapture.io.dataset_tables import (
     ImageGroup,
     Protocol,
+    RelocalizationPair,
     SimilarityTransform,
     World,
     write_groups,
+    write_names,
     write_protocol,
+    write_relocalization,
     write_world,
 )
-from megloc_kapture.io.status_table import QueryStatus, write_status
+from megloc_kapture.io.files import write_json_model
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
+from megloc_kapture.io.tables import QueryStatus, write_status
 from megloc_kapture.pipeline.datasets import DatasetChoice
 from megloc_kapture.pipeline.manifests import Manifest
 from megloc_kapture.pipeline.run import Run

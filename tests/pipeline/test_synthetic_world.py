@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from megloc_kapture.io.dataset_tables import read_groups
 from megloc_kapture.io.images import image_size
-from megloc_kapture.io.kapture_store import KaptureFolder, read_pairs
-from megloc_kapture.io.side_tables import read_groups
+from megloc_kapture.io.kapture import KaptureFolder, read_pairs
 
 pytestmark = pytest.mark.slow
 

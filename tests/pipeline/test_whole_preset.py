@@ -12,12 +12,10 @@ import numpy as np
 import pytest
 
 from megloc_kapture.cli.main import main
-from megloc_kapture.io.cluster_table import read_clusters
-from megloc_kapture.io.kapture_store import KaptureFolder
-from megloc_kapture.io.refinement_table import read_refinement
-from megloc_kapture.io.status_table import read_status
+from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.tables import read_clusters, read_refinement, read_status
 from megloc_kapture.io.weights import find_weights, read_weights
-from megloc_kapture.io.weights_registry import registry
+from megloc_kapture.io.weights.registry import registry
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 from whole_preset import (  # noqa: E402

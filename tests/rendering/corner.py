@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.io.depth_maps import write_depth_map
-from megloc_kapture.io.images import write_image
-from megloc_kapture.io.kapture_store import KaptureData, Sensor, write_sensors
+from megloc_kapture.io.images import write_depth_map, write_image
+from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
 from megloc_kapture.values import Camera, RigidTransform
 
 CAMERA = Camera("PINHOLE", 400, 300, (300.0, 302.0, 200.0, 150.0))

@@ -16,7 +16,7 @@ from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
 from megloc_kapture.features.vlad import VladOptions
 from megloc_kapture.io.colmap import TriangulationOptions
 from megloc_kapture.io.images import write_image
-from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, Sensor, write_sensors
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
 from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
 from megloc_kapture.pipeline.executors import open_executor, single_threaded

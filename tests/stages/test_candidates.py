@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from megloc_kapture.io.kapture_store import FeatureConfig, FeatureWriter, KaptureFolder
+from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
 from megloc_kapture.retrieval.diversity import DiversityOptions
 from megloc_kapture.retrieval.fusion import FusionOptions, fuse
 from megloc_kapture.stages import candidates

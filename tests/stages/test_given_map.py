@@ -16,7 +16,8 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.features.colmap_sift import ColmapSift, ColmapSiftOptions
 from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
 from megloc_kapture.io.colmap import TriangulationOptions
-from megloc_kapture.io.kapture_store import (
+from megloc_kapture.io.files import link_images
+from megloc_kapture.io.kapture import (
     FeatureConfig,
     FeatureWriter,
     KaptureFolder,
@@ -25,7 +26,6 @@ from megloc_kapture.io.kapture_store import (
     write_points3d,
     write_sensors,
 )
-from megloc_kapture.io.links import link_images
 from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
 from megloc_kapture.matching.verification import KnownPoseOptions
 from megloc_kapture.stages.given_map import given_map, given_type, has_descriptors, join_maps

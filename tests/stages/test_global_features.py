@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from megloc_kapture.errors import DataError, PluginError
-from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.stages.global_features import BATCH, describe_images, extract_global_features
 from megloc_kapture.stages.work import Work
 

@@ -20,7 +20,7 @@ from megloc_kapture.geometry.image_variants import ImageVariant
 from megloc_kapture.io.colmap import TriangulationOptions
 from megloc_kapture.io.csv_table import read_csv_table
 from megloc_kapture.io.images import read_image_rgb, write_image
-from megloc_kapture.io.kapture_store import (
+from megloc_kapture.io.kapture import (
     ImagePair,
     KaptureData,
     KaptureFolder,

@@ -13,7 +13,8 @@ import pytest
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import project
-from megloc_kapture.io.kapture_store import (
+from megloc_kapture.io.dataset_tables import ImageGroup
+from megloc_kapture.io.kapture import (
     FeatureConfig,
     FeatureWriter,
     KaptureData,
@@ -22,7 +23,6 @@ from megloc_kapture.io.kapture_store import (
     write_points3d,
     write_sensors,
 )
-from megloc_kapture.io.side_tables import ImageGroup
 from megloc_kapture.mapping.pairs_by_covisibility import PairsByCovisibilityOptions
 from megloc_kapture.mapping.pairs_by_poses import PairsByPosesOptions
 from megloc_kapture.mapping.pairs_by_sequence import PairsBySequenceOptions

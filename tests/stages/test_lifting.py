@@ -12,8 +12,8 @@ from megloc_kapture.datasets.synthetic.writing import write_synthetic_kapture
 from megloc_kapture.errors import DataError
 from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
 from megloc_kapture.geometry.cameras import px_from_cam
-from megloc_kapture.io.depth_maps import read_depth_map
-from megloc_kapture.io.kapture_store import KaptureFolder, write_sensors
+from megloc_kapture.io.images import read_depth_map
+from megloc_kapture.io.kapture import KaptureFolder, write_sensors
 from megloc_kapture.mapping.lifting import LiftingOptions
 from megloc_kapture.stages.depth_records import depth_records
 from megloc_kapture.stages.lifting import lift_map

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError, PluginError
 from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
 from megloc_kapture.io.images import read_image_rgb, write_image
-from megloc_kapture.io.kapture_store import KaptureFolder
-from megloc_kapture.io.mask_counts import read_mask_counts
+from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.tables import read_mask_counts
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera, LocalFeatures

@@ -7,9 +7,8 @@ from typing import Any
 
 import kapture.io.csv
 
-from megloc_kapture.io.cluster_table import CLUSTERS_FILE, read_clusters
-from megloc_kapture.io.kapture_store import KaptureFolder
-from megloc_kapture.io.status_table import STATUS_FILE, read_status
+from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.tables import CLUSTERS_FILE, STATUS_FILE, read_clusters, read_status
 from megloc_kapture.stages.candidates import QueryPairsOptions, Retrieval
 from megloc_kapture.stages.image_pairs import pair_queries
 from megloc_kapture.stages.localized_folder import write_localized

@@ -11,12 +11,15 @@ from typing import Any
 import pytest
 
 from megloc_kapture.evaluation.report.refinement import consistency_sentence
-from megloc_kapture.io.consistency_table import CONSISTENCY_FILE, read_consistency
+from megloc_kapture.io.dataset_tables import ImageGroup
 from megloc_kapture.io.images import read_image_rgb
-from megloc_kapture.io.kapture_store import KaptureFolder
-from megloc_kapture.io.refinement_table import read_refinement
-from megloc_kapture.io.side_tables import ImageGroup
-from megloc_kapture.io.status_table import read_status
+from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.tables import (
+    CONSISTENCY_FILE,
+    read_consistency,
+    read_refinement,
+    read_status,
+)
 from megloc_kapture.plugins import PoseRefinement
 from megloc_kapture.refinement.consistency import Displacement
 from megloc_kapture.stages.localized_folder import write_localized

@@ -14,9 +14,9 @@ import pytest
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import project
-from megloc_kapture.io.depth_maps import write_depth_map
-from megloc_kapture.io.json_model import read_json_model
-from megloc_kapture.io.kapture_store import (
+from megloc_kapture.io.files import read_json_model
+from megloc_kapture.io.images import write_depth_map
+from megloc_kapture.io.kapture import (
     FeatureConfig,
     FeatureWriter,
     KaptureData,
@@ -27,7 +27,7 @@ from megloc_kapture.io.kapture_store import (
     write_points3d,
     write_sensors,
 )
-from megloc_kapture.io.point_covariances import read_point_covariances
+from megloc_kapture.io.kapture.points import read_point_covariances
 from megloc_kapture.mapping.uncertainty import point_covariances
 from megloc_kapture.stages.map_refinement import (
     KEPT_FILE,

@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 
 from megloc_kapture.errors import PluginError
-from megloc_kapture.io.kapture_store import KaptureFolder
-from megloc_kapture.io.refinement_table import read_refinement
-from megloc_kapture.io.side_tables import ImageGroup
-from megloc_kapture.io.status_table import read_status
+from megloc_kapture.io.dataset_tables import ImageGroup
+from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.tables import read_refinement, read_status
 from megloc_kapture.plugins import POSE_REFINERS, PluginChoice, PoseRefinement, plugin_names
 from megloc_kapture.stages.localized_folder import write_localized
 from megloc_kapture.stages.pose_refinement import PoseRefinementOptions, refine_poses

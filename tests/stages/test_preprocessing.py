@@ -20,10 +20,9 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError, OptionError, OutputError, PluginError
 from megloc_kapture.evaluation.report.masks import SegmentedClasses
 from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
-from megloc_kapture.io.depth_maps import read_depth_map
-from megloc_kapture.io.images import image_size, read_image_rgb, write_image
-from megloc_kapture.io.json_model import read_json_model
-from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, Sensor, write_sensors
+from megloc_kapture.io.files import read_json_model
+from megloc_kapture.io.images import image_size, read_depth_map, read_image_rgb, write_image
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.mapping.lifting import lift_keypoints
 from megloc_kapture.preprocessing.fixed_masks import FixedMask
 from megloc_kapture.stages.depth_records import depth_records

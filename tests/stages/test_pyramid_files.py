@@ -9,8 +9,8 @@ import pytest
 
 from megloc_kapture.errors import OutputError
 from megloc_kapture.geometry.image_variants import ImageVariant
-from megloc_kapture.io.kapture_features import FeatureReader, feature_folder
-from megloc_kapture.io.kapture_store import FeatureConfig, FeatureWriter
+from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter
+from megloc_kapture.io.kapture.features import FeatureReader, feature_folder
 from megloc_kapture.matching.guided_pyramid import VariantMatches
 from megloc_kapture.stages.pyramid_files import MatchSpool, PyramidFeatures
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from megloc_kapture.errors import PluginError
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.io.images import read_image_rgb
-from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder
+from megloc_kapture.io.kapture import ImagePair, KaptureFolder
 from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions
 from megloc_kapture.localization.cluster_poses import QueryView, TypedMatches
 from megloc_kapture.localization.map_index import MapIndex

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from megloc_kapture.io.kapture_store import KaptureData, Sensor
+from megloc_kapture.io.kapture import KaptureData, Sensor
 from megloc_kapture.stages.query_units import query_units
 from megloc_kapture.values import Camera, RigidTransform
 

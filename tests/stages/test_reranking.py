@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.kapture_store import (
+from megloc_kapture.io.kapture import (
     FeatureConfig,
     FeatureWriter,
     ImagePair,
@@ -17,7 +17,7 @@ from megloc_kapture.io.kapture_store import (
     read_pairs,
     write_pairs,
 )
-from megloc_kapture.io.match_counts import PairCount, match_counts_path, write_match_counts
+from megloc_kapture.io.tables import PairCount, match_counts_path, write_match_counts
 from megloc_kapture.stages.matches import iterate_candidates
 from megloc_kapture.stages.reranking import (
     RerankingOptions,

@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from megloc_kapture.io.side_tables import ImageGroup, write_groups, write_priors
+from megloc_kapture.io.dataset_tables import ImageGroup, write_groups, write_priors
 from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
 
 IMAGES = ["a.jpg", "b.jpg", "c.jpg", "d.jpg"]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.io.kapture_store import KaptureData, Sensor
+from megloc_kapture.io.kapture import KaptureData, Sensor
 from megloc_kapture.stages.rig_siblings import poses_through_rig
 from megloc_kapture.values import Camera, Pose, RigidTransform
 

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from megloc_kapture.errors import DataError, OutputError
-from megloc_kapture.io.kapture_store import KaptureFolder, write_observations, write_points3d
-from megloc_kapture.io.point_covariances import write_point_covariances
+from megloc_kapture.io.kapture import KaptureFolder, write_observations, write_points3d
+from megloc_kapture.io.kapture.points import write_point_covariances
 from megloc_kapture.localization.map_index import MapIndex
 from megloc_kapture.stages.shared_index import (
     index_map,

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import project, px_from_cam
 from megloc_kapture.io.colmap import TriangulationOptions
-from megloc_kapture.io.kapture_store import (
+from megloc_kapture.io.kapture import (
     FeatureConfig,
     FeatureWriter,
     ImagePair,

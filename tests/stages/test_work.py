@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.stages.work import FolderSpec, ordered_map, untracked
 
 

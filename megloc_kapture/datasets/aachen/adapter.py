@@ -44,8 +44,8 @@ from megloc_kapture.datasets.official import (
 from megloc_kapture.datasets.reference_map import ReferenceModel
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.protocols import protocol_of
-from megloc_kapture.io.kapture_store import KaptureData, Sensor
-from megloc_kapture.io.side_tables import ImageGroup, World
+from megloc_kapture.io.dataset_tables import ImageGroup, World
+from megloc_kapture.io.kapture import KaptureData, Sensor
 from megloc_kapture.values import Options
 
 # the first timestamp of each list; map images count from 0

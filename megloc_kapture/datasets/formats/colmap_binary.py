@@ -28,7 +28,7 @@ from megloc_kapture.datasets.formats.colmap_model import (
 from megloc_kapture.datasets.formats.sparse_points import Tracks
 from megloc_kapture.datasets.formats.text_lines import check_plain, image_name
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.kapture_sensors import unit_quaternion
+from megloc_kapture.io.kapture.sensors import unit_quaternion
 from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, RigidTransform
 
 _MAX_NAME_BYTES = 4096

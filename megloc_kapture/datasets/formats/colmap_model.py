@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.datasets.formats.sparse_points import SparsePoints, Tracks, image_order
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.atomic import atomic_write
+from megloc_kapture.io.files import atomic_write
 from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, RigidTransform
 
 # the ids of camera models, as binary models and databases have them

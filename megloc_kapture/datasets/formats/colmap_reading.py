@@ -43,7 +43,7 @@ from megloc_kapture.datasets.formats.text_lines import (
     read_lines,
 )
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.kapture_sensors import unit_quaternion
+from megloc_kapture.io.kapture.sensors import unit_quaternion
 from megloc_kapture.values import Camera, RigidTransform
 
 _ID_END = 2**32 - 1

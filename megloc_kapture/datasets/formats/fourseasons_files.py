@@ -24,7 +24,7 @@ from megloc_kapture.datasets.formats.text_lines import (
     shown,
 )
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.kapture_sensors import unit_quaternion
+from megloc_kapture.io.kapture.sensors import unit_quaternion
 from megloc_kapture.values import Camera, RigidTransform
 
 CAMERA_FILES = ("undistorted_calib_0.txt", "undistorted_calib_1.txt")

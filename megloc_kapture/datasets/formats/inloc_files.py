@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from megloc_kapture.datasets.formats.text_lines import Line, read_lines
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.atomic import write_bytes
-from megloc_kapture.io.kapture_data import FLOAT_PATTERN
+from megloc_kapture.io.files import write_bytes
+from megloc_kapture.io.kapture.text import FLOAT_PATTERN
 from megloc_kapture.io.mat_file import read_mat_array
 from megloc_kapture.values import RigidTransform
 

@@ -25,8 +25,8 @@ from megloc_kapture.datasets.formats.sparse_points import (
 )
 from megloc_kapture.datasets.formats.text_lines import Line, NumberRows, TextFile
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.atomic import atomic_write
-from megloc_kapture.io.kapture_sensors import unit_quaternion
+from megloc_kapture.io.files import atomic_write
+from megloc_kapture.io.kapture.sensors import unit_quaternion
 from megloc_kapture.values import RigidTransform
 
 HEADER = "NVM_V3"

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from megloc_kapture.datasets.formats.text_lines import Line, read_lines
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.atomic import write_bytes
+from megloc_kapture.io.files import write_bytes
 from megloc_kapture.io.paths import check_relative
 from megloc_kapture.values import Camera
 

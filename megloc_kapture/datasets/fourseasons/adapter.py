@@ -55,8 +55,8 @@ from megloc_kapture.datasets.official import (
 )
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.protocols import protocol_of
-from megloc_kapture.io.kapture_store import KaptureData
-from megloc_kapture.io.side_tables import ImageGroup, Protocol
+from megloc_kapture.io.dataset_tables import ImageGroup, Protocol
+from megloc_kapture.io.kapture import KaptureData
 from megloc_kapture.values import Options, RigidTransform
 
 NAME = "4seasons"

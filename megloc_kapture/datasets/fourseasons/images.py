@@ -18,9 +18,9 @@ from megloc_kapture.datasets.fourseasons.recordings import CAMERAS, Recording, R
 from megloc_kapture.datasets.kapture_folders import MAPPING
 from megloc_kapture.datasets.official import Missing
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.challenge_tables import RelocalizationPair
-from megloc_kapture.io.depth_maps import write_depth_map
-from megloc_kapture.io.kapture_store import KaptureData, Sensor
+from megloc_kapture.io.dataset_tables import RelocalizationPair
+from megloc_kapture.io.images import write_depth_map
+from megloc_kapture.io.kapture import KaptureData, Sensor
 from megloc_kapture.values import Camera, RigidTransform
 
 RIG, DEPTH = "car", "depth"

@@ -30,8 +30,8 @@ from megloc_kapture.datasets.fourseasons.recordings import (
 )
 from megloc_kapture.datasets.official import Missing
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.kapture_store import KaptureFolder
-from megloc_kapture.io.side_tables import SimilarityTransform, World
+from megloc_kapture.io.dataset_tables import SimilarityTransform, World
+from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import RigidTransform
 
 _SEMI_MAJOR_M = 6378137.0

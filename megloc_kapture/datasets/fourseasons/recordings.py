@@ -21,7 +21,7 @@ from megloc_kapture.datasets.formats.fourseasons_files import (
 from megloc_kapture.datasets.kapture_form import is_kapture
 from megloc_kapture.datasets.official import Count, Missing
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.kapture import KaptureFolder
 
 CAMERAS = ("cam0", "cam1")
 CALIBRATION_FOLDERS = ("calibration", "Calibration")

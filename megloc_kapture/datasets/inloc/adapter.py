@@ -35,9 +35,9 @@ from megloc_kapture.datasets.official import (
 )
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.protocols import protocol_of
+from megloc_kapture.io.dataset_tables import ImageGroup, World
 from megloc_kapture.io.images import image_size
-from megloc_kapture.io.kapture_store import KaptureData, Sensor
-from megloc_kapture.io.side_tables import ImageGroup, World
+from megloc_kapture.io.kapture import KaptureData, Sensor
 from megloc_kapture.values import Camera, Options, RigidTransform
 
 CUTOUTS, QUERIES, DEPTH = "database/cutouts", "query/iphone7", "depth"

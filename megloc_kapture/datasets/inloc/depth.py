@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.datasets.formats.inloc_files import Cutout, read_cutout_points
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.depth_maps import write_depth_map
+from megloc_kapture.io.images import write_depth_map
 from megloc_kapture.values import Camera
 
 # the points of another image are off by a good part of its width, those of its own by little

@@ -49,7 +49,7 @@ from megloc_kapture.datasets.robotcar.layout import (
 )
 from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.protocols import protocol_of
-from megloc_kapture.io.side_tables import ImageGroup, Protocol, World
+from megloc_kapture.io.dataset_tables import ImageGroup, Protocol, World
 
 __all__ = ["RobotCar", "RobotCarOptions"]
 

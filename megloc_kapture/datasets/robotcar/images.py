@@ -26,7 +26,7 @@ from megloc_kapture.datasets.robotcar.layout import (
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.poses import rotation_angles_deg, stack_poses
 from megloc_kapture.io.images import image_size
-from megloc_kapture.io.kapture_store import KaptureData, Sensor
+from megloc_kapture.io.kapture import KaptureData, Sensor
 from megloc_kapture.values import Camera, Options, RigidTransform
 
 

@@ -30,7 +30,7 @@ from megloc_kapture.datasets.robotcar.layout import (
     read_test_names,
 )
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.kapture_store import KaptureFolder, Sensor
+from megloc_kapture.io.kapture import KaptureFolder, Sensor
 from megloc_kapture.values import Camera, RigidTransform
 
 _LOCATION = re.compile(r"[0-9]{2,3}")

@@ -29,8 +29,8 @@ from megloc_kapture.datasets.synthetic.map_shots import MapShots, draw_map_and_q
 from megloc_kapture.datasets.synthetic.options import stream
 from megloc_kapture.datasets.synthetic.shots import Shot
 from megloc_kapture.datasets.synthetic.sift_points import write_sift_database
-from megloc_kapture.io.atomic import write_bytes
-from megloc_kapture.io.kapture_store import KaptureData, Sensor, write_sensors
+from megloc_kapture.io.files import write_bytes
+from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
 from megloc_kapture.stages.work import Track, untracked
 
 __all__ = ["AACHEN_TWIN_VERSION", "AachenTwinOptions", "write_aachen_twin"]

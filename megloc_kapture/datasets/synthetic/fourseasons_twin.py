@@ -45,9 +45,9 @@ from megloc_kapture.datasets.synthetic.shots import Shot
 from megloc_kapture.datasets.synthetic.studio import draw_shots
 from megloc_kapture.datasets.synthetic.tracks import exact_tracks
 from megloc_kapture.datasets.synthetic.views import View
-from megloc_kapture.io.atomic import write_bytes
+from megloc_kapture.io.files import write_bytes
 from megloc_kapture.io.images import write_image
-from megloc_kapture.io.kapture_store import KaptureData, Sensor, write_sensors
+from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
 from megloc_kapture.stages.work import Track, untracked
 from megloc_kapture.values import Options, RigidTransform
 

@@ -28,10 +28,10 @@ from megloc_kapture.datasets.synthetic.portable import settled
 from megloc_kapture.datasets.synthetic.shots import Shot, noise_seed
 from megloc_kapture.datasets.synthetic.studio import draw_shots
 from megloc_kapture.datasets.synthetic.views import View
+from megloc_kapture.io.dataset_tables import SIDE_TABLES, ImageGroup, write_groups
 from megloc_kapture.io.images import write_image
-from megloc_kapture.io.kapture_store import KaptureData, Sensor, write_sensors
+from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
 from megloc_kapture.io.mat_file import write_mat_arrays
-from megloc_kapture.io.side_tables import SIDE_TABLES, ImageGroup, write_groups
 from megloc_kapture.stages.work import Track, untracked
 from megloc_kapture.values import Options, RigidTransform
 

@@ -31,8 +31,8 @@ from megloc_kapture.datasets.synthetic.robotcar_shots import (
 )
 from megloc_kapture.datasets.synthetic.shots import Shot
 from megloc_kapture.datasets.synthetic.sift_points import write_sift_database
-from megloc_kapture.io.atomic import write_bytes
-from megloc_kapture.io.kapture_store import KaptureData, Sensor, write_sensors
+from megloc_kapture.io.files import write_bytes
+from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
 from megloc_kapture.stages.work import Track, untracked
 from megloc_kapture.values import Camera, RigidTransform
 

@@ -14,10 +14,7 @@ from megloc_kapture.datasets.synthetic.shots import Shot
 from megloc_kapture.datasets.synthetic.studio import draw_shots
 from megloc_kapture.datasets.synthetic.views import View
 from megloc_kapture.datasets.synthetic.world import SyntheticWorld, build_world
-from megloc_kapture.io.depth_maps import write_depth_map
-from megloc_kapture.io.images import write_image
-from megloc_kapture.io.kapture_store import KaptureData, Sensor, write_sensors
-from megloc_kapture.io.side_tables import (
+from megloc_kapture.io.dataset_tables import (
     ImageGroup,
     Protocol,
     World,
@@ -25,6 +22,8 @@ from megloc_kapture.io.side_tables import (
     write_protocol,
     write_world,
 )
+from megloc_kapture.io.images import write_depth_map, write_image
+from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
 from megloc_kapture.stages.work import Track, untracked
 
 DATASET = "synthetic"

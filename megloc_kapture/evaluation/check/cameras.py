@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from megloc_kapture.evaluation.check.reading import MapCameras, Reference
 from megloc_kapture.geometry.poses import rotation_matrices
-from megloc_kapture.io.side_tables import ImageGroup
+from megloc_kapture.io.dataset_tables import ImageGroup
 
 # how many map cameras a pose's orientation is compared with: a panoramic scan has 36 of one centre
 _NEIGHBOURS = 48

@@ -27,7 +27,7 @@ from megloc_kapture.evaluation.check.mistakes import (
     undecided,
 )
 from megloc_kapture.evaluation.check.reading import MapCameras, Reference
-from megloc_kapture.io.side_tables import World
+from megloc_kapture.io.dataset_tables import World
 
 # a mistake of the whole file shows in this many of its poses
 _SAMPLE = 240

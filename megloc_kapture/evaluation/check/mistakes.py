@@ -21,7 +21,7 @@ from megloc_kapture.geometry.poses import (
     multiply_quats,
     rotate,
 )
-from megloc_kapture.io.side_tables import World
+from megloc_kapture.io.dataset_tables import World
 from megloc_kapture.values import RigidTransform
 
 Arrays = tuple[NDArray[np.float64], NDArray[np.float64]]

@@ -15,21 +15,23 @@ from megloc_kapture.evaluation import pose_files
 from megloc_kapture.evaluation.check.findings import Finding, Severity, plural
 from megloc_kapture.evaluation.pose_files import names_in_pose_file
 from megloc_kapture.geometry.poses import camera_centers, stack_poses
-from megloc_kapture.io.challenge_tables import RelocalizationPair, read_names, read_relocalization
-from megloc_kapture.io.kapture_store import KaptureFolder
-from megloc_kapture.io.side_tables import (
+from megloc_kapture.io.dataset_tables import (
     MAX_QUATERNION_NORM_ERROR,
     SIDE_TABLES,
     ImageGroup,
     PoseFileFormat,
     Protocol,
+    RelocalizationPair,
     World,
     read_groups,
+    read_names,
     read_priors,
     read_protocol,
+    read_relocalization,
     read_world,
 )
-from megloc_kapture.io.text import read_text
+from megloc_kapture.io.files import read_text
+from megloc_kapture.io.kapture import KaptureFolder
 
 _MAPPING, _QUERY = "mapping", "query"
 _KEYS: dict[PoseFileFormat, int] = {"ltvl": 1, "mlad": 2}

@@ -10,8 +10,7 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.check.comparison import compare_poses, compare_relative
 from megloc_kapture.evaluation.check.findings import CheckReport, Finding, Severity, plural, some
 from megloc_kapture.evaluation.check.reading import Reference, Rows, read_rows
-from megloc_kapture.io.challenge_tables import RelocalizationPair
-from megloc_kapture.io.side_tables import ImageGroup
+from megloc_kapture.io.dataset_tables import ImageGroup, RelocalizationPair
 
 _MLAD_DATASETS = ("4seasons",)
 # datasets whose server is known to take either of two endings

@@ -15,10 +15,10 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.report.document import Block, Paragraph, Picture, Pictures
 from megloc_kapture.evaluation.report.pictures import dotted, encoded, image_tag, shrunk
 from megloc_kapture.evaluation.report.wording import counted
+from megloc_kapture.io.files import read_json_model
 from megloc_kapture.io.images import read_image_rgb
-from megloc_kapture.io.json_model import read_json_model
-from megloc_kapture.io.kapture_store import KaptureFolder
-from megloc_kapture.io.mask_counts import read_mask_counts
+from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.tables import read_mask_counts
 from megloc_kapture.values import Options
 
 _BOX = (340, 280)

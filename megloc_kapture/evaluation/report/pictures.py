@@ -15,7 +15,7 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.results import ResultContext
 from megloc_kapture.geometry.cameras import bearing_rays, focal_px
 from megloc_kapture.io.images import read_image_rgb
-from megloc_kapture.io.kapture_store import FeatureReader, MatchesReader
+from megloc_kapture.io.kapture import FeatureReader, MatchesReader
 from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.values import Camera, RigidTransform
 

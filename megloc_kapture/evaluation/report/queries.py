@@ -32,7 +32,7 @@ from megloc_kapture.evaluation.results import ResultContext
 from megloc_kapture.evaluation.scoring import Evaluation, QueryResult
 from megloc_kapture.evaluation.without_truth import QueryWithoutTruth, ResultWithoutTruth
 from megloc_kapture.geometry.poses import camera_centers, invert_quats, rotate, stack_poses
-from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import RigidTransform
 
 NUM_SHOWN = 10

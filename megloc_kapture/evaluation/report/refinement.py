@@ -31,7 +31,7 @@ from megloc_kapture.evaluation.report.wording import (
     format_percent,
 )
 from megloc_kapture.evaluation.results import ResultContext
-from megloc_kapture.io.consistency_table import ConsistencyRow
+from megloc_kapture.io.tables import ConsistencyRow
 from megloc_kapture.plugins import RankingScene
 from megloc_kapture.values import Camera, RefinementRow, RigidTransform
 

@@ -20,9 +20,8 @@ from megloc_kapture.evaluation.report.document import (
     Section,
     Table,
 )
-from megloc_kapture.io.atomic import write_bytes
 from megloc_kapture.io.csv_table import write_csv_table
-from megloc_kapture.io.json_model import write_json
+from megloc_kapture.io.files import write_bytes, write_json
 
 REPORT_HTML = "report.html"
 _WIDTH = 92

@@ -19,10 +19,9 @@ from scipy.spatial.transform import Rotation
 from megloc_kapture.datasets.aachen.adapter import Aachen, AachenOptions
 from megloc_kapture.datasets.official import OfficialDataset, write_official
 from megloc_kapture.errors import DataError, PluginError
-from megloc_kapture.io.challenge_tables import read_names
+from megloc_kapture.io.dataset_tables import read_groups, read_names, read_protocol
 from megloc_kapture.io.images import write_image
-from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, Sensor, write_sensors
-from megloc_kapture.io.side_tables import read_groups, read_protocol
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.plugins import DATASETS, DatasetAdapter, load_plugin
 from megloc_kapture.values import Camera, RigidTransform
 

@@ -17,7 +17,7 @@ from megloc_kapture.datasets.aachen.adapter import Aachen, AachenOptions
 from megloc_kapture.datasets.official import OfficialDataset, write_official
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.images import write_image
-from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.datasets import choose_dataset
 
 import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py

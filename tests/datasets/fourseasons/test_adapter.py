@@ -18,10 +18,16 @@ from megloc_kapture.datasets.fourseasons.poses import LocalFrame, read_keyframe_
 from megloc_kapture.datasets.fourseasons.recordings import Recording
 from megloc_kapture.datasets.official import Missing, OfficialDataset, write_official
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.io.challenge_tables import RelocalizationPair, read_relocalization
-from megloc_kapture.io.depth_maps import read_depth_map
-from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, Sensor, write_sensors
-from megloc_kapture.io.side_tables import read_groups, read_priors, read_protocol, read_world
+from megloc_kapture.io.dataset_tables import (
+    RelocalizationPair,
+    read_groups,
+    read_priors,
+    read_protocol,
+    read_relocalization,
+    read_world,
+)
+from megloc_kapture.io.images import read_depth_map
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.values import Camera, RigidTransform
 
 # at odd nanoseconds: a float of 64 bits would move them

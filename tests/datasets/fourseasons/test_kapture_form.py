@@ -13,7 +13,7 @@ from megloc_kapture.datasets.fourseasons.adapter import FourSeasons, FourSeasons
 from megloc_kapture.datasets.official import OfficialDataset, write_official
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.images import write_image
-from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import RigidTransform
 
 DAY, SNOW = "recording_2020-05-01_10-00-00", "recording_2021-01-02_10-00-00"

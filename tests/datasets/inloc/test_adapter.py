@@ -16,9 +16,8 @@ from megloc_kapture.datasets.inloc.adapter import InLoc, InLocOptions
 from megloc_kapture.datasets.inloc.depth import depth_camera
 from megloc_kapture.datasets.official import OfficialDataset, write_official
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.challenge_tables import read_names
-from megloc_kapture.io.kapture_store import KaptureFolder
-from megloc_kapture.io.side_tables import read_groups, read_protocol
+from megloc_kapture.io.dataset_tables import read_groups, read_names, read_protocol
+from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.plugins import DATASETS, load_plugin
 from megloc_kapture.values import Camera
 

@@ -13,7 +13,7 @@ from kapture.io.csv import kapture_to_dir
 from megloc_kapture.datasets.inloc.adapter import InLoc, InLocOptions
 from megloc_kapture.datasets.official import OfficialDataset, write_official
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.datasets import choose_dataset
 
 

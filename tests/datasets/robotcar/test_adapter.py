@@ -15,10 +15,9 @@ from robotcar_files import CAMERAS, QUERIES, REFERENCE, TEST, TRAIN, put, ts, wr
 from megloc_kapture.datasets.official import OfficialDataset, write_official
 from megloc_kapture.datasets.robotcar.adapter import RobotCar, RobotCarOptions
 from megloc_kapture.errors import DataError, MeglocError, OptionError, PluginError
-from megloc_kapture.io.challenge_tables import read_names
+from megloc_kapture.io.dataset_tables import read_groups, read_names, read_priors, read_protocol
 from megloc_kapture.io.images import write_image
-from megloc_kapture.io.kapture_store import KaptureFolder, write_sensors
-from megloc_kapture.io.side_tables import read_groups, read_priors, read_protocol
+from megloc_kapture.io.kapture import KaptureFolder, write_sensors
 from megloc_kapture.plugins import DATASETS, DatasetAdapter, load_plugin
 from megloc_kapture.values import Camera, RigidTransform
 

@@ -15,8 +15,8 @@ from robotcar_files import CAMERAS, QUERIES, TEST, TRAIN, ts, write_layout
 from megloc_kapture.datasets.official import OfficialDataset, write_official
 from megloc_kapture.datasets.robotcar.adapter import RobotCar, RobotCarOptions
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder
-from megloc_kapture.io.side_tables import read_priors
+from megloc_kapture.io.dataset_tables import read_priors
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder
 from megloc_kapture.pipeline.datasets import choose_dataset
 
 TEST_LIST = "robotcar_v2_test.txt"

@@ -29,9 +29,8 @@ from megloc_kapture.datasets.synthetic.fourseasons_twin import (
     FourSeasonsTwinOptions,
     write_fourseasons_twin,
 )
-from megloc_kapture.io.depth_maps import read_depth_map
-from megloc_kapture.io.images import image_size, read_image_rgb
-from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder
+from megloc_kapture.io.images import image_size, read_depth_map, read_image_rgb
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder
 from megloc_kapture.values import RigidTransform
 
 SMALL = FourSeasonsTwinOptions(

@@ -16,10 +16,9 @@ import megloc_kapture  # noqa: F401  before kapture
 from megloc_kapture.datasets.inloc.adapter import InLoc, InLocOptions
 from megloc_kapture.datasets.official import write_official
 from megloc_kapture.datasets.synthetic.inloc_twin import InLocTwinOptions, write_inloc_twin
-from megloc_kapture.io.depth_maps import read_depth_map
-from megloc_kapture.io.images import read_image_rgb
-from megloc_kapture.io.kapture_store import KaptureFolder
-from megloc_kapture.io.side_tables import read_groups
+from megloc_kapture.io.dataset_tables import read_groups
+from megloc_kapture.io.images import read_depth_map, read_image_rgb
+from megloc_kapture.io.kapture import KaptureFolder
 
 SMALL = InLocTwinOptions(
     modules=1,

@@ -28,9 +28,8 @@ from megloc_kapture.datasets.synthetic.robotcar_twin import (
     RobotCarTwinOptions,
     write_robotcar_twin,
 )
-from megloc_kapture.io.challenge_tables import read_names
+from megloc_kapture.io.dataset_tables import read_groups, read_names
 from megloc_kapture.io.images import image_size, read_image_rgb
-from megloc_kapture.io.side_tables import read_groups
 
 import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
 

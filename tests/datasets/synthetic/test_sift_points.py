@@ -23,7 +23,7 @@ from megloc_kapture.datasets.synthetic.robotcar_twin import (
     write_robotcar_twin,
 )
 from megloc_kapture.features.colmap_sift import ColmapSift
-from megloc_kapture.io.kapture_store import ImagePair, KaptureFolder
+from megloc_kapture.io.kapture import ImagePair, KaptureFolder
 from megloc_kapture.localization.map_index import MapIndex
 from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
 from megloc_kapture.matching.verification import TwoViewOptions

@@ -11,10 +11,9 @@ import pytest
 from megloc_kapture.datasets.synthetic.options import SyntheticWorldOptions
 from megloc_kapture.datasets.synthetic.world import SyntheticWorld, build_world
 from megloc_kapture.datasets.synthetic.writing import depth_name, write_synthetic_kapture
-from megloc_kapture.io.depth_maps import read_depth_map
-from megloc_kapture.io.images import read_image_rgb
-from megloc_kapture.io.kapture_store import KaptureFolder, to_kapture
-from megloc_kapture.io.side_tables import read_groups, read_protocol, read_world
+from megloc_kapture.io.dataset_tables import read_groups, read_protocol, read_world
+from megloc_kapture.io.images import read_depth_map, read_image_rgb
+from megloc_kapture.io.kapture import KaptureFolder, to_kapture
 
 SMALL = SyntheticWorldOptions(
     num_places=2,

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from megloc_kapture.evaluation.check.reading import MapCameras, Reference, read_reference
 from megloc_kapture.geometry.poses import camera_centers, stack_poses
-from megloc_kapture.io.kapture_store import KaptureFolder
-from megloc_kapture.io.side_tables import ImageGroup
+from megloc_kapture.io.dataset_tables import ImageGroup
+from megloc_kapture.io.kapture import KaptureFolder
 
 OPENGL = np.diag([1.0, -1.0, -1.0])
 # x, y, z of the file are x, z, -y of the map: y up instead of z up

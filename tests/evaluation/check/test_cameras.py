@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from megloc_kapture.evaluation.check.cameras import Neighbourhood, camera_sets, storey_offset
 from megloc_kapture.evaluation.check.reading import MapCameras, Reference
-from megloc_kapture.io.side_tables import ImageGroup
+from megloc_kapture.io.dataset_tables import ImageGroup
 
 IMAGES = ("m1", "m2", "m3", "m4")
 CAMERAS = MapCameras(IMAGES, np.tile([1.0, 0, 0, 0], (4, 1)), np.zeros((4, 3)))

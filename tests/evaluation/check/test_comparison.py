@@ -15,7 +15,7 @@ from megloc_kapture.evaluation.check.comparison import path_scores
 from megloc_kapture.evaluation.check.findings import CheckReport, Finding
 from megloc_kapture.evaluation.check.reading import Reference
 from megloc_kapture.evaluation.check.submission import check_submission
-from megloc_kapture.io.side_tables import ImageGroup, SimilarityTransform, World
+from megloc_kapture.io.dataset_tables import ImageGroup, SimilarityTransform, World
 
 CLASSIC = {
     "inverted": ("inverted",),

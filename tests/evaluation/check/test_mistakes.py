@@ -18,7 +18,7 @@ from megloc_kapture.evaluation.check.mistakes import (
     restore_relative,
     undecided,
 )
-from megloc_kapture.io.side_tables import SimilarityTransform, World
+from megloc_kapture.io.dataset_tables import SimilarityTransform, World
 
 ALL = np.ones((3, 10), dtype=bool)
 

@@ -14,7 +14,7 @@ from megloc_kapture.evaluation.check.submission import (
     match_names,
     match_pairs,
 )
-from megloc_kapture.io.side_tables import ImageGroup
+from megloc_kapture.io.dataset_tables import ImageGroup
 
 ROBOTCAR = {
     f"rear/{100 + i}.jpg": f"{c}/rear/{100 + i}.jpg" for i, c in enumerate(["dawn", "night"] * 3)

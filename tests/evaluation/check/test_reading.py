@@ -12,15 +12,15 @@ from hypothesis import strategies as st
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.check.reading import Rows, read_reference, read_rows
 from megloc_kapture.evaluation.pose_files import read_mlad_file, read_pose_file
-from megloc_kapture.io.challenge_tables import write_names
-from megloc_kapture.io.kapture_store import KaptureFolder, write_sensors
-from megloc_kapture.io.side_tables import (
+from megloc_kapture.io.dataset_tables import (
     ImageGroup,
     PoseFileFormat,
     Protocol,
     write_groups,
+    write_names,
     write_protocol,
 )
+from megloc_kapture.io.kapture import KaptureFolder, write_sensors
 
 GOOD = "a.jpg 0.6 0.8 0 0 1.5 -0.2 3\n"
 GOOD_PAIR = "100 205 1.5 -0.2 3 0.8 0 0 0.6\n"

@@ -19,8 +19,7 @@ from megloc_kapture.evaluation.check.reading import MapCameras, Reference, read_
 from megloc_kapture.evaluation.check.submission import (
     check_submission,
 )
-from megloc_kapture.io.challenge_tables import RelocalizationPair
-from megloc_kapture.io.side_tables import Protocol
+from megloc_kapture.io.dataset_tables import Protocol, RelocalizationPair
 
 START = 1_600_000_000_000_000_000
 

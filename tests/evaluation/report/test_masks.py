@@ -19,10 +19,10 @@ from megloc_kapture.evaluation.report.reports import render_report
 from megloc_kapture.evaluation.results import ResultContext, context_of
 from megloc_kapture.evaluation.scoring import evaluate_poses
 from megloc_kapture.evaluation.without_truth import WithoutTruth
+from megloc_kapture.io.dataset_tables import Protocol, write_protocol
 from megloc_kapture.io.images import write_image
-from megloc_kapture.io.kapture_store import FeatureConfig, FeatureWriter, KaptureFolder
-from megloc_kapture.io.mask_counts import write_mask_counts
-from megloc_kapture.io.side_tables import Protocol, write_protocol
+from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
+from megloc_kapture.io.tables import write_mask_counts
 
 CLASSES = ("road", "building", "sky", "person", "car")
 WIDTH, HEIGHT = 640, 480  # of the camera that the kaptures have

@@ -24,9 +24,9 @@ from megloc_kapture.evaluation.report.pictures import (
 from megloc_kapture.evaluation.report.queries import Chosen, QueryPictures
 from megloc_kapture.evaluation.results import ResultContext, context_of
 from megloc_kapture.geometry.cameras import project
+from megloc_kapture.io.dataset_tables import Protocol, write_protocol
 from megloc_kapture.io.images import write_image
-from megloc_kapture.io.kapture_store import FeatureConfig, FeatureWriter, MatchesWriter
-from megloc_kapture.io.side_tables import Protocol, write_protocol
+from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, MatchesWriter
 from megloc_kapture.values import Camera, RigidTransform
 
 CAMERA = Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, 0.02))

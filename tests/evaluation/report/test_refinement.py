@@ -16,10 +16,9 @@ from megloc_kapture.evaluation.report.document import Block, Pictures, Table
 from megloc_kapture.evaluation.report.pictures import encoded, image_tag
 from megloc_kapture.evaluation.report.refinement import in_tiles, refinement_blocks
 from megloc_kapture.evaluation.results import ResultContext
-from megloc_kapture.io.cluster_table import ClusterRow
-from megloc_kapture.io.depth_maps import write_depth_map
-from megloc_kapture.io.images import write_image
-from megloc_kapture.io.kapture_store import KaptureData, KaptureFolder, Sensor, write_sensors
+from megloc_kapture.io.images import write_depth_map, write_image
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
+from megloc_kapture.io.tables import ClusterRow
 from megloc_kapture.values import Camera, RefinementRow, RigidTransform
 
 Displace = Callable[[RigidTransform, np.ndarray, float], RigidTransform]

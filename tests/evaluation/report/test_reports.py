@@ -19,7 +19,7 @@ from megloc_kapture.evaluation.report.queries import disputed_queries, worst_que
 from megloc_kapture.evaluation.report.reports import render_report, report_text, write_report
 from megloc_kapture.evaluation.scoring import Evaluation, evaluate_poses
 from megloc_kapture.evaluation.statistics import Comparison, compare, over_seeds
-from megloc_kapture.io.status_table import QueryStatus
+from megloc_kapture.io.tables import QueryStatus
 from megloc_kapture.values import RigidTransform
 
 HERE = RigidTransform.identity()

@@ -1,4 +1,4 @@
-from megloc_kapture.io.kapture_store import KaptureFolder
+from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.stages.stage import Stage, StageWork
 from megloc_kapture.values import Options
 

@@ -1,0 +1,410 @@
+"""Files: read whole, written atomically, linked, kept as JSON; output folders and their claims.
+
+A file is written beside its final path under a name that no reader lists (``.<token>.tmp``) and
+then renamed over it: a killed run or a full disk leaves the old state or the new one. There is no
+fsync: after a power cut the file system decides, and a thousand small feature files would pay for
+it. Images are linked, never copied or changed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import errno
+import json
+import os
+import secrets
+import shutil
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO, NoReturn, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from megloc_kapture.errors import DataError, OutputError
+
+TEMPORARY_SUFFIX = ".tmp"
+MARKER = ".megloc"
+
+ModelT = TypeVar("ModelT", bound=BaseModel)
+
+
+# ------------------------------------------------------------------------------------ reading
+
+
+def read_content(path: Path | str) -> bytes:
+    """All bytes of a plain file.
+
+    Raises
+    ------
+    DataError : missing, not readable, or no plain file: reading a pipe or a device might never end.
+    """
+    path = Path(path)
+    try:
+        if path.exists() and not path.is_file():
+            raise DataError("not a plain file", path=path)
+        return path.read_bytes()
+    except FileNotFoundError as error:
+        raise DataError("cannot read: the file is missing", path=path) from error
+    except OSError as error:
+        raise DataError(f"cannot read: {error.strerror or error}", path=path) from error
+
+
+def read_text(path: Path | str) -> str:
+    """The text of a UTF-8 file (ASCII included); a byte order mark is dropped.
+
+    Line ends are left as they are.
+
+    Raises
+    ------
+    DataError : see :func:`read_content`; or it is not UTF-8 or holds a NUL; names the file and the
+        line where the text breaks.
+    """
+    content = read_content(path)
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = content.count(b"\n", 0, error.start) + 1
+        raise DataError("not a text file in UTF-8", path=path, line=line) from error
+    if "\0" in text:
+        line = text.count("\n", 0, text.index("\0")) + 1
+        raise DataError("a NUL character in a text file", path=path, line=line)
+    return text
+
+
+# ------------------------------------------------------------------------------------ writing
+
+
+def output_error(path: Path | str, error: OSError) -> OutputError:
+    """The :class:`OutputError` for an ``OSError`` met while writing ``path``."""
+    reason = error.strerror or str(error) or type(error).__name__
+    return OutputError(f"{path}: cannot write: {reason}")
+
+
+@contextlib.contextmanager
+def atomic_write(path: Path | str) -> Iterator[BinaryIO]:
+    """Open a binary file that replaces ``path`` when the block ends well.
+
+    Missing parent folders are made. When the block raises, the temporary file is removed and
+    ``path`` is as it was.
+
+    Raises
+    ------
+    OutputError : the file cannot be written (disk full, permission, ...); names ``path``.
+    """
+    path = Path(path)
+    temporary = path.parent / f".{secrets.token_hex(8)}{TEMPORARY_SUFFIX}"
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            # mode "x" and not mkstemp, whose files are closed to everybody else
+            with open(temporary, "xb") as file:
+                yield file
+            os.replace(temporary, path)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                temporary.unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        if error.filename is not None and not _concerns(error, path, temporary):
+            raise  # not from writing: the block met it while reading something else
+        raise output_error(path, error) from error
+
+
+def _concerns(error: OSError, path: Path, temporary: Path) -> bool:
+    named = os.fspath(error.filename)
+    ours = {os.fspath(path), os.fspath(temporary), *map(os.fspath, path.parents)}
+    return named in ours
+
+
+def write_bytes(path: Path | str, content: bytes) -> None:
+    """Write a whole file atomically; see :func:`atomic_write`."""
+    with atomic_write(path) as file:
+        file.write(content)
+
+
+def replace_directory(new: Path, path: Path) -> None:
+    """Replace folder ``path``, which need not exist, by folder ``new``.
+
+    Both must be on one file system. On Linux the two are exchanged in one step, so that a run
+    killed here leaves either the old or the new folder at ``path``; what was there before is
+    then removed. A run killed during that removal leaves a rest at ``new``'s old name.
+
+    Raises
+    ------
+    OutputError : ``path`` is a file or a link (a user's link is not ours to replace), or the
+        file system refuses; names ``path``.
+    """
+    new, path = Path(new), Path(path)
+    if path.is_symlink() or (path.exists() and not path.is_dir()):
+        raise OutputError(f"{path}: is a link or a file, not a folder; move it away first")
+    try:
+        if not path.exists():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            os.rename(new, path)
+            return
+        if _exchange(new, path):
+            shutil.rmtree(new)
+            return
+        old = path.with_name(f".{path.name}.{secrets.token_hex(8)}{TEMPORARY_SUFFIX}")
+        os.rename(path, old)
+        os.rename(new, path)
+        shutil.rmtree(old)
+    except OSError as error:
+        raise output_error(path, error) from error
+
+
+def _exchange(first: Path, second: Path) -> bool:
+    """Swap two paths in one step; False where the system has no such call."""
+    if not sys.platform.startswith("linux"):
+        return False
+    try:
+        renameat2 = ctypes.CDLL(None, use_errno=True).renameat2
+    except (OSError, AttributeError):
+        return False
+    at_fdcwd, rename_exchange = -100, 2
+    done = renameat2(
+        at_fdcwd, os.fsencode(first), at_fdcwd, os.fsencode(second), ctypes.c_uint(rename_exchange)
+    )
+    if done == 0:
+        return True
+    code = ctypes.get_errno()
+    if code in (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP):
+        return False
+    raise OSError(code, os.strerror(code), os.fspath(second))
+
+
+# ------------------------------------------------------------------------------------ folders
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A folder that was made ours, and what it was before.
+
+    Attributes
+    ----------
+    made : the folders that had to be made for it, innermost first.
+    old_mark : content of the mark that stood there; None: there was none.
+    """
+
+    folder: Path
+    made: tuple[Path, ...]
+    old_mark: bytes | None
+
+    def undo(self) -> None:
+        """Take back the mark and the folders that were made; what has been written stays."""
+        mark = self.folder / MARKER
+        with contextlib.suppress(OSError, OutputError):
+            if self.old_mark is None:
+                mark.unlink(missing_ok=True)
+            elif mark.read_bytes() != self.old_mark:
+                write_bytes(mark, self.old_mark)
+        for folder in self.made:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+
+
+def claim_folder(folder: Path, *, kind: str, force: bool = False) -> Claim:
+    """Make a folder ours, or refuse it.
+
+    A folder is ours when it is new, empty, or carries our mark with the same kind. With
+    ``force`` any folder will do; what stands in it and is not written anew stays.
+
+    Parameters
+    ----------
+    kind : what the folder is for, one word; written into the mark.
+
+    Raises
+    ------
+    OutputError : the folder is somebody else's, or cannot be made; it is as it was.
+    """
+    folder = Path(folder)
+    mark = folder / MARKER
+    content = f"{kind}\n".encode()
+    try:
+        made = tuple(path for path in (folder, *folder.parents) if not path.exists())
+        if not made and not folder.is_dir():
+            raise OutputError(f"{folder}: is a file, a folder is needed")
+        old_mark = mark.read_bytes() if mark.is_file() else None
+        if not made and old_mark != content and not force and any(folder.iterdir()):
+            raise OutputError(
+                f"{folder}: is not empty and not a {kind} of megloc; give an empty folder, "
+                "or -f to write into it all the same"
+            )
+    except OSError as error:
+        raise output_error(folder, error) from error
+    claim = Claim(folder, made, old_mark)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if old_mark != content:
+            write_bytes(mark, content)
+    except OSError as error:
+        claim.undo()
+        raise output_error(folder, error) from error
+    except OutputError:
+        claim.undo()
+        raise
+    return claim
+
+
+@contextlib.contextmanager
+def staged_output(folder: Path, *, kind: str, force: bool = False) -> Iterator[Path]:
+    """A folder to write a command's output to; it gets to ``folder`` only when the block ends well.
+
+    Files that are written anew replace old ones, one by one; others stay. When the
+    block raises, ``folder`` is as it was, and gone if it was not there.
+
+    Raises
+    ------
+    OutputError : see :func:`claim_folder`.
+    """
+    folder = Path(folder)
+    claim = claim_folder(folder, kind=kind, force=force)
+    staging = folder / f".partial-{secrets.token_hex(4)}"
+    try:
+        try:
+            staging.mkdir()
+            yield staging
+            _merge(staging, folder)
+        finally:
+            shutil.rmtree(staging, ignore_errors=True)
+    except OSError as error:
+        claim.undo()
+        # an error that names no file comes from writing: the disk is full, or a quota met
+        if error.filename is not None and not _lies_in(error.filename, folder):
+            raise
+        raise output_error(folder, error) from error
+    except BaseException:
+        claim.undo()
+        raise
+
+
+def _lies_in(name: str | bytes | int, folder: Path) -> bool:
+    if isinstance(name, int):
+        return False
+    return Path(os.path.abspath(os.fsdecode(name))).is_relative_to(os.path.abspath(folder))
+
+
+def _merge(source: Path, target: Path) -> None:
+    for entry in sorted(source.iterdir()):
+        path = target / entry.name
+        if entry.is_dir() and not entry.is_symlink() and path.is_dir() and not path.is_symlink():
+            _merge(entry, path)
+        else:
+            if path.is_symlink():
+                path.unlink()
+            os.replace(entry, path)
+
+
+# -------------------------------------------------------- links; OutputError where one cannot be
+
+
+def link_images(source_root: Path, output_root: Path) -> None:
+    """Make ``output_root/sensors/records_data`` (and masks) a link to ``source_root``'s."""
+    for name in ("records_data", "masks"):
+        source = Path(source_root).resolve() / "sensors" / name
+        link = Path(output_root) / "sensors" / name
+        if source.exists():
+            with _new_link(link):
+                if link.is_symlink():
+                    link.unlink()
+                link.symlink_to(source.resolve(), target_is_directory=True)
+
+
+def link_records(output_root: Path, links: Mapping[str, Path]) -> None:
+    """Make folders or images below ``output_root/sensors/records_data`` links to a dataset's.
+
+    Parameters
+    ----------
+    links : path below ``records_data`` -> the folder or file it shows; ``""`` is ``records_data``
+        itself.
+    """
+    records = Path(output_root) / "sensors" / "records_data"
+    for name, target in links.items():
+        link = records / name if name else records
+        with _new_link(link):
+            link.symlink_to(Path(target).resolve(), target_is_directory=True)
+
+
+def link_file(source: Path, link: Path) -> None:
+    """Make ``link`` a link to one file; a file or link of that name is replaced."""
+    with _new_link(link):
+        link.unlink(missing_ok=True)
+        link.symlink_to(Path(source).resolve())
+
+
+def hard_link(source: Path, link: Path) -> None:
+    """Make ``link`` another name of a file, or a copy of it where the file system has no such."""
+    with _new_link(link):
+        link.unlink(missing_ok=True)
+        try:
+            os.link(source, link)
+        except OSError:  # another file system, or one without hard links
+            shutil.copyfile(source, link)
+
+
+@contextlib.contextmanager
+def _new_link(link: Path) -> Iterator[None]:
+    """Make the folder of a link; an OutputError names the link."""
+    try:
+        link.parent.mkdir(parents=True, exist_ok=True)
+        yield
+    except OSError as error:
+        raise output_error(link, error) from error
+
+
+# --------------------------------------------------------------------------------------- JSON
+
+
+def read_json_model(path: Path | str, model: type[ModelT]) -> ModelT:
+    """Read one JSON file as ``model``.
+
+    Raises
+    ------
+    DataError : the file cannot be read, is not JSON (names the line; NaN and infinity are not
+        JSON), or does not fit the model (names the field).
+    """
+    text = read_text(path)
+    try:
+        content = json.loads(text, parse_constant=_refuse_constant)
+    except json.JSONDecodeError as error:
+        raise DataError(f"not JSON: {error.msg}", path=path, line=error.lineno) from error
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"not JSON: {error}", path=path) from error
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        raise DataError(first_problem(error), path=path) from error
+
+
+def write_json_model(path: Path | str, model: BaseModel) -> None:
+    """Write ``model`` as indented JSON, atomically; the same model gives the same bytes."""
+    write_json(path, model.model_dump(mode="json"))
+
+
+def write_json(path: Path | str, content: Any) -> None:
+    """Write plain JSON data, indented and atomically.
+
+    Raises
+    ------
+    ValueError : ``content`` holds NaN or infinity, which JSON does not know.
+    OutputError : the file cannot be written.
+    """
+    text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
+    write_bytes(path, f"{text}\n".encode())
+
+
+def first_problem(error: ValidationError) -> str:
+    """The first problem of a validation in one line: ``field: what is wrong``."""
+    problem = error.errors(include_url=False)[0]
+    field = ".".join(str(part) for part in problem["loc"])
+    message = problem["msg"].removeprefix("Value error, ")
+    more = error.error_count() - 1
+    tail = f" (and {more} more)" if more else ""
+    return f"{field}: {message}{tail}" if field else f"{message}{tail}"
+
+
+def _refuse_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is not a number in JSON")

@@ -1,0 +1,56 @@
+"""The kapture store: all that other rooms use of it, under one name.
+
+The format is parsed and written by the modules of this package, strictly and fast. kapture itself
+is needed only by who wants its objects (:func:`to_kapture`), and imported there alone: that takes a
+second.
+"""
+
+from megloc_kapture.io.kapture.data import KaptureData, Sensor
+from megloc_kapture.io.kapture.features import (
+    FeatureConfig,
+    FeatureKind,
+    FeatureReader,
+    FeatureWriter,
+    feature_folder,
+)
+from megloc_kapture.io.kapture.folder import KaptureFolder, to_kapture
+from megloc_kapture.io.kapture.matches import (
+    ImagePair,
+    MatchesReader,
+    MatchesWriter,
+    read_pairs,
+    write_pairs,
+)
+from megloc_kapture.io.kapture.observations import Observations, write_observations
+from megloc_kapture.io.kapture.points import (
+    read_point_covariances,
+    write_point_covariances,
+    write_points3d,
+)
+from megloc_kapture.io.kapture.sensors import unit_quaternion, write_sensors
+from megloc_kapture.io.kapture.vectors import KaptureVectors
+
+__all__ = [
+    "FeatureConfig",
+    "FeatureKind",
+    "FeatureReader",
+    "FeatureWriter",
+    "ImagePair",
+    "KaptureData",
+    "KaptureFolder",
+    "KaptureVectors",
+    "MatchesReader",
+    "MatchesWriter",
+    "Observations",
+    "Sensor",
+    "feature_folder",
+    "read_pairs",
+    "read_point_covariances",
+    "to_kapture",
+    "unit_quaternion",
+    "write_observations",
+    "write_pairs",
+    "write_point_covariances",
+    "write_points3d",
+    "write_sensors",
+]

@@ -1,0 +1,359 @@
+"""One kapture folder, read lazily and never written."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.images import read_image_rgb
+from megloc_kapture.io.kapture.data import KaptureData
+from megloc_kapture.io.kapture.features import (
+    ArrayKind,
+    FeatureKind,
+    FeatureReader,
+    feature_folder,
+    list_types,
+)
+from megloc_kapture.io.kapture.matches import MatchesReader
+from megloc_kapture.io.kapture.observations import (
+    Observations,
+    find_observation,
+    read_observations,
+)
+from megloc_kapture.io.kapture.points import read_points3d
+from megloc_kapture.io.kapture.sensors import read_kapture_data
+from megloc_kapture.io.paths import Roots, check_no_escape, safe_join
+from megloc_kapture.values import RigidTransform
+
+if TYPE_CHECKING:
+    import kapture
+
+_ARRAY_KINDS: tuple[ArrayKind, ...] = ("keypoints", "descriptors", "global_features")
+
+
+class KaptureFolder:
+    """Lazy reader of a kapture folder and of feature folders in the orphan layout beside it.
+
+    The kapture's own features come first: a feature folder adds types, and images to a type.
+    Links may lead to below any of the folders given here, those of images under
+    ``sensors/records_data`` anywhere; the folders themselves may be links.
+
+    Parameters
+    ----------
+    root : folder with ``sensors/`` and perhaps ``reconstruction/``.
+    features_dirs : folders with ``local_features/`` and ``global_features/``.
+    allow_links_below : further folders that links may lead to. kapture-localization's proxy
+        folders consist of links: to be read, their targets must be named here.
+    """
+
+    def __init__(
+        self,
+        root: Path | str,
+        *,
+        features_dirs: Sequence[Path | str] = (),
+        allow_links_below: Sequence[Path | str] = (),
+    ) -> None:
+        self.root = Path(root)
+        self.features_dirs = tuple(Path(d) for d in features_dirs)
+        self.allow_links_below = tuple(Path(d) for d in allow_links_below)
+        self._data: KaptureData | None = None
+        self._points: NDArray[np.float64] | None = None
+        self._observations: dict[str, Observations] | None = None
+
+    def with_features(self, features_dirs: Sequence[Path | str]) -> KaptureFolder:
+        """The same folder, with these feature folders instead of its own."""
+        return KaptureFolder(
+            self.root, features_dirs=features_dirs, allow_links_below=self.allow_links_below
+        )
+
+    def read(self) -> KaptureData:
+        """Sensors, rigs, trajectories and records; parsed once.
+
+        Raises
+        ------
+        DataError : names file and line.
+        """
+        if self._data is None:
+            self._data = read_kapture_data(self.root, allow_links_below=self._roots()[1:])
+        return self._data
+
+    def image_path(self, image: str) -> Path:
+        """Path of an image; checked as text, the file need not exist and may be a link.
+
+        Raises
+        ------
+        DataError : the name leads out of ``records_data``.
+        """
+        return safe_join(self.root / "sensors" / "records_data", image)
+
+    def depth_path(self, name: str) -> Path:
+        """Path of a depth map; see :meth:`image_path`."""
+        return self.image_path(name)
+
+    def types(self, kind: FeatureKind) -> list[str]:
+        """Type names of one kind of features, sorted."""
+        found = set(list_types(self.root, kind, orphan=False))
+        for folder in self.features_dirs:
+            found.update(list_types(folder, kind, orphan=True))
+        return sorted(found)
+
+    def keypoints(self, type_name: str) -> FeatureReader:
+        """Keypoints of a type.
+
+        Raises
+        ------
+        DataError : no such type, or a broken configuration.
+        """
+        return self._features("keypoints", type_name)
+
+    def descriptors(self, type_name: str) -> FeatureReader:
+        """Descriptors of a type; see :meth:`keypoints`."""
+        return self._features("descriptors", type_name)
+
+    def global_features(self, type_name: str) -> FeatureReader:
+        """Global features of a type; see :meth:`keypoints`."""
+        return self._features("global_features", type_name)
+
+    def matches(self, type_name: str) -> MatchesReader:
+        """Matches of a keypoints type; see :meth:`keypoints`."""
+        folders = self._folders("matches", type_name)
+        if not folders:
+            raise DataError(self._absent("matches", type_name))
+        return MatchesReader(type_name, folders)
+
+    def has_points(self) -> bool:
+        """True where there are 3D points and observations, which localization needs."""
+        return self._points_path().is_file() and self._observations_path().is_file()
+
+    def points3d(self) -> NDArray[np.float64]:
+        """3D points, float64 (N, 6): X Y Z R G B; colours 0 where there are none.
+
+        Read once; the array is shared and cannot be written to.
+
+        Raises
+        ------
+        DataError : missing or broken; names file and line.
+        """
+        if self._points is None:
+            points = read_points3d(check_no_escape(self._roots(), self._points_path()))
+            points.setflags(write=False)
+            self._points = points
+        return self._points
+
+    def observations(self) -> dict[str, Observations]:
+        """Observations of the 3D points, by keypoints type.
+
+        Read once; the arrays are shared and cannot be written to. Point ids are checked against
+        the points, keypoint ids against the keypoints of every image that has some (an image
+        without is kapture's way to say that it was taken out of the map).
+
+        Raises
+        ------
+        DataError : missing or broken, or ids out of range; names file and line.
+        """
+        if self._observations is None:
+            path = check_no_escape(self._roots(), self._observations_path())
+            found = read_observations(path)
+            num_points = len(self.points3d())
+            for observations in found.values():
+                self._check_observations(observations, num_points, path)
+                for array in (
+                    observations.point_ids,
+                    observations.image_ids,
+                    observations.keypoint_ids,
+                ):
+                    array.setflags(write=False)
+            self._observations = found
+        return dict(self._observations)
+
+    def validate(self, *, deep: bool = False) -> None:
+        """Cross-check everything that is there.
+
+        Configurations and sizes of all feature files; descriptors against keypoints; observations
+        against points and keypoints. With ``deep`` also every image is decoded and compared with
+        its camera's size, every array read and checked to be finite, every match checked against
+        the keypoints.
+
+        Raises
+        ------
+        DataError : the first thing found wrong.
+        """
+        self.read()
+        readers = {kind: self._readers(kind) for kind in _ARRAY_KINDS}
+        for kind in _ARRAY_KINDS:
+            for reader in readers[kind].values():
+                for image in reader.names:
+                    reader.length(image)
+        for descriptors in readers["descriptors"].values():
+            self._check_descriptors(descriptors, readers["keypoints"])
+        for type_name in self.types("matches"):
+            self._check_matches(
+                self.matches(type_name), readers["keypoints"].get(type_name), deep=deep
+            )
+        if self._observations_path().exists() or self._points_path().exists():
+            self.points3d()
+        if self._observations_path().exists():
+            self.observations()
+        if deep:
+            self._check_images()
+            for kind in _ARRAY_KINDS:
+                for reader in readers[kind].values():
+                    _check_finite(reader)
+
+    def _features(self, kind: ArrayKind, type_name: str) -> FeatureReader:
+        folders = self._folders(kind, type_name)
+        if not folders:
+            raise DataError(self._absent(kind, type_name))
+        return FeatureReader(kind, type_name, folders)
+
+    def _readers(self, kind: ArrayKind) -> dict[str, FeatureReader]:
+        return {name: self._features(kind, name) for name in self.types(kind)}
+
+    def _roots(self, first: Path | None = None) -> tuple[Path, ...]:
+        """Folders that links may lead to; the one they are found in comes first, for messages."""
+        return (first or self.root, self.root, *self.features_dirs, *self.allow_links_below)
+
+    def _folders(self, kind: FeatureKind, type_name: str) -> list[tuple[Roots, Path]]:
+        candidates = [(self.root, False), *((folder, True) for folder in self.features_dirs)]
+        return [
+            (self._roots(root), feature_folder(root, kind, type_name, orphan=orphan))
+            for root, orphan in candidates
+            if type_name in list_types(root, kind, orphan=orphan)
+        ]
+
+    def _absent(self, kind: FeatureKind, type_name: str) -> str:
+        searched = ", ".join(str(d) for d in (self.root, *self.features_dirs))
+        present = ", ".join(self.types(kind)) or "none"
+        return f"no {kind} of type {type_name!r} in {searched}; there are: {present}"
+
+    def _points_path(self) -> Path:
+        return self.root / "reconstruction" / "points3d.txt"
+
+    def _observations_path(self) -> Path:
+        return self.root / "reconstruction" / "observations.txt"
+
+    def _check_descriptors(
+        self, descriptors: FeatureReader, keypoints_by_type: dict[str, FeatureReader]
+    ) -> None:
+        keypoints_type = cast(str, descriptors.config.keypoints_type)
+        keypoints = keypoints_by_type.get(keypoints_type)
+        for image in descriptors.names:
+            if keypoints is None or image not in keypoints:
+                raise DataError(
+                    f"image {image!r} has descriptors but no keypoints of type {keypoints_type!r}",
+                    path=descriptors.where(image),
+                )
+            if descriptors.length(image) != keypoints.length(image):
+                raise DataError(
+                    f"{descriptors.length(image)} descriptors for "
+                    f"{keypoints.length(image)} keypoints",
+                    path=descriptors.where(image),
+                )
+
+    def _check_matches(
+        self, matches: MatchesReader, keypoints: FeatureReader | None, *, deep: bool
+    ) -> None:
+        pairs = matches.pairs
+        if not deep:
+            return
+        for pair in pairs:
+            indices, _ = matches.read(*pair)
+            for image, column in zip(pair, indices.T, strict=True):
+                if keypoints is None or image not in keypoints or len(column) == 0:
+                    continue
+                if column.max() >= keypoints.length(image):
+                    raise DataError(
+                        f"matches of {pair[0]!r} and {pair[1]!r} (type {matches.type_name!r}) "
+                        f"point past the keypoints of {image!r}"
+                    )
+
+    def _check_observations(self, observations: Observations, num_points: int, path: Path) -> None:
+        limit = np.full(len(observations.image_names), np.iinfo(np.int32).max, dtype=np.int64)
+        keypoints_type = observations.keypoints_type
+        if keypoints_type in self.types("keypoints"):
+            keypoints = self.keypoints(keypoints_type)
+            for index, image in enumerate(observations.image_names):
+                if image in keypoints:
+                    limit[index] = keypoints.length(image)
+        past_points = observations.point_ids >= num_points
+        wrong = past_points | (observations.keypoint_ids >= limit[observations.image_ids])
+        if not wrong.any():
+            return
+        first = int(np.flatnonzero(wrong)[0])
+        point = int(observations.point_ids[first])
+        image = observations.image_names[int(observations.image_ids[first])]
+        keypoint = int(observations.keypoint_ids[first])
+        line = find_observation(path, keypoints_type, point, image, keypoint)
+        if past_points[first]:
+            raise DataError(
+                f"point id {point}, but there are {num_points} points", path=path, line=line
+            )
+        raise DataError(
+            f"keypoint id {keypoint}, but {image!r} has "
+            f"{int(limit[observations.image_ids[first]])} keypoints of type {keypoints_type!r}",
+            path=path,
+            line=line,
+        )
+
+    def _check_images(self) -> None:
+        data = self.read()
+        for image in data.image_names():
+            path = self.image_path(image)
+            pixels = read_image_rgb(path)
+            sensor = data.sensors[data.record_of(image)[1]]
+            size = (pixels.shape[1], pixels.shape[0])
+            expected = (int(float(sensor.params[1])), int(float(sensor.params[2])))
+            if size != expected:
+                raise DataError(
+                    f"image is {size[0]}x{size[1]}, its camera {expected[0]}x{expected[1]}",
+                    path=path,
+                )
+
+
+def _check_finite(reader: FeatureReader) -> None:
+    for image in reader.names:
+        if not np.isfinite(reader.read(image)).all():
+            raise DataError("not all values are finite", path=reader.where(image))
+
+
+def to_kapture(source: KaptureData | KaptureFolder | Path | str) -> kapture.Kapture:
+    """The sensors, rigs, trajectories and records as kapture's own object, for its tools."""
+    import kapture
+
+    if isinstance(source, Path | str):
+        source = KaptureFolder(source)
+    data = source.read() if isinstance(source, KaptureFolder) else source
+    sensors = kapture.Sensors()
+    for sensor_id, sensor in sorted(data.sensors.items()):
+        sensors[sensor_id] = kapture.create_sensor(
+            sensor.sensor_type, list(sensor.params), sensor.name or None
+        )
+
+    def transform(pose: RigidTransform) -> kapture.PoseTransform:
+        return kapture.PoseTransform(list(pose.quat_wxyz), list(pose.translation))
+
+    rigs = kapture.Rigs()
+    for rig_id, members in sorted(data.rigs.items()):
+        for sensor_id, pose in sorted(members.items()):
+            rigs[rig_id, sensor_id] = transform(pose)
+    trajectories = kapture.Trajectories()
+    for (timestamp, device_id), pose in sorted(data.trajectories.items()):
+        trajectories[int(timestamp), device_id] = transform(pose)
+    records_camera = kapture.RecordsCamera()
+    for (timestamp, sensor_id), name in sorted(data.records_camera.items()):
+        records_camera[int(timestamp), sensor_id] = name
+    records_depth = kapture.RecordsDepth()
+    for (timestamp, sensor_id), name in sorted(data.records_depth.items()):
+        records_depth[int(timestamp), sensor_id] = name
+    return kapture.Kapture(
+        sensors=sensors,
+        rigs=rigs or None,
+        trajectories=trajectories or None,
+        records_camera=records_camera or None,
+        records_depth=records_depth or None,
+    )

@@ -1,0 +1,242 @@
+"""Matches between two images, and pairs of images worth matching.
+
+Matches are keypoint indices and scores. kapture stores a pair under its lexicographically smaller
+name, as float64 (M, 3): index, index, score. Its own writers do not order the pair, so the other
+order is found too. Pairs files are kapture-localization's: query image, map image, score.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.files import output_error, write_bytes
+from megloc_kapture.io.kapture.blobs import BlobSource, FolderBlobWriter
+from megloc_kapture.io.kapture.features import (
+    SUFFIX,
+    blob_sources,
+    check_field,
+    feature_folder,
+)
+from megloc_kapture.io.kapture.tars import TarBlobWriter
+from megloc_kapture.io.kapture.text import format_table, named, parse_float, read_rows
+from megloc_kapture.io.paths import Roots, check_output, check_relative
+
+_BETWEEN = ".overlapping/"
+_ROW_BYTES = 3 * 8
+# kapture stores indices as float64; beyond this they would not be exact
+_MAX_INDEX = 2**53
+
+
+class MatchesReader:
+    """The matches of one keypoints type, from one or several folders; the first one counts."""
+
+    def __init__(self, type_name: str, folders: Sequence[tuple[Roots, Path]]) -> None:
+        """``folders``: (roots that links may not leave, folder of the type), in order.
+
+        Raises
+        ------
+        DataError : no folder.
+        """
+        if not folders:
+            raise DataError(f"no matches of type {type_name!r}")
+        self.type_name = type_name
+        self._sources: list[BlobSource] = []
+        for roots, folder in folders:
+            self._sources += blob_sources(roots, folder, "matches")
+        self._pairs: list[tuple[str, str]] | None = None
+
+    @property
+    def pairs(self) -> list[tuple[str, str]]:
+        """Matched pairs ``(a, b)`` with ``a < b``, sorted.
+
+        Raises
+        ------
+        DataError : a file that names no pair, or an image with itself.
+        """
+        if self._pairs is None:
+            found = set()
+            for source in self._sources:
+                for name in source.names():
+                    parts = name.removesuffix(SUFFIX["matches"]).split(_BETWEEN)
+                    if len(parts) != 2 or parts[0] == parts[1]:
+                        raise DataError("does not name a pair of images", path=source.where(name))
+                    found.add((min(parts), max(parts)))
+            self._pairs = sorted(found)
+        return list(self._pairs)
+
+    def __contains__(self, pair: object) -> bool:
+        if not isinstance(pair, tuple) or len(pair) != 2:
+            return False
+        return self._find(str(pair[0]), str(pair[1])) is not None
+
+    def read(self, a: str, b: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Matches of a pair in either order.
+
+        Returns
+        -------
+        indices : int64 (M, 2), the first column into ``a``'s keypoints, the second into ``b``'s.
+        scores : float64 (M,).
+
+        Raises
+        ------
+        DataError : no such pair, a truncated file, or indices that are not whole and >= 0.
+        """
+        found = self._find(a, b)
+        if found is None:
+            raise DataError(f"no matches of type {self.type_name!r} for {a!r} and {b!r}")
+        source, name, swapped = found
+        content = source.read(name)
+        if len(content) % _ROW_BYTES:
+            raise DataError(
+                f"{len(content)} bytes are not whole rows of 3 x float64; truncated?",
+                path=source.where(name),
+            )
+        rows = np.frombuffer(content, dtype="<f8").reshape(-1, 3)
+        columns = rows[:, :2]
+        with np.errstate(invalid="ignore"):
+            valid = (columns >= 0) & (columns < _MAX_INDEX) & (columns == np.floor(columns))
+        if not valid.all():
+            row = int(np.flatnonzero(~valid.all(axis=1))[0])
+            raise DataError(
+                f"row {row}: {columns[row].tolist()} are not keypoint indices",
+                path=source.where(name),
+            )
+        if swapped:
+            columns = columns[:, ::-1]
+        return columns.astype(np.int64), rows[:, 2].copy()
+
+    def _find(self, a: str, b: str) -> tuple[BlobSource, str, bool] | None:
+        first, second = min(a, b), max(a, b)
+        for source in self._sources:
+            for left, right in ((first, second), (second, first)):
+                name = f"{left}{_BETWEEN}{right}{SUFFIX['matches']}"
+                if name in source:
+                    return source, name, left != a
+        return None
+
+
+class MatchesWriter(AbstractContextManager["MatchesWriter"]):
+    """Write matches of one keypoints type; each pair's file is atomic.
+
+    ``(a, b) in writer`` tells what is written already. Use as a context manager.
+    """
+
+    def __init__(
+        self, root: Path, type_name: str, *, tar: bool = False, orphan: bool = False
+    ) -> None:
+        """
+        Raises
+        ------
+        DataError : the type name cannot be the name of a folder.
+        OutputError : cannot be written.
+        """
+        self.type_name = type_name
+        folder = feature_folder(Path(root), "matches", type_name, orphan=orphan)
+        check_output(Path(root), folder)
+        try:
+            # kapture lists a type by its folder; with no pair at all there must still be one
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise output_error(folder, error) from error
+        self._blobs: FolderBlobWriter | TarBlobWriter
+        self._blobs = TarBlobWriter(folder / "matches.tar") if tar else FolderBlobWriter(folder)
+
+    def __contains__(self, pair: tuple[str, str]) -> bool:
+        return _name(min(pair), max(pair)) in self._blobs
+
+    def write(self, a: str, b: str, indices: ArrayLike, scores: ArrayLike) -> None:
+        """Write one pair: integer indices (M, 2) in the order ``a``, ``b``, and scores (M,).
+
+        Raises
+        ------
+        ValueError : other shapes, indices that are not integers or negative, or ``a == b``.
+        DataError : a name that is no plain relative path.
+        OutputError : cannot be written.
+        """
+        if a == b:
+            raise ValueError(f"image {a!r} matched with itself")
+        pairs = np.asarray(indices)
+        values = np.asarray(scores, dtype=np.float64)
+        if pairs.size == 0:
+            pairs = pairs.reshape(0, 2).astype(np.int64)
+        if pairs.ndim != 2 or pairs.shape[1] != 2 or values.shape != (len(pairs),):
+            raise ValueError(f"expected (M, 2) and (M,), got {pairs.shape} and {values.shape}")
+        if not np.issubdtype(pairs.dtype, np.integer):
+            raise ValueError(f"indices must be integers, got {pairs.dtype}")
+        if pairs.size and int(pairs.min()) < 0:
+            raise ValueError("indices must not be negative")
+        rows = np.empty((len(pairs), 3), dtype="<f8")
+        rows[:, :2] = pairs if a < b else pairs[:, ::-1]
+        rows[:, 2] = values
+        self._blobs.write(_name(check_field(min(a, b)), check_field(max(a, b))), rows.tobytes())
+
+    def close(self) -> None:
+        """Finish the tar; the writer is of no use afterwards."""
+        self._blobs.close()
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _name(first: str, second: str) -> str:
+    return f"{first}{_BETWEEN}{second}{SUFFIX['matches']}"
+
+
+PAIRS_HEADER = "# query_image, map_image, score"
+
+
+@dataclass(frozen=True, order=True, slots=True)
+class ImagePair:
+    """Two images worth matching; the higher the score, the sooner."""
+
+    query: str
+    map: str
+    score: float
+
+
+def read_pairs(path: Path | str) -> list[ImagePair]:
+    """Read a pairs file, in the order of the file; a repeated pair counts once, where it is first.
+
+    Raises
+    ------
+    DataError : names file and line.
+    """
+    path = Path(path)
+    pairs: list[ImagePair] = []
+    seen: set[tuple[str, str]] = set()
+    for line, fields in read_rows(path):
+        if len(fields) != 3:
+            raise DataError(f"expected 3 columns, got {len(fields)}", path=path, line=line)
+        query, map_image = fields[:2]
+        with named(path, line):
+            check_relative(query)
+            check_relative(map_image)
+        score = parse_float(fields[2], "score", path, line)
+        if (query, map_image) not in seen:
+            seen.add((query, map_image))
+            pairs.append(ImagePair(query, map_image, score))
+    return pairs
+
+
+def write_pairs(path: Path | str, pairs: Iterable[ImagePair]) -> None:
+    """Write a pairs file in the given order, atomically.
+
+    Raises
+    ------
+    DataError : a name that is no plain relative path, or a score that is not finite.
+    OutputError : cannot be written.
+    """
+    rows = []
+    for pair in pairs:
+        score = float(pair.score)
+        if not -float("inf") < score < float("inf"):
+            raise DataError(f"score of {pair.query!r}, {pair.map!r} is not finite")
+        rows.append([check_relative(pair.query), check_relative(pair.map), repr(score)])
+    write_bytes(path, format_table(PAIRS_HEADER, rows))

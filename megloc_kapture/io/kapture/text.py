@@ -1,0 +1,126 @@
+"""kapture's text files: one grammar, read strictly, written so that it reads back the same.
+
+Fields are separated by commas, spaces around a field do not count, a line that starts with ``#``
+is a comment. Every complaint names file and line. Timestamps and ids are integers of any length,
+never floats.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.files import read_text
+from megloc_kapture.io.paths import has_control_characters
+
+FORMAT_VERSION = "1.1"
+FORMAT_LINE = f"# kapture format: {FORMAT_VERSION}"
+BYTE_ORDER_MARK = b"\xef\xbb\xbf"
+
+# Python's float() takes more ("1_0", "nan", digits of other scripts) than the format allows
+FLOAT_PATTERN = re.compile(r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
+_VERSION_PATTERN = re.compile(r"# kapture format:\s*([0-9]+\.[0-9]+)")
+_INTEGER_PATTERN = re.compile(r"[+-]?[0-9]{1,40}")
+
+Row = tuple[int, list[str]]
+
+
+def read_lines(path: Path) -> list[str]:
+    """Lines of a UTF-8 text file without their ends (LF or CRLF); a byte order mark is dropped.
+
+    Raises
+    ------
+    DataError : missing, not readable, not UTF-8 or with a NUL (names the line).
+    """
+    lines = read_text(path).split("\n")
+    if lines[-1] == "":
+        lines.pop()
+    return [line.removesuffix("\r") for line in lines]
+
+
+def read_rows(path: Path, *, version_required: bool = False) -> Iterator[Row]:
+    """Rows of a kapture CSV file as ``(line number, stripped fields)``; comments left out.
+
+    Raises
+    ------
+    DataError : see :func:`read_lines`; or the format version on line 1 is another than 1.1, or
+        absent although required; or a line begins with blanks and "#": to kapture that is no
+        comment, and a name that could not be written again.
+    """
+    lines = read_lines(path)
+    check_version(path, lines[0] if lines else "", required=version_required)
+    for number, line in enumerate(lines, start=1):
+        if line.startswith("#") or not line.strip():
+            continue
+        if line.lstrip().startswith("#"):
+            raise DataError("a comment must begin in the first column", path=path, line=number)
+        yield number, split_fields(line)
+
+
+def split_fields(line: str) -> list[str]:
+    """Fields of a line: between commas, without the spaces around."""
+    return [field.strip() for field in line.split(",")]
+
+
+def check_version(path: Path, first_line: str, *, required: bool) -> None:
+    """Refuse a file whose first line names another format version than 1.1."""
+    found = _VERSION_PATTERN.search(first_line)
+    if found is None:
+        if required:
+            raise DataError(f"the first line must be '{FORMAT_LINE}'", path=path, line=1)
+    elif found[1] != FORMAT_VERSION:
+        raise DataError(
+            f"kapture format {found[1]} is not supported; upgrade it to {FORMAT_VERSION}",
+            path=path,
+            line=1,
+        )
+
+
+def parse_integer(text: str, what: str, path: Path, line: int) -> int:
+    """A decimal integer, exactly; never through float."""
+    if not _INTEGER_PATTERN.fullmatch(text):
+        raise DataError(f"{what} {text!r} is not an integer", path=path, line=line)
+    return int(text)
+
+
+def parse_float(text: str, what: str, path: Path | None = None, line: int | None = None) -> float:
+    """A finite decimal number."""
+    if not FLOAT_PATTERN.fullmatch(text):
+        finite = text.lower().lstrip("+-") not in ("nan", "inf", "infinity")
+        problem = "is not a number" if finite else "is not finite"
+        raise DataError(f"{what} {text!r} {problem}", path=path, line=line)
+    value = float(text)
+    if not math.isfinite(value):
+        raise DataError(f"{what} {text!r} is not finite", path=path, line=line)
+    return value
+
+
+@contextlib.contextmanager
+def named(path: Path, line: int | None = None) -> Iterator[None]:
+    """A DataError of the block gets the file and the line."""
+    try:
+        yield
+    except DataError as error:
+        raise DataError(error.message, path=path, line=line) from None
+
+
+def format_table(header: str, rows: Iterable[Sequence[str]]) -> bytes:
+    """A kapture CSV file: the version line, the column header, the rows.
+
+    Raises
+    ------
+    DataError : a field that would not be read back as it is (comma, line break, outer spaces).
+    """
+    lines = [FORMAT_LINE, header]
+    for row in rows:
+        for text in row:
+            if "," in text or text != text.strip() or has_control_characters(text):
+                raise DataError(f"{text!r} cannot stand in a kapture text file")
+        if row[0].startswith("#"):
+            raise DataError(f"{row[0]!r} would be read as a comment")
+        lines.append(", ".join(row))
+    return ("\n".join(lines) + "\n").encode("utf-8")

@@ -1,0 +1,342 @@
+"""The tables of a workspace as records: one type, one reader and one writer each.
+
+==================== =============================================================================
+status.csv           the outcome of every query, beside the localized poses
+clusters.csv         the clusters of candidates that every query was tried in
+refinement.csv       the outcome of refining each query's pose, step by step
+map_consistency.csv  how far a map's own images would move, by coordinate frame
+match_counts.csv     matches of each pair, found and verified, beside the matches of a type
+masked.csv           keypoints that masks removed, by image, beside the features of a type
+==================== =============================================================================
+
+Readers raise DataError, which names file, line and column (see :meth:`.csv_table.Table.read`);
+writers OutputError where the file cannot be written.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+from pydantic import Field, model_validator
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.csv_table import (
+    COUNT,
+    IMAGES,
+    POSE,
+    TEXT,
+    YES_NO,
+    Table,
+    list_of,
+    number,
+    one_of,
+    or_empty,
+)
+from megloc_kapture.io.paths import check_relative
+from megloc_kapture.values import ClusterPose, Options, RefinementRow, RigidTransform
+
+STATUS_FILE = "status.csv"
+CLUSTERS_FILE = "clusters.csv"
+REFINEMENT_FILE = "refinement.csv"
+CONSISTENCY_FILE = "map_consistency.csv"
+
+Fallback = Literal["none", "retrieval", "rig"]
+
+
+class QueryStatus(Options):
+    """One row of ``status.csv``.
+
+    Parameters
+    ----------
+    image : the query.
+    status : ``localized``: the pose was estimated from the image; ``failed``: it was not.
+    reason : why it failed; empty for a localized query.
+    num_matches : 2D-3D matches the solver was given.
+    num_inliers : those that agree with the pose.
+    cluster : index of the candidate cluster the pose comes from; None without clusters.
+    fallback : ``retrieval``: a failed query was given the pose of the best retrieved map image, a
+        guess; ``rig``: it was given its pose through the rig, by another camera of its moment.
+        Everything that counts poses says how many of them are fallbacks.
+    candidates : the map images the pose comes from, best first.
+    refinement : by method, whether a refined pose was accepted or why the one before it stays;
+        empty where nothing was refined.
+    remarks : steps that were left out because the query, or the map, lacks what they need.
+    """
+
+    image: str
+    status: Literal["localized", "failed"]
+    reason: str = ""
+    num_matches: int = Field(default=0, ge=0)
+    num_inliers: int = Field(default=0, ge=0)
+    cluster: int | None = Field(default=None, ge=0)
+    fallback: Fallback = "none"
+    candidates: tuple[str, ...] = ()
+    refinement: str = ""
+    remarks: str = ""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> QueryStatus:
+        try:
+            check_relative(self.image)
+        except DataError as error:
+            raise ValueError(error.message) from error
+        if self.status == "localized" and self.fallback != "none":
+            raise ValueError("a localized query has no fallback pose")
+        if self.status == "localized" and self.reason:
+            raise ValueError("a localized query has no reason to fail")
+        if self.status == "failed" and not self.reason.strip():
+            raise ValueError("a failed query needs a reason")
+        if any(not name or "," in name for name in self.candidates):
+            raise ValueError("a candidate is empty or holds a ','")
+        return self
+
+
+_STATUS = Table(
+    QueryStatus,
+    {
+        "image": TEXT,
+        "status": TEXT,
+        "reason": TEXT,
+        "num_matches": COUNT,
+        "num_inliers": COUNT,
+        "cluster": or_empty(COUNT),
+        "fallback": TEXT,
+        "candidates": IMAGES,
+        "refinement": TEXT,
+        "remarks": TEXT,
+    },
+    keys=[("image",)],
+)
+
+
+def read_status(path: Path | str) -> dict[str, QueryStatus]:
+    """Read ``status.csv`` (the file itself): image -> status, sorted by image."""
+    return {row.image: row for row in sorted(_STATUS.read(path), key=lambda row: row.image)}
+
+
+def write_status(path: Path | str, statuses: Iterable[QueryStatus]) -> None:
+    """Write ``status.csv`` (the file itself), sorted by image."""
+    _STATUS.write(path, sorted(statuses, key=lambda status: status.image))
+
+
+@dataclass(frozen=True)
+class ClusterRow:
+    """One row of ``clusters.csv``.
+
+    Parameters
+    ----------
+    image : the query.
+    cluster : its number; ``status.csv`` names the one a pose comes from.
+    chosen : ``yes``: the pose comes from this one.
+    score : of the ranking; None without a pose, ``reason`` then says why.
+    images : map images of the cluster that match the query, best first.
+    cam_from_world : its pose before the final refinement; None without one.
+    """
+
+    image: str
+    cluster: int
+    chosen: Literal["yes", "no"]
+    num_matches: int
+    num_inliers: int
+    score: float | None
+    reason: str
+    images: tuple[str, ...]
+    cam_from_world: RigidTransform | None
+
+
+_CLUSTERS = Table(
+    ClusterRow,
+    {
+        "image": TEXT,
+        "cluster": COUNT,
+        "chosen": one_of("yes", "no"),
+        "num_matches": COUNT,
+        "num_inliers": COUNT,
+        "score": or_empty(number(".6g")),
+        "reason": TEXT,
+        "images": IMAGES,
+        "cam_from_world": or_empty(POSE),
+    },
+)
+
+
+def read_clusters(path: Path | str) -> dict[str, list[ClusterRow]]:
+    """Read ``clusters.csv`` (the file itself): query -> its clusters."""
+    clusters: dict[str, list[ClusterRow]] = {}
+    for row in _CLUSTERS.read(path):
+        clusters.setdefault(row.image, []).append(row)
+    return clusters
+
+
+def write_clusters(
+    path: Path, rows: Iterable[tuple[str, tuple[ClusterPose, ...], int | None]]
+) -> None:
+    """Write the clusters of every query: (image, its clusters, number of the chosen one)."""
+    records = [
+        ClusterRow(
+            image=image,
+            cluster=index,
+            chosen="yes" if index == chosen else "no",
+            num_matches=cluster.num_matches,
+            num_inliers=cluster.num_inliers,
+            score=cluster.score,
+            reason=cluster.reason,
+            images=cluster.images,
+            cam_from_world=cluster.cam_from_world,
+        )
+        for image, clusters, chosen in sorted(rows, key=lambda row: row[0])
+        for index, cluster in enumerate(clusters)
+    ]
+    _CLUSTERS.write(path, records)
+
+
+def _refinement_row(accepted: bool, **values: Any) -> RefinementRow:
+    row = RefinementRow(**values)
+    if accepted != row.accepted:
+        raise DataError(f"accepted and reason {row.reason!r} contradict each other")
+    return row
+
+
+_REFINEMENT = Table(
+    _refinement_row,
+    {
+        "image": TEXT,
+        "method": TEXT,
+        "accepted": YES_NO,
+        "reason": TEXT,
+        "moved_m": number(".6f"),
+        "turned_deg": number(".6f"),
+        "measures": list_of(";"),
+        "before": POSE,
+    },
+)
+
+
+def refinement_text(rows: Sequence[RefinementRow]) -> str:
+    """The outcome of refining a query's pose, as ``status.csv`` has it."""
+    return "; ".join(f"{row.method}: {'accepted' if row.accepted else row.reason}" for row in rows)
+
+
+def read_refinement(path: Path | str) -> list[RefinementRow]:
+    """Read ``refinement.csv`` (the file itself), in its order."""
+    return list(_REFINEMENT.read(path))
+
+
+def write_refinement(path: Path, rows: Iterable[RefinementRow]) -> None:
+    """Write ``refinement.csv`` (the file itself) by image; the steps of one stay in order."""
+    _REFINEMENT.write(path, sorted(rows, key=lambda row: row.image))
+
+
+@dataclass(frozen=True)
+class ConsistencyRow:
+    """One row of ``map_consistency.csv``: a refiner's test of one coordinate frame of a map.
+
+    Attributes
+    ----------
+    images, contradicting : map images whose displacement is known, and those that contradict.
+    moved_m, turned_deg, moved_px, claimed_m, claimed_deg, squared_distance : their medians, as of
+        ``megloc_kapture.refinement.consistency.Displacement``; NaN where there is none.
+    reason : why poses of queries are not refined there; empty where they are.
+    """
+
+    frame: str
+    method: str
+    images: int
+    contradicting: int
+    moved_m: float
+    turned_deg: float
+    moved_px: float
+    claimed_m: float
+    claimed_deg: float
+    squared_distance: float
+    reason: str
+
+
+_MEDIAN = or_empty(number(".6g"), math.nan)
+_CONSISTENCY = Table(
+    ConsistencyRow,
+    {
+        "frame": TEXT,
+        "method": TEXT,
+        "images": COUNT,
+        "contradicting": COUNT,
+        "moved_m": _MEDIAN,
+        "turned_deg": _MEDIAN,
+        "moved_px": _MEDIAN,
+        "claimed_m": _MEDIAN,
+        "claimed_deg": _MEDIAN,
+        "squared_distance": _MEDIAN,
+        "reason": TEXT,
+    },
+)
+
+
+def read_consistency(path: Path | str) -> list[ConsistencyRow]:
+    """Read ``map_consistency.csv`` (the file itself), in its order."""
+    return list(_CONSISTENCY.read(path))
+
+
+def write_consistency(path: Path, rows: Iterable[ConsistencyRow]) -> None:
+    """Write ``map_consistency.csv`` (the file itself), in the order given."""
+    _CONSISTENCY.write(path, rows)
+
+
+@dataclass(frozen=True)
+class PairCount:
+    """One row of ``match_counts.csv``: matches that were found, and that verification left."""
+
+    image: str
+    other: str
+    matches: int
+    verified: int
+
+
+_MATCH_COUNTS = Table(
+    PairCount, {"image": TEXT, "other": TEXT, "matches": COUNT, "verified": COUNT}
+)
+
+
+def match_counts_path(features_dir: Path, type_name: str) -> Path:
+    """``match_counts.csv`` of a keypoints type in a features folder (orphan layout)."""
+    return features_dir / "local_features" / type_name / "match_counts.csv"
+
+
+def read_match_counts(features_dir: Path, type_name: str) -> list[PairCount]:
+    """Read ``match_counts.csv`` of a keypoints type, in its order."""
+    return list(_MATCH_COUNTS.read(match_counts_path(features_dir, type_name)))
+
+
+def write_match_counts(features_dir: Path, type_name: str, counts: Iterable[PairCount]) -> None:
+    """Write ``match_counts.csv`` of a keypoints type, in the order given."""
+    _MATCH_COUNTS.write(match_counts_path(features_dir, type_name), counts)
+
+
+class MaskCount(NamedTuple):
+    """One row of ``masked.csv``."""
+
+    image: str
+    num_masked: int
+
+
+_MASK_COUNTS = Table(MaskCount, {"image": TEXT, "num_masked": COUNT})
+
+
+def mask_counts_path(features_dir: Path, type_name: str) -> Path:
+    """``masked.csv`` of a keypoints type in a feature folder (orphan layout)."""
+    return features_dir / "local_features" / type_name / "masked.csv"
+
+
+def read_mask_counts(features_dir: Path, type_name: str) -> dict[str, int]:
+    """Read ``masked.csv`` of a keypoints type: image -> keypoints; empty where there is none."""
+    path = mask_counts_path(features_dir, type_name)
+    return {row.image: row.num_masked for row in _MASK_COUNTS.read(path)} if path.is_file() else {}
+
+
+def write_mask_counts(features_dir: Path, type_name: str, counts: Mapping[str, int]) -> None:
+    """Write ``masked.csv`` of a keypoints type: image that has a mask -> keypoints it removed."""
+    rows = (MaskCount(image, count) for image, count in sorted(counts.items()))
+    _MASK_COUNTS.write(mask_counts_path(features_dir, type_name), rows)

@@ -1,0 +1,41 @@
+"""Weights of networks: the folder they lie in, their sha256, their tensors, read safely."""
+
+from megloc_kapture.io.weights.folder import (
+    FOLDER_VARIABLE,
+    SOURCE_KEY,
+    UNVERIFIED,
+    MissingWeightsError,
+    WeightsFile,
+    add_weights,
+    check_sha256,
+    convert_weights,
+    describe,
+    files_of,
+    find_all_weights,
+    find_weights,
+    how_to_get,
+    prove,
+    read_weights,
+    sha256_of,
+    weights_folder,
+)
+
+__all__ = [
+    "FOLDER_VARIABLE",
+    "SOURCE_KEY",
+    "UNVERIFIED",
+    "MissingWeightsError",
+    "WeightsFile",
+    "add_weights",
+    "check_sha256",
+    "convert_weights",
+    "describe",
+    "files_of",
+    "find_all_weights",
+    "find_weights",
+    "how_to_get",
+    "prove",
+    "read_weights",
+    "sha256_of",
+    "weights_folder",
+]

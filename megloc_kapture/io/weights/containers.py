@@ -1,0 +1,246 @@
+"""Tensors out of every container that checkpoints are published in; nothing of a file is ever run.
+
+A pickle is a program. What torch saves is read by torch's restricted reader, which builds tensors
+and plain containers and refuses everything else; ``pickle`` itself is used nowhere.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import tarfile
+import zlib
+from collections.abc import Callable, Mapping
+from pathlib import PurePath
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.errors import DataError, OptionError
+
+if TYPE_CHECKING:
+    import torch
+
+CONVERTER = "docs/weights.md, section 'Checkpoints with foreign objects'"
+_INDEX = ".index"
+_TAR_MAGIC = slice(257, 262)
+# under these keys training scripts keep the state dict
+_STATE_KEYS = ("state_dict", "model_state")
+
+
+def read_checkpoint(
+    content: bytes, where: str, read_beside: Callable[[str], bytes]
+) -> dict[str, torch.Tensor]:
+    """All tensors of a checkpoint by name, on the processor.
+
+    Parameters
+    ----------
+    content : the file's bytes: of torch (also with ``state_dict`` or ``model_state`` in it),
+        safetensors, npz, ONNX (initialisers), MATLAB's ``.mat`` of NetVLAD, TensorFlow's
+        ``.index``, or a tar of the latter.
+    where : the file; its ending says what it is, save for tars and torch's files.
+    read_beside : content of the file beside it whose name ends otherwise than in
+        ``.index``.
+
+    Returns
+    -------
+    dict : names without the prefix ``module.`` of parallel training.
+
+    Raises
+    ------
+    DataError : no container of these, broken, or holds objects that are never loaded.
+    OptionError : an ONNX file, and the package onnx is not installed.
+    """
+    ending = PurePath(where).suffix.lower()
+    if ending == ".safetensors":
+        return _of_safetensors(content, where)
+    if ending == ".npz":
+        return _of_arrays(_npz(content, where), where)
+    if ending == ".onnx":
+        return _of_arrays(_onnx(content, where), where)
+    if ending == ".mat":
+        from megloc_kapture.io.weights.netvlad import read_matlab_netvlad
+
+        return read_matlab_netvlad(content, where)
+    if ending == _INDEX:
+        from megloc_kapture.io.weights.tensorflow import read_tensor_bundle
+
+        return _of_arrays(read_tensor_bundle(content, read_beside, where), where)
+    if content[_TAR_MAGIC] == b"ustar" or content[:2] == b"\x1f\x8b":
+        return _of_arrays(_tar(content, where), where)
+    return _of_torch(content, where)
+
+
+def _of_torch(content: bytes, where: str) -> dict[str, torch.Tensor]:
+    from pickle import UnpicklingError  # the error that torch raises
+
+    import torch
+
+    from megloc_kapture.io.weights.apgem import holds_pca, stand_ins, tensors_beside
+
+    is_apgem = holds_pca(content)
+    try:
+        with torch.serialization.safe_globals(stand_ins() if is_apgem else _dropped()):
+            found = torch.load(io.BytesIO(content), weights_only=True, map_location="cpu")
+    except Exception as error:  # torch's reader raises what it likes for broken bytes
+        foreign = sorted(set(re.findall(r"GLOBAL ([\w.]+)", str(error))))
+        if isinstance(error, UnpicklingError) and foreign:
+            raise DataError(
+                f"holds objects that are never loaded ({', '.join(foreign)}), because loading "
+                f"them runs code; convert it once, as {CONVERTER} says",
+                path=where,
+            ) from error
+        raise DataError(
+            "no file of weights that can be read (torch, safetensors, npz, ONNX, TensorFlow), "
+            "or it is damaged",
+            path=where,
+        ) from error
+    tensors = _state_dict(found, where)
+    if is_apgem and isinstance(found, Mapping):
+        tensors |= tensors_beside(found, where)
+    return tensors
+
+
+class _Dropped:
+    """Stands for an object that is not needed: takes whatever it is built of, keeps nothing."""
+
+    def __init__(self, *_: object) -> None:
+        pass
+
+    def __setstate__(self, _: object) -> None:
+        pass
+
+
+def _dropped() -> list[Any]:
+    """Stand-ins for what torch's reader would refuse though no weight depends on it.
+
+    Training scripts keep a score beside the weights (DeepLabV3+: ``best_score``), and a score of
+    numpy is pickled as a call of numpy.core.multiarray.scalar on a numpy.dtype. Allowing those two
+    would hand bytes of the file to numpy's C code; a stand-in of the same name runs nothing, and
+    the score, which is no tensor, is left out.
+    """
+    names = ("numpy.dtype", "numpy.core.multiarray.scalar", "numpy._core.multiarray.scalar")
+    return [(_Dropped, name) for name in names]
+
+
+def _state_dict(found: Any, where: str) -> dict[str, torch.Tensor]:
+    import torch
+
+    for key in _STATE_KEYS:
+        if isinstance(found, Mapping) and isinstance(found.get(key), Mapping):
+            found = found[key]
+    tensors: dict[str, torch.Tensor] = {}
+    for key, value in found.items() if isinstance(found, Mapping) else ():
+        if isinstance(value, torch.Tensor):
+            name = str(key).removeprefix("module.")
+            if name in tensors:
+                raise DataError(f"{name} is in it twice, with and without 'module.'", path=where)
+            tensors[name] = value.detach()
+    if not tensors:
+        raise DataError("holds no tensors by name", path=where)
+    return tensors
+
+
+def _of_safetensors(content: bytes, where: str) -> dict[str, torch.Tensor]:
+    from safetensors import SafetensorError
+    from safetensors.torch import load
+
+    try:
+        return _state_dict(load(content), where)
+    except (SafetensorError, KeyError, ValueError) as error:  # KeyError: a type torch has not
+        raise DataError(f"not a safetensors file that can be read: {error}", path=where) from error
+
+
+def _npz(content: bytes, where: str) -> dict[str, NDArray[Any]]:
+    try:
+        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays.files}
+    except Exception as error:  # zip, zlib and numpy's header each raise their own
+        raise DataError(f"not an npz file that can be read: {error}", path=where) from error
+
+
+def _onnx(content: bytes, where: str) -> dict[str, NDArray[Any]]:
+    """The initialisers of an ONNX model; bfloat16 becomes float32, which is exact."""
+    try:
+        from onnx import TensorProto, load_model_from_string, numpy_helper
+    except ImportError as error:
+        raise OptionError(
+            f"{where}: to read ONNX files, install the package onnx: "
+            "pip install 'megloc-kapture[convert]'"
+        ) from error
+    found: dict[str, NDArray[Any]] = {}
+    try:
+        model = load_model_from_string(content)
+        if not model.HasField("graph"):
+            raise ValueError("no graph in it")
+        if model.graph.sparse_initializer:
+            raise ValueError("sparse initialisers are not supported")
+        for tensor in model.graph.initializer:
+            if tensor.data_location == TensorProto.EXTERNAL:
+                raise ValueError(f"the weights {tensor.name!r} lie in another file")
+            if tensor.name in found:
+                raise ValueError(f"two initialisers {tensor.name!r}")
+            if tensor.data_type in (TensorProto.UNDEFINED, TensorProto.STRING):
+                raise ValueError(f"initialiser {tensor.name!r} is no array of numbers")
+            if any(size < 0 for size in tensor.dims):  # numpy would guess the size
+                raise ValueError(f"initialiser {tensor.name!r} of shape {list(tensor.dims)}")
+            try:
+                array = numpy_helper.to_array(tensor)
+            except ValueError as error:
+                raise ValueError(f"initialiser {tensor.name!r}: {error}") from error
+            widened = tensor.data_type == TensorProto.BFLOAT16
+            found[tensor.name] = array.astype(np.float32) if widened else array
+    except Exception as error:  # protobuf and onnx each raise their own
+        problem = str(error).partition("\n")[0] or type(error).__name__
+        raise DataError(f"not an ONNX file that can be read: {problem}", path=where) from error
+    return found
+
+
+def _tar(content: bytes, where: str) -> dict[str, NDArray[Any]]:
+    """The TensorFlow checkpoint in a tar; its members are read in memory, nothing is unpacked."""
+    from megloc_kapture.io.weights.tensorflow import read_tensor_bundle
+
+    try:
+        with tarfile.open(fileobj=io.BytesIO(content)) as archive:
+            members = {m.name: m for m in archive.getmembers() if m.isreg()}
+            # a Mac adds ._NAME beside each NAME
+            stems = [
+                name.removesuffix(_INDEX)
+                for name in sorted(members)
+                if name.endswith(_INDEX) and not PurePath(name).name.startswith("._")
+            ]
+            if len(stems) != 1:
+                some = f": {', '.join(stems)}" if stems else ""
+                raise DataError(
+                    f"{len(stems)} TensorFlow checkpoints (X.index) in it, not one{some}",
+                    path=where,
+                )
+
+            def read(ending: str) -> bytes:
+                member = members.get(stems[0] + ending)
+                file = None if member is None else archive.extractfile(member)
+                if file is None:
+                    raise DataError(f"no {stems[0]}{ending} in it", path=where)
+                return file.read()
+
+            return read_tensor_bundle(read(_INDEX), read, f"{where}/{stems[0]}{_INDEX}")
+    except (tarfile.TarError, OSError, EOFError, zlib.error) as error:
+        problem = str(error).partition("\n")[0]  # of gz, bz2 and xz, tarfile tells each
+        raise DataError(f"not a tar file that can be read: {problem}", path=where) from error
+
+
+def _of_arrays(arrays: Mapping[str, NDArray[Any]], where: str) -> dict[str, torch.Tensor]:
+    import torch
+
+    try:
+        return _state_dict(
+            {
+                # torch wants the machine's byte order, and memory that it may write to
+                name: torch.from_numpy(np.array(a, dtype=a.dtype.newbyteorder("="), order="C"))
+                for name, a in arrays.items()
+            },
+            where,
+        )
+    except TypeError as error:
+        raise DataError(f"holds arrays that are no numbers: {error}", path=where) from error

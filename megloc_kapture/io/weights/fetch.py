@@ -1,0 +1,252 @@
+"""Downloads that go on where they stopped, and get their name only when they are right.
+
+What has arrived lies beside the file (``.NAME.part``), with what tells one state of the file on
+the server from another (``.NAME.part.json``). The rest is asked for with ``Range`` and, so that two
+states are never joined, ``If-Range`` (RFC 9110, sections 13.1.5 and 14.2).
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import hashlib
+import http.client
+import io
+import os
+import re
+import shutil
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+
+from pydantic import BaseModel
+
+from megloc_kapture.errors import DataError, MeglocError, OutputError
+from megloc_kapture.io.files import output_error, read_json_model, write_json_model
+
+CHUNK = 1 << 20
+_TIMEOUT_S = 60.0
+# bytes that come, and how many chunks of them there will be; yields them again
+Watch = Callable[[Iterator[bytes], int], Iterable[bytes]]
+
+
+class TransferError(MeglocError):
+    """The server cannot be reached, refuses, or the transfer broke; says how to go on."""
+
+
+class _Partial(BaseModel):
+    """The file that the bytes which have arrived are the beginning of."""
+
+    url: str
+    validator: str
+    total: int
+
+
+def fetch(
+    url: str,
+    path: Path,
+    *,
+    size: int | None = None,
+    sha256: str | None = None,
+    watch: Watch = lambda chunks, _: chunks,
+) -> str:
+    """Download a file; goes on with what an earlier try left beside its path.
+
+    Parameters
+    ----------
+    size, sha256 : what the file must have, where that is known.
+    watch : sees the chunks go by, to show progress.
+
+    Returns
+    -------
+    str : the file's sha256.
+
+    Raises
+    ------
+    TransferError : the server cannot be reached or refuses, or the transfer broke; what has
+        arrived stays, and the next call goes on with it.
+    DataError : what came is not the file; it is removed again.
+    OutputError : it cannot be written, for one because the disk is full; what has arrived stays.
+    """
+    part = path.with_name(f".{path.name}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(part, "a+b") as file:
+            _lock(file, part, path)
+            try:
+                _transfer(url, file, _state_path(part), watch, expected=size)
+            except OSError as error:
+                raise _cannot_write(part, error) from error
+            found = _check(file, url, size, sha256)
+            os.replace(part, path)
+            _state_path(part).unlink(missing_ok=True)
+    except DataError:
+        part.unlink(missing_ok=True)
+        _state_path(part).unlink(missing_ok=True)
+        raise
+    except OSError as error:
+        raise output_error(path, error) from error
+    return found
+
+
+def _transfer(
+    url: str, file: io.BufferedRandom, state_path: Path, watch: Watch, *, expected: int | None
+) -> None:
+    """Bring the rest, or all of it where the server does not give the rest of the same state."""
+    have = file.seek(0, os.SEEK_END)
+    state = _read_state(state_path, url)
+    if state is None or have > state.total:
+        have = 0
+    elif have == state.total:
+        return
+    with _opened(url, have, state) as response:
+        start = _start(response, have, state)
+        if start is None:
+            state_path.unlink(missing_ok=True)
+            raise TransferError(
+                f"{url}: the server sends another part of the file than asked for; run the same "
+                "command again to begin anew"
+            )
+        if response.headers.get_content_type() == "text/html":
+            raise TransferError(f"{url}: a web page came instead of the file; fetch it by hand")
+        length = response.headers.get("Content-Length")
+        rest = int(length) if length is not None and length.isdigit() else None
+        total = expected if rest is None else start + rest
+        file.truncate(start)
+        file.seek(start)
+        _remember(state_path, url, response, total)
+        if rest is not None:
+            _need_space(file, rest)
+        chunks = watch(_chunks(response, url, total, start), -(-(rest or 0) // CHUNK))
+        for chunk in chunks:
+            file.write(chunk)
+        file.flush()
+
+
+def _opened(url: str, have: int, state: _Partial | None) -> http.client.HTTPResponse:
+    request = urllib.request.Request(url, headers={"User-Agent": "megloc-kapture"})
+    if have and state is not None:
+        request.add_header("Range", f"bytes={have}-")
+        request.add_header("If-Range", state.validator)
+    opener = urllib.request.build_opener(SafeRedirects)
+    try:
+        return opener.open(request, timeout=_TIMEOUT_S)
+    except urllib.error.HTTPError as error:
+        if error.code == http.HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE and have:
+            return _opened(url, 0, None)
+        raise TransferError(f"{url}: the server answers {error.code} {error.reason}") from error
+    except (OSError, http.client.HTTPException) as error:
+        reason = getattr(error, "reason", None) or error or type(error).__name__
+        raise TransferError(f"{url}: cannot be reached: {reason}") from error
+
+
+class SafeRedirects(urllib.request.HTTPRedirectHandler):
+    """Redirections are followed, but never from https to what anybody on the way can change."""
+
+    def redirect_request(  # noqa: D102
+        self,
+        req: urllib.request.Request,
+        fp: object,
+        code: int,
+        msg: str,
+        headers: http.client.HTTPMessage,
+        newurl: str,
+    ) -> urllib.request.Request | None:
+        if not newurl.startswith(("https:",) if req.type == "https" else ("https:", "http:")):
+            raise TransferError(f"{req.full_url}: leads to {newurl}, which is not safe")
+        return super().redirect_request(req, fp, code, msg, headers, newurl)  # type: ignore[arg-type]
+
+
+def _start(response: http.client.HTTPResponse, have: int, state: _Partial | None) -> int | None:
+    """The byte at which the answer begins; None where it is not what was asked for."""
+    if response.status != http.HTTPStatus.PARTIAL_CONTENT:
+        return 0
+    told = re.fullmatch(r"bytes (\d+)-(\d+)/(\d+)", response.headers.get("Content-Range", ""))
+    if told is None or state is None or (int(told[1]), int(told[3])) != (have, state.total):
+        return None
+    return have
+
+
+def _chunks(
+    response: http.client.HTTPResponse, url: str, total: int | None, start: int
+) -> Iterator[bytes]:
+    have = start
+    try:
+        while chunk := response.read(CHUNK):
+            have += len(chunk)
+            yield chunk
+    except (OSError, http.client.HTTPException) as error:
+        raise _broken(url, have, total) from error
+    if total is not None and have < total:
+        # a connection that is closed early reads as the end of the file
+        raise _broken(url, have, total)
+
+
+def _broken(url: str, have: int, total: int | None) -> TransferError:
+    whole = "" if total is None else f" of {total}"
+    return TransferError(
+        f"{url}: the transfer broke after {have}{whole} bytes; run the same command again to go on"
+    )
+
+
+def _remember(path: Path, url: str, response: http.client.HTTPResponse, total: int | None) -> None:
+    """Keep what a continuation needs; nothing where the server gives no strong validator."""
+    validator = response.headers.get("ETag") or response.headers.get("Last-Modified")
+    if validator is None or validator.startswith("W/") or total is None:
+        path.unlink(missing_ok=True)
+    else:
+        write_json_model(path, _Partial(url=url, validator=validator, total=total))
+
+
+def _read_state(path: Path, url: str) -> _Partial | None:
+    try:
+        state = read_json_model(path, _Partial)
+    except DataError:  # not there, or not whole: begin again
+        return None
+    return state if state.url == url else None
+
+
+def _state_path(part: Path) -> Path:
+    return part.with_name(f"{part.name}.json")
+
+
+def _lock(file: io.BufferedRandom, part: Path, path: Path) -> None:
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        # between opening and locking it may have been finished, and have got its name
+        ours = part.exists() and os.path.samestat(os.fstat(file.fileno()), part.stat())
+    except BlockingIOError:
+        ours = False
+    if not ours:
+        raise OutputError(f"{path}: another megloc is fetching it")
+
+
+def _need_space(file: io.BufferedRandom, rest: int) -> None:
+    free = shutil.disk_usage(os.fspath(file.name)).free
+    if free < rest:
+        raise OSError(errno.ENOSPC, f"{os.strerror(errno.ENOSPC)} ({rest} bytes, {free} are free)")
+
+
+def _cannot_write(part: Path, error: OSError) -> OutputError:
+    failed = output_error(part, error)
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        return OutputError(f"{failed}; make room and run the same command again to go on")
+    return failed
+
+
+def _check(file: io.BufferedRandom, url: str, size: int | None, sha256: str | None) -> str:
+    file.seek(0)
+    found = hashlib.file_digest(file, "sha256").hexdigest()
+    have = file.tell()
+    if sha256 is not None and found != sha256:
+        raise DataError(
+            f"what came is not the published file: sha256 {found} instead of {sha256} "
+            f"({have} bytes); it was removed",
+            path=url,
+        )
+    if size is not None and have != size:
+        raise DataError(f"{have} bytes came instead of {size}; they were removed", path=url)
+    if not have:
+        raise DataError("an empty file came", path=url)
+    return found

@@ -1,0 +1,518 @@
+"""Mutated and random files: each reader gives a result or a DataError that names the file.
+
+The table READERS has the readers of ``megloc_kapture.io`` with the bytes that are mutated. The
+quick tier draws a few examples of each, the tests marked ``fuzz`` many.
+"""
+
+from __future__ import annotations
+
+import io
+import sys
+import tarfile
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import onnx
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from onnx import helper, numpy_helper
+from safetensors.torch import save
+from scipy.io import savemat
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.dataset_tables import (
+    read_groups,
+    read_names,
+    read_priors,
+    read_protocol,
+    read_world,
+)
+from megloc_kapture.io.images import image_size, read_image_rgb
+from megloc_kapture.io.kapture import read_pairs, read_point_covariances, write_pairs
+from megloc_kapture.io.kapture.features import DTYPES, read_config
+from megloc_kapture.io.kapture.observations import Observations, read_observations
+from megloc_kapture.io.kapture.points import read_points3d
+from megloc_kapture.io.kapture.sensors import read_kapture_data
+from megloc_kapture.io.kapture.tars import TarBlobs
+from megloc_kapture.io.mat_file import read_mat, read_mat_array
+from megloc_kapture.io.tables import (
+    read_clusters,
+    read_consistency,
+    read_mask_counts,
+    read_match_counts,
+    read_refinement,
+    read_status,
+)
+from megloc_kapture.io.weights.containers import read_checkpoint
+
+BUNDLE = Path(__file__).parent.parent / "io/weights/data/tensor_bundle/graph.ckpt-7"
+VERSION = "# kapture format: 1.1\n"
+POSE = "0.5, 0.5, 0.5, 0.5, 1.0, -2.0, 3.0"
+CELL = "1.0 0.0 0.0 0.0 1.0 -2.0 3.0"
+# both readers are asked everything: files of any size go to the one or to the other
+PLAIN, LARGE = 1 << 62, 0
+
+
+class Reader(NamedTuple):
+    """A file that is read, relative to a folder, and its bytes before they are mutated."""
+
+    file: str
+    whole: bytes
+    read: Callable[[Path], object]
+
+
+def saved_mat(*, compressed: bool) -> bytes:
+    out, cells = io.BytesIO(), np.empty((1, 2), object)
+    cells[0, 0], cells[0, 1] = np.arange(24.0).reshape(2, 3, 4), {"type": "conv", "w": np.ones(3)}
+    savemat(out, {"net": {"layers": cells}, "XYZ": np.eye(3)}, do_compression=compressed)
+    return out.getvalue()
+
+
+def saved_torch(content: Any, *, legacy: bool = False) -> bytes:
+    out = io.BytesIO()
+    torch.save(content, out, _use_new_zipfile_serialization=not legacy)
+    return out.getvalue()
+
+
+def saved_apgem() -> bytes:
+    """A checkpoint that holds an object of scikit-learn by name."""
+    module = "sklearn.decomposition.pca"
+    kind = type("PCA", (), {"__module__": module})
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("sklearn", "sklearn.decomposition", module):
+            patch.setitem(sys.modules, name, ModuleType(name))
+        patch.setattr(sys.modules[module], "PCA", kind, raising=False)
+        pca = kind()
+        pca.__dict__.update(
+            mean_=np.ones(2), components_=np.eye(2), explained_variance_=np.ones(2), whiten=False
+        )
+        return saved_torch({"state_dict": TENSORS, "pca": {"a": pca}}, legacy=True)
+
+
+def saved_npz() -> bytes:
+    out = io.BytesIO()
+    np.savez(out, **{name: value.numpy() for name, value in TENSORS.items()})
+    return out.getvalue()
+
+
+def saved_onnx() -> bytes:
+    tensors = [numpy_helper.from_array(value.numpy(), name) for name, value in TENSORS.items()]
+    tensors.append(helper.make_tensor("typed", onnx.TensorProto.FLOAT16, (2,), [1.0, -2.0]))
+    graph = helper.make_graph([], "graph", [], [], initializer=tensors)
+    return helper.make_model(graph).SerializeToString()
+
+
+def saved_tar(members: dict[str, bytes]) -> bytes:
+    out = io.BytesIO()
+    with tarfile.open(fileobj=out, mode="w", format=tarfile.PAX_FORMAT) as tar:
+        for name, content in members.items():
+            info = tarfile.TarInfo(name)
+            info.size = len(content)
+            info.mtime = 0.5 if name.startswith("e") else 0  # in a header of its own
+            tar.addfile(info, io.BytesIO(content))
+    return out.getvalue()
+
+
+def saved_array() -> bytes:
+    out = io.BytesIO()
+    np.save(out, np.arange(18.0).reshape(3, 6))
+    return out.getvalue()
+
+
+def encoded(suffix: str) -> bytes:
+    pixels = np.random.default_rng(0).integers(0, 256, (9, 7, 3), dtype=np.uint8)
+    return bytes(cv2.imencode(suffix, pixels)[1])
+
+
+def read_images(path: Path) -> None:
+    for read in (read_image_rgb, image_size):
+        with suppress(DataError):
+            read(path)
+    read_image_rgb(path)
+
+
+def read_sensors(path: Path) -> None:
+    for pose in read_kapture_data(path.parent.parent).trajectories.values():
+        assert abs(np.linalg.norm(pose.quat_wxyz) - 1) < 1e-12
+
+
+def read_tar(path: Path) -> None:
+    blobs = TarBlobs(path.parent, path, ".kpt")
+    for name in blobs.names():
+        blobs.read(name)
+
+
+def read_mats(path: Path) -> None:
+    content = path.read_bytes()
+    with suppress(DataError):
+        read_mat(content, path.name)
+    found = read_mat_array(path, "XYZ")
+    assert found.dtype == np.float64 and found.size * 8 <= len(content) * 1032
+
+
+def read_weights(path: Path) -> None:
+    data = BUNDLE.with_name(f"{BUNDLE.name}.data-00000-of-00001").read_bytes()
+    read_checkpoint(path.read_bytes(), str(path), lambda _: data)
+
+
+def read_pairs_again(path: Path) -> None:
+    pairs = read_pairs(path)
+    write_pairs(path, pairs)
+    assert read_pairs(path) == pairs
+
+
+def rows(observations: dict[str, Observations]) -> dict[str, list[tuple[int, str, int]]]:
+    """Observations as rows of point, image and keypoint."""
+    return {
+        kind: [
+            (point, found.image_names[image], keypoint)
+            for point, image, keypoint in zip(
+                found.point_ids.tolist(),
+                found.image_ids.tolist(),
+                found.keypoint_ids.tolist(),
+                strict=True,
+            )
+        ]
+        for kind, found in observations.items()
+    }
+
+
+def outcome(read: Callable[..., Any], path: Path, **options: int) -> Any:
+    try:
+        return read(path, **options)
+    except DataError as error:
+        assert path.name in str(error)
+        return None
+
+
+def read_observations_twice(path: Path) -> None:
+    """By both readers, the compiled one in chunks of a few lines: they agree on anything."""
+    plain = outcome(read_observations, path, large_bytes=PLAIN)
+    compiled = outcome(read_observations, path, large_bytes=LARGE, chunk_bytes=50)
+    assert (plain is None) == (compiled is None)
+    if plain is not None:
+        assert rows(plain) == rows(compiled)
+    read_observations(path)
+
+
+def read_points_twice(path: Path) -> None:
+    """By both readers: they agree on anything."""
+    plain = outcome(read_points3d, path, large_bytes=PLAIN)
+    pandas = outcome(read_points3d, path, large_bytes=LARGE)
+    assert (plain is None) == (pandas is None)
+    if plain is not None:
+        assert np.array_equal(plain.view(np.uint64), pandas.view(np.uint64))
+    read_points3d(path)
+
+
+TENSORS = {"a.weight": torch.arange(6.0).reshape(2, 3), "a.count": torch.tensor(7)}
+SENSORS = {
+    "sensors": f"{VERSION}cam, , camera, PINHOLE, 640, 480, 500, 500, 320, 240\nd, , depth, "
+    "SIMPLE_PINHOLE, 64, 48, 50, 32, 24\n",
+    "rigs": f"rig, cam, {POSE}\nrig, d, {POSE}\n",
+    "trajectories": f"1, rig, {POSE}\n2, cam, , , , , , , \n",
+    "records_camera": "1, cam, a.jpg\n2, cam, b/c.jpg\n",
+    "records_depth": "1, d, a.depth\n",
+}
+READERS = {
+    **{
+        name: Reader(f"sensors/{name}.txt", content.encode(), read_sensors)
+        for name, content in SENSORS.items()
+    },
+    "observations": Reader(
+        "observations.txt", b"0, t, a b.jpg, 1, c, 2\n# c\n5, u, c, 07\n", read_observations_twice
+    ),
+    "points": Reader("points3d.txt", b"# X, Y, Z\n1.5,-2e3,.5\n1,2,3\n", read_points_twice),
+    "covariances": Reader(
+        "reconstruction/point_covariances.npy",
+        saved_array(),
+        lambda path: read_point_covariances(path.parent.parent, 3),
+    ),
+    "pairs": Reader("pairs.txt", b"# q, m, s\na, b, 1.5\nb/c, a, -2\n", read_pairs_again),
+    "configuration": Reader(
+        "descriptors.txt",
+        b"sift, float32, 128, sift, L2\n",
+        lambda path: DTYPES[read_config(path, "descriptors").dtype.name],
+    ),
+    "features in a tar": Reader(
+        "x.tar", saved_tar({"a.kpt": b"1234", "e/f.kpt": b"", "c.kpt": bytes(700)}), read_tar
+    ),
+    "jpg": Reader("x.jpg", encoded(".jpg"), read_images),
+    "png": Reader("x.png", encoded(".png"), read_images),
+    "bmp": Reader("x.bmp", encoded(".bmp"), read_images),
+    "status": Reader(
+        "status.csv",
+        b"image,status,reason,num_matches,num_inliers,cluster,fallback,candidates,refinement,"
+        b'remarks\na,localized,,9,8,0,none,"b,c",,\nd,failed,why,0,0,,rig,,,\n',
+        read_status,
+    ),
+    "clusters": Reader(
+        "clusters.csv",
+        b"image,cluster,chosen,num_matches,num_inliers,score,reason,images,cam_from_world\n"
+        + f'a,0,yes,4,3,1.5,,"b,c",{CELL}\n'.encode(),
+        read_clusters,
+    ),
+    "refinement": Reader(
+        "refinement.csv",
+        b"image,method,accepted,reason,moved_m,turned_deg,measures,before\n"
+        + f"a,icp,yes,,0.1,0.2,m=1;n=2,{CELL}\n".encode(),
+        read_refinement,
+    ),
+    "consistency": Reader(
+        "map_consistency.csv",
+        b"frame,method,images,contradicting,moved_m,turned_deg,moved_px,claimed_m,claimed_deg,"
+        b"squared_distance,reason\n,icp,3,0,0.1,,1,2,3,4,\n",
+        read_consistency,
+    ),
+    "match counts": Reader(
+        "local_features/t/match_counts.csv",
+        b"image,other,matches,verified\na,b,3,2\n",
+        lambda path: read_match_counts(path.parent.parent.parent, "t"),
+    ),
+    "mask counts": Reader(
+        "local_features/t/masked.csv",
+        b"image,num_masked\na,3\n",
+        lambda path: read_mask_counts(path.parent.parent.parent, "t"),
+    ),
+    "groups": Reader(
+        "groups.csv",
+        b"image,condition,frame,location,scored\na,day,,,1\n",
+        lambda path: read_groups(path.parent),
+    ),
+    "priors": Reader(
+        "priors.csv", b"query,permitted\na,b\na,c\n", lambda path: read_priors(path.parent)
+    ),
+    "names": Reader("names.csv", b"image,name\na,b\n", lambda path: read_names(path.parent)),
+    "world": Reader(
+        "world.json",
+        b'{"official_from_local": {"quat_wxyz": [0.6, 0, 0.8, 0], "scale": 2}, "unit": "m"}',
+        lambda path: read_world(path.parent),
+    ),
+    "protocol": Reader(
+        "protocol.json",
+        b'{"dataset": "x", "thresholds": [[0.25, 2.0], [5, null]], "pools": {"a": ["b"]}}',
+        lambda path: read_protocol(path.parent),
+    ),
+    "mat": Reader("x.mat", saved_mat(compressed=False), read_mats),
+    "mat, packed": Reader("x.mat", saved_mat(compressed=True), read_mats),
+    "torch": Reader("x.pth", saved_torch(TENSORS), read_weights),
+    "torch, legacy": Reader(
+        "x.pth", saved_torch({"state_dict": TENSORS}, legacy=True), read_weights
+    ),
+    "AP-GeM": Reader("x.pt", saved_apgem(), read_weights),
+    "safetensors": Reader("x.safetensors", save(TENSORS), read_weights),
+    "npz": Reader("x.npz", saved_npz(), read_weights),
+    "onnx": Reader("x.onnx", saved_onnx(), read_weights),
+    "NetVLAD": Reader("x.mat", saved_mat(compressed=True), read_weights),
+    "TensorFlow": Reader(
+        "x.index", BUNDLE.with_name("graph.ckpt-7.index").read_bytes(), read_weights
+    ),
+    "TensorFlow in a tar": Reader(
+        "x.tar",
+        saved_tar(
+            {
+                f"g{ending}": BUNDLE.with_name(BUNDLE.name + ending).read_bytes()
+                for ending in (".index", ".data-00000-of-00001")
+            }
+        ),
+        read_weights,
+    ),
+}
+
+TOKENS = st.sampled_from(
+    [
+        b",",
+        b", ",
+        b"\n",
+        b"\r\n",
+        b"\r",
+        b"#",
+        b" ",
+        b"\0",
+        b"\xff",
+        b'"',
+        b"-",
+        b"..",
+        b"/",
+        b"nan",
+    ]
+    + [b"1e999", b"1e", b"-1", b"0", b"9" * 19, b"cam", b"rig", b"\xc3\xa9", b"\xc2\xa0", b"\x85"]
+    + [
+        b"\xe2\x80\x83",
+        b"\\",
+        b"{",
+        b"[",
+        b"\x7f\xff\xff\xff",
+        b"\xff\xff\xff\x7f",
+        VERSION.encode(),
+    ]
+)
+# (what part of the file before it, in thousandths; bytes taken away there; bytes put there)
+EDITS = st.lists(
+    st.tuples(st.integers(0, 1000), st.integers(0, 6), st.binary(max_size=6) | TOKENS),
+    min_size=1,
+    max_size=6,
+)
+CUTS = st.just(1000) | st.integers(0, 1000)
+
+
+def mutated(whole: bytes, edits: list[tuple[int, int, bytes]], cut: int) -> bytes:
+    content = bytearray(whole)
+    for at, taken, put in edits:
+        begin = at * len(content) // 1000
+        content[begin : begin + taken] = put
+    return bytes(content[: cut * len(content) // 1000])
+
+
+def placed(reader: Reader, folder: Path, content: bytes) -> Path:
+    """Write some bytes as the reader's file, with what belongs beside it."""
+    path = folder / reader.file
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if reader.read is read_sensors:
+        for name, table in SENSORS.items():
+            (path.parent / f"{name}.txt").write_text(table)
+    path.write_bytes(content)
+    return path
+
+
+def survives(reader: Reader, folder: Path, content: bytes) -> None:
+    """Read some bytes as the reader's file: nothing comes of it but a result or a DataError."""
+    path = placed(reader, folder, content)
+    try:
+        reader.read(path)
+    except DataError as error:
+        assert "\n" not in str(error)
+        # a broken table of sensors/ may show in another one
+        assert (path.parent.name if reader.read is read_sensors else path.name) in str(error)
+    except MemoryError:
+        pass
+
+
+ANY = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+MANY = settings(ANY, max_examples=400)
+EACH = pytest.mark.parametrize("name", READERS)
+
+
+@EACH
+def test_whole_files_are_read(name: str, tmp_path: Path) -> None:
+    """What is mutated is right to begin with; else the mutations would show nothing."""
+    reader = READERS[name]
+    path = placed(reader, tmp_path, reader.whole)
+    if name == "NetVLAD":  # a MAT file, but not of this network
+        with pytest.raises(DataError, match="not NetVLAD's struct net"):
+            reader.read(path)
+    else:
+        reader.read(path)
+
+
+@EACH
+@given(EDITS, CUTS)
+@ANY
+def test_mutations(
+    name: str, tmp_path: Path, edits: list[tuple[int, int, bytes]], cut: int
+) -> None:
+    survives(READERS[name], tmp_path, mutated(READERS[name].whole, edits, cut))
+
+
+@pytest.mark.fuzz
+@EACH
+@given(EDITS, CUTS)
+@MANY
+def test_many_mutations(
+    name: str, tmp_path: Path, edits: list[tuple[int, int, bytes]], cut: int
+) -> None:
+    survives(READERS[name], tmp_path, mutated(READERS[name].whole, edits, cut))
+
+
+@pytest.mark.fuzz
+@EACH
+@given(st.binary(max_size=300) | st.lists(TOKENS, max_size=40).map(b"".join), st.booleans())
+@ANY
+def test_random_bytes(name: str, tmp_path: Path, content: bytes, ended: bool) -> None:
+    survives(READERS[name], tmp_path, READERS[name].whole * ended + content)
+
+
+# ------------------------------------- files nearly right, to reach deep into both readers
+
+FIELDS = st.sampled_from(
+    ["0", "1", "17", " 5 ", "007", "-1", "x", "", "t", "u u", "a.jpg", "b/c d.jpg", "é", "..", "#"]
+    + ["\u2003", "9" * 18, "9" * 19, "\t3", "a\u00a0", "\0", "2147483647", "2147483648"]
+)
+GOOD = st.builds(
+    lambda point, kind, pairs: f"{point}, {kind}" + "".join(f", {i}, {k}" for i, k in pairs),
+    st.integers(0, 40),
+    st.sampled_from(["t", "u", "v w"]),
+    st.lists(
+        st.tuples(st.sampled_from(["a", "b/c d", "é" * 20, "x" * 70]), st.integers(0, 99)),
+        max_size=5,
+    ),
+)
+OBSERVATION_ROWS = (
+    GOOD
+    | st.lists(FIELDS, max_size=7).map(", ".join)
+    | st.sampled_from(["", "# c", "#é", " ", "\r", "\u2003"])
+)
+OBSERVATION_FILES = st.builds(
+    lambda rows, end, tail: end.join(rows) + tail,
+    st.lists(OBSERVATION_ROWS, max_size=12),
+    st.sampled_from(["\n", "\r\n"]),
+    st.sampled_from(["", "\n", "\n\n"]),
+).map(str.encode) | st.binary(max_size=200)
+
+
+@given(st.lists(GOOD, min_size=1).map(lambda r: "\n".join(r).encode()) | OBSERVATION_FILES)
+@MANY
+@pytest.mark.fuzz
+def test_both_readers_of_observations_agree(tmp_path: Path, content: bytes) -> None:
+    survives(READERS["observations"], tmp_path, content)
+
+
+NUMBERS = st.one_of(
+    st.floats(allow_nan=False, allow_infinity=False).map(repr),
+    st.floats(-1e6, 1e6).map("{:.10f}".format),  # kapture's own writer
+    st.floats(allow_nan=False, allow_infinity=False).map("{:.18e}".format),
+    st.floats(allow_nan=False, allow_infinity=False).map("{:.25e}".format),
+    st.decimals(
+        allow_nan=False, allow_infinity=False, places=30, min_value=-100, max_value=100
+    ).map("{:f}".format),
+    st.builds(
+        "{}{}{}{}".format,
+        st.sampled_from(["", "-", "+", "0", "-00"]),
+        st.from_regex(r"[0-9]{1,25}", fullmatch=True),
+        st.sampled_from(["", "."]) | st.from_regex(r"\.[0-9]{1,25}", fullmatch=True),
+        st.just("") | st.integers(-340, 300).map("e{}".format),
+    ),
+    # half-way cases, where a wrong last digit would show
+    st.integers(2**53, 2**56).map(str),
+    st.integers(2**52, 2**53 - 1).map(lambda m: f"{m}.5"),
+    st.sampled_from(
+        ["4.9e-324", "2.2250738585072011e-308", "1.7976931348623157e308", "9007199254740993"]
+    ),
+).filter(lambda text: np.isfinite(float(text)))
+POINT_FIELDS = NUMBERS | st.sampled_from(
+    ["", "x", "nan", "1e999", "1 2", " 5\t", ".", "-", "1e", "\0"]
+)
+POINT_ROWS = st.lists(NUMBERS, min_size=3, max_size=3) | st.lists(POINT_FIELDS, max_size=7)
+POINT_FILES = (
+    st.lists(
+        POINT_ROWS.map(",".join)
+        | st.sampled_from(["", "# c", "#é", "\u2003", "\r", '"1",2,3', "1,2,3 # c", "True,1,2"]),
+        max_size=10,
+    )
+    .map("\n".join)
+    .map(str.encode)
+) | st.text(st.sampled_from("0123456789+-.eE, \t\r\n#"), max_size=60).map(str.encode)
+
+
+@given(POINT_FILES)
+@MANY
+@pytest.mark.fuzz
+def test_both_readers_of_points_agree(tmp_path: Path, content: bytes) -> None:
+    survives(READERS["points"], tmp_path, content)

@@ -1,0 +1,97 @@
+"""The adapter that lets kapture-localization's tools run on current packages."""
+
+from __future__ import annotations
+
+import importlib.util
+import subprocess
+import sys
+from types import ModuleType
+
+import kloc_tools
+import numpy as np
+import pycolmap
+import pytest
+from kloc_tools import run_tool, shims, tool_scripts
+
+from megloc_kapture.errors import OptionError
+
+needs_kapture_localization = pytest.mark.skipif(
+    importlib.util.find_spec("kapture_localization") is None,
+    reason="kapture-localization is not installed",
+)
+
+
+def test_shims_add_names_and_take_them_away() -> None:
+    assert not hasattr(np, "float")
+    with shims(pycolmap):
+        assert np.float is float
+        assert callable(pycolmap.absolute_pose_estimation)
+    assert not hasattr(np, "float")
+    assert not hasattr(pycolmap, "absolute_pose_estimation")
+
+
+def test_shims_are_taken_away_after_an_error() -> None:
+    with pytest.raises(RuntimeError), shims(pycolmap):
+        raise RuntimeError
+    assert not hasattr(np, "float")
+
+
+def test_shims_leave_an_old_pycolmap_alone() -> None:
+    old = ModuleType("old_pycolmap")
+    old.absolute_pose_estimation = original = object()
+    with shims(old):
+        assert old.absolute_pose_estimation is original
+    assert old.absolute_pose_estimation is original
+
+
+def test_absolute_pose_estimation_as_kapture_localization_calls_it() -> None:
+    rng = np.random.default_rng(0)
+    camera = pycolmap.Camera(
+        model="PINHOLE", width=640, height=480, params=[500.0, 500.0, 320.0, 240.0]
+    )
+    points = rng.uniform([-1, -1, 4], [1, 1, 6], (60, 3))
+    pixels = camera.img_from_cam(points + [0.1, -0.2, 0.3])
+    pixels[:10] += 100.0
+    with shims(pycolmap):
+        # lists of arrays and a plain dictionary, as its tools pass them
+        found = pycolmap.absolute_pose_estimation(
+            list(pixels), list(points), camera, estimation_options={"ransac": {"max_error": 8.0}}
+        )
+        none = pycolmap.absolute_pose_estimation([], [], camera)
+    assert found["num_inliers"] == 50
+    assert found["inliers"] == [False] * 10 + [True] * 50
+    np.testing.assert_allclose(found["cam_from_world"].translation, [0.1, -0.2, 0.3], atol=1e-6)
+    assert none is None
+
+
+@needs_kapture_localization
+def test_tools_are_found_where_pip_put_them() -> None:
+    scripts = tool_scripts()
+    assert scripts["kapture_compute_matches"].is_file()
+    assert scripts["kapture_pycolmap_localize"].suffix == ".py"
+
+
+@needs_kapture_localization
+def test_unknown_tool_is_refused_with_the_known_ones() -> None:
+    with pytest.raises(OptionError, match="no tool 'kapture_nothing'.*kapture_compute_matches"):
+        run_tool("kapture_nothing", [], pycolmap)
+
+
+@needs_kapture_localization
+def test_tool_sees_its_own_command_line_and_ours_is_restored(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    argv, path = list(sys.argv), list(sys.path)
+    with pytest.raises(SystemExit) as stopped:
+        run_tool("kapture_compute_matches.py", ["--help"], pycolmap)
+    assert stopped.value.code == 0
+    assert "--pairsfile-path" in capsys.readouterr().out
+    assert (sys.argv, sys.path) == (argv, path)
+
+
+@needs_kapture_localization
+@pytest.mark.parametrize("arguments", [[], ["kapture_nothing"]])
+def test_command_refuses_in_one_line(arguments: list[str]) -> None:
+    command = [sys.executable, kloc_tools.__file__, *arguments]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)

@@ -1,0 +1,280 @@
+"""One kapture folder: lazy reading and the checks across its files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from megloc_kapture.errors import DataError, OutputError
+from megloc_kapture.io.images import write_image
+from megloc_kapture.io.kapture import (
+    FeatureConfig,
+    FeatureWriter,
+    KaptureData,
+    KaptureFolder,
+    MatchesWriter,
+    Observations,
+    Sensor,
+    write_observations,
+    write_points3d,
+    write_sensors,
+)
+from megloc_kapture.values import Camera, RigidTransform
+
+FLOAT = np.dtype("float32")
+IMAGES = ("a.jpg", "b/c.jpg")
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """A whole small kapture: 2 images with 5 keypoints each, 3 points."""
+    root = tmp_path / "map"
+    data = KaptureData(
+        sensors={"cam": Sensor.from_camera(Camera("SIMPLE_PINHOLE", 8, 6, (9, 4, 3)))}
+    )
+    for time, image in enumerate(IMAGES):
+        data.records_camera[time, "cam"] = image
+        data.trajectories[time, "cam"] = RigidTransform.identity()
+        write_image(root / "sensors/records_data" / image, np.full((6, 8, 3), 100, np.uint8))
+    write_sensors(root, data)
+    with (
+        FeatureWriter(root, "keypoints", "T", FeatureConfig("k", FLOAT, 2)) as keypoints,
+        FeatureWriter(root, "descriptors", "T", FeatureConfig("d", FLOAT, 4, "T")) as descriptors,
+        FeatureWriter(root, "global_features", "G", FeatureConfig("g", FLOAT, 3)) as features,
+        MatchesWriter(root, "T") as matches,
+    ):
+        for image in IMAGES:
+            keypoints.write(image, np.ones((5, 2)))
+            descriptors.write(image, np.ones((5, 4)))
+            features.write(image, np.ones(3))
+        matches.write(*IMAGES, np.array([[0, 4], [3, 1]]), np.ones(2))
+    write_points3d(root, np.ones((3, 3)))
+    write_points(root)
+    return root
+
+
+def write_points(root: Path, *extra: tuple[int, int, int]) -> None:
+    """Observations: two good ones and the given (point, image, keypoint)."""
+    points, images, keypoints = np.array([(0, 0, 0), (2, 1, 4), *extra]).T
+    write_observations(root, {"T": Observations("T", IMAGES, points, images, keypoints)})
+
+
+def refuse(root: Path, match: str, *, deep: bool = False) -> None:
+    with pytest.raises(DataError, match=match):
+        KaptureFolder(root).validate(deep=deep)
+
+
+def test_a_whole_kapture_is_valid(root: Path) -> None:
+    folder = KaptureFolder(root)
+    folder.validate()
+    folder.validate(deep=True)
+    assert folder.read() is folder.read()
+    assert folder.image_path("b/c.jpg") == root / "sensors/records_data/b/c.jpg"
+    kinds = ("keypoints", "descriptors", "global_features", "matches")
+    assert [folder.types(kind) for kind in kinds] == [["T"], ["T"], ["G"], ["T"]]
+    assert folder.keypoints("T").length("a.jpg") == 5
+    assert folder.matches("T").pairs == [IMAGES]
+    assert folder.has_points()
+    assert folder.points3d().shape == (3, 6)
+    assert len(folder.observations()["T"]) == 2
+    assert not KaptureFolder(root / "sensors").has_points()
+
+
+def test_what_is_shared_cannot_be_written_to(root: Path) -> None:
+    folder = KaptureFolder(root)
+    observations = folder.observations()["T"]
+    for array in (folder.points3d(), observations.point_ids, observations.keypoint_ids):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1
+
+
+def test_absent_types_are_named_with_those_that_are_there(root: Path) -> None:
+    folder = KaptureFolder(root)
+    reads = (folder.keypoints, folder.descriptors, folder.global_features, folder.matches)
+    for read, present in zip(reads, "TTGT", strict=True):
+        for name in ("X", "..", "T/../T", ""):
+            with pytest.raises(DataError, match=f"there are: {present}"):
+                read(name)
+
+
+def test_features_beside_the_kapture_are_added(root: Path, tmp_path: Path) -> None:
+    beside = tmp_path / "beside"
+    with FeatureWriter(
+        beside, "keypoints", "T", FeatureConfig("k", FLOAT, 2), orphan=True
+    ) as writer:
+        writer.write("query.jpg", np.zeros((1, 2)))
+        writer.write("a.jpg", np.zeros((9, 2)))
+    with MatchesWriter(beside, "U", tar=True, orphan=True) as matches:
+        matches.write("a.jpg", "query.jpg", np.array([[0, 0]]), np.ones(1))
+    folder = KaptureFolder(root, features_dirs=[beside, tmp_path / "not_there_yet"])
+    keypoints = folder.keypoints("T")
+    assert keypoints.names == ["a.jpg", "b/c.jpg", "query.jpg"]
+    assert keypoints.length("a.jpg") == 5  # the kapture's own come first
+    assert folder.types("matches") == ["T", "U"]
+    assert len(folder.matches("U").read("query.jpg", "a.jpg")[0]) == 1
+
+
+def test_names_lead_nowhere_else(root: Path) -> None:
+    for name in ("../../sensors.txt", "/etc/passwd", "a/../b", ""):
+        for path_of in (KaptureFolder(root).image_path, KaptureFolder(root).depth_path):
+            with pytest.raises(DataError):
+                path_of(name)
+
+
+def test_images_may_be_links_and_so_may_the_root(root: Path, tmp_path: Path) -> None:
+    outside = tmp_path / "photos"
+    (root / "sensors/records_data").rename(outside)
+    (root / "sensors/records_data").symlink_to(outside)
+    (outside / "a.jpg").rename(tmp_path / "moved.jpg")
+    (outside / "a.jpg").symlink_to(tmp_path / "moved.jpg")
+    (tmp_path / "link").symlink_to(root)
+    KaptureFolder(tmp_path / "link").validate(deep=True)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "sensors/sensors.txt",
+        "sensors/trajectories.txt",
+        "reconstruction/keypoints/T/keypoints.txt",
+        "reconstruction/keypoints/T/a.jpg.kpt",
+        "reconstruction/descriptors/T",
+        "reconstruction/global_features/G/b",
+        "reconstruction/matches/T",
+        "reconstruction/points3d.txt",
+        "reconstruction/observations.txt",
+        "reconstruction",
+    ],
+)
+def test_nothing_else_may_be_a_link_out_of_the_kapture(
+    root: Path, tmp_path: Path, name: str
+) -> None:
+    (root / name).rename(tmp_path / "moved")
+    (root / name).symlink_to(tmp_path / "moved")
+    refuse(root, "link")
+
+
+def test_nothing_is_written_through_a_link_out_of_the_output(root: Path, tmp_path: Path) -> None:
+    output = tmp_path / "output"
+    output.mkdir()
+    for name in ("sensors", "reconstruction"):
+        (output / name).symlink_to(root / name)  # an output that borrows from somebody's map
+    before = {p: p.read_bytes() for p in root.rglob("*") if p.is_file()}
+    config = FeatureConfig("k", FLOAT, 2)
+    writes = (
+        lambda: write_sensors(output, KaptureData()),
+        lambda: write_points3d(output, np.zeros((1, 3))),
+        lambda: write_observations(output, {}),
+        lambda: FeatureWriter(output, "keypoints", "T", config),
+        lambda: FeatureWriter(output, "keypoints", "new", config, tar=True),
+        lambda: MatchesWriter(output, "T"),
+    )
+    for write in writes:
+        with pytest.raises(OutputError, match="link that leaves"):
+            write()
+    assert {p: p.read_bytes() for p in root.rglob("*") if p.is_file()} == before
+
+
+def test_descriptors_and_keypoints_must_be_of_one_length(root: Path) -> None:
+    (root / "reconstruction/descriptors/T/a.jpg.desc").write_bytes(bytes(4 * 16))
+    refuse(root, r"a\.jpg\.desc: 4 descriptors for 5 keypoints")
+
+
+def test_descriptors_need_keypoints(root: Path) -> None:
+    (root / "reconstruction/keypoints/T/a.jpg.kpt").unlink()
+    refuse(root, r"'a\.jpg' has descriptors but no keypoints of type 'T'")
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["keypoints/T/a.jpg.kpt", "descriptors/T/a.jpg.desc", "global_features/G/a.jpg.gfeat"],
+)
+def test_truncated_features_are_refused(root: Path, name: str) -> None:
+    path = root / "reconstruction" / name
+    path.write_bytes(path.read_bytes()[:-1])
+    refuse(root, f"{path.name}: .*truncated")
+
+
+def test_observations_past_the_points_name_file_and_line(root: Path) -> None:
+    write_points(root, (3, 0, 0))
+    refuse(root, r"observations\.txt:5: point id 3, but there are 3 points")
+    with pytest.raises(DataError, match="point id 3"):
+        KaptureFolder(root).observations()
+
+
+def test_observations_past_the_keypoints_name_file_and_line(root: Path) -> None:
+    write_points(root, (1, 1, 5))
+    refuse(root, r"observations\.txt:4: keypoint id 5, but 'b/c\.jpg' has 5 keypoints of type 'T'")
+
+
+def test_observations_of_images_taken_out_of_the_map_are_left_alone(root: Path) -> None:
+    write_points(root, (1, 1, 4))
+    for path in (root / "reconstruction").rglob("c.jpg.*"):
+        path.unlink()
+    KaptureFolder(root).validate()
+
+
+def test_observations_need_points(root: Path) -> None:
+    (root / "reconstruction/points3d.txt").unlink()
+    refuse(root, r"points3d\.txt: cannot read: the file is missing")
+
+
+def test_matches_past_the_keypoints_are_found_by_a_deep_check(root: Path) -> None:
+    with MatchesWriter(root, "T") as matches:
+        matches.write(*IMAGES, np.array([[0, 5]]), np.ones(1))
+    KaptureFolder(root).validate()
+    refuse(root, r"point past the keypoints of 'b/c\.jpg'", deep=True)
+
+
+def test_broken_images_are_found_by_a_deep_check(root: Path) -> None:
+    image = root / "sensors/records_data/a.jpg"
+    content = image.read_bytes()
+    image.write_bytes(content[: len(content) // 2])
+    KaptureFolder(root).validate()
+    refuse(root, r"a\.jpg: not an image", deep=True)
+    write_image(image, np.zeros((6, 9, 3), np.uint8))
+    refuse(root, r"a\.jpg: image is 9x6, its camera 8x6", deep=True)
+
+
+def test_features_that_are_not_finite_are_found_by_a_deep_check(root: Path) -> None:
+    with FeatureWriter(root, "global_features", "G", FeatureConfig("g", FLOAT, 3)) as features:
+        features.write("a.jpg", np.array([1, np.nan, 2]))
+    KaptureFolder(root).validate()
+    refuse(root, r"a\.jpg\.gfeat: not all values are finite", deep=True)
+
+
+def test_real_folders_are_read_and_valid(shared_data: Path) -> None:
+    roots = sorted(p.parent for p in shared_data.glob("scenes/*/*/sensors"))
+    roots += sorted(p.parent for p in shared_data.glob("foreign_maps/*/*/sensors"))
+    roots += sorted(p.parent for p in shared_data.glob("kapture_samples/*/kapture/*/sensors"))
+    assert len(roots) >= 18
+    for root in roots:
+        folder = KaptureFolder(root)
+        folder.validate()
+        data = folder.read()
+        assert len(data.image_names()) > 0
+        with_poses = root.name in ("mapping", "mapping_rig", "map", "query_gt", "training")
+        assert len(data.poses()) == (len(data.image_names()) if with_poses else 0)
+
+
+def test_a_map_of_other_tools_is_read(shared_data: Path) -> None:
+    folder = KaptureFolder(shared_data / "foreign_maps/virtual_gallery/map")
+    folder.validate(deep=True)
+    assert folder.points3d().shape == (630, 6)
+    observations = folder.observations()["r2d2_500"]
+    assert (len(observations), len(observations.image_names)) == (3766, 12)
+    assert folder.descriptors("r2d2_500").config.keypoints_type == "r2d2_500"
+    assert folder.keypoints("r2d2_500").config.name == "r2d2"  # the folder's name counts
+    assert folder.global_features("AP-GeM-LM18").read(observations.image_names[0]).shape == (2048,)
+
+
+def test_poses_through_a_rig_are_those_of_the_cameras(shared_data: Path) -> None:
+    gallery = shared_data / "foreign_maps/virtual_gallery"
+    by_camera = KaptureFolder(gallery / "map").read().poses()
+    by_rig = KaptureFolder(gallery / "mapping_rig").read().poses()
+    assert by_camera.keys() == by_rig.keys()
+    for image, pose in by_camera.items():
+        assert np.allclose(pose.rotation_matrix(), by_rig[image].rotation_matrix(), atol=1e-9)
+        assert np.allclose(pose.center(), by_rig[image].center(), atol=1e-6)

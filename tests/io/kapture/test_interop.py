@@ -1,0 +1,322 @@
+"""What we write, kapture reads back equal; what kapture writes, we read equal."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tarfile
+from pathlib import Path
+
+import kapture
+import kapture.io.csv
+import kapture.io.features
+import kapture.io.records
+import numpy as np
+import pytest
+from kapture.io.tar import TarHandler
+
+from megloc_kapture.io.images import read_depth_map, write_depth_map
+from megloc_kapture.io.kapture import (
+    FeatureConfig,
+    FeatureWriter,
+    ImagePair,
+    KaptureData,
+    KaptureFolder,
+    MatchesWriter,
+    Observations,
+    Sensor,
+    read_pairs,
+    to_kapture,
+    write_observations,
+    write_pairs,
+    write_points3d,
+    write_sensors,
+)
+from megloc_kapture.values import Camera, RigidTransform
+
+FLOAT = np.dtype("float32")
+IMAGES = ("cam 0/a.jpg", "cam 0/b.jpg", "z.png")
+TIME = 1602074877390449152
+INDICES = np.array([[0, 3], [4, 1]])
+SCORES = np.array([0.25, 1 / 3])
+
+
+def a_rotation(seed: int) -> RigidTransform:
+    rng = np.random.default_rng(seed)
+    quat = rng.normal(size=4)
+    quat /= np.linalg.norm(quat)
+    return RigidTransform(tuple(quat.tolist()), tuple(rng.normal(0, 1e6, 3).tolist()))
+
+
+def our_data() -> KaptureData:
+    camera = Camera("OPENCV", 640, 480, (1 / 3 + 500, 500.5, 320, 240, 1e-17, -0.1, 0, 2.5e-5))
+    return KaptureData(
+        sensors={
+            "cam0": Sensor.from_camera(camera, name="left"),
+            "cam1": Sensor.from_camera(Camera("SIMPLE_PINHOLE", 64, 48, (50, 32, 24))),
+            "raw": Sensor("", "camera", ("UNKNOWN_CAMERA", "10", "20")),
+            "deep": Sensor.from_camera(
+                Camera("SIMPLE_PINHOLE", 4, 3, (5, 2, 1.5)), sensor_type="depth"
+            ),
+            "gps": Sensor("", "gnss", ("EPSG:4326",)),
+        },
+        rigs={"rig": {"cam0": a_rotation(0), "cam1": a_rotation(1)}, "car": {"rig": a_rotation(2)}},
+        trajectories={(TIME, "rig"): a_rotation(3), (TIME + 1, "cam1"): a_rotation(4)},
+        records_camera={
+            (TIME, "cam0"): IMAGES[0],
+            (TIME, "cam1"): IMAGES[1],
+            (TIME + 1, "cam1"): IMAGES[2],
+        },
+        records_depth={(TIME, "deep"): "a.depth"},
+    )
+
+
+def assert_same_pose(theirs: kapture.PoseTransform, ours: RigidTransform) -> None:
+    assert tuple(theirs.r_raw) == ours.quat_wxyz
+    assert tuple(theirs.t_raw) == ours.translation
+
+
+def assert_same_sensors(theirs: kapture.Kapture, ours: KaptureData) -> None:
+    assert set(theirs.sensors) == set(ours.sensors)
+    for sensor_id, sensor in ours.sensors.items():
+        assert (theirs.sensors[sensor_id].name or "") == sensor.name
+        assert theirs.sensors[sensor_id].sensor_type == sensor.sensor_type
+        assert tuple(str(p) for p in theirs.sensors[sensor_id].sensor_params) == sensor.params
+        if sensor_id.startswith("cam"):
+            assert tuple(theirs.sensors[sensor_id].camera_params[2:]) == sensor.camera().params
+    assert set(theirs.rigs.key_pairs()) == {(r, s) for r, rig in ours.rigs.items() for s in rig}
+    for rig_id, rig in ours.rigs.items():
+        for sensor_id, pose in rig.items():
+            assert_same_pose(theirs.rigs[rig_id][sensor_id], pose)
+    assert set(theirs.trajectories.key_pairs()) == set(ours.trajectories)
+    for key, pose in ours.trajectories.items():
+        assert_same_pose(theirs.trajectories[key], pose)
+    for their_records, our_records in (
+        (theirs.records_camera, ours.records_camera),
+        (theirs.records_depth, ours.records_depth),
+    ):
+        assert {key: their_records[key] for key in their_records.key_pairs()} == our_records
+
+
+def arrays() -> dict[str, dict[str, np.ndarray]]:
+    rng = np.random.default_rng(0)
+    return {
+        "keypoints": {i: rng.normal(size=(5, 3)).astype(np.float32) for i in IMAGES},
+        "descriptors": {i: rng.integers(0, 256, (5, 8)).astype(np.uint8) for i in IMAGES},
+        "global_features": {i: rng.normal(size=16) for i in IMAGES},
+    }
+
+
+CONFIGS = {
+    "keypoints": FeatureConfig("superpoint", FLOAT, 3),
+    "descriptors": FeatureConfig("sp desc", np.dtype("uint8"), 8, "T", "L2"),
+    "global_features": FeatureConfig("netvlad", np.dtype("float64"), 16, None, "L2"),
+}
+POINTS = np.random.default_rng(1).normal(0, 100, (4, 6))
+OBSERVATIONS = Observations(
+    "T",
+    IMAGES,
+    np.array([0, 0, 3]),
+    np.array([2, 0, 1], dtype=np.int32),
+    np.array([4, 0, 2], dtype=np.int32),
+)
+
+
+def write_ours(root: Path, *, tar: bool) -> None:
+    write_sensors(root, our_data())
+    for kind, by_image in arrays().items():
+        with FeatureWriter(root, kind, "T", CONFIGS[kind], tar=tar) as writer:  # type: ignore[arg-type]
+            for image, array in by_image.items():
+                writer.write(image, array)
+    with MatchesWriter(root, "T", tar=tar) as matches:
+        matches.write(IMAGES[1], IMAGES[0], INDICES, SCORES)
+    write_points3d(root, POINTS)
+    write_observations(root, {"T": OBSERVATIONS})
+
+
+@pytest.mark.parametrize("tar", [False, True])
+def test_kapture_reads_what_we_write(tmp_path: Path, tar: bool) -> None:
+    write_ours(tmp_path, tar=tar)
+    with kapture.io.csv.get_all_tar_handlers(str(tmp_path)) as tars:
+        assert len(tars.keypoints) == len(tars.matches) == int(tar)
+        theirs = kapture.io.csv.kapture_from_dir(str(tmp_path), tar_handlers=tars)
+        assert_same_sensors(theirs, our_data())
+        for kind, by_image in arrays().items():
+            found = getattr(theirs, kind)["T"]
+            config = CONFIGS[kind]
+            assert set(found) == set(IMAGES)
+            assert (found.type_name, found.dsize) == (config.name, config.dsize)
+            assert found.dtype == config.dtype.type
+            path_of = getattr(kapture.io.features, f"get_{kind}_fullpath")
+            read = getattr(kapture.io.features, f"image_{kind}_from_file")
+            for image, array in by_image.items():
+                path = path_of("T", str(tmp_path), image, tars)
+                assert np.array_equal(
+                    read(path, found.dtype, found.dsize), array.reshape(-1, config.dsize)
+                )
+        assert theirs.descriptors["T"].keypoints_type == "T"
+        assert set(theirs.matches["T"]) == {(IMAGES[0], IMAGES[1])}
+        path = kapture.io.features.get_matches_fullpath(
+            (IMAGES[0], IMAGES[1]), "T", str(tmp_path), tars
+        )
+        rows = kapture.io.features.image_matches_from_file(path)
+        assert np.array_equal(rows, np.c_[INDICES[:, ::-1], SCORES])
+        assert np.array_equal(theirs.points3d.as_array(), POINTS)
+        assert {key: theirs.observations[key] for key in theirs.observations.key_pairs()} == {
+            (0, "T"): [(IMAGES[2], 4), (IMAGES[0], 0)],
+            (3, "T"): [(IMAGES[1], 2)],
+        }
+
+
+def their_kapture() -> kapture.Kapture:
+    theirs = to_kapture(our_data())
+    theirs.keypoints = {"T": kapture.Keypoints("superpoint", np.float32, 3, set(IMAGES))}
+    theirs.descriptors = {"T": kapture.Descriptors("sp desc", np.uint8, 8, "T", "L2", set(IMAGES))}
+    theirs.global_features = {
+        "T": kapture.GlobalFeatures("netvlad", np.float64, 16, "L2", set(IMAGES))
+    }
+    theirs.points3d = kapture.Points3d(np.round(POINTS, 10))  # all that its writer keeps
+    theirs.observations = kapture.Observations()
+    for point, image, keypoint in zip(*OBSERVATIONS_AS_LISTS, strict=True):
+        theirs.observations.add(point, "T", IMAGES[image], keypoint)
+    return theirs
+
+
+OBSERVATIONS_AS_LISTS = (
+    OBSERVATIONS.point_ids.tolist(),
+    OBSERVATIONS.image_ids.tolist(),
+    OBSERVATIONS.keypoint_ids.tolist(),
+)
+
+
+def write_theirs(root: Path, *, tar: bool) -> None:
+    kapture.io.csv.kapture_to_dir(str(root), their_kapture())
+    handlers = {}
+    for kind in [*arrays(), "matches"]:
+        folder = root / "reconstruction" / kind / "T"
+        folder.mkdir(parents=True, exist_ok=True)
+        if tar:
+            tarfile.open(folder / f"{kind}.tar", "w").close()
+            handlers[kind] = TarHandler(str(folder / f"{kind}.tar"), "a")
+    for kind, by_image in arrays().items():
+        path_of = getattr(kapture.io.features, f"get_{kind}_fullpath")
+        write = getattr(kapture.io.features, f"image_{kind}_to_file")
+        for image, array in by_image.items():
+            if tar:  # an older version first: the last one must win
+                write(path_of("T", str(root), image, handlers[kind]), array * 0)
+            write(path_of("T", str(root), image, handlers.get(kind)), array)
+    rows = np.c_[INDICES, SCORES].astype(np.float64)
+    path = kapture.io.features.get_matches_fullpath(
+        IMAGES[:2], "T", str(root), handlers.get("matches")
+    )
+    kapture.io.features.image_matches_to_file(path, rows)
+    for handler in handlers.values():
+        handler.close()
+
+
+@pytest.mark.parametrize("tar", [False, True])
+def test_we_read_what_kapture_writes(tmp_path: Path, tar: bool) -> None:
+    write_theirs(tmp_path, tar=tar)
+    folder = KaptureFolder(tmp_path)
+    folder.validate()
+    assert folder.read() == our_data()
+    for kind, by_image in arrays().items():
+        assert folder.types(kind) == ["T"]  # type: ignore[arg-type]
+        features = getattr(folder, kind)("T")
+        assert features.config == CONFIGS[kind]
+        assert features.names == sorted(IMAGES)
+        for image, array in by_image.items():
+            assert np.array_equal(features.read(image), array)
+    indices, scores = folder.matches("T").read(IMAGES[0], IMAGES[1])
+    assert np.array_equal(indices, INDICES) and np.array_equal(scores, SCORES)
+    assert np.array_equal(folder.points3d(), np.round(POINTS, 10))
+    read = folder.observations()["T"]
+    assert read.image_names == IMAGES
+    for array, expected in zip(
+        (read.point_ids, read.image_ids, read.keypoint_ids), OBSERVATIONS_AS_LISTS, strict=True
+    ):
+        assert array.tolist() == expected
+
+
+def test_kapture_reads_our_tar_after_its_own_writer_added_to_it(tmp_path: Path) -> None:
+    write_ours(tmp_path, tar=True)
+    path = tmp_path / "reconstruction/keypoints/T/keypoints.tar"
+    with TarHandler(str(path), "a") as tar:
+        tar.add_array_to_tar("new.jpg.kpt", np.full((1, 3), 7, np.float32))
+    keypoints = KaptureFolder(tmp_path).keypoints("T")
+    assert keypoints.names == sorted([*IMAGES, "new.jpg"])
+    assert np.array_equal(keypoints.read("new.jpg"), np.full((1, 3), 7))
+
+
+def test_partial_poses_of_kapture_are_no_poses(tmp_path: Path) -> None:
+    theirs = their_kapture()
+    theirs.trajectories[TIME + 2, "cam0"] = kapture.PoseTransform(r=None, t=[1, 2, 3])
+    theirs.trajectories[TIME + 3, "cam0"] = kapture.PoseTransform(r=[1, 0, 0, 0], t=None)
+    kapture.io.csv.kapture_to_dir(str(tmp_path), theirs)
+    assert KaptureFolder(tmp_path).read() == our_data()
+
+
+def test_to_kapture_gives_the_same_as_kapture_s_reader(tmp_path: Path) -> None:
+    write_sensors(tmp_path, our_data())
+    for source in (our_data(), KaptureFolder(tmp_path), tmp_path, str(tmp_path)):
+        assert_same_sensors(to_kapture(source), our_data())
+
+
+def test_depth_maps_are_kapture_s(tmp_path: Path) -> None:
+    depth = np.random.default_rng(0).normal(2, 1, (3, 4)).astype(np.float32)
+    write_sensors(tmp_path, our_data())
+    write_depth_map(KaptureFolder(tmp_path).depth_path("a.depth"), depth)
+    path = kapture.io.records.get_depth_map_fullpath(str(tmp_path), "a.depth")
+    assert np.array_equal(kapture.io.records.depth_map_from_file(path, (4, 3)), depth)
+    kapture.io.records.depth_map_to_file(str(tmp_path / "b.depth"), depth + 1)
+    assert np.array_equal(read_depth_map(tmp_path / "b.depth", width=4, height=3), depth + 1)
+
+
+def test_kapture_reads_our_pairs(tmp_path: Path) -> None:
+    pairs = [ImagePair("q", "m", 0.1 + 0.2), ImagePair("q", "a b", -1.0)]
+    write_pairs(tmp_path / "pairs.txt", pairs)
+    with open(tmp_path / "pairs.txt") as file:
+        table = kapture.io.csv.table_from_file(file)
+    assert [ImagePair(q, m, float(s)) for q, m, s in table] == pairs
+    with open(tmp_path / "theirs.txt", "w") as file:
+        kapture.io.csv.table_to_file(
+            file,
+            [[p.query, p.map, p.score] for p in pairs],
+            header="# query_image, map_image, score",
+        )
+    assert read_pairs(tmp_path / "theirs.txt") == pairs
+
+
+def test_kapture_and_we_read_the_same_map_of_other_tools(shared_data: Path) -> None:
+    root = shared_data / "foreign_maps/virtual_gallery/map"
+    theirs = kapture.io.csv.kapture_from_dir(str(root))
+    folder = KaptureFolder(root)
+    assert np.array_equal(folder.points3d(), theirs.points3d.as_array())
+    ours = folder.observations()["r2d2_500"]
+    rows = [
+        (point, image, keypoint)
+        for point, kind in sorted(theirs.observations.key_pairs())
+        for image, keypoint in theirs.observations[point, kind]
+    ]
+    names = np.array(ours.image_names)[ours.image_ids].tolist()
+    assert rows == list(
+        zip(ours.point_ids.tolist(), names, ours.keypoint_ids.tolist(), strict=True)
+    )
+    for key, pose in folder.read().trajectories.items():
+        assert np.allclose(theirs.trajectories[key].r_raw, pose.quat_wxyz, atol=1e-12)
+        assert tuple(theirs.trajectories[key].t_raw) == pose.translation
+    keypoints = folder.keypoints("r2d2_500")
+    assert set(keypoints.names) == theirs.keypoints["r2d2_500"]
+
+
+def test_importing_the_store_imports_nothing_heavy() -> None:
+    code = (
+        "import sys, megloc_kapture.io.kapture, megloc_kapture.io.images;"
+        "print(*sorted({m.split('.')[0] for m in sys.modules}))"
+    )
+    loaded = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    ).stdout.split()
+    assert "numpy" in loaded
+    heavy = {"torch", "numba", "kapture", "quaternion", "cv2", "pandas", "scipy", "PIL", "pycolmap"}
+    assert heavy.isdisjoint(loaded)

@@ -1,0 +1,154 @@
+"""The registry is whole and says what nets.md, the reference of all networks, says."""
+
+from __future__ import annotations
+
+import re
+from fnmatch import fnmatchcase
+from itertools import product
+from pathlib import Path
+
+import pytest
+from pydantic import ValidationError
+
+from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.io.weights.registry import (
+    PublishedFile,
+    Weights,
+    by_file_name,
+    by_sha256,
+    lookup,
+    registry,
+)
+
+# what plugins call their weights by
+NAMES = (
+    *("superpoint_v1", "superpoint_v6_from_tf", "superglue_outdoor", "superglue_indoor"),
+    *("aslfeat", "aliked-t16", "aliked-n16", "aliked-n16rot", "aliked-n32"),
+    *("xfeat", "xfeat-lighterglue", "r2d2_WAF_N16", "r2d2_WASF_N16", "r2d2_WASF_N8_big"),
+    *("superpoint_lightglue", "aliked_lightglue"),
+    *("deeplabv3plus-resnet101", "deeplabv3plus-mobilenet"),
+    *("apgem-resnet101", "apgem-resnet101-lm18", "delg-r50-gld", "delg-r101-gldv2clean"),
+)
+# in the reference's table, but no file that the registry keeps
+BESIDE = ("*.data-00000-of-00001", "*.meta")
+# in the registry, but not in that table
+EXTRA = {
+    *("superpoint_lightglue.pth", "aliked_lightglue.pth"),
+    *("best_deeplabv3plus_resnet101_cityscapes_os16.pth", "r50delg_gldv2clean_20200914.tar.gz"),
+    *("MegaLoc/model.safetensors", "megaloc.torch", "ResNet50_2048_eigenplaces.pth"),
+}
+
+
+def test_all_plugins_find_theirs() -> None:
+    assert set(NAMES) <= set(registry())
+    assert all(name == weights.name for name, weights in registry().items())
+
+
+def test_no_file_is_two() -> None:
+    names = [n for w in registry().values() for file in w.files for n in file.names]
+    names += [weights.converted for weights in registry().values()]
+    assert len(names) == len(set(names))
+    sums = [file.sha256 for w in registry().values() for file in w.files if file.sha256]
+    assert len(sums) == len(set(sums)) > 20
+
+
+def test_licences_that_forbid_commercial_use_are_marked() -> None:
+    for weights in registry().values():
+        forbids = re.search(r"noncommercial|research|-NC-|unconfirmed", weights.licence)
+        assert weights.commercial == (forbids is None), weights.name
+
+
+def test_hashes_in_the_names_of_torch_hub_are_those_of_the_files() -> None:
+    """torch.hub calls a file by the first eight digits of its sha256."""
+    checked = 0
+    for weights in registry().values():
+        for file in weights.files:
+            if found := re.search(r"-([0-9a-f]{8})\.pth$", file.name):
+                assert file.sha256 is not None and file.sha256.startswith(found[1])
+                checked += 1
+    assert checked == 3
+
+
+def test_places_are_safe_and_end_in_the_files_names() -> None:
+    for weights in registry().values():
+        assert weights.page.startswith("https://")
+        for file in weights.files:
+            if file.url is not None:
+                assert file.url.startswith("https://")
+                # folders of the name may stand anywhere above
+                place = iter(file.url.partition("?")[0].split("/"))
+                assert all(part in place for part in file.name.split("/")), file.url
+                assert next(place, None) is None
+
+
+def expanded(text: str) -> set[str]:
+    """``a.{b,c}`` to ``a.b`` and ``a.c``."""
+    parts = re.split(r"\{([^}]*)\}", text)
+    choices = [part.split(",") if row % 2 else [part] for row, part in enumerate(parts)]
+    return {"".join(chosen) for chosen in product(*choices)}
+
+
+def test_the_reference_names_the_same_files(shared_data: Path) -> None:
+    reference = shared_data.parent / "reference" / "nets.md"
+    if not reference.is_file():
+        pytest.skip(f"no {reference}")
+    section = reference.read_text(encoding="utf-8").split("\n## ")[1]
+    rows = [line.split("|") for line in section.splitlines() if line.startswith("|")][2:]
+    told = {
+        n for row in rows for quoted in re.findall(r"`([^`]+)`", row[3]) for n in expanded(quoted)
+    }
+    told = {name for name in told if not any(fnmatchcase(name, b) for b in BESIDE)}
+    kept = {n for w in registry().values() for file in w.files for n in file.names}
+    assert len(told) > 30
+    for name in told:
+        assert any(fnmatchcase(k, name) for k in kept), f"{name} is not in the registry"
+    first = {file.name for w in registry().values() for file in w.files}
+    for name in first - EXTRA:
+        assert any(fnmatchcase(name, t) for t in told), f"{name} is not in the reference"
+
+
+def test_lookup() -> None:
+    assert lookup("xfeat").files[1].name == "xfeat.onnx"
+    with pytest.raises(OptionError, match="no weights 'xfeet' in the registry; there are superpo"):
+        lookup("xfeet")
+    found = by_file_name("superpoint_lightglue_v0-1_arxiv.pth")
+    assert found is not None and found[0].name == "superpoint_lightglue"
+    found = by_file_name("alex.pth")
+    assert found is not None and found[1].name == "v0.1/alex.pth"
+    assert by_file_name("nothing.pth") is None and by_sha256(64 * "0") is None
+
+
+GOOD = dict(
+    name="net",
+    purpose="finds",
+    page="https://example.org/net",
+    licence="MIT",
+    terms="all",
+    commercial=True,
+    files=({"name": "net.pth"},),
+)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"page": "example.org/net"},
+        {"page": "javascript:alert(1)"},
+        {"files": ()},
+        {"files": ({"name": "../net.pth"},)},
+        {"files": ({"name": "/net.pth"},)},
+        {"files": ({"name": "net.pth", "also": ("../net.pth",)},)},
+        {"files": ({"name": "net.pth", "sha256": "abc"},)},
+        {"files": ({"name": "net.pth", "size": 0},)},
+        {"files": ({"name": "net.pth", "url": "file:///net.pth"},)},
+        {"name": "a/b"},
+        {"terms": ""},
+        {"colour": "red"},
+    ],
+    ids=str,
+)
+def test_wrong_entries_are_refused(wrong: dict[str, object]) -> None:
+    weights = Weights.model_validate(GOOD)
+    assert weights.files == (PublishedFile(name="net.pth"),) and weights.to_fetch is None
+    with pytest.raises((ValidationError, DataError)):
+        Weights.model_validate(GOOD | wrong)
