@@ -35,11 +35,16 @@ from corridor_scene import ROOM_DISTANCE_M, Seen, write_corridor
 from mapped_scene import Query, Scene, errors, hypotheses, read_scene
 from scenes import megloc
 
-from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions, absolute_pose
+from megloc_kapture.localization.absolute_pose import absolute_pose
 from megloc_kapture.localization.clusters import ClusterOptions
-from megloc_kapture.localization.correspondences import observed_matches
-from megloc_kapture.localization.distinctive_inliers import DistinctiveInliers
-from megloc_kapture.localization.ranking import InlierCount, InlierSpread, ReprojectionScore
+from megloc_kapture.localization.estimation import AbsolutePoseOptions
+from megloc_kapture.localization.map_index import observed_matches
+from megloc_kapture.localization.ranking import (
+    DistinctiveInliers,
+    InlierCount,
+    InlierSpread,
+    ReprojectionScore,
+)
 from megloc_kapture.plugins import PoseHypothesis, PoseRanker
 from megloc_kapture.stages.query_poses import LocalizationOptions, localize_views
 from megloc_kapture.values import Failure, Pose, RigidTransform

@@ -35,8 +35,7 @@ from inloc_rooms import HARDER, InLocRooms
 from mapped_scene import Query, Scene, read_scene
 from numpy.typing import NDArray
 
-from megloc_kapture.localization.distinctive_inliers import DistinctiveInliers
-from megloc_kapture.localization.ranking import InlierCount
+from megloc_kapture.localization.ranking import DistinctiveInliers, InlierCount
 from megloc_kapture.plugins import PluginChoice, PoseHypothesis, PoseRanker
 from megloc_kapture.stages.perceptual_ranking import PerceptualRanker
 

@@ -22,7 +22,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from megloc_kapture.io.weights import FOLDER_VARIABLE, find_weights, read_weights
-from megloc_kapture.nets.loading import load_strictly
+from megloc_kapture.nets.runtime import load_strictly
 
 Describe = Callable[[NDArray[np.uint8]], NDArray[np.float32]]
 

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions, absolute_pose
+from megloc_kapture.localization.absolute_pose import absolute_pose
+from megloc_kapture.localization.estimation import AbsolutePoseOptions
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation, plan_map
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice

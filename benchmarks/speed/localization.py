@@ -74,7 +74,6 @@ from megloc_kapture.io.kapture import (  # noqa: E402
     write_points3d,
     write_sensors,
 )
-from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions  # noqa: E402
 from megloc_kapture.localization.cluster_poses import (  # noqa: E402
     QueryView,
     TypedMatches,
@@ -84,8 +83,11 @@ from megloc_kapture.localization.clusters import (  # noqa: E402
     ClusterOptions,
     cluster_candidates,
 )
-from megloc_kapture.localization.correspondences import observed_matches  # noqa: E402
-from megloc_kapture.localization.map_index import MapIndex  # noqa: E402
+from megloc_kapture.localization.estimation import AbsolutePoseOptions  # noqa: E402
+from megloc_kapture.localization.map_index import (
+    MapIndex,  # noqa: E402
+    observed_matches,  # noqa: E402
+)
 from megloc_kapture.values import Pose  # noqa: E402
 
 NUM_CANDIDATES = 20

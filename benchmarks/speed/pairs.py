@@ -23,14 +23,16 @@ from numpy.typing import NDArray
 from timing import table
 
 from megloc_kapture.geometry.cameras import bearing_rays, project
-from megloc_kapture.mapping.frustum_overlap import frustum_overlap
-from megloc_kapture.mapping.pairs import exhaustive_pairs
-from megloc_kapture.mapping.pairs_by_covisibility import (
+from megloc_kapture.mapping.pairs import (
     PairsByCovisibilityOptions,
+    PairsByPosesOptions,
+    PairsBySequenceOptions,
+    exhaustive_pairs,
+    frustum_overlap,
     pairs_by_covisibility,
+    pairs_by_poses,
+    pairs_by_sequence,
 )
-from megloc_kapture.mapping.pairs_by_poses import PairsByPosesOptions, pairs_by_poses
-from megloc_kapture.mapping.pairs_by_sequence import PairsBySequenceOptions, pairs_by_sequence
 from megloc_kapture.matching.verification import ray_slopes, verify_with_poses
 from megloc_kapture.values import Camera, RigidTransform
 

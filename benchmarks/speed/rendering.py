@@ -41,15 +41,15 @@ from megloc_kapture.datasets.synthetic.views import PlacePainter  # noqa: E402
 from megloc_kapture.datasets.synthetic.world import build_world  # noqa: E402
 from megloc_kapture.geometry.poses import rotation_angles_deg  # noqa: E402
 from megloc_kapture.plugins import DepthView, PoseRefinement  # noqa: E402
+from megloc_kapture.refinement.acceptance import squared_distance  # noqa: E402
 from megloc_kapture.refinement.photometric import perturbed  # noqa: E402
-from megloc_kapture.refinement.rendering import refine_by_rendering  # noqa: E402
-from megloc_kapture.refinement.rendering_acceptance import squared_distance  # noqa: E402
-from megloc_kapture.refinement.rendering_options import RenderingOptions  # noqa: E402
-from megloc_kapture.refinement.rendering_views import (  # noqa: E402
+from megloc_kapture.refinement.references import (  # noqa: E402
     REFERENCES,
+    RenderingOptions,  # noqa: E402
     RenderingQuery,
     RenderingReference,
 )
+from megloc_kapture.refinement.rendering import refine_by_rendering  # noqa: E402
 from megloc_kapture.values import RigidTransform  # noqa: E402
 
 GOOD_M, GOOD_DEG = 0.005, 0.1

@@ -10,16 +10,19 @@ import torch
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.features.keypoint_selection import select_keypoints
 from megloc_kapture.io.weights import WeightsFile, find_weights, read_weights, sha256_of
 from megloc_kapture.nets.aliked import AlikedNet, aliked_from
-from megloc_kapture.nets.bilinear import read_bilinear
 from megloc_kapture.nets.runtime import NetworkOptions, image_tensor, inference, pick_device
-from megloc_kapture.nets.score_maps import select_pixels, suppress_non_maxima
-from megloc_kapture.nets.subpixel import soft_argmax
+from megloc_kapture.nets.sampling import read_bilinear
+from megloc_kapture.nets.score_maps import (
+    select_keypoints,
+    select_pixels,
+    soft_argmax,
+    suppress_non_maxima,
+)
 from megloc_kapture.values import LocalFeatures
 
-_TEMPERATURE = 0.1  # of the sub-pixel place, the one the network was trained with
+_TEMPERATURE = 0.1  # of the sub-pixel position, the one the network was trained with
 
 
 class AlikedOptions(NetworkOptions):

@@ -13,14 +13,22 @@ from numpy.typing import NDArray
 from pydantic import Field
 from torch.nn import functional
 
-from megloc_kapture.features.keypoint_selection import select_keypoints
 from megloc_kapture.io.weights import WeightsFile, find_weights, read_weights, sha256_of
-from megloc_kapture.nets.aslfeat import DESCRIPTOR_SIZE, STRIDE, AslFeatNet, aslfeat_from
-from megloc_kapture.nets.aslfeat_detection import on_no_edge
-from megloc_kapture.nets.bilinear import pixel_table, read_bilinear
+from megloc_kapture.nets.aslfeat import (
+    DESCRIPTOR_SIZE,
+    STRIDE,
+    AslFeatNet,
+    aslfeat_from,
+    on_no_edge,
+)
 from megloc_kapture.nets.runtime import NetworkOptions, inference, pick_device
-from megloc_kapture.nets.score_maps import select_pixels, suppress_non_maxima
-from megloc_kapture.nets.subpixel import parabola_peak
+from megloc_kapture.nets.sampling import pixel_table, read_bilinear
+from megloc_kapture.nets.score_maps import (
+    parabola_peak,
+    select_keypoints,
+    select_pixels,
+    suppress_non_maxima,
+)
 from megloc_kapture.values import LocalFeatures
 
 _BORDER_PX = 5

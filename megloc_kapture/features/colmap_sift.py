@@ -64,7 +64,7 @@ class ColmapSift:
             first_octave=options.first_octave,
             peak_threshold=options.peak_threshold,
         )
-        # several orientations at one place keep their order
+        # several orientations at one position keep their order
         order = np.argsort(-keypoints[:, 2], kind="stable")
         num_masked = 0
         if mask is not None and masked:

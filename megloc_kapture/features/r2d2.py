@@ -11,12 +11,16 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from torch.nn import functional
 
-from megloc_kapture.features.keypoint_selection import select_keypoints
 from megloc_kapture.io.weights import WeightsFile, find_weights, read_weights, sha256_of
-from megloc_kapture.nets.image_pyramid import pyramid_levels
-from megloc_kapture.nets.r2d2 import DESCRIPTOR_SIZE, R2D2Maps, R2D2Network, load_r2d2
+from megloc_kapture.nets.r2d2 import (
+    DESCRIPTOR_SIZE,
+    R2D2Maps,
+    R2D2Network,
+    load_r2d2,
+    pyramid_levels,
+)
 from megloc_kapture.nets.runtime import NetworkOptions, image_tensor, inference, pick_device
-from megloc_kapture.nets.score_maps import window_maximum
+from megloc_kapture.nets.score_maps import select_keypoints, window_maximum
 from megloc_kapture.values import LocalFeatures
 
 _DEFAULT_WEIGHTS = "r2d2_WASF_N16"

@@ -24,11 +24,12 @@ from megloc_kapture.nets.superpoint import (
     CELL_PX,
     DESCRIPTOR_SIZE,
     PointNetwork,
+    is_superpoint_batchnorm,
     sample_descriptors,
     superpoint,
+    superpoint_batchnorm,
     superpoint_with_descriptor,
 )
-from megloc_kapture.nets.superpoint_batchnorm import is_superpoint_batchnorm, superpoint_batchnorm
 from megloc_kapture.values import LocalFeatures
 
 _OFFICIAL_WEIGHTS = "superpoint_v1"

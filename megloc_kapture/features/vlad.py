@@ -70,7 +70,7 @@ class VladOptions(Options):
 
 @dataclass(frozen=True, eq=False)
 class Vocabulary:
-    """What describes an image.
+    """Visual words, and the whitening of the vectors that they give.
 
     Attributes
     ----------
@@ -131,7 +131,7 @@ def train_vlad(
     del sampled
     most = min(_WHITENING_IMAGES, max(2, _WHITENING_NUMBERS // vocabulary.size))
     described = [image for image, chosen in zip(images, rows, strict=True) if len(chosen)]
-    if len(described) > most:  # spread over the names, and so over places and sequences
+    if len(described) > most:  # spread over the names, and so over sequences
         picks = np.linspace(0, len(described) - 1, most).round().astype(np.int64)
         described = [described[pick] for pick in picks]
     vectors = np.empty((len(described), vocabulary.size), dtype=np.float32)
@@ -232,7 +232,7 @@ def _sum_by_label(
 
 
 def sample_rows(counts: Iterable[int], total: int, seed: int) -> list[NDArray[np.int64]]:
-    """Which descriptor rows of each image train the vocabulary; about ``total`` rows in all."""
+    """Descriptor rows of each image that train the vocabulary; about ``total`` rows in all."""
     counts = list(counts)
     rng = np.random.default_rng(seed)
     everything = sum(counts)

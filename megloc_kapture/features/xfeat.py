@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 from torch.nn import functional
 
-from megloc_kapture.features.keypoint_selection import select_keypoints
 from megloc_kapture.io.weights import WeightsFile, find_weights, read_weights, sha256_of
 from megloc_kapture.nets.runtime import NetworkOptions, image_tensor, inference, pick_device
-from megloc_kapture.nets.score_maps import suppress_non_maxima
+from megloc_kapture.nets.score_maps import select_keypoints, suppress_non_maxima
 from megloc_kapture.nets.xfeat import (
     DESCRIPTOR_SIZE,
     STRIDE,

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, order=True)
 class ImageVariant:
-    """How an image is changed.
+    """Scale and rotation of an image.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ class ImageVariant:
 
     @property
     def is_identity(self) -> bool:
-        """Whether it is the image as it is."""
+        """True if it is the image as it is."""
         return self == ImageVariant()
 
     def scaled_size(self, width: int, height: int) -> tuple[int, int]:
@@ -85,7 +85,7 @@ class ImageVariant:
     def px_in_variant(
         self, px: NDArray[np.floating[Any]], width: int, height: int
     ) -> NDArray[np.float64]:
-        """Where pixels (N, 2) of an image of this size are in its variant; float64 (N, 2)."""
+        """Pixels (N, 2) of an image of this size, in its variant; float64 (N, 2)."""
         scaled = self.scaled_size(width, height)
         x, y = np.asarray(px, dtype=np.float64).T * (
             np.array(scaled)[:, None] / np.array([[width], [height]])
@@ -101,7 +101,7 @@ class ImageVariant:
     def px_in_original(
         self, px: NDArray[np.floating[Any]], width: int, height: int
     ) -> NDArray[np.float64]:
-        """Where pixels (N, 2) of the variant are in the original of this size; float64 (N, 2)."""
+        """Pixels (N, 2) of the variant, in the original of this size; float64 (N, 2)."""
         scaled = self.scaled_size(width, height)
         x, y = np.asarray(px, dtype=np.float64).T
         back = {

@@ -125,7 +125,7 @@ def rotation_angles_deg(quats_a: Float64Array, quats_b: Float64Array) -> Float64
 
 
 def movement(old: RigidTransform, new: RigidTransform) -> tuple[float, float]:
-    """How far a camera goes between two ``cam_from_world``: its centre in metres, and degrees."""
+    """Movement of a camera between two ``cam_from_world``: of its centre in metres, and degrees."""
     moved_m = float(np.linalg.norm(new.center() - old.center()))
     turned_deg = rotation_angles_deg(np.array(new.quat_wxyz), np.array(old.quat_wxyz))
     return moved_m, float(turned_deg)

@@ -10,13 +10,14 @@ Imported only when needed: numba costs half a second to import. Loops elsewhere 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.compiling import compiled_loop
-from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, ONE_FOCAL_MODELS, Camera
+from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, ONE_FOCAL_MODELS, Camera, RigidTransform
 
 NUM_PARAMS = 12
 
@@ -51,6 +52,24 @@ def packed_params(camera: Camera) -> NDArray[np.float64]:
         params = (params[0], *params)
     packed[: len(params)] = params
     return packed
+
+
+def packed_views(
+    cameras: Sequence[Camera], cams_from_world: Sequence[RigidTransform]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
+    """Posed cameras as compiled loops take them.
+
+    Returns
+    -------
+    rotations, translations : float64 (I, 3, 3) and (I, 3) of ``cams_from_world``.
+    models, params : int64 (I,) of :func:`model_id` and float64 (I, 12) of :func:`packed_params`.
+    """
+    return (
+        np.array([pose.rotation_matrix() for pose in cams_from_world]).reshape(-1, 3, 3),
+        np.array([pose.translation for pose in cams_from_world], np.float64).reshape(-1, 3),
+        np.array([model_id(camera) for camera in cameras], np.int64),
+        np.array([packed_params(camera) for camera in cameras]).reshape(-1, NUM_PARAMS),
+    )
 
 
 def project_with_jacobian(

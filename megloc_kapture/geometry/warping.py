@@ -1,4 +1,4 @@
-"""What reference images with depth show of another view: warping with a z-buffer.
+"""Warping of reference images with depth into another view, with a z-buffer.
 
 Each reference's depth map is drawn as a surface into the view; the nearest surface of all of them
 is what the view sees. Every pixel of the view then looks its colour up, bilinearly, in the
@@ -73,7 +73,7 @@ class WarpSource:
 
 @dataclass(frozen=True, eq=False)
 class WarpedView:
-    """What references show of a view.
+    """A view as references show it.
 
     Attributes
     ----------
@@ -221,7 +221,7 @@ def _look_up(
 
 
 def _remap(array: NDArray[Any], x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[Any]:
-    """Values (N, ...) of an array (H, W, ...) at N places, bilinear."""
+    """Values (N, ...) of an array (H, W, ...) at N positions, bilinear."""
     if not len(x):
         return np.zeros((0, *array.shape[2:]), array.dtype)
     # OpenCV takes no more than 32767 rows or columns
@@ -248,7 +248,7 @@ def _at_resolution(
 
 
 def _not_hidden(source: WarpSource, in_image: Floats, px: Floats) -> NDArray[np.bool_]:
-    """Which points (N, 3) the image sees, though it was the depth sensor beside it that did."""
+    """Mask of the points (N, 3) of the depth sensor beside an image that the image sees too."""
     own, _ = _seen_depth(source, source.camera, source.cam_from_world)
     height, width = own.shape
     with np.errstate(invalid="ignore"):

@@ -14,16 +14,18 @@ from itertools import zip_longest
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.localization.correspondences import ObservedMatches, observed_matches
+from megloc_kapture.geometry.poses import cross_matrix
+from megloc_kapture.localization.absolute_pose import refine_pose
 from megloc_kapture.localization.estimation import (
     AbsolutePoseOptions,
     PoseEstimate,
-    estimate_stacked,
+    PoseProblem,
+    View,
+    estimate_pose,
+    split_by_view,
 )
-from megloc_kapture.localization.map_index import MapIndex
-from megloc_kapture.localization.pose_refinement import refine_stacked
-from megloc_kapture.localization.same_place import same_place
-from megloc_kapture.localization.views import StackedViews, View, split_by_view, stack_views
+from megloc_kapture.localization.map_index import MapIndex, ObservedMatches, observed_matches
+from megloc_kapture.localization.ranking import poses_agree
 from megloc_kapture.plugins import HypothesisView, PoseHypothesis
 from megloc_kapture.values import Camera, ClusterPose, Failure, Pose, RigidTransform
 
@@ -49,7 +51,7 @@ class TypedMatches:
 
 @dataclass(frozen=True, eq=False)
 class QueryView:
-    """One camera of a query: its place on the rig, and its matches by keypoints type."""
+    """One camera of a query: its pose on the rig, and its matches by keypoints type."""
 
     name: str
     camera: Camera
@@ -62,7 +64,7 @@ class QueryView:
         return list(dict.fromkeys(named))
 
 
-def in_turn(rankings: Sequence[Sequence[str]]) -> list[str]:
+def interleave(rankings: Sequence[Sequence[str]]) -> list[str]:
     """One ranking of several: the first of each, then the second of each; each name once."""
     ranks = zip_longest(*rankings)
     return list(dict.fromkeys(name for rank in ranks for name in rank if name is not None))
@@ -87,8 +89,8 @@ def localize_in_clusters(
 ) -> ClusterLocalization:
     """Localize a query in each cluster by itself, rank the poses, and refine the best.
 
-    Clusters whose poses explain each other are one place after all (images that look to different
-    sides share no points), and are localized in together.
+    Clusters whose poses explain each other are joined (images that look to different sides share no
+    points), and are localized in together.
 
     Parameters
     ----------
@@ -104,7 +106,7 @@ def localize_in_clusters(
     over the keypoints types, in their order. Or a failure with its reason.
     """
     clock = _Clock()
-    matched = in_turn([view.matched_images() for view in views])
+    matched = interleave([view.matched_images() for view in views])
     rank_of = {image: rank for rank, image in enumerate(matched)}
     clusters = [[image for image in cluster if image in rank_of] for cluster in clusters]
     gathered = [[observed_matches(m.index, m.matches) for m in view.matches] for view in views]
@@ -114,11 +116,11 @@ def localize_in_clusters(
     clock.lap("correspondences")
 
     def attempt(cluster: Sequence[str], frame: str) -> _Attempt:
-        problem = stack_views(
+        problem = PoseProblem.of(
             [_view(view, own, cluster) for view, own in zip(views, gathered, strict=True)]
         )
         clock.lap("correspondences")
-        estimate = estimate_stacked(problem, options)
+        estimate = estimate_pose(problem, options)
         hypothesis = None
         if isinstance(estimate, PoseEstimate):
             hypothesis = _hypothesis(tuple(cluster), views, problem, estimate, options)
@@ -126,7 +128,7 @@ def localize_in_clusters(
         return _Attempt(tuple(cluster), frame, problem, estimate, hypothesis)
 
     attempts = [attempt(clusters[at], frames[at] if frames else "") for at in tried]
-    attempts = _joined(attempts, attempt, rank_of.__getitem__)
+    attempts = _join_agreeing(attempts, attempt, rank_of.__getitem__)
     if not attempts:
         failure = Failure("no match is with a point of the map", seconds=clock.seconds)
         return ClusterLocalization(failure, (0,) * len(views))
@@ -139,7 +141,7 @@ def localize_in_clusters(
     if isinstance(estimate, Failure):
         result: Pose | Failure = _failure(ranked, best)
     else:
-        result = refine_stacked(problem, estimate, options)
+        result = refine_pose(problem, estimate, options)
         clock.lap("refinement")
     result = replace(result, candidates=ranked[best].images, clusters=ranked, seconds=clock.seconds)
     if isinstance(result, Pose):
@@ -153,7 +155,7 @@ class _Attempt:
 
     cluster: tuple[str, ...]
     frame: str
-    problem: StackedViews
+    problem: PoseProblem
     estimate: PoseEstimate | Failure
     hypothesis: PoseHypothesis | None
 
@@ -162,34 +164,34 @@ class _Attempt:
         return self.hypothesis is None
 
 
-def _joined(
+def _join_agreeing(
     attempts: list[_Attempt],
     attempt: Callable[[Sequence[str], str], _Attempt],
     rank_of: Callable[[str], int],
 ) -> list[_Attempt]:
-    """Attempts of one place made one, where that does not lose inliers; in their order."""
-    places: list[list[_Attempt]] = []
+    """Join attempts whose poses agree, where that does not lose inliers; in their order."""
+    groups: list[list[_Attempt]] = []
     for each in attempts:
-        for place in places:
-            first = place[0]
+        for group in groups:
+            first = group[0]
             if (
                 each.frame == first.frame
                 and each.hypothesis is not None
                 and first.hypothesis is not None
-                and same_place(each.hypothesis, first.hypothesis)
+                and poses_agree(each.hypothesis, first.hypothesis)
             ):
-                place.append(each)
+                group.append(each)
                 break
         else:
-            places.append([each])
+            groups.append([each])
     found: list[_Attempt] = []
-    for place in places:
-        together = place[0]
-        if len(place) > 1:
-            images = [image for each in place for image in each.cluster]
+    for group in groups:
+        together = group[0]
+        if len(group) > 1:
+            images = [image for each in group for image in each.cluster]
             together = attempt(sorted(images, key=rank_of), together.frame)
-        kept = together.estimate.num_inliers >= max(each.estimate.num_inliers for each in place)
-        found += [together] if kept else place
+        kept = together.estimate.num_inliers >= max(each.estimate.num_inliers for each in group)
+        found += [together] if kept else group
     return found
 
 
@@ -263,7 +265,7 @@ def _view(view: QueryView, gathered: Sequence[ObservedMatches], cluster: Sequenc
 def _hypothesis(
     images: tuple[str, ...],
     views: Sequence[QueryView],
-    problem: StackedViews,
+    problem: PoseProblem,
     estimate: PoseEstimate,
     options: AbsolutePoseOptions,
 ) -> PoseHypothesis:
@@ -301,3 +303,72 @@ class _Clock:
         now = time.perf_counter()
         self.seconds[step] = self.seconds.get(step, 0.0) + now - self._last
         self._last = now
+
+
+def poses_of_cameras(
+    views: Sequence[QueryView], found: ClusterLocalization
+) -> list[Pose | Failure]:
+    """One result per camera of a localized rig, with its own matches and inliers.
+
+    A camera without any inlier has not been localized, whatever the others say: it fails, and it
+    is for who asked to give it its pose through the rig.
+    """
+    result = found.result
+    if not isinstance(result, Pose) or result.inliers is None:
+        raise ValueError("the rig has no pose, or its inliers are not known")
+    masks = np.split(result.inliers, np.cumsum(found.matches_of_views)[:-1])
+    cameras: list[Pose | Failure] = []
+    for view, inliers in zip(views, masks, strict=True):
+        num_inliers = int(inliers.sum())
+        if num_inliers == 0:
+            cameras.append(
+                Failure(
+                    "no inlier in this camera; others of its rig were localized",
+                    num_matches=len(inliers),
+                    candidates=result.candidates,
+                    clusters=_of_camera(result.clusters, view.cam_from_rig),
+                    seconds=result.seconds,
+                )
+            )
+            continue
+        cameras.append(
+            replace(
+                result,
+                cam_from_world=view.cam_from_rig @ result.cam_from_world,
+                clusters=_of_camera(result.clusters, view.cam_from_rig),
+                num_matches=len(inliers),
+                num_inliers=num_inliers,
+                inliers=inliers,
+                covariance=None
+                if result.covariance is None
+                else transform_covariance(result.covariance, view.cam_from_rig),
+            )
+        )
+    return cameras
+
+
+def _of_camera(
+    clusters: Sequence[ClusterPose], cam_from_rig: RigidTransform
+) -> tuple[ClusterPose, ...]:
+    """The clusters of a rig, with the poses of one of its cameras."""
+    return tuple(
+        cluster
+        if cluster.cam_from_world is None
+        else replace(cluster, cam_from_world=cam_from_rig @ cluster.cam_from_world)
+        for cluster in clusters
+    )
+
+
+def transform_covariance(
+    covariance: NDArray[np.float64], cam_from_rig: RigidTransform
+) -> NDArray[np.float64]:
+    """Covariance (6, 6) of ``cam_from_rig @ rig_from_world`` of one of ``rig_from_world``.
+
+    Both of left perturbations, rotation first: with ``C exp(xi) = exp(Ad_C xi) C`` it is
+    ``Ad_C covariance Ad_C^T`` (Barfoot, State Estimation for Robotics, section 7.1.4).
+    """
+    rotation = cam_from_rig.rotation_matrix()
+    adjoint = np.zeros((6, 6))
+    adjoint[:3, :3] = adjoint[3:, 3:] = rotation
+    adjoint[3:, :3] = cross_matrix(np.array(cam_from_rig.translation)) @ rotation
+    return np.asarray(adjoint @ covariance @ adjoint.T)

@@ -1,4 +1,4 @@
-"""Clusters of a query's candidates: images of one place, each with a pose of its own.
+"""Clusters of a query's candidates, each with a pose of its own.
 
 MegLoc, section "Cluster-wise localization": retrieval returns images of several places that look
 alike, and the matches of one place are outliers to the pose of another. So the retrieved images are
@@ -23,7 +23,7 @@ from megloc_kapture.values import Options
 
 
 class ClusterOptions(Options):
-    """How a query's candidates are divided into places."""
+    """Options of the clusters of a query's candidates."""
 
     by: Literal["none", "poses", "covisibility"] = Field(
         default="covisibility",
@@ -88,7 +88,7 @@ def cluster_candidates(
     centers: Mapping[str, NDArray[np.float64]],
     indices: Sequence[MapIndex],
 ) -> list[tuple[str, ...]]:
-    """Divide candidates into places.
+    """Divide candidates into clusters.
 
     Parameters
     ----------

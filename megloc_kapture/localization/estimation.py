@@ -1,4 +1,4 @@
-"""First estimate of a pose and its inliers: LO-RANSAC by poselib.
+"""2D-3D matches of a camera or a rig, and the first estimate of its pose: LO-RANSAC by poselib.
 
 P3P where the matches of one camera have to do, GP3P where several cameras of a rig have some.
 The same seed gives the same pose, from however many threads. A failure is a falsy value with its
@@ -17,17 +17,134 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import focal_px, normalized_from_px
-from megloc_kapture.localization.views import (
-    StackedViews,
-    View,
-    stack_views,
-    undo_recentring,
-)
-from megloc_kapture.values import Failure, Options, RigidTransform
+from megloc_kapture.values import Camera, Failure, Options, RigidTransform
 
 # GP3P draws from C's rand(), one state for the whole process
 _RAND = threading.Lock()
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One camera and its matches; a camera on its own is a rig of one, at its origin.
+
+    Attributes
+    ----------
+    camera : the intrinsics.
+    cam_from_rig : the camera in its rig; the identity for a camera on its own.
+    points_px : float (N, 2) pixels, first pixel's centre at (0.5, 0.5).
+    points_world : float64 (N, 3) the points that they are matched with.
+    point_covariances : float64 (N, 6) of the points as xx, xy, xz, yy, yz, zz in the map's unit
+        squared, for a measurement noise of 1 px, not finite where unknown; or None. An unknown
+        covariance counts as none at all.
+
+    Raises
+    ------
+    DataError : the arrays do not have these shapes.
+    """
+
+    camera: Camera
+    cam_from_rig: RigidTransform
+    points_px: NDArray[np.floating[Any]]
+    points_world: NDArray[np.float64]
+    point_covariances: NDArray[np.float64] | None = None
+
+    def __post_init__(self) -> None:
+        count = len(self.points_px)
+        if self.points_px.shape != (count, 2) or self.points_world.shape != (count, 3):
+            raise DataError(
+                f"pixels {self.points_px.shape} and points {self.points_world.shape} of a view "
+                "are not (N, 2) and (N, 3)"
+            )
+        if self.point_covariances is not None and self.point_covariances.shape != (count, 6):
+            raise DataError(
+                f"covariances {self.point_covariances.shape} of {count} points are not ({count}, 6)"
+            )
+
+
+def split_by_view(views: Sequence[View], per_match: NDArray[Any]) -> list[NDArray[Any]]:
+    """One part for each view of what runs over the matches of all views, such as inliers (N,)."""
+    return np.split(per_match, np.cumsum([len(view.points_px) for view in views])[:-1])
+
+
+@dataclass(frozen=True, eq=False)
+class PoseProblem:
+    """The matches of a camera, or of all cameras of a rig, that its pose is estimated from.
+
+    Attributes
+    ----------
+    views : of each camera, as they were given.
+    points_px, points : float64 (N, 2) and (N, 3), the latter minus ``offset``.
+    covariances : float64 (N, 6), or (0, 6) where no view has any.
+    starts : int64 (V + 1,) first match of each view.
+    cameras : of the views in their rig, as
+        :func:`~megloc_kapture.geometry.projection.packed_views` has them.
+    offset : float64 (3,), a point amid the others: far from the origin (ECEF) float64 loses what
+        a recentred world keeps.
+    """
+
+    views: tuple[View, ...]
+    points_px: NDArray[np.float64]
+    points: NDArray[np.float64]
+    covariances: NDArray[np.float64]
+    starts: NDArray[np.int64]
+    cameras: tuple[NDArray[Any], ...]
+    offset: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, views: Sequence[View]) -> PoseProblem:
+        """The problem of any number of views, their matches in the same order."""
+        from megloc_kapture.geometry.projection import packed_views
+
+        starts = np.zeros(len(views) + 1, dtype=np.int64)
+        np.cumsum([len(view.points_px) for view in views], out=starts[1:])
+        world = _joined([view.points_world for view in views], 3)
+        offset = _amid(world)
+        covariances = np.zeros((0, 6))
+        if any(view.point_covariances is not None for view in views):
+            covariances = _joined(
+                [
+                    np.zeros((len(view.points_px), 6))
+                    if view.point_covariances is None
+                    else view.point_covariances
+                    for view in views
+                ],
+                6,
+            )
+        return cls(
+            views=tuple(views),
+            points_px=_joined([view.points_px for view in views], 2),
+            points=world - offset,
+            covariances=covariances,
+            starts=starts,
+            cameras=packed_views(
+                [view.camera for view in views], [view.cam_from_rig for view in views]
+            ),
+            offset=offset,
+        )
+
+    @property
+    def matches(self) -> tuple[NDArray[Any], ...]:
+        """The arrays that :mod:`~megloc_kapture.localization.pose_kernels` calls ``matches``."""
+        return (self.points_px, self.points, self.covariances, self.starts, *self.cameras)
+
+
+def _joined(parts: Sequence[NDArray[np.floating[Any]]], width: int) -> NDArray[np.float64]:
+    return np.concatenate([np.zeros((0, width)), *parts], dtype=np.float64)
+
+
+def _amid(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    # the median of some of them: any point nearby serves, and wrong points must not move it far
+    some = points[:: max(1, len(points) // 64)]
+    some = np.sort(some[np.isfinite(some).all(axis=1)], axis=0)
+    return some[len(some) // 2] if len(some) else np.zeros(3)
+
+
+def undo_recentring(pose: RigidTransform, offset: NDArray[np.float64]) -> RigidTransform:
+    """``rig_from_world`` of a pose in a world that was moved by minus ``offset`` (3,)."""
+    t = np.array(pose.translation) - pose.rotation_matrix() @ offset
+    return RigidTransform(pose.quat_wxyz, (float(t[0]), float(t[1]), float(t[2])))
 
 
 class AbsolutePoseOptions(Options):
@@ -86,7 +203,7 @@ class PoseEstimate:
 
 
 def estimate_pose(
-    views: Sequence[View], options: AbsolutePoseOptions | None = None
+    problem: PoseProblem, options: AbsolutePoseOptions | None = None
 ) -> PoseEstimate | Failure:
     """Estimate ``rig_from_world`` from the matches of one camera or several.
 
@@ -96,19 +213,15 @@ def estimate_pose(
     -------
     PoseEstimate, or Failure with the reason.
     """
-    return estimate_stacked(stack_views(views), options or AbsolutePoseOptions())
-
-
-def estimate_stacked(stacked: StackedViews, options: AbsolutePoseOptions) -> PoseEstimate | Failure:
-    """:func:`estimate_pose` of views that are stacked already."""
-    count = len(stacked.points)
+    options = options or AbsolutePoseOptions()
+    count = len(problem.points)
     if count < options.min_inliers:
         return Failure(
             f"{count} 2D-3D matches, at least {options.min_inliers} are needed", num_matches=count
         )
     # a camera's distortion cannot be undone everywhere: such rays are NaN
-    rays = np.concatenate([normalized_from_px(v.camera, v.points_px) for v in stacked.views])
-    usable = np.isfinite(rays).all(axis=1) & np.isfinite(stacked.points).all(axis=1)
+    rays = np.concatenate([normalized_from_px(v.camera, v.points_px) for v in problem.views])
+    usable = np.isfinite(rays).all(axis=1) & np.isfinite(problem.points).all(axis=1)
     num_usable = int(np.count_nonzero(usable))
     if num_usable < options.min_inliers:
         return Failure(
@@ -116,13 +229,13 @@ def estimate_stacked(stacked: StackedViews, options: AbsolutePoseOptions) -> Pos
             "are needed",
             num_matches=count,
         )
-    rig_from_world = _ransac(stacked, rays, usable, options)
-    errors_px = _errors_px(stacked, rig_from_world, usable)
+    rig_from_world = _ransac(problem, rays, usable, options)
+    errors_px = _errors_px(problem, rig_from_world, usable)
     inliers = errors_px <= options.max_error_px
     num_inliers = int(np.count_nonzero(inliers))
     if num_inliers < options.min_inliers:
         return too_few_agree(num_inliers, count, options)
-    pose = undo_recentring(rig_from_world, stacked.offset)
+    pose = undo_recentring(rig_from_world, problem.offset)
     return PoseEstimate(pose, usable, inliers, errors_px)
 
 
@@ -136,7 +249,7 @@ def too_few_agree(num_inliers: int, count: int, options: AbsolutePoseOptions) ->
 
 
 def _errors_px(
-    stacked: StackedViews, rig_from_world: RigidTransform, usable: NDArray[np.bool_]
+    problem: PoseProblem, rig_from_world: RigidTransform, usable: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
     """Errors in pixels (N,), infinite behind the camera and where a match is not ``usable``.
 
@@ -147,7 +260,7 @@ def _errors_px(
     count = len(usable)
     errors = np.empty(count)
     pose_kernels.measure(
-        pose_kernels.matches_of(stacked),
+        problem.matches,
         usable,
         rig_from_world.rotation_matrix(),
         np.array(rig_from_world.translation),
@@ -160,7 +273,7 @@ def _errors_px(
 
 
 def _ransac(
-    stacked: StackedViews,
+    problem: PoseProblem,
     rays: NDArray[np.float64],
     usable: NDArray[np.bool_],
     options: AbsolutePoseOptions,
@@ -173,7 +286,7 @@ def _ransac(
     bundle = {"max_iterations": 0}
     points_2d, points_3d, extrinsics, pinholes, cams_from_rig = [], [], [], [], []
     for view, first, last in zip(
-        stacked.views, stacked.starts[:-1].tolist(), stacked.starts[1:].tolist(), strict=True
+        problem.views, problem.starts[:-1].tolist(), problem.starts[1:].tolist(), strict=True
     ):
         rows = first + np.flatnonzero(usable[first:last])
         if len(rows) == 0:
@@ -182,7 +295,7 @@ def _ransac(
         # models is shorter than COLMAP's
         focal = focal_px(view.camera)
         points_2d.append(rays[rows] * focal)
-        points_3d.append(stacked.points[rows])
+        points_3d.append(problem.points[rows])
         pinholes.append(
             {"model": "PINHOLE", "width": 1, "height": 1, "params": [focal, focal, 0.0, 0.0]}
         )

@@ -1,9 +1,7 @@
 """Compiled loops over a map's index and a query's matches: arrays in, arrays out.
 
 Imported where they are called, not where their module is: numba costs half a second to import.
-Whatever is sorted is sorted stably by digits (least significant first), which is linear in the
-number of keys and gives the same order everywhere. No loop costs more for a larger map, except the
-one that builds the index.
+No loop costs more for a larger map, except the one that builds the index.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls, allow-untyped-decorators
@@ -13,70 +11,6 @@ from __future__ import annotations
 import numpy as np
 
 from megloc_kapture.compiling import compiled_loop
-
-_U = np.uint64
-_SIGN = _U(1 << 63)
-_DIGIT = 11
-_DIGITS = 1 << _DIGIT
-_LOW = _U(_DIGITS - 1)
-
-
-@compiled_loop
-def _sorted_by(keys, order):
-    """``order``, int64 indices into ``keys`` (uint64), stably sorted by them; uses ``order`` up."""
-    count = len(order)
-    if count == 0:
-        return order
-    varying = _U(0)
-    for i in range(count):
-        varying |= keys[order[i]] ^ keys[order[0]]
-    spare = np.empty(count, np.int64)
-    starts = np.empty(_DIGITS, np.int64)
-    for shift in range(0, 64, _DIGIT):
-        bits = _U(shift)
-        if (varying >> bits) & _LOW == _U(0):
-            continue
-        starts[:] = 0
-        for i in range(count):
-            starts[np.int64((keys[order[i]] >> bits) & _LOW)] += 1
-        total = 0
-        for digit in range(_DIGITS):
-            size = starts[digit]
-            starts[digit] = total
-            total += size
-        for i in range(count):
-            here = np.int64((keys[order[i]] >> bits) & _LOW)
-            spare[starts[here]] = order[i]
-            starts[here] += 1
-        order, spare = spare, order
-    return order
-
-
-@compiled_loop
-def _sorted_from_bit(keys, lowest):
-    """``keys``, int64 and not negative, stably sorted by the bits from ``lowest`` on; used up."""
-    varying = np.int64(0)
-    for key in keys:
-        varying |= key ^ keys[0]
-    spare = np.empty_like(keys)
-    starts = np.empty(_DIGITS, np.int64)
-    for shift in range(lowest, 63, _DIGIT):
-        if (varying >> shift) & (_DIGITS - 1) == 0:
-            continue
-        starts[:] = 0
-        for key in keys:
-            starts[(key >> shift) & (_DIGITS - 1)] += 1
-        total = 0
-        for digit in range(_DIGITS):
-            size = starts[digit]
-            starts[digit] = total
-            total += size
-        for key in keys:
-            here = (key >> shift) & (_DIGITS - 1)
-            spare[starts[here]] = key
-            starts[here] += 1
-        keys, spare = spare, keys
-    return keys
 
 
 @compiled_loop
@@ -137,13 +71,12 @@ def observed(offsets, keypoint_ids, point_ids, rows, starts, pairs, scores):
 
 
 @compiled_loop
-def shared_points(offsets, point_ids, rows):
-    """How many points every two of the images observe both, int64 (n, n); see ``MapIndex``."""
+def sightings(offsets, point_ids, rows):
+    """Every observation of the images ``rows`` (n,) as one number: its point above its image."""
     total = 0
     for row in rows:
         if row >= 0:
             total += offsets[row + 1] - offsets[row]
-    # a point above the image that sees it, in one number: sorted without looking anything up
     keys = np.empty(total, np.int64)
     k = 0
     for i in range(len(rows)):
@@ -151,16 +84,19 @@ def shared_points(offsets, point_ids, rows):
             for at in range(offsets[rows[i]], offsets[rows[i] + 1]):
                 keys[k] = (np.int64(point_ids[at]) << 32) | i
                 k += 1
-    keys = _sorted_from_bit(keys, 32)
-    shared = np.zeros((len(rows), len(rows)), np.int64)
-    seeing = np.empty(len(rows), np.int64)
+    return keys
+
+
+@compiled_loop
+def count_shared(keys, shared):
+    """Add to ``shared`` (n, n) the points that two images see, of sorted :func:`sightings`."""
+    seeing = np.empty(len(shared), np.int64)
     begin = 0
-    while begin < total:
+    while begin < len(keys):
         point = keys[begin] >> 32
         count = 0
         end = begin
-        # the order is stable: the images of a point come in ascending order
-        while end < total and keys[end] >> 32 == point:
+        while end < len(keys) and keys[end] >> 32 == point:
             owner = keys[end] & 0xFFFFFFFF
             if count == 0 or seeing[count - 1] != owner:
                 seeing[count] = owner
@@ -170,73 +106,23 @@ def shared_points(offsets, point_ids, rows):
             for b in range(a + 1):
                 shared[seeing[a], seeing[b]] += 1
         begin = end
-    for a in range(len(rows)):
+    for a in range(len(shared)):
         for b in range(a):
             shared[b, a] = shared[a, b]
-    return shared
 
 
 @compiled_loop
-def resolve(keypoint_ids, point_ids, similarities, image_rows, taken):
-    """One point per keypoint and one keypoint per point, of the matches with ``taken`` images.
+def choose(ranked, keypoints, points):
+    """Mask of the pairs that are taken in the order ``ranked``, each keypoint and point once.
 
-    Returns keypoints, points and support, all int64, sorted by keypoint.
+    ``keypoints`` and ``points`` count from 0 without gaps.
     """
-    total = 0
-    order = np.empty(len(keypoint_ids), np.int64)
-    for i in range(len(keypoint_ids)):
-        if taken[image_rows[i]]:
-            order[total] = i
-            total += 1
-    order = _sorted_by(point_ids.view(np.uint64), order[:total])
-    order = _sorted_by(keypoint_ids.view(np.uint64), order)
-
-    # every distinct pair once, sorted by keypoint, then point
-    keypoints = np.empty(total, np.int64)
-    points = np.empty(total, np.int64)
-    best = np.empty(total, np.float64)
-    support = np.zeros(total, np.int64)
-    count = 0
-    for i in order:
-        similarity = similarities[i] + 0.0  # of minus zero: zero
-        new = count == 0 or keypoints[count - 1] != keypoint_ids[i]
-        if new or points[count - 1] != point_ids[i]:
-            keypoints[count] = keypoint_ids[i]
-            points[count] = point_ids[i]
-            best[count] = similarity
-            count += 1
-        elif similarity > best[count - 1]:
-            best[count - 1] = similarity
-        support[count - 1] += 1
-
-    # best pair first: most support, then highest similarity, then smallest ids
-    falling = best[:count].view(np.uint64)
-    for i in range(count):
-        if falling[i] & _SIGN == _U(0):
-            falling[i] = ~(falling[i] | _SIGN)
-    ranked = _sorted_by(falling, np.arange(count))
-    ranked = _sorted_by(~support[:count].view(np.uint64), ranked)
-
-    # small numbers for the points, so that what is used up can be marked in an array
-    by_point = _sorted_by(points[:count].view(np.uint64), np.arange(count))
-    number = np.empty(count, np.int64)
-    for i in range(count):
-        here = by_point[i]
-        if i == 0:
-            number[here] = 0
-        else:
-            before = by_point[i - 1]
-            number[here] = number[before] + (points[here] != points[before])
-    first = np.empty(count, np.int64)  # pair of the same keypoint
-    for i in range(count):
-        first[i] = first[i - 1] if i and keypoints[i] == keypoints[i - 1] else i
-
-    point_used = np.zeros(count, np.bool_)
-    keypoint_used = np.zeros(count, np.bool_)
-    chosen = np.zeros(count, np.bool_)
+    keypoint_used = np.zeros(len(ranked), np.bool_)
+    point_used = np.zeros(len(ranked), np.bool_)
+    chosen = np.zeros(len(ranked), np.bool_)
     for i in ranked:
-        if not keypoint_used[first[i]] and not point_used[number[i]]:
-            keypoint_used[first[i]] = True
-            point_used[number[i]] = True
+        if not keypoint_used[keypoints[i]] and not point_used[points[i]]:
+            keypoint_used[keypoints[i]] = True
+            point_used[points[i]] = True
             chosen[i] = True
-    return keypoints[:count][chosen], points[:count][chosen], support[:count][chosen]
+    return chosen

@@ -1,4 +1,4 @@
-"""A map's points and observations as arrays: from keypoints of map images to 3D points."""
+"""A map's points and observations as arrays, and the 2D-3D matches of a query with them."""
 
 from __future__ import annotations
 
@@ -76,9 +76,9 @@ class MapIndex:
         found = np.full(len(keypoint_ids), -1, dtype=np.int64)
         if len(keypoints) == 0 or len(keypoint_ids) == 0:
             return found
-        place = np.minimum(np.searchsorted(keypoints, keypoint_ids), len(keypoints) - 1)
-        hit = keypoints[place] == keypoint_ids
-        found[hit] = points[place[hit]]
+        rows = np.minimum(np.searchsorted(keypoints, keypoint_ids), len(keypoints) - 1)
+        hit = keypoints[rows] == keypoint_ids
+        found[hit] = points[rows[hit]]
         return found
 
     def rows_of(self, images: Sequence[str]) -> NDArray[np.int64]:
@@ -86,15 +86,19 @@ class MapIndex:
         return np.array([self.row_of_image.get(image, -1) for image in images], dtype=np.int64)
 
     def shared_points(self, images: Sequence[str]) -> NDArray[np.int64]:
-        """How many points every two of the images both observe, int64 (n, n), symmetric.
+        """Number of points that every two of the images both observe, int64 (n, n), symmetric.
 
         The diagonal has the points that an image observes. The cost grows with these images'
         observations, not with the map; an image that is not in the map shares nothing.
         """
         from megloc_kapture.localization import index_kernels
 
-        shared = index_kernels.shared_points(self.offsets, self.point_ids, self.rows_of(images))
-        return np.asarray(shared, dtype=np.int64)
+        rows = self.rows_of(images)
+        keys = index_kernels.sightings(self.offsets, self.point_ids, rows)
+        keys.sort()
+        shared = np.zeros((len(rows), len(rows)), dtype=np.int64)
+        index_kernels.count_shared(keys, shared)
+        return shared
 
 
 def _read_only(array: NDArray[Any]) -> NDArray[Any]:
@@ -102,3 +106,107 @@ def _read_only(array: NDArray[Any]) -> NDArray[Any]:
     view = array.view()
     view.setflags(write=False)
     return view
+
+
+@dataclass(frozen=True, eq=False)
+class Correspondences:
+    """2D-3D matches: every keypoint and every point at most once.
+
+    Attributes
+    ----------
+    keypoint_ids : int64 (N,), rows of the query's keypoints, ascending.
+    point_ids : int64 (N,), rows of the map's points.
+    support : int64 (N,), number of map images that say so.
+    """
+
+    keypoint_ids: NDArray[np.int64]
+    point_ids: NDArray[np.int64]
+    support: NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class ObservedMatches:
+    """Matches of a query with map keypoints that observe a point, conflicts and all.
+
+    Attributes
+    ----------
+    keypoint_ids : int64 (M,), rows of the query's keypoints, not negative.
+    point_ids : int64 (M,), rows of the map's points, not negative.
+    similarities : float64 (M,), higher is better.
+    image_rows : int64 (M,), which of the map images the match is with, from 0.
+    num_images : int, of the map images, whether they have matches or not.
+    """
+
+    keypoint_ids: NDArray[np.int64]
+    point_ids: NDArray[np.int64]
+    similarities: NDArray[np.float64]
+    image_rows: NDArray[np.int64]
+    num_images: int
+
+    def resolve(self, rows: NDArray[np.bool_] | None = None) -> Correspondences:
+        """One point per keypoint and one keypoint per point, of the matches with some images.
+
+        The same keypoint can meet several points through different map images, and the reverse.
+        What most images say wins; then the most similar descriptors; then the smaller ids.
+        Conflicts are settled greedily from the best on, so that a loser may still get its second
+        choice. Images that are left out have no say.
+
+        Parameters
+        ----------
+        rows : bool (num_images,), the images whose matches count; all where it is None.
+        """
+        from megloc_kapture.localization import index_kernels
+
+        if rows is None:
+            rows = np.ones(self.num_images, dtype=np.bool_)
+        elif rows.shape != (self.num_images,):
+            raise ValueError(f"rows has shape {rows.shape}, expected ({self.num_images},)")
+        taken = np.flatnonzero(rows[self.image_rows])
+        if len(taken) == 0:
+            none = np.zeros(0, dtype=np.int64)
+            return Correspondences(none, none, none)
+        # both in one number: equals are the same pair, and their order does not matter
+        taken = taken[np.argsort((self.keypoint_ids[taken] << 32) | self.point_ids[taken])]
+        keypoints, points = self.keypoint_ids[taken], self.point_ids[taken]
+        # every distinct pair once, sorted by keypoint, then point
+        new = (np.diff(keypoints, prepend=-1) != 0) | (np.diff(points, prepend=-1) != 0)
+        first = np.flatnonzero(new)
+        best = np.maximum.reduceat(self.similarities[taken], first)
+        support = np.diff(first, append=len(taken))
+        keypoints, points = keypoints[first], points[first]
+        chosen = index_kernels.choose(
+            np.lexsort((-best, -support)),
+            np.cumsum(np.diff(keypoints, prepend=keypoints[0]) != 0),
+            np.unique(points, return_inverse=True)[1],
+        )
+        return Correspondences(keypoints[chosen], points[chosen], support[chosen])
+
+
+def observed_matches(
+    index: MapIndex,
+    matches: Sequence[tuple[str, NDArray[np.integer[Any]], NDArray[np.floating[Any]]]],
+) -> ObservedMatches:
+    """The matches whose map keypoint observes a point.
+
+    Parameters
+    ----------
+    matches : of each map image: its name, rows of query and map keypoints (K, 2), scores (K,). An
+        image that is not in the map has nothing to say.
+    """
+    from megloc_kapture.localization import index_kernels
+
+    if not matches:
+        empty = np.zeros(0, dtype=np.int64)
+        return ObservedMatches(empty, empty, np.zeros(0), empty, 0)
+    starts = np.zeros(len(matches) + 1, dtype=np.int64)
+    np.cumsum([len(pairs) for _, pairs, _ in matches], out=starts[1:])
+    keypoint_ids, point_ids, similarities, image_rows = index_kernels.observed(
+        index.offsets,
+        index.keypoint_ids,
+        index.point_ids,
+        index.rows_of([image for image, _, _ in matches]),
+        starts,
+        np.concatenate([pairs for _, pairs, _ in matches], dtype=np.int64),
+        np.concatenate([scores for _, _, scores in matches], dtype=np.float64),
+    )
+    return ObservedMatches(keypoint_ids, point_ids, similarities, image_rows, len(matches))

@@ -1,7 +1,7 @@
 """Compiled loops of the pose refinement: errors, robust costs and normal equations of matches.
 
 Imported only when a pose is estimated: numba costs half a second to import. The matches are those
-of :class:`megloc_kapture.localization.views.StackedViews`, as the tuple of :func:`matches_of`.
+of :attr:`megloc_kapture.localization.estimation.PoseProblem.matches`.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls, allow-untyped-decorators
@@ -9,14 +9,11 @@ of :class:`megloc_kapture.localization.views.StackedViews`, as the tuple of :fun
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from megloc_kapture.compiling import compiled_loop
 from megloc_kapture.geometry.projection import project_point
-from megloc_kapture.localization.views import StackedViews
 
 _MAX_STEPS = 20
 # squared length in standard deviations (for one pixel) of a step that is the last one
@@ -25,20 +22,6 @@ _LAST_STEP = 1e-5
 _LEAST_DAMPING, _DAMPING = 1e-9, 1e-4
 # of a point that a step has put behind the camera: as if it were a hundred pixels off
 _BEHIND = 1e4
-
-
-def matches_of(stacked: StackedViews) -> tuple[NDArray[Any], ...]:
-    """What the loops here call ``matches``."""
-    return (
-        stacked.points_px,
-        stacked.points,
-        stacked.covariances,
-        stacked.starts,
-        stacked.rotations,
-        stacked.translations,
-        stacked.models,
-        stacked.params,
-    )
 
 
 @compiled_loop

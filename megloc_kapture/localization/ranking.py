@@ -1,4 +1,4 @@
-"""Which of several candidate poses is right, by their inliers: our own pose rankers."""
+"""Pose rankers: scores of the candidate poses of a query by their inliers."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
+from scipy.spatial import cKDTree
 
+from megloc_kapture.geometry.cameras import project
 from megloc_kapture.plugins import HypothesisView, PoseHypothesis, RankingScene
 from megloc_kapture.values import Options
 
@@ -31,7 +33,7 @@ class InlierSpreadOptions(Options):
 class InlierSpread:
     """Plugin ``spread``: the cells of a grid over the image that hold inliers.
 
-    A repeated detail gives many inliers in one place of the image, the right pose has them all over
+    A repeated detail gives many inliers in one part of the image, the right pose has them all over
     it (Irschara et al., "From structure-from-motion point clouds to fast location recognition",
     CVPR 2009, section 4: effective inliers). Of equal numbers of cells more inliers win.
     """
@@ -80,3 +82,69 @@ def _sum_of_views(
         [sum(score(view, each.max_error_px) for view in each.views) for each in hypotheses],
         dtype=np.float64,
     )
+
+
+class DistinctiveInliersOptions(Options):
+    """Options of the ranker ``distinctive``."""
+
+    radius: float = Field(
+        default=0.03, ge=0, description="of a place's inliers, share of the image's longer side"
+    )
+    power: float = Field(default=4.0, gt=0, description="1 shares an inlier evenly")
+
+
+class DistinctiveInliers:
+    """Plugin ``distinctive``: inliers, each weighted by how few hypotheses explain it.
+
+    Rooms that are alike all explain the query's walls and furniture, and which of them gives most
+    inliers hangs on how well each was mapped. What only one of them explains tells them apart. So
+    an inlier has the weight ``1 / n ** power``, where ``n`` counts the hypotheses with an inlier
+    there, its own included: after the geometric bursts between places of Sattler et al.,
+    "Large-scale location recognition and the geometric burstiness problem", CVPR 2016. It counts
+    within a radius, as no hypothesis has a match for every keypoint of what it explains.
+
+    Two hypotheses agree where either's pose explains the inliers of the other; they
+    do not count against each other.
+    """
+
+    Options = DistinctiveInliersOptions
+
+    def __init__(self, options: DistinctiveInliersOptions | None = None) -> None:
+        self.options = options or DistinctiveInliersOptions()
+
+    def score(
+        self, hypotheses: Sequence[PoseHypothesis], scene: RankingScene
+    ) -> NDArray[np.float64]:
+        """Scores (H,)."""
+        scores = np.zeros(len(hypotheses))
+        same = [[poses_agree(a, b) for b in hypotheses] for a in hypotheses]
+        for number in range(len(hypotheses[0].views) if hypotheses else 0):
+            views = [hypothesis.views[number] for hypothesis in hypotheses]
+            camera = views[0].camera
+            radius_px = max(self.options.radius * max(camera.width, camera.height), 1e-3)
+            inliers = [view.points_px[view.inliers] for view in views]
+            trees = [cKDTree(points) for points in inliers]
+            for at, points in enumerate(inliers):
+                explaining = np.ones(len(points))
+                for other, tree in enumerate(trees):
+                    if other != at and not same[at][other]:
+                        explaining += np.isfinite(
+                            tree.query(points, distance_upper_bound=radius_px)[0]
+                        )
+                scores[at] += float((explaining**-self.options.power).sum())
+        return scores
+
+
+def poses_agree(one: PoseHypothesis, other: PoseHypothesis) -> bool:
+    """True if either pose has at least half of the other's inliers as inliers too."""
+    return _explains(one, other) or _explains(other, one)
+
+
+def _explains(this: PoseHypothesis, other: PoseHypothesis) -> bool:
+    close = total = 0
+    for view, others in zip(this.views, other.views, strict=True):
+        points, pixels = others.points_world[others.inliers], others.points_px[others.inliers]
+        errors = np.linalg.norm(project(view.camera, view.cam_from_world, points) - pixels, axis=1)
+        close += int((errors <= this.max_error_px).sum())
+        total += len(points)
+    return 2 * close >= total

@@ -1,9 +1,28 @@
-"""Pairs of images as arrays: all of them, and each once."""
+"""Pairs of map images: by poses, co-visibility or sequence, and the overlap of their views."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
+from scipy.spatial import cKDTree
+
+from megloc_kapture.geometry.cameras import bearing_rays, px_from_cam
+from megloc_kapture.values import Camera, Options, RigidTransform
+
+_BLOCK_ELEMENTS = 1 << 20  # distances held at once; each takes about 80 bytes on the way
+# where hardly any two images look the same way, an image searches no further than this
+_MAX_SEARCHED = 1024
+# of a point that more images than this see, an image counts only those that near it
+_TRACK_WINDOW = 512
+_IMAGES_AT_ONCE = 256  # images; each is worked out by itself, so that chunks change nothing
+_PAIRS_AT_ONCE = 1024  # pairs; each is worked out by itself, so that chunks change nothing
+# pixels looked at, across and down; depths, in distances of the two centres
+_GRID = (9, 7)
+_DEPTHS = 2.0 ** np.arange(-2, 8, 0.5)
 
 
 def exhaustive_pairs(count: int) -> NDArray[np.int64]:
@@ -24,3 +43,240 @@ def each_once(keys: NDArray[np.int64]) -> NDArray[np.int64]:
     """The keys (K,) sorted, each once; what np.unique does, which takes ten times as long."""
     ascending = np.sort(keys)
     return ascending[np.append(True, ascending[1:] != ascending[:-1])[: len(keys)]]
+
+
+class PairsByPosesOptions(Options):
+    """Options of pairs by poses; the distance is per image, so it needs no metric scale."""
+
+    num_neighbours: int = Field(default=20, gt=0, description="nearest centres taken per image")
+    max_distance: float | None = Field(
+        default=None, gt=0, description="in the map's unit; none: no bound"
+    )
+    max_angle_deg: float = Field(default=60.0, gt=0, le=180, description="between optical axes")
+    min_overlap: float | None = Field(
+        default=None,
+        gt=0,
+        le=1,
+        description="share of one image's points in the other's view, of the pairs so found; "
+        "needs points; none: no bound",
+    )
+
+
+def pairs_by_poses(
+    cams_from_world: list[RigidTransform], options: PairsByPosesOptions | None = None
+) -> NDArray[np.int64]:
+    """Pairs of images that stand close and look the same way.
+
+    Candidates come from a k-d tree in growing neighbourhoods, block by block. An image looks at no
+    more than the 1024 nearest centres, so that time and memory grow with the number of images.
+
+    Returns
+    -------
+    int64 (P, 2), indices i < j, sorted, each pair once.
+    """
+    options = options or PairsByPosesOptions()
+    count = len(cams_from_world)
+    if count < 2:
+        return np.zeros((0, 2), dtype=np.int64)
+    centers = np.array([pose.center() for pose in cams_from_world])
+    axes = np.array([pose.rotation_matrix()[2] for pose in cams_from_world])
+    min_cosine = np.cos(np.radians(options.max_angle_deg))
+    # the tree's own bound is exclusive
+    bound = np.inf if options.max_distance is None else np.nextafter(options.max_distance, np.inf)
+    tree = cKDTree(centers)
+    found = [np.zeros((0, 2), dtype=np.int64)]
+    waiting = np.arange(count)
+    # an image is its own nearest centre
+    largest = min(count, max(_MAX_SEARCHED, options.num_neighbours) + 1)
+    size = min(largest, 4 * options.num_neighbours + 1)
+    while len(waiting):
+        unfinished = []
+        block = max(1, _BLOCK_ELEMENTS // size)
+        for start in range(0, len(waiting), block):
+            part = waiting[start : start + block]
+            distance, index = tree.query(centers[part], k=size, distance_upper_bound=bound)
+            valid = np.isfinite(distance) & (index != part[:, None])
+            other = np.where(valid, index, 0)
+            cosine = np.einsum("nd,nkd->nk", axes[part], axes[other])
+            good = valid & (cosine >= min_cosine - 1e-12)
+            rank = np.cumsum(good, axis=1)
+            # an image whose neighbours look elsewhere searches further
+            done = (rank[:, -1] >= options.num_neighbours) | ~np.isfinite(distance[:, -1])
+            done |= size >= largest
+            take = good & (rank <= options.num_neighbours) & done[:, None]
+            rows, columns = np.nonzero(take)
+            found.append(np.stack([part[rows], index[rows, columns]], axis=1))
+            unfinished.append(part[~done])
+        waiting = np.concatenate(unfinished)
+        size = min(largest, 2 * size)
+    return unique_pairs(np.concatenate(found))
+
+
+class PairsByCovisibilityOptions(Options):
+    """Options of pairs by co-visibility."""
+
+    top_k: int = Field(default=20, gt=0, description="images taken that share most points")
+    min_shared_points: int = Field(default=15, gt=0, description="points both images observe")
+
+
+def pairs_by_covisibility(
+    num_images: int,
+    point_ids: NDArray[np.integer[Any]],
+    image_ids: NDArray[np.integer[Any]],
+    options: PairsByCovisibilityOptions | None = None,
+) -> NDArray[np.int64]:
+    """Pairs of each image with those that share most points with it; of equals the first.
+
+    The sparse product of the observations with themselves, row by row, of which only the best of
+    each row are kept. Its time is the number of observations times the length of a track, which is
+    bounded: of a point that very many images see, an image counts as seeing it only the 512 before
+    and the 512 after it in the order of the images.
+
+    Parameters
+    ----------
+    point_ids, image_ids : (O,), the observations; in any order, repeated ones count once.
+
+    Returns
+    -------
+    int64 (P, 2), indices i < j, sorted, each pair once.
+    """
+    from megloc_kapture.mapping import kernels
+
+    options = options or PairsByCovisibilityOptions()
+    if len(point_ids) == 0:
+        return np.zeros((0, 2), dtype=np.int64)
+    # an observation in one number, sorted by point, then image
+    keys = each_once(np.asarray(point_ids, dtype=np.int64) * num_images + image_ids)
+    points, images = np.divmod(keys, num_images)
+    track_ends = np.flatnonzero(np.append(points[1:] != points[:-1], True)) + 1
+    track = np.repeat(np.arange(len(track_ends)), np.diff(track_ends, prepend=0))
+    track_starts = np.append(0, track_ends)
+    of_image = np.argsort(images, kind="stable")
+    starts = np.append(0, np.cumsum(np.bincount(images, minlength=num_images)))
+    best = np.full((num_images, options.top_k), -1, dtype=np.int64)
+    arguments = (starts, of_image, images, track, track_starts, _TRACK_WINDOW)
+    kernels.in_chunks(
+        num_images,
+        _IMAGES_AT_ONCE,
+        lambda first, last: kernels.most_shared(
+            first, last, *arguments, options.min_shared_points, best
+        ),
+    )
+    rows, columns = np.nonzero(best >= 0)
+    return unique_pairs(np.stack([rows, best[rows, columns]], axis=1))
+
+
+class PairsBySequenceOptions(Options):
+    """Options of pairs by temporal sequence."""
+
+    window: int = Field(default=5, gt=0, description="images that each is paired with after it")
+    loop: bool = Field(default=False, description="the first image follows the last one")
+
+
+def pairs_by_sequence(
+    cameras: Sequence[str], timestamps: Sequence[int], options: PairsBySequenceOptions | None = None
+) -> NDArray[np.int64]:
+    """Pairs of each image with the next ones of its camera.
+
+    Parameters
+    ----------
+    cameras, timestamps : (N,), which camera took an image and when; images of one camera at the
+        same time follow each other as they are given.
+
+    Returns
+    -------
+    int64 (P, 2), indices i < j, sorted, each pair once.
+    """
+    options = options or PairsBySequenceOptions()
+    sequences: dict[str, list[int]] = {}
+    for image in sorted(range(len(cameras)), key=lambda image: timestamps[image]):
+        sequences.setdefault(cameras[image], []).append(image)
+    found = [np.zeros((0, 2), dtype=np.int64)]
+    for sequence in sequences.values():
+        images = np.array(sequence, dtype=np.int64)
+        for step in range(1, min(options.window, len(images) - 1) + 1):
+            found.append(np.stack([images[:-step], images[step:]], axis=1))
+            if options.loop:
+                found.append(np.stack([images[-step:], images[:step]], axis=1))
+    return unique_pairs(np.concatenate(found))
+
+
+def views_can_overlap(
+    first: Camera,
+    first_from_world: RigidTransform,
+    second: Camera,
+    second_from_world: RigidTransform,
+) -> bool:
+    """True if some point in the view of one camera is in that of the other, whatever is seen.
+
+    Looked for along the rays of a grid of pixels, from a quarter of the distance between the
+    cameras to infinity.
+    """
+    between = second_from_world @ first_from_world.inverse()
+    return _reaches(first, second, between) or _reaches(second, first, between.inverse())
+
+
+def _reaches(first: Camera, second: Camera, second_from_first: RigidTransform) -> bool:
+    x, y = np.meshgrid(
+        *(np.linspace(0, size, n) for size, n in zip(_size(first), _GRID, strict=True))
+    )
+    rays = bearing_rays(first, np.stack([x.ravel(), y.ravel()], axis=1))
+    turned = rays @ second_from_first.rotation_matrix().T
+    offset = np.asarray(second_from_first.translation)
+    depths = _DEPTHS * np.linalg.norm(offset)
+    # without a distance between them, and at infinity, only the turn counts
+    points = [turned, *(turned * depth + offset for depth in depths[depths > 0])]
+    with np.errstate(invalid="ignore"):
+        seen = px_from_cam(second, np.concatenate(points))
+        inside = ((seen >= 0) & (seen <= _size(second))).all(axis=1)
+    return bool(inside.any())
+
+
+def _size(camera: Camera) -> tuple[int, int]:
+    return camera.width, camera.height
+
+
+def frustum_overlap(
+    pairs: NDArray[np.int64],
+    cameras: Sequence[Camera],
+    cams_from_world: Sequence[RigidTransform],
+    xyz: NDArray[np.float64],
+    point_ids: NDArray[np.integer[Any]],
+    image_ids: NDArray[np.integer[Any]],
+) -> NDArray[np.float64]:
+    """Share of the points an image observes that fall into the other's image, for pairs of images.
+
+    The larger of a pair's two shares: a near view and a far one overlap though the far one sees
+    much besides. Nothing is known of what hides a point.
+
+    Parameters
+    ----------
+    pairs : int64 (P, 2), rows of ``cameras`` and ``cams_from_world``.
+    xyz : float64 (N, 3) in the world.
+    point_ids, image_ids : (O,), the observations, rows of ``xyz`` and of ``cameras``; in any order.
+
+    Returns
+    -------
+    float64 (P,) from 0 to 1, NaN where neither image observes a point.
+    """
+    from megloc_kapture.geometry.projection import packed_views
+    from megloc_kapture.mapping import kernels
+
+    shares = np.full(len(pairs), np.nan)
+    if len(pairs) == 0:
+        return shares
+    keys = each_once(np.asarray(image_ids, dtype=np.int64) * max(len(xyz), 1) + point_ids)
+    images, points = np.divmod(keys, max(len(xyz), 1))
+    arguments = (
+        np.ascontiguousarray(pairs, dtype=np.int64),
+        np.append(0, np.cumsum(np.bincount(images, minlength=len(cameras)))),
+        points,
+        np.ascontiguousarray(xyz, dtype=np.float64),
+        *packed_views(cameras, cams_from_world),
+        np.array([(camera.width, camera.height) for camera in cameras], dtype=np.float64),
+        shares,
+    )
+    kernels.in_chunks(
+        len(pairs), _PAIRS_AT_ONCE, lambda first, last: kernels.shares_seen(first, last, *arguments)
+    )
+    return shares

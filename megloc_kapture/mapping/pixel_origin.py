@@ -1,4 +1,4 @@
-"""Where a map of another tool puts the pixel origin.
+"""Pixel origin of a map of another tool.
 
 COLMAP has (0, 0) at the corner of the first pixel, many networks and simulators at its centre.
 Keypoints and intrinsics of one map need not agree. What can be measured is their offset: half a
@@ -38,7 +38,7 @@ class ObservedImage:
 
 @dataclass(frozen=True)
 class PixelOrigin:
-    """What was found.
+    """Pixel origin of a map, and the evidence for it.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Which points of a map, and which of their observations, to do without.
+"""Rejection of points of a map and of their observations.
 
 Reprojection error, triangulation angle and track length as COLMAP's ``ObservationManager`` has
 them, and the uncertainty of the points. Arrays in, masks out; nothing is moved.
@@ -23,7 +23,7 @@ _SIGMA_OF_MAD = 1.4826  # of normally distributed values: 1 / (quantile of 3/4)
 
 
 class ConsistencyOptions(Options):
-    """What images and points must agree in; none: not asked for."""
+    """Options: limits on reprojection errors, angles and tracks; none: no limit."""
 
     max_reprojection_error_px: float | None = Field(
         default=None, gt=0, description="an observation farther from its keypoint is dropped"
@@ -41,7 +41,7 @@ class ConsistencyOptions(Options):
 
 
 class UncertaintyOptions(Options):
-    """Which points are too uncertain; none: not asked for.
+    """Options: limits on the points' uncertainty; none: no limit.
 
     The deviation of a point is the largest of its three, for a noise of 1 px in the images. Points
     whose uncertainty is not known (lifted ones, which a single image sees) stay.
@@ -62,7 +62,7 @@ class UncertaintyOptions(Options):
     )
 
     def needs_deviations(self) -> bool:
-        """Whether any point can be rejected."""
+        """True if any point can be rejected."""
         return any(limit is not None for limit in self.model_dump().values())
 
 
@@ -84,7 +84,7 @@ class ObservedPoints:
     cams_from_world: Sequence[RigidTransform]
 
     def starts(self) -> NDArray[np.int64]:
-        """Where the observations of each point begin, and where the last one's end; (N + 1,)."""
+        """First observation of each point, and the end of the last one's; int64 (N + 1,)."""
         starts = np.zeros(len(self.xyz) + 1, dtype=np.int64)
         np.cumsum(track_lengths(self), out=starts[1:])
         return starts
@@ -113,8 +113,8 @@ def reprojection_errors_px(
     observed: ObservedPoints, keypoints_px: NDArray[np.floating[Any]]
 ) -> Floats:
     """Distance (O,) of each observation's keypoint (O, 2) from its point; infinite behind."""
-    from megloc_kapture.geometry.projection import model_id, packed_params
-    from megloc_kapture.mapping import rejection_kernels as kernels
+    from megloc_kapture.geometry.projection import packed_views
+    from megloc_kapture.mapping import kernels
 
     errors = np.empty(len(observed.point_ids))
     if len(errors):
@@ -123,9 +123,7 @@ def reprojection_errors_px(
             observed.image_ids,
             np.ascontiguousarray(keypoints_px, dtype=np.float64),
             observed.xyz,
-            *observed.rotations_and_translations(),
-            np.array([model_id(camera) for camera in observed.cameras], dtype=np.int64),
-            np.stack([packed_params(camera) for camera in observed.cameras]),
+            *packed_views(observed.cameras, observed.cams_from_world),
             errors,
         )
     return errors
@@ -133,7 +131,7 @@ def reprojection_errors_px(
 
 def mean_depths(observed: ObservedPoints) -> Floats:
     """Mean depth (N,) of each point in the images that observe it; NaN where none does."""
-    from megloc_kapture.mapping import rejection_kernels as kernels
+    from megloc_kapture.mapping import kernels
 
     depths = np.empty(len(observed.xyz))
     kernels.mean_depths(
@@ -152,12 +150,12 @@ def track_lengths(observed: ObservedPoints) -> NDArray[np.int64]:
 
 
 def seen_at_angle(observed: ObservedPoints, min_angle_deg: float) -> Mask:
-    """Whether any two images see a point at this angle or a wider one; bool (N,).
+    """Mask (N,) of the points that two images see at this angle or a wider one.
 
     The angle is COLMAP's: that between the rays, or between one and the other turned round, where
     that is less.
     """
-    from megloc_kapture.mapping import rejection_kernels as kernels
+    from megloc_kapture.mapping import kernels
 
     wide = np.empty(len(observed.xyz), dtype=bool)
     centers = np.array([pose.center() for pose in observed.cams_from_world]).reshape(-1, 3)
@@ -169,7 +167,7 @@ def seen_at_angle(observed: ObservedPoints, min_angle_deg: float) -> Mask:
 
 
 def too_uncertain(deviations: Floats, depths: Floats, options: UncertaintyOptions) -> Mask:
-    """Which points to reject by their uncertainty; bool (N,).
+    """Mask (N,) of the points to reject by their uncertainty.
 
     Parameters
     ----------

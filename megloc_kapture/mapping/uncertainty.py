@@ -1,4 +1,4 @@
-"""How uncertain the points of a map are, from the images that observe them.
+"""Covariances of the points of a map, from the images that observe them.
 
 MegLoc, section "Mapping": a point's uncertainty from its observations, poses and cameras fixed.
 With ``p_c = R_cw p_w + t_cw`` and the camera's projection ``pi``, an observation has the Jacobian
@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.mapping.chunks import in_chunks
 from megloc_kapture.values import Camera, RigidTransform
 
 Floats = NDArray[np.float64]
@@ -54,8 +53,8 @@ def point_covariances(
     ------
     DataError : ids that are no rows, or not as many poses as cameras.
     """
-    from megloc_kapture.geometry.projection import model_id, packed_params
-    from megloc_kapture.mapping import uncertainty_kernels as kernels
+    from megloc_kapture.geometry.projection import packed_views
+    from megloc_kapture.mapping import kernels
 
     if len(cameras) != len(cams_from_world):
         raise DataError(f"{len(cameras)} cameras and {len(cams_from_world)} poses, not as many")
@@ -67,12 +66,12 @@ def point_covariances(
         starts,
         image_ids,
         np.ascontiguousarray(xyz, dtype=np.float64),
-        *_matrices(cams_from_world),
-        np.array([model_id(camera) for camera in cameras], dtype=np.int64),
-        np.stack([packed_params(camera) for camera in cameras]),
+        *packed_views(cameras, cams_from_world),
         out,
     )
-    in_chunks(len(xyz), _CHUNK, lambda a, b: kernels.covariances_of_points(a, b, *arguments))
+    kernels.in_chunks(
+        len(xyz), _CHUNK, lambda a, b: kernels.covariances_of_points(a, b, *arguments)
+    )
     return out
 
 
@@ -87,18 +86,14 @@ def point_deviations(covariances: Floats) -> Floats:
     -------
     float64 (N, 3) in the map's unit for a noise of 1 px, ascending; NaN where unknown.
     """
-    from megloc_kapture.mapping import uncertainty_kernels as kernels
+    from megloc_kapture.mapping import kernels
 
     out = np.full((len(covariances), 3), np.nan)
     known = np.ascontiguousarray(covariances, dtype=np.float64)
-    in_chunks(len(covariances), _CHUNK, lambda a, b: kernels.deviations_of_points(a, b, known, out))
+    kernels.in_chunks(
+        len(covariances), _CHUNK, lambda a, b: kernels.deviations_of_points(a, b, known, out)
+    )
     return out
-
-
-def _matrices(poses: Sequence[RigidTransform]) -> tuple[Floats, Floats]:
-    """Rotations (I, 3, 3) and translations (I, 3)."""
-    rotations = np.stack([pose.rotation_matrix() for pose in poses])
-    return rotations, np.array([pose.translation for pose in poses], dtype=np.float64)
 
 
 def _by_point(
@@ -107,7 +102,7 @@ def _by_point(
     num_points: int,
     num_images: int,
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-    """Where each point's observations begin (N + 1,), and the images (O,) in that order.
+    """First observation of each point (N + 1,), and the images (O,) in that order.
 
     The compiled loops check no bounds: ids that are no rows end here.
     """

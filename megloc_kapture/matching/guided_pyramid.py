@@ -166,13 +166,13 @@ class VariantMatches:
 
 
 def as_they_are(found: list[VariantMatches]) -> list[VariantMatches]:
-    """What every variant found."""
+    """The matches of every variant."""
     return found
 
 
 @dataclass(frozen=True)
-class Judgement:
-    """What is right of an image's matches with another one.
+class PairVerifier:
+    """Verifies an image's matches with another one.
 
     Attributes
     ----------
@@ -250,7 +250,7 @@ def match_variants(
     variants: Sequence[VariantFeatures],
     others: Sequence[ImageFeatures],
     match: Match,
-    judgements: Sequence[Judgement],
+    judgements: Sequence[PairVerifier],
 ) -> list[list[VariantMatches]]:
     """Verified matches of an image's variants with each of several other images.
 

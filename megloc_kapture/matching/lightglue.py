@@ -1,24 +1,143 @@
-"""LightGlue (Lindenberger et al., ICCV 2023) for the features it has weights for."""
+"""LightGlue (Lindenberger et al., ICCV 2023), and LighterGlue, its small form for XFeat."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from pydantic import Field
+from torch.nn.utils.rnn import pad_sequence
 
-from megloc_kapture.matching.learned_pairs import LearnedPairs, LearnedPairsOptions
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.weights import WeightsFile, find_weights, read_weights, sha256_of
 from megloc_kapture.nets.lightglue import (
+    KeypointBatch,
     LightGlueNetwork,
     LightGlueShape,
+    load_lighterglue,
     load_lightglue,
+    mutual_matches,
     renamed_blocks,
+    require_kornia,
 )
+from megloc_kapture.nets.runtime import NetworkOptions, inference, pick_device
+from megloc_kapture.values import ImageFeatures
 
+Matches = tuple[NDArray[np.int64], NDArray[np.float32]]
+Loader = Callable[[Mapping[str, torch.Tensor], str], LightGlueNetwork]
 _SHAPE = LightGlueShape(width=256, num_heads=4)
 
 
-class LightGlueOptions(LearnedPairsOptions):
+class PairNetworkOptions(NetworkOptions):
+    """Options that these matchers share."""
+
+    weights: str
+    threshold: float = Field(default=0.1, ge=0, lt=1, description="probability of a match")
+
+
+class PairNetwork:
+    """A matcher that is a network of LightGlue's kind.
+
+    Parameters
+    ----------
+    options : of the matcher.
+    load : makes the network of a checkpoint's tensors and the file's name.
+
+    Raises
+    ------
+    OptionError : kornia is not installed.
+    MissingWeightsError : the checkpoint is not there.
+    """
+
+    def __init__(self, options: PairNetworkOptions, load: Loader) -> None:
+        require_kornia()
+        self.options = options
+        self._load = load
+        self._file = find_weights(options.weights)
+
+    def weights(self) -> dict[str, str]:
+        """sha256 of the checkpoint by its file name."""
+        return {self._file.path.name: sha256_of(self._file)}
+
+    def match(self, a: ImageFeatures, b: ImageFeatures) -> Matches:
+        """Matches int64 (K, 2), rows of a and b, sorted by a, and their probabilities (K,)."""
+        return self.match_many(a, [b])[0]
+
+    def match_many(self, a: ImageFeatures, others: Sequence[ImageFeatures]) -> list[Matches]:
+        """The matches of one image with each of several, in their order.
+
+        On a GPU all pairs are one batch. On a processor, where a batch gains nothing, each pair
+        runs alone, and has to the last bit what it has without the others.
+
+        Raises
+        ------
+        DataError : the checkpoint does not fit, or the descriptors do not fit it.
+        OptionError : the device is not there.
+        """
+        device = pick_device(self.options.device)
+        network = _network(self._load, self._file, device)
+        for image in (a, *others):
+            _check(image, network.descriptor_size, self._file)
+        none: Matches = (np.zeros((0, 2), np.int64), np.zeros(0, np.float32))
+        found = [none for _ in others]
+        rows = [at for at, b in enumerate(others) if len(a.keypoints_px) and len(b.keypoints_px)]
+        batches = [rows] if rows and device.type == "cuda" else [[row] for row in rows]
+        with inference(device, self.options.half_precision):
+            for batch in batches:
+                assignment = network(
+                    _batch([a] * len(batch), device),
+                    _batch([others[row] for row in batch], device),
+                )
+                matched = mutual_matches(assignment, self.options.threshold)
+                for row, (matches, scores) in zip(batch, matched, strict=True):
+                    found[row] = matches.cpu().numpy(), scores.cpu().numpy()
+        return found
+
+
+@lru_cache(maxsize=2)
+def _network(load: Loader, file: WeightsFile, device: torch.device) -> LightGlueNetwork:
+    return load(read_weights(file), str(file.path)).to(device)
+
+
+def _check(image: ImageFeatures, expected: int, file: WeightsFile) -> None:
+    if len(image.descriptors) and image.descriptors.shape[1] != expected:
+        raise DataError(
+            f"these weights match descriptors of {expected} values, the features' have "
+            f"{image.descriptors.shape[1]}",
+            path=file.path,
+        )
+
+
+def normalised_points(image: ImageFeatures) -> NDArray[np.float32]:
+    """Keypoints (N, 2) float32 as the networks know them: the image's longer side is -1 to 1.
+
+    They were trained with the first pixel's centre at (0, 0) and the middle at half the size. A
+    keypoint of the first row or column may then be less than -1, by half a pixel at most, and is
+    clamped: no position outside was seen in training.
+    """
+    size = np.array([image.width, image.height], np.float64)
+    xy = image.keypoints_px[:, :2].astype(np.float64) - 0.5
+    return np.clip((xy - size / 2) / (size.max() / 2), -1, 1).astype(np.float32)
+
+
+def _batch(images: Sequence[ImageFeatures], device: torch.device) -> KeypointBatch:
+    points = [torch.from_numpy(normalised_points(image)) for image in images]
+    descriptors = [
+        torch.from_numpy(np.ascontiguousarray(image.descriptors, np.float32)) for image in images
+    ]
+    lengths = torch.tensor([len(rows) for rows in points])
+    present = torch.arange(int(lengths.max()))[None] < lengths[:, None]
+    return KeypointBatch(
+        pad_sequence(points, batch_first=True).to(device),
+        pad_sequence(descriptors, batch_first=True).to(device),
+        None if bool(present.all()) else present[..., None].to(device),
+    )
+
+
+class LightGlueOptions(PairNetworkOptions):
     """Options of LightGlue."""
 
     weights: str = Field(
@@ -27,14 +146,29 @@ class LightGlueOptions(LearnedPairsOptions):
     )
 
 
-class LightGlue(LearnedPairs):
+class LightGlue(PairNetwork):
     """The matcher ``lightglue``, for SuperPoint's features or ALIKED's; needs kornia."""
 
     Options = LightGlueOptions
 
     def __init__(self, options: LightGlueOptions | None = None) -> None:
-        super().__init__(options or LightGlueOptions(), _load)
+        super().__init__(options or LightGlueOptions(), _load_lightglue)
 
 
-def _load(tensors: Mapping[str, torch.Tensor], where: str) -> LightGlueNetwork:
+def _load_lightglue(tensors: Mapping[str, torch.Tensor], where: str) -> LightGlueNetwork:
     return load_lightglue(renamed_blocks(tensors), where, _SHAPE)
+
+
+class LighterGlueOptions(PairNetworkOptions):
+    """Options of LighterGlue."""
+
+    weights: str = Field(default="xfeat-lighterglue", description="name in the registry, or a file")
+
+
+class LighterGlue(PairNetwork):
+    """The matcher ``lighterglue`` for features of type ``xfeat``; needs kornia."""
+
+    Options = LighterGlueOptions
+
+    def __init__(self, options: LighterGlueOptions | None = None) -> None:
+        super().__init__(options or LighterGlueOptions(), load_lighterglue)

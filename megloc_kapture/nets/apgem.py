@@ -14,9 +14,14 @@ from torch import nn
 from torch.nn import functional
 
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.nets.gem import generalized_mean
-from megloc_kapture.nets.loading import load_strictly
-from megloc_kapture.nets.resnet import IMAGENET_DEVIATION, IMAGENET_MEAN, Depth, ResNet
+from megloc_kapture.nets.runtime import load_strictly
+from megloc_kapture.nets.trunks import (
+    IMAGENET_DEVIATION,
+    IMAGENET_MEAN,
+    Depth,
+    ResNet,
+    generalized_mean,
+)
 
 DESCRIPTOR_SIZE = 2048
 # what a checkpoint may hold beside the state dict; the names of scikit-learn's attributes

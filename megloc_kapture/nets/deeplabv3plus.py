@@ -14,8 +14,13 @@ from torch import nn
 from torch.nn import functional as F
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.nets.mobilenetv2 import CHANNELS, LOW_LEVEL_CHANNELS, MobileNetV2
-from megloc_kapture.nets.resnet import ResNet, imagenet_normalised
+from megloc_kapture.nets.trunks import (
+    MOBILENET_CHANNELS,
+    MOBILENET_LOW_LEVEL_CHANNELS,
+    MobileNetV2,
+    ResNet,
+    imagenet_normalised,
+)
 
 Backbone = Literal["resnet101", "mobilenet"]
 
@@ -25,7 +30,7 @@ _DILATIONS = (6, 12, 18)
 
 
 def backbone_of(keys: Collection[str], where: str) -> Backbone:
-    """Which trunk the keys of a checkpoint are of; ``where`` names the file.
+    """Trunk that the keys of a checkpoint are of; ``where`` names the file.
 
     Raises
     ------
@@ -64,7 +69,7 @@ class Pooling(nn.Sequential):
 
 
 class AtrousPyramid(nn.Module):
-    """What stands around a place at several distances: five branches, side by side, projected."""
+    """Atrous spatial pyramid pooling: five branches of different dilation, projected together."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -111,7 +116,7 @@ class DeepLabV3Plus(nn.Module):
             self.classifier = Head(2048, 256, num_classes)
         else:
             self.backbone = MobileNetV2()
-            self.classifier = Head(CHANNELS, LOW_LEVEL_CHANNELS, num_classes)
+            self.classifier = Head(MOBILENET_CHANNELS, MOBILENET_LOW_LEVEL_CHANNELS, num_classes)
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
         """Logits (B, classes, h, w) of an RGB image (B, 3, H, W) in [0, 1]."""

@@ -47,7 +47,7 @@ class DinoV2(nn.Module):
 
         Parameters
         ----------
-        image : (B, 3, H, W), see :func:`megloc_kapture.nets.resnet.imagenet_normalised`. Pixels
+        image : (B, 3, H, W), see :func:`megloc_kapture.nets.trunks.imagenet_normalised`. Pixels
             at the right and at the bottom that fill no patch are left out.
 
         Returns
@@ -66,10 +66,10 @@ class DinoV2(nn.Module):
         return tokens[:, 1:].mT.reshape(patches.shape), tokens[:, 0]
 
     def positions(self, rows: int, columns: int) -> torch.Tensor:
-        """What is added to the tokens of so many patches, (1, 1 + rows * columns, C).
+        """Position embeddings of the tokens of so many patches, (1, 1 + rows * columns, C).
 
         Learnt positions are scaled bicubically, without a filter against aliasing, as DINOv2 does
-        it: by ``(rows + 0.1) / grid``, from which the places that are read follow too, instead of
+        it: by ``(rows + 0.1) / grid``, from which the positions read follow too, instead of
         by ``rows / grid``, as transformers does. At 23 patches of 37 they lie up to 0.16 learnt
         positions beside those.
         """

@@ -13,9 +13,8 @@ from torch import nn
 from torch.nn import functional
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.nets.gem import generalized_mean
-from megloc_kapture.nets.loading import load_strictly
-from megloc_kapture.nets.resnet import Depth, ResNet, imagenet_normalised
+from megloc_kapture.nets.runtime import load_strictly
+from megloc_kapture.nets.trunks import Depth, ResNet, generalized_mean, imagenet_normalised
 
 _CHANNELS = 2048
 _DEEPER = "backbone.6.22.conv1.weight"  # a block that only ResNet-101 has

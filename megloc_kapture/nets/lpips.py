@@ -10,10 +10,8 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from megloc_kapture.nets.alexnet import AlexNetFeatures
-from megloc_kapture.nets.loading import load_strictly
-from megloc_kapture.nets.squeezenet import SqueezeNetFeatures
-from megloc_kapture.nets.vgg import Vgg16Features
+from megloc_kapture.nets.runtime import load_strictly
+from megloc_kapture.nets.trunks import AlexNetFeatures, SqueezeNetFeatures, Vgg16Features
 
 Trunk = Literal["alex", "vgg", "squeeze"]
 

@@ -14,8 +14,8 @@ from torch import nn
 from torch.nn import functional as F
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.nets.loading import load_strictly
-from megloc_kapture.nets.vgg import Vgg16Features
+from megloc_kapture.nets.runtime import load_strictly
+from megloc_kapture.nets.trunks import Vgg16Features
 
 Order = Literal["dk", "kd"]
 

@@ -6,7 +6,7 @@ convolution 8 by 8 is replaced by three of 2 by 2.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import torch
@@ -14,13 +14,11 @@ from torch import nn
 from torch.nn import functional
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.nets.loading import load_strictly
+from megloc_kapture.nets.runtime import load_strictly
 
 DESCRIPTOR_SIZE = 128
-
 _MEAN = (0.485, 0.456, 0.406)
 _DEVIATION = (0.229, 0.224, 0.225)
-
 # kernel, width in units of the base width, dilation; ReLU after those of 3 by 3
 _LAYERS = (
     (3, 1, 1),
@@ -32,10 +30,12 @@ _LAYERS = (
     (2, 4, 4),
     (2, 4, 8),
 )
+_STEPS_PER_OCTAVE = 4
+_TOLERANCE = 0.001  # of a scale: a side that rounding leaves a pixel short is still large enough
 
 
 class R2D2Maps(NamedTuple):
-    """What the network says of images (B, 3, H, W).
+    """Descriptors, repeatability and reliability of images (B, 3, H, W).
 
     Attributes
     ----------
@@ -113,3 +113,34 @@ def load_r2d2(tensors: Mapping[str, torch.Tensor], where: str) -> R2D2Network:
     network = R2D2Network(base_width=len(first))
     load_strictly(network, tensors, where)
     return network.eval()
+
+
+def pyramid_levels(image: torch.Tensor, *, min_size: int, max_size: int) -> Iterator[torch.Tensor]:
+    """An image at scales 1, 2^-1/4, 2^-1/2 and so on, each level resized from the one before.
+
+    This is R2D2's pyramid (Revaud et al., 2019, section 4); a pixel of one level is w'/w of the
+    pixels of another, both having their origin at the image's corner.
+
+    Parameters
+    ----------
+    image : float (B, C, H, W).
+    min_size, max_size : the levels' longer side in pixels; larger ones are made but left out. An
+        image that is itself smaller than ``min_size`` is the only level.
+
+    Yields
+    ------
+    (B, C, h, w), largest first.
+    """
+    height, width = image.shape[-2:]
+    longer = max(height, width)
+    smallest = min(1.0, min_size / longer)
+    level, step = image, 0
+    while (scale := 2.0 ** (-step / _STEPS_PER_OCTAVE)) + _TOLERANCE >= smallest:
+        size = round(height * scale), round(width * scale)
+        if min(size) == 0:
+            return
+        if step:
+            level = functional.interpolate(level, size, mode="bilinear", align_corners=False)
+        if scale - _TOLERANCE <= max_size / longer:
+            yield level
+        step += 1

@@ -1,20 +1,23 @@
-"""Where and in which precision networks run."""
+"""Devices, precision and inputs of networks, and their checkpoints loaded strictly by name."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Literal
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import Field
+from torch import nn
 
-from megloc_kapture.errors import OptionError
+from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.values import Options
 
 Device = Literal["auto", "cpu", "cuda"]
+_NAMED = 5  # keys of each kind that a message names
 
 
 class NetworkOptions(Options):
@@ -62,3 +65,67 @@ def image_tensor(image: NDArray[np.uint8], device: torch.device) -> torch.Tensor
     """An RGB image, uint8 (H, W, 3), as float32 (1, 3, H, W) in [0, 1]."""
     planes = torch.from_numpy(np.array(image.transpose(2, 0, 1), order="C"))
     return planes.to(device)[None].float() / 255.0
+
+
+def sized_tensor(
+    image: NDArray[np.uint8], max_size_px: int | None, device: torch.device
+) -> torch.Tensor:
+    """An RGB image, uint8 (H, W, 3), as float32 (1, 3, h, w) in [0, 1]; never larger than it was.
+
+    Beyond ``max_size_px`` pixels are the means of the areas they cover, not rounded, as hloc makes
+    them. Sides are rounded to whole pixels, halves to even ones, and are at least 1.
+    """
+    height, width = image.shape[:2]
+    if max_size_px is None or max(height, width) <= max_size_px:
+        return image_tensor(image, device)
+    scale = max_size_px / max(height, width)
+    size = max(round(width * scale), 1), max(round(height * scale), 1)
+    resized = cv2.resize(image.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    return torch.from_numpy(np.asarray(resized)).to(device).permute(2, 0, 1)[None] / 255.0
+
+
+def load_strictly(
+    module: nn.Module,
+    tensors: Mapping[str, torch.Tensor],
+    where: str,
+    *,
+    may_lack: Collection[str] = (),
+) -> None:
+    """Load a state dict into a module, every key and shape as the module has it.
+
+    Parameters
+    ----------
+    where : the file, for messages.
+    may_lack : keys of the module that the file need not have.
+
+    Raises
+    ------
+    DataError : names keys that are missing, unexpected, or of another shape.
+    """
+    expected = module.state_dict()
+    missing = sorted(set(expected) - set(tensors) - set(may_lack))
+    unexpected = sorted(set(tensors) - set(expected))
+    reshaped = [
+        f"{key} is {tuple(tensors[key].shape)}, not {tuple(expected[key].shape)}"
+        for key in sorted(set(expected) & set(tensors))
+        if tensors[key].shape != expected[key].shape
+    ]
+    wrong = [
+        f"{len(keys)} {what}: {_some(keys)}"
+        for what, keys in (
+            ("missing keys", missing),
+            ("unexpected keys", unexpected),
+            ("keys of another shape", reshaped),
+        )
+        if keys
+    ]
+    if wrong:
+        raise DataError(
+            f"this file does not fit {type(module).__name__}; {'; '.join(wrong)}", path=where
+        )
+    module.load_state_dict(dict(tensors), strict=False)
+
+
+def _some(keys: Sequence[str]) -> str:
+    more = len(keys) - _NAMED
+    return ", ".join(keys[:_NAMED]) + (f" and {more} more" if more > 0 else "")

@@ -106,3 +106,89 @@ def select_pixels(
     values = scores[yx[:, 0], yx[:, 1]]
     order = torch.sort(values, descending=True, stable=True).indices[:max_keypoints]
     return SelectedPixels(yx[order].flip(1), values[order], num_masked)
+
+
+def soft_argmax(
+    scores: torch.Tensor, xy: torch.Tensor, radius: int, temperature: float
+) -> torch.Tensor:
+    """Mean position in the square around each pixel, weighted by exp(score / temperature).
+
+    ALIKED's (Zhao et al., TIM 2023) differentiable keypoint detection.
+
+    Parameters
+    ----------
+    scores : (H, W).
+    xy : int64 (N, 2), columns and rows, no closer to the map's border than the radius.
+    radius : of the square, pixels.
+
+    Returns
+    -------
+    float (N, 2), of the scores' type; a pixel's centre is an integer.
+    """
+    side = torch.arange(-radius, radius + 1, device=scores.device)
+    steps = torch.cartesian_prod(side, side)  # (dy, dx)
+    around = scores[xy[:, 1:] + steps[:, 0], xy[:, :1] + steps[:, 1]]
+    weights = torch.softmax(around / temperature, dim=1)
+    return xy + weights @ steps.flip(1).to(scores.dtype)
+
+
+def parabola_peak(scores: torch.Tensor, xy: torch.Tensor) -> torch.Tensor:
+    """Peak of the paraboloid through the pixels around each, at most half a pixel away per axis.
+
+    One Newton step, -H^-1 g, with the central differences of the score map (Lowe, IJCV 2004,
+    section 4); none where the Hessian is singular.
+
+    Parameters
+    ----------
+    scores : (H, W).
+    xy : int64 (N, 2), columns and rows, none at the map's border.
+
+    Returns
+    -------
+    float (N, 2), of the scores' type; a pixel's centre is an integer.
+    """
+    x, y = xy.unbind(1)
+
+    def at(dx: int, dy: int) -> torch.Tensor:
+        return scores[y + dy, x + dx]
+
+    gradient_x = (at(1, 0) - at(-1, 0)) / 2
+    gradient_y = (at(0, 1) - at(0, -1)) / 2
+    xx = at(1, 0) - 2 * at(0, 0) + at(-1, 0)
+    yy = at(0, 1) - 2 * at(0, 0) + at(0, -1)
+    mixed = (at(-1, -1) + at(1, 1) - at(1, -1) - at(-1, 1)) / 4
+    determinant = xx * yy - mixed * mixed
+    safe = torch.where(determinant == 0, torch.inf, determinant)
+    step_x = (mixed * gradient_y - yy * gradient_x) / safe
+    step_y = (mixed * gradient_x - xx * gradient_y) / safe
+    return xy + torch.stack([step_x, step_y], dim=1).clamp(-0.5, 0.5)
+
+
+def select_keypoints(
+    xy_px: NDArray[np.float32],
+    scores: NDArray[np.float32],
+    *,
+    size: tuple[int, int],
+    mask: NDArray[np.bool_] | None,
+    max_keypoints: int,
+) -> tuple[NDArray[np.int64], int]:
+    """Rows of the best keypoints, best first, ties by y, then x; and how many the mask removed.
+
+    Parameters
+    ----------
+    xy_px : float32 (N, 2), the first pixel's centre at (0.5, 0.5).
+    scores : float32 (N,).
+    size : (H, W) of the image.
+    mask : bool (H, W), True where keypoints may be, or None; applied before the best are selected.
+    """
+    rows = np.arange(len(xy_px))
+    num_masked = 0
+    if mask is not None:
+        # rounding may put a keypoint of a resized image onto the image's last edge
+        last = np.array([size[1] - 1, size[0] - 1])
+        column, row = np.clip(xy_px.astype(np.int64), 0, last).T
+        allowed = mask[row, column]
+        rows = rows[allowed]
+        num_masked = len(allowed) - len(rows)
+    order = np.lexsort((xy_px[rows, 0], xy_px[rows, 1], -scores[rows]))
+    return rows[order[:max_keypoints]], num_masked

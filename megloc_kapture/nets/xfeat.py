@@ -11,7 +11,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from megloc_kapture.nets.loading import load_strictly
+from megloc_kapture.nets.runtime import load_strictly
 
 STRIDE = 32
 """Width and height of an input are multiples of it."""

@@ -18,7 +18,7 @@ from megloc_kapture.localization.cluster_poses import (
     ImageMatches,
     QueryView,
     TypedMatches,
-    in_turn,
+    interleave,
 )
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap
@@ -298,7 +298,7 @@ class Localizer:
             views.append(QueryView(query.name, image.camera, tuple(typed), cam_from_rig))
             rankings.append([ranked[at] for at in kept])
             remarks.append(tuple(left_out))
-        candidates = in_turn(rankings)
+        candidates = interleave(rankings)
         frames = [self.map.restrictions.frame(name) for name in candidates]
         return _Matched(images, tuple(views), candidates, frames, tuple(remarks))
 

@@ -17,9 +17,15 @@ from megloc_kapture.plugins import (
     LocalFeatureExtractor,
     load_plugin,
 )
-from megloc_kapture.preprocessing.frame_plan import FrameOptions, FramePlan, plan_frame
-from megloc_kapture.preprocessing.frames import processed_image, processed_mask, reached_region
-from megloc_kapture.preprocessing.mask_margin import with_margin
+from megloc_kapture.preprocessing.frames import (
+    FrameOptions,
+    FramePlan,
+    plan_frame,
+    processed_image,
+    processed_mask,
+    reached_region,
+)
+from megloc_kapture.preprocessing.masks import with_margin
 from megloc_kapture.stages.class_masks import ClassMasks
 from megloc_kapture.stages.global_features import describe_images
 from megloc_kapture.stages.image_masks import MaskOptions

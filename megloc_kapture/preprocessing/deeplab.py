@@ -12,8 +12,13 @@ from pydantic import Field
 
 from megloc_kapture.io.weights import WeightsFile, find_weights, read_weights, sha256_of
 from megloc_kapture.nets.deeplabv3plus import DeepLabV3Plus, backbone_of, most_likely
-from megloc_kapture.nets.loading import load_strictly
-from megloc_kapture.nets.runtime import NetworkOptions, image_tensor, inference, pick_device
+from megloc_kapture.nets.runtime import (
+    NetworkOptions,
+    image_tensor,
+    inference,
+    load_strictly,
+    pick_device,
+)
 
 # by train id, as cityscapesScripts numbers them
 CITYSCAPES_CLASSES = (

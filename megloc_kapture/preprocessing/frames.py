@@ -8,23 +8,32 @@ resizing then would blur it twice.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from megloc_kapture.geometry.cameras import bearing_rays, px_from_cam
-from megloc_kapture.preprocessing.frame_plan import FramePlan
-from megloc_kapture.preprocessing.pixel_map import sees
-from megloc_kapture.preprocessing.resizing import resized
+from megloc_kapture.preprocessing.resampling import (
+    PixelMap,
+    cropped_size,
+    fitted_size,
+    resized,
+    same_lens,
+    scaled_camera,
+    sees,
+    undistorted_camera,
+)
+from megloc_kapture.values import Camera, Options
 
 # what lies between two points that belong to each other does so too: the models fold slowly
 _CHECKED_EVERY = 16
 # original pixels between which a map is interpolated, which costs it less than 0.005 px; the
 # library's own interpolation rounds positions to 1/32 px
 _INTERPOLATED_PX = 4
-
 Float32 = NDArray[np.float32]
 
 
@@ -70,7 +79,7 @@ def processed_mask(mask: NDArray[np.bool_], plan: FramePlan) -> NDArray[np.bool_
 
 @lru_cache(maxsize=2)
 def reached_region(plan: FramePlan) -> NDArray[np.bool_] | None:
-    """Where the processed image shows what the original does, bool (H, W); None: everywhere."""
+    """Mask (H, W) of the processed image's pixels that the original shows; None: all of them."""
     if not plan.warps:
         return None
     width, height = plan.processed.width, plan.processed.height
@@ -108,7 +117,7 @@ def _grid(x: NDArray[np.floating[Any]], y: NDArray[np.floating[Any]]) -> NDArray
 
 @lru_cache(maxsize=4)
 def _sampled_at(plan: FramePlan, samples: int) -> tuple[Float32, Float32]:
-    """Where the original is sampled, float32 (samples * H, samples * W) x and y.
+    """Positions at which the original is sampled, float32 (samples * H, samples * W) x and y.
 
     The first pixel's centre is at (0, 0), as OpenCV has it.
     """
@@ -131,3 +140,96 @@ def _sampled_at(plan: FramePlan, samples: int) -> tuple[Float32, Float32]:
     for one in maps:
         one.setflags(write=False)
     return maps[0], maps[1]
+
+
+class FrameOptions(Options):
+    """Size and projection of the images; by default they stay as they are."""
+
+    max_size_px: int | None = Field(
+        default=None, gt=0, description="the larger side of larger images; unset: as it is"
+    )
+    upscale: bool = Field(
+        default=False, description="smaller images get that larger side too, not only larger ones"
+    )
+    multiple_of: int = Field(
+        default=8,
+        gt=0,
+        description="of both sides where images are resized or undistorted; what is more is cut "
+        "off at the right and at the bottom",
+    )
+    undistort: bool = Field(
+        default=False, description="images as a pinhole camera would have taken them"
+    )
+    blank_pixels: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="undistorted images show, 0: no pixel that was not seen; 1: all that was seen",
+    )
+
+    def idle(self) -> dict[str, str]:
+        idle = {}
+        if self.max_size_px is None:
+            idle["upscale"] = "max_size_px says to which size"
+            if not self.undistort:
+                idle["multiple_of"] = "images are neither resized (max_size_px) nor undistorted"
+        if not self.undistort:
+            idle["blank_pixels"] = "undistort is off"
+        return idle
+
+
+@dataclass(frozen=True, slots=True)
+class FramePlan:
+    """One camera and what pre-processing makes of it; the pose stays.
+
+    Parameters
+    ----------
+    original, processed : the cameras before and after.
+    resized : width and height before the crop.
+    shrink : how many original pixels of the undistorted image a processed one spans, the larger
+        of the two axes; 1 or less where nothing is made smaller.
+    """
+
+    original: Camera
+    processed: Camera
+    resized: tuple[int, int]
+    shrink: float
+
+    @property
+    def warps(self) -> bool:
+        """True if the images are undistorted."""
+        return not same_lens(self.original, self.processed)
+
+    @property
+    def changes_pixels(self) -> bool:
+        """True if the images become other ones."""
+        size = (self.processed.width, self.processed.height)
+        return self.warps or size != (self.original.width, self.original.height)
+
+    def pixel_map(self) -> PixelMap:
+        """Carries keypoints between the two."""
+        return PixelMap(self.original, self.processed)
+
+
+def plan_frame(camera: Camera, options: FrameOptions) -> FramePlan:
+    """Plan the frame of a camera.
+
+    Raises
+    ------
+    OptionError : its images are too small to be cropped.
+    """
+    lens = camera
+    if options.undistort:
+        lens = undistorted_camera(camera, blank_pixels=options.blank_pixels)
+    warps = not same_lens(camera, lens)
+    width, height = lens.width, lens.height
+    if options.max_size_px is not None:
+        width, height = fitted_size(
+            lens.width, lens.height, options.max_size_px, upscale=options.upscale
+        )
+    processed = scaled_camera(lens, width, height)
+    if warps or options.max_size_px is not None:
+        cropped_width, cropped_height = cropped_size(width, height, options.multiple_of)
+        processed = replace(processed, width=cropped_width, height=cropped_height)
+    shrink = max(lens.width / width, lens.height / height)
+    return FramePlan(camera, processed, (width, height), shrink)

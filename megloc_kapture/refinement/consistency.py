@@ -25,10 +25,14 @@ from numpy.typing import NDArray
 
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.plugins import RankingScene
-from megloc_kapture.refinement.photometric_points import DepthPoints, lift_points, visibility
-from megloc_kapture.refinement.references import ReferenceImages
-from megloc_kapture.refinement.rendering_acceptance import CHI2_OF_CHANCE
-from megloc_kapture.refinement.rendering_views import RenderingQuery, RenderingReference
+from megloc_kapture.refinement.acceptance import CHI2_OF_CHANCE
+from megloc_kapture.refinement.depth_points import DepthPoints, lift_points, visibility
+from megloc_kapture.refinement.references import (
+    ReferenceImages,
+    RenderingQuery,
+    RenderingReference,
+    reference_of,
+)
 from megloc_kapture.values import RigidTransform
 
 # of a map: images whose displacement is known, after which there is no need of more; that many at
@@ -48,7 +52,7 @@ _RESOLVED_PX = 0.05
 
 @dataclass(frozen=True)
 class Displacement:
-    """How far refinement moves an image from a pose that should be right.
+    """Displacement by refinement of an image from a pose that should be right.
 
     Attributes
     ----------
@@ -67,7 +71,7 @@ class Displacement:
 
     @property
     def contradicts(self) -> bool:
-        """Whether it is more than what is claimed explains, and than alignment resolves."""
+        """True if it is more than the claim explains, and than alignment resolves."""
         return self.squared_distance > CHI2_OF_CHANCE and self.moved_px > _RESOLVED_PX
 
 
@@ -79,7 +83,7 @@ Displace = Callable[
 
 @dataclass(frozen=True)
 class Consistency:
-    """What held-out images say of a map.
+    """Consistency of a map by its held-out images.
 
     Attributes
     ----------
@@ -96,7 +100,7 @@ class Consistency:
 
     @property
     def consistent(self) -> bool:
-        """Whether refinement in this map is as accurate as it claims, as far as is known."""
+        """True if refinement in this map is as accurate as it claims, as far as is known."""
         return not self.reason
 
 
@@ -106,16 +110,16 @@ class HoldsOut(Protocol):
 
     name: str
     require_consistent_map: bool
-    """Whether poses may be refined only in a map that was found consistent."""
+    """If true, poses may be refined only in a map that was found consistent."""
 
     def hold_out(
         self, image: str, images: ReferenceImages, scene: RankingScene
     ) -> Displacement | None:
-        """How far a map image would move; None where the others do not say."""
+        """Displacement of a map image; None where the others do not determine it."""
         ...
 
 
-def sample(names: Sequence[str]) -> list[str]:
+def spread_names(names: Sequence[str]) -> list[str]:
     """At most ``MAX_TRIED`` names, the first of which are spread evenly over all, as all are.
 
     Names are taken in van der Corput's order of their ranks: neighbours in time or space, whose
@@ -127,8 +131,8 @@ def sample(names: Sequence[str]) -> list[str]:
     return [names[at] for at in order if at < len(names)][:MAX_TRIED]
 
 
-def consistency(displacements: Iterable[Displacement | None]) -> Consistency:
-    """The verdict on a map by what :func:`held_out` gave for a :func:`sample` of its images.
+def judge_consistency(displacements: Iterable[Displacement | None]) -> Consistency:
+    """Judge a map by the displacements of :func:`refine_held_out` of :func:`spread_names`.
 
     No more are asked for once ``MAX_TESTED`` are known.
     """
@@ -162,7 +166,7 @@ def consistency(displacements: Iterable[Displacement | None]) -> Consistency:
     return Consistency(len(known), contradicting, median, reason)
 
 
-def held_out(
+def refine_held_out(
     image: str,
     images: ReferenceImages,
     scene: RankingScene,
@@ -170,7 +174,7 @@ def held_out(
     *,
     max_references: int,
 ) -> Displacement | None:
-    """How far a map image moves from its given pose when it is refined against others.
+    """Displacement of a map image from its given pose when it is refined against others.
 
     Parameters
     ----------
@@ -186,18 +190,18 @@ def held_out(
     ------
     DataError : an image or a depth map cannot be read, or does not fit its camera.
     """
-    view = _reference(image, scene)
+    view = reference_of(image, scene)
     if view is None:
         return None
     own = lift_points(view.camera, view.cam_from_world, view.depth)
-    references = _elsewhere(view, own, images, scene)[:max_references]
+    references = _references_elsewhere(view, own, images, scene)[:max_references]
     if not references:
         return None
     query = RenderingQuery(view.image, view.camera, view.mask)
     return displace(query, references, view.cam_from_world)
 
 
-def _elsewhere(
+def _references_elsewhere(
     view: RenderingReference, own: DepthPoints, images: ReferenceImages, scene: RankingScene
 ) -> list[RenderingReference]:
     """Images that see the surfaces of another under another angle, those that see most first."""
@@ -213,23 +217,10 @@ def _elsewhere(
     )
     # a stable sort: of equals the nearest comes first
     best = sorted(near, key=lambda name: -_share_inside(points, name, scene))[:_BEST]
-    found = [each for name in best if (each := _reference(name, scene)) is not None]
+    found = [each for name in best if (each := reference_of(name, scene)) is not None]
     shared = [_share_seen(view, own, each) for each in found]
     order = np.argsort(-np.array(shared), kind="stable")
     return [found[k] for k in order if shared[k] >= _MIN_SHARED]
-
-
-def _reference(name: str, scene: RankingScene) -> RenderingReference | None:
-    depth = scene.map_depth(name)
-    if depth is None:
-        return None
-    return RenderingReference(
-        scene.map_image(name),
-        scene.map_camera(name),
-        scene.map_pose(name),
-        depth,
-        scene.map_mask(name),
-    )
 
 
 def _share_inside(points: NDArray[np.float64], name: str, scene: RankingScene) -> float:

@@ -18,22 +18,21 @@ from pydantic import Field, model_validator
 
 from megloc_kapture.geometry.poses import rotation_angles_deg
 from megloc_kapture.plugins import PoseRefinement, RankingScene
-from megloc_kapture.refinement.depth_cloud import DepthCloudOptions, depth_cloud
-from megloc_kapture.refinement.icp_fit import (
+from megloc_kapture.refinement.depth_points import DepthCloudOptions, depth_cloud
+from megloc_kapture.refinement.icp_surface import (
+    NORMAL_NEIGHBOURS,
+    MapCloudOptions,
+    Surface,
     SurfaceFit,
     condition_number,
+    downsample,
     fit_covariance,
-    surface_fit,
-)
-from megloc_kapture.refinement.icp_map_cloud import MapCloudOptions, map_cloud
-from megloc_kapture.refinement.icp_registration import (
-    NORMAL_NEIGHBOURS,
-    Surface,
     fit_to_surface,
+    fit_weighted,
+    map_cloud,
+    surface_fit,
     surface_of,
-    thinned,
 )
-from megloc_kapture.refinement.icp_weighted import fit_weighted
 from megloc_kapture.values import Camera, Options, RigidTransform
 
 Floats = NDArray[np.float64]
@@ -143,25 +142,25 @@ def refine_by_icp(
     ``overlap_after`` (share of points that have map within the finest), ``moved_m``,
     ``moved_deg`` and ``condition``, as far as it came; accepted only if residual and overlap
     improve and every limit of the options holds. Its covariance is that of
-    :func:`~megloc_kapture.refinement.icp_fit.fit_covariance`.
+    :func:`~megloc_kapture.refinement.icp_surface.fit_covariance`.
     """
     options = options or IcpOptions()
     # near the camera coordinates are small, whatever the world's origin
     center = cam_from_world.center()
     local_from_cam = RigidTransform(cam_from_world.inverse().quat_wxyz, (0.0, 0.0, 0.0))
-    fine_points = thinned(query_points, options.voxels_m[-1])
-    fine_map = thinned(map_points - center, options.voxels_m[-1])
+    fine_points = downsample(query_points, options.voxels_m[-1])
+    fine_map = downsample(map_points - center, options.voxels_m[-1])
     if len(fine_points) < options.min_points:
         return _kept(cam_from_world, f"the query's depth has {len(fine_points)} points only")
     if len(fine_map) < options.min_points:
         return _kept(cam_from_world, f"the map has {len(fine_map)} points here only")
     levels = _levels(fine_points, fine_map, options)
-    if reason := _hopeless(levels, local_from_cam, options):
+    if reason := _reason_to_skip(levels, local_from_cam, options):
         return _kept(cam_from_world, reason)
     before = _fit(levels[-1], local_from_cam, options)
     measures = {"residual_before_m": before.residual_m, "overlap_before": before.overlap}
     pixels = query_points[:: -(-len(query_points) // _MAX_PIXELS)]
-    moved, reason = _fitted(levels, pixels, local_from_cam, options)
+    moved, reason = _fit_levels(levels, pixels, local_from_cam, options)
     if reason:
         return PoseRefinement(cam_from_world, reason, measures)
     after = _fit(levels[-1], moved, options)
@@ -175,7 +174,7 @@ def refine_by_icp(
         "moved_deg": moved_deg,
         "condition": condition,
     }
-    if reason := _refusal(before, after, condition, options):
+    if reason := _reason_to_refuse(before, after, condition, options):
         return PoseRefinement(cam_from_world, reason, measures)
     x, y, z = (center + np.array(moved.translation)).tolist()
     world_from_cam = RigidTransform(moved.quat_wxyz, (x, y, z))
@@ -187,7 +186,9 @@ def refine_by_icp(
 def _levels(fine_points: Floats, fine_map: Floats, options: IcpOptions) -> list[_Level]:
     """Coarse to fine; the finest has the points that it is given."""
     coarser = [
-        _Level(surface_of(thinned(fine_map, voxel_m)), thinned(fine_points, voxel_m), distance_m)
+        _Level(
+            surface_of(downsample(fine_map, voxel_m)), downsample(fine_points, voxel_m), distance_m
+        )
         for voxel_m, distance_m in zip(
             options.voxels_m[:-1], options.max_distances_m[:-1], strict=True
         )
@@ -205,8 +206,10 @@ def _fit(level: _Level, local_from_cam: RigidTransform, options: IcpOptions) -> 
     )
 
 
-def _hopeless(levels: Sequence[_Level], local_from_cam: RigidTransform, options: IcpOptions) -> str:
-    """Why fitting need not be tried; empty where it should be."""
+def _reason_to_skip(
+    levels: Sequence[_Level], local_from_cam: RigidTransform, options: IcpOptions
+) -> str:
+    """Reason why fitting need not be tried; empty where it should be."""
     spacing, limit = levels[-1].surface.spacing(), options.max_distances_m[-1]
     if spacing > limit:
         return (
@@ -223,7 +226,7 @@ def _hopeless(levels: Sequence[_Level], local_from_cam: RigidTransform, options:
     return ""
 
 
-def _fitted(
+def _fit_levels(
     levels: Sequence[_Level], pixels: Floats, start: RigidTransform, options: IcpOptions
 ) -> tuple[RigidTransform, str]:
     """Coarse to fine by voxels, then by pixels: ``local_from_cam``, or why it is none."""
@@ -233,7 +236,7 @@ def _fitted(
         if found is None:
             return start, "no point of the map is near the query's"
         moved = found
-        if reason := _too_far(start, moved, options):
+        if reason := _reason_too_far(start, moved, options):
             return start, reason
     found = fit_weighted(
         levels[-1].surface,
@@ -244,7 +247,7 @@ def _fitted(
     )
     if found is None:
         return start, "the surfaces do not determine the pose"
-    return found, _too_far(start, found, options)
+    return found, _reason_too_far(start, found, options)
 
 
 def _noise(depth_m: Floats, noise: tuple[float, float, float]) -> Floats:
@@ -259,7 +262,7 @@ def _movement(start: RigidTransform, end: RigidTransform) -> tuple[float, float]
     return float(moved_m), float(angle)
 
 
-def _too_far(start: RigidTransform, end: RigidTransform, options: IcpOptions) -> str:
+def _reason_too_far(start: RigidTransform, end: RigidTransform, options: IcpOptions) -> str:
     moved_m, moved_deg = _movement(start, end)
     if moved_m > options.max_moved_m:
         return f"the pose moved by {moved_m:.3f} m, at most {options.max_moved_m:g} m is allowed"
@@ -271,8 +274,10 @@ def _too_far(start: RigidTransform, end: RigidTransform, options: IcpOptions) ->
     return ""
 
 
-def _refusal(before: SurfaceFit, after: SurfaceFit, condition: float, options: IcpOptions) -> str:
-    """Why a refined pose is not taken; empty where it is."""
+def _reason_to_refuse(
+    before: SurfaceFit, after: SurfaceFit, condition: float, options: IcpOptions
+) -> str:
+    """Reason why a refined pose is not taken; empty where it is."""
     if after.overlap < options.min_overlap:
         return (
             f"{100 * after.overlap:.0f} % of the query's points are on the map, "

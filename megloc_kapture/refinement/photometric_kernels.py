@@ -45,7 +45,7 @@ def camera_of(camera: Camera) -> tuple[int, NDArray[np.float64], float]:
 
 
 @compiled_loop
-def _project(camera, r, t, points, places):
+def _project(camera, r, t, points, shown_at):
     """Points in the camera of pose ``r``, ``t``, and where its image shows them.
 
     A lens' polynomial holds inside the image; past its turning point it may lead back into it. So a
@@ -53,7 +53,7 @@ def _project(camera, r, t, points, places):
 
     Parameters
     ----------
-    places : (11, N or more), filled with the points' coordinates there; px and py, NaN where not
+    shown_at : (11, N or more), filled with the points' coordinates there; px and py, NaN where not
         shown; and the derivatives of px by these coordinates, and of py.
     """
     model, p, reach2 = camera
@@ -65,29 +65,29 @@ def _project(camera, r, t, points, places):
         shown = (z > 0.0) & (x * x + y * y <= reach2 * z * z)
         inverse = 1.0 / z
         fx, fy = p[0] * inverse, p[1] * inverse
-        places[0, k], places[1, k], places[2, k] = x, y, z
+        shown_at[0, k], shown_at[1, k], shown_at[2, k] = x, y, z
         # those of a pinhole, by the dozen
-        places[3, k] = fx * x + p[2] if shown else math.nan
-        places[4, k] = fy * y + p[3] if shown else math.nan
-        places[5, k], places[6, k], places[7, k] = fx, 0.0, -fx * x * inverse
-        places[8, k], places[9, k], places[10, k] = 0.0, fy, -fy * y * inverse
+        shown_at[3, k] = fx * x + p[2] if shown else math.nan
+        shown_at[4, k] = fy * y + p[3] if shown else math.nan
+        shown_at[5, k], shown_at[6, k], shown_at[7, k] = fx, 0.0, -fx * x * inverse
+        shown_at[8, k], shown_at[9, k], shown_at[10, k] = 0.0, fy, -fy * y * inverse
     if model <= PINHOLES:
         return
     for k in range(len(points)):
-        if math.isnan(places[3, k]):
+        if math.isnan(shown_at[3, k]):
             continue
-        inverse = 1.0 / places[2, k]
-        u, v = places[0, k] * inverse, places[1, k] * inverse
+        inverse = 1.0 / shown_at[2, k]
+        u, v = shown_at[0, k] * inverse, shown_at[1, k] * inverse
         a, b, au, av, bu, bv = distorted(model, p, u, v)
         fx, fy = p[0] * inverse, p[1] * inverse
-        places[3, k], places[4, k] = p[0] * a + p[2], p[1] * b + p[3]
-        places[5, k], places[6, k], places[7, k] = fx * au, fx * av, -fx * (au * u + av * v)
-        places[8, k], places[9, k], places[10, k] = fy * bu, fy * bv, -fy * (bu * u + bv * v)
+        shown_at[3, k], shown_at[4, k] = p[0] * a + p[2], p[1] * b + p[3]
+        shown_at[5, k], shown_at[6, k], shown_at[7, k] = fx * au, fx * av, -fx * (au * u + av * v)
+        shown_at[8, k], shown_at[9, k], shown_at[10, k] = fy * bu, fy * bv, -fy * (bu * u + bv * v)
 
 
 @compiled_loop
 def _corner(valid, x, y):
-    """Row and column of the upper left of the four pixels about a place, and how far it is off it.
+    """Row and column of the upper left of the four pixels about a position, and the offset.
 
     ``x``, ``y`` count from the centre of the first pixel. Row and column are -1 where not all four
     are valid.
@@ -103,7 +103,7 @@ def _corner(valid, x, y):
 
 @compiled_loop
 def _read(values, row, column, a, b, c):
-    """Channel ``c`` at a place that :func:`_corner` gave, and its derivatives by x and y."""
+    """Channel ``c`` at a position that :func:`_corner` gave, and its derivatives by x and y."""
     v00, v01 = values[row, column, c], values[row, column + 1, c]
     v10, v11 = values[row + 1, column, c], values[row + 1, column + 1, c]
     top, low = (1.0 - a) * v00 + a * v01, (1.0 - a) * v10 + a * v11
@@ -113,7 +113,7 @@ def _read(values, row, column, a, b, c):
 
 @compiled_loop
 def read_values(values, valid, x, y, out, found):
-    """Values (N, C) at N places by bilinear interpolation, and where there are any, bool (N,)."""
+    """Values (N, C) at N pixels by bilinear interpolation, and where there are any, bool (N,)."""
     for k in range(len(x)):
         row, column, a, b = _corner(valid, x[k], y[k])
         found[k] = row >= 0
@@ -124,55 +124,44 @@ def read_values(values, valid, x, y, out, found):
 
 
 @compiled_loop
-def evaluate(
-    points,
-    values,
-    groups,
-    level,
-    valid,
-    scale_xy,
-    camera,
-    rotation,
-    translation,
-    gains,
-    biases,
-    out,
-):
+def evaluate(chosen, query, alignment, out):
     """Residuals and what they are made of, for each point: float64 (N, C, 8), NaN where not seen.
 
     Parameters
     ----------
-    points : (N, 3), in the world. values : (N, C), in their reference. groups : (N,), of which
-        reference each is.
-    level, valid : (h, w, C) and (h, w), of the query; scale_xy : (2,), its pixels per pixel of the
-        camera. camera : of :func:`camera_of`.
-    rotation, translation : ``cam_from_world``.
-    gains, biases : (G, C).
+    chosen : points (N, 3), in the world, their values (N, C) in their reference, and the group
+        (N,), the reference each is of.
+    query : a level (h, w, C), where it is valid (h, w), its pixels per pixel of the camera (2,),
+        and the camera, of :func:`camera_of`.
+    alignment : rotation and translation of ``cam_from_world``, gains and biases (G, C).
     out : filled per point and channel with the residual, its six derivatives by a left
         perturbation of the pose, rotation first, and the query's value.
     """
+    points, values, groups = chosen
+    level, valid, scale_xy, camera = query
+    rotation, translation, gains, biases = alignment
     channels = values.shape[1]
-    places = np.empty((11, min(len(points), _ROWS)))
+    shown_at = np.empty((11, min(len(points), _ROWS)))
     for start in range(0, len(points), _ROWS):
         stop = min(start + _ROWS, len(points))
-        _project(camera, rotation, translation, points[start:stop], places)
+        _project(camera, rotation, translation, points[start:stop], shown_at)
         for k in range(start, stop):
             n = k - start
-            px, py = places[3, n] * scale_xy[0] - 0.5, places[4, n] * scale_xy[1] - 0.5
+            px, py = shown_at[3, n] * scale_xy[0] - 0.5, shown_at[4, n] * scale_xy[1] - 0.5
             row, column, a, b = _corner(valid, px, py)
             if row < 0:
                 for c in range(channels):
                     out[k, c, 0] = math.nan
                 continue
-            x, y, z = places[0, n], places[1, n], places[2, n]
+            x, y, z = shown_at[0, n], shown_at[1, n], shown_at[2, n]
             group = groups[k]
             for c in range(channels):
                 value, by_x, by_y = _read(level, row, column, a, b, c)
                 gain = gains[group, c]
                 gx, gy = gain * scale_xy[0] * by_x, gain * scale_xy[1] * by_y
-                d0 = gx * places[5, n] + gy * places[8, n]
-                d1 = gx * places[6, n] + gy * places[9, n]
-                d2 = gx * places[7, n] + gy * places[10, n]
+                d0 = gx * shown_at[5, n] + gy * shown_at[8, n]
+                d1 = gx * shown_at[6, n] + gy * shown_at[9, n]
+                d2 = gx * shown_at[7, n] + gy * shown_at[10, n]
                 out[k, c, 0] = gain * value + biases[group, c] - values[k, c]
                 # d^T (omega x p) = omega^T (p x d)
                 out[k, c, 1] = y * d2 - z * d1
@@ -185,7 +174,7 @@ def evaluate(
 
 
 @compiled_loop
-def normal_equations(rows, groups, squared_scale, pose, mixed, own, pose_gradient, own_gradient):
+def normal_equations(rows, groups, squared_scale, sums):
     """Robust cost and normal equations of the residuals that :func:`evaluate` gives.
 
     A point's squared length ``e^2`` is the mean of its squared residuals over channels; its cost is
@@ -195,14 +184,15 @@ def normal_equations(rows, groups, squared_scale, pose, mixed, own, pose_gradien
     Parameters
     ----------
     rows : (N, C, 8). groups : (N,).
-    pose, pose_gradient : (6, 6), its upper half, and (6,), of the pose. mixed : (G, C, 6, 2), of
-        the pose with gain and bias. own, own_gradient : (G, C, 3), gain gain, gain bias, bias bias,
-        and (G, C, 2). The sums are added to what is there.
+    sums : added to. Of the pose (6, 6), its upper half; of the pose with gain and bias
+        (G, C, 6, 2); of these, gain gain, gain bias, bias bias (G, C, 3); the gradients of the pose
+        (6,) and of gain and bias (G, C, 2).
 
     Returns
     -------
     The sum of the costs, and of how many points.
     """
+    pose, mixed, own, pose_gradient, own_gradient = sums
     channels = rows.shape[1]
     cost = 0.0
     count = 0
@@ -238,56 +228,18 @@ def normal_equations(rows, groups, squared_scale, pose, mixed, own, pose_gradien
 
 
 @compiled_loop
-def evaluated_equations(
-    points,
-    values,
-    groups,
-    level,
-    valid,
-    scale_xy,
-    camera,
-    rotation,
-    translation,
-    gains,
-    biases,
-    squared_scale,
-    pose,
-    mixed,
-    own,
-    pose_gradient,
-    own_gradient,
-):
+def evaluated_equations(chosen, query, alignment, squared_scale, sums):
     """:func:`normal_equations` of :func:`evaluate`, by a few rows, which stay in the cache."""
+    points, values, groups = chosen
     rows = np.empty((min(len(points), _ROWS), values.shape[1], 8))
     cost = 0.0
     count = 0
     for start in range(0, len(points), _ROWS):
         stop = min(start + _ROWS, len(points))
         some = rows[: stop - start]
-        evaluate(
-            points[start:stop],
-            values[start:stop],
-            groups[start:stop],
-            level,
-            valid,
-            scale_xy,
-            camera,
-            rotation,
-            translation,
-            gains,
-            biases,
-            some,
-        )
-        more, seen = normal_equations(
-            some,
-            groups[start:stop],
-            squared_scale,
-            pose,
-            mixed,
-            own,
-            pose_gradient,
-            own_gradient,
-        )
+        part = points[start:stop], values[start:stop], groups[start:stop]
+        evaluate(part, query, alignment, some)
+        more, seen = normal_equations(some, groups[start:stop], squared_scale, sums)
         cost += more
         count += seen
     return cost, count
@@ -306,12 +258,12 @@ def splat_depths(points, camera, size_xy, cell_px, r, t, nearest, cells, depths)
         with its depth.
     """
     columns = nearest.shape[1]
-    places = np.empty((11, min(len(points), _ROWS)))
+    shown_at = np.empty((11, min(len(points), _ROWS)))
     for start in range(0, len(points), _ROWS):
         stop = min(start + _ROWS, len(points))
-        _project(camera, r, t, points[start:stop], places)
+        _project(camera, r, t, points[start:stop], shown_at)
         for k in range(start, stop):
-            z, px, py = places[2, k - start], places[3, k - start], places[4, k - start]
+            z, px, py = shown_at[2, k - start], shown_at[3, k - start], shown_at[4, k - start]
             cells[k] = -1
             depths[k] = z
             # not so for NaN either
@@ -349,25 +301,27 @@ def strongest_per_cell(x, y, energy, wanted, cell_px, best):
 
 
 @compiled_loop
-def correlations(points, values, groups, level, valid, scale_xy, camera, rotations, sums, out):
-    """Correlation of the query with the references for each of several turns of the camera.
+def correlations(chosen, query, rotations, sums, out):
+    """Correlation of the query with the references for each of several rotations of the camera.
 
     Parameters
     ----------
-    points : (N, 3), in the camera. The others down to ``camera`` are those of :func:`evaluate`.
+    chosen, query : as of :func:`evaluate`, but the points in the camera.
     rotations : (K, 3, 3), which turn the points.
     sums : (G, C, 6), space to work in.
     out : (K,), filled with the correlation over all points about the means of their reference and
         channel, 0 where nothing is seen.
     """
+    points, values, groups = chosen
+    level, valid, scale_xy, camera = query
     zero = np.zeros(3)
     channels = values.shape[1]
-    places = np.empty((11, len(points)))
+    shown_at = np.empty((11, len(points)))
     for turn in range(len(rotations)):
         sums[:] = 0.0
-        _project(camera, rotations[turn], zero, points, places)
+        _project(camera, rotations[turn], zero, points, shown_at)
         for k in range(len(points)):
-            px, py = places[3, k] * scale_xy[0] - 0.5, places[4, k] * scale_xy[1] - 0.5
+            px, py = shown_at[3, k] * scale_xy[0] - 0.5, shown_at[4, k] * scale_xy[1] - 0.5
             row, column, a, b = _corner(valid, px, py)
             if row < 0:
                 continue

@@ -2,8 +2,13 @@
 
 The pose is the one under which they look like the query, up to a gain and a bias per reference
 (:mod:`megloc_kapture.refinement.photometric`). A result counts only where it is better than what
-there was (:mod:`megloc_kapture.refinement.rendering_acceptance`); otherwise the old pose stays,
-with the reason.
+there was (:mod:`megloc_kapture.refinement.acceptance`); otherwise the old pose stays, with the
+reason.
+
+Gradients lead to the right pose from a few pixels only, of a level on which the light of day and
+night has not changed what is seen; coarser levels, which would lead there from further away, show
+the light more than the things. So rotations of the camera are tried one by one on that level: a
+small error of a pose is nearly a rotation, as far as the image goes.
 """
 
 from __future__ import annotations
@@ -12,36 +17,42 @@ from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from functools import partial
 
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.geometry.cameras import focal_px
 from megloc_kapture.plugins import PoseRefinement, RankingScene
-from megloc_kapture.refinement.consistency import Displacement, held_out
-from megloc_kapture.refinement.photometric import MIN_POINTS, Alignment, LevelProblem
-from megloc_kapture.refinement.photometric_directions import beside
-from megloc_kapture.refinement.photometric_fit import correlation
-from megloc_kapture.refinement.photometric_minimum import minimised
-from megloc_kapture.refinement.photometric_occluders import agreeing
-from megloc_kapture.refinement.photometric_points import (
-    Visibility,
-    choose_points,
-    usable_cells,
-    visibility,
+from megloc_kapture.refinement.acceptance import (
+    Candidate,
+    accept_or_keep,
+    correlation,
+    perturbed_starts,
 )
-from megloc_kapture.refinement.photometric_pyramid import FeatureMaps
-from megloc_kapture.refinement.photometric_search import best_turns
-from megloc_kapture.refinement.references import ReferenceImages
-from megloc_kapture.refinement.rendering_acceptance import Candidate, judged
-from megloc_kapture.refinement.rendering_options import RenderingOptions
-from megloc_kapture.refinement.rendering_views import (
+from megloc_kapture.refinement.consistency import Displacement, refine_held_out
+from megloc_kapture.refinement.depth_points import Visibility, usable_cells, visibility
+from megloc_kapture.refinement.photometric import (
+    MIN_POINTS,
+    Alignment,
+    LevelProblem,
+    minimise,
+    unoccluded_points,
+)
+from megloc_kapture.refinement.pyramid import ChosenPoints, FeatureMaps, Level, choose_points
+from megloc_kapture.refinement.references import (
     REFERENCES,
     PyramidKind,
+    ReferenceImages,
+    RenderingOptions,
     RenderingQuery,
     RenderingReference,
     pyramid_of,
+    reference_of,
 )
 from megloc_kapture.values import Camera, RigidTransform
 
-# turns of the camera, of those tried, from which the alignment begins
+# rotations of the camera, of those tried, from which the alignment begins
 _MAX_STARTS = 5
-# points by which turns are tried, and from each of those the alignment
+# points by which rotations are tried, and from each of those the alignment
 _SEARCH_POINTS, _START_POINTS = 1500, 2500
 # of a level: an alignment is done when it moves points by less, the last of all, the others
 _LAST_STEP_PX, _COARSE_STEP_PX = 0.01, 0.2
@@ -49,6 +60,11 @@ _LAST_STEP_PX, _COARSE_STEP_PX = 0.01, 0.2
 _PX_PER_POINT, _COARSE_POINTS = 24, 3200
 # standard errors by which the cost falls where nobody need ask whether the start was as good
 _CLEAR = 4.0
+_STEP_PX = 2.0  # of the level, between rotations that are tried
+_MAX_ROTATIONS = 4000
+# rotations as near as this many steps are one
+_NEAR_STEPS = 2.0
+Float64 = NDArray[np.float64]
 
 
 def refine_by_rendering(
@@ -91,7 +107,7 @@ def displacement_by_rendering(
     *,
     features: FeatureMaps | None = None,
 ) -> Displacement | None:
-    """How far :func:`refine_by_rendering` moves a pose that should be right.
+    """Displacement by :func:`refine_by_rendering` of a pose that should be right.
 
     Where it keeps the pose, how far the least cost nearby is from it. None where the references do
     not determine the pose: they cover too little, correlate too little, or lead out of its bounds.
@@ -139,52 +155,52 @@ class _Refining:
 
     def refine(self, start: RigidTransform) -> PoseRefinement:
         """See :func:`refine_by_rendering`."""
-        sight, overlap = self._sight(start)
+        sight, overlap = self._visibility(start)
         if sight is None:
             return _uncovered(start, overlap)
         coarsest = min([len(self.query_levels), *map(len, self.levels)]) - 1
-        searched = self._judged(start, overlap, self._searched(coarsest, start, sight))
+        searched = self._decide(start, overlap, self._align_from_search(coarsest, start, sight))
         clear = searched.accepted and searched.measures["significance"] >= _CLEAR
         if clear or coarsest == 0:
             return searched
         # looking around may lead away from a pose that was nearly right
-        direct = self._judged(start, overlap, self._aligned(0, start, sight))
+        direct = self._decide(start, overlap, self._align(0, start, sight))
         if not searched.accepted:
             return direct if direct.accepted else searched
         return max((direct, searched), key=_correlation_after)
 
     def refine_nearby(self, start: RigidTransform) -> PoseRefinement:
         """The same at the finest level alone, without looking around."""
-        sight, overlap = self._sight(start)
+        sight, overlap = self._visibility(start)
         if sight is None:
             return _uncovered(start, overlap)
-        return self._judged(start, overlap, self._aligned(0, start, sight))
+        return self._decide(start, overlap, self._align(0, start, sight))
 
-    def _sight(self, start: RigidTransform) -> tuple[Visibility | None, float]:
-        """What is seen of the references, if enough, and the share of the query they cover."""
+    def _visibility(self, start: RigidTransform) -> tuple[Visibility | None, float]:
+        """Visibility of the references, if it is enough, and the share of the query covered."""
         sight = visibility(self.points, self.camera, start)
         overlap = self._overlap(sight)
         return None if overlap < max(self.options.min_overlap, 1e-9) else sight, overlap
 
-    def _searched(
+    def _align_from_search(
         self, coarsest: int, start: RigidTransform, sight: Visibility
     ) -> Candidate | None:
         """Coarse to fine, from the best of what is found around the start."""
         problem = self._problem(coarsest, start, sight)
         if len(problem.chosen.points) < MIN_POINTS:
             return None
-        pose = self._begun_beside(problem, self._begun(problem, start))
-        found = self._aligned(coarsest, pose, sight)
+        pose = self._best_perturbation(problem, self._best_rotation(problem, start))
+        found = self._align(coarsest, pose, sight)
         for number in range(coarsest - 1, -1, -1):
             if found is None:
                 break
             pose = found.alignment.cam_from_world
             if number == coarsest - 1:  # later steps are too small to uncover anything
                 sight = visibility(self.points, self.camera, pose)
-            found = self._aligned(number, pose, sight)
+            found = self._align(number, pose, sight)
         return found
 
-    def _aligned(self, number: int, pose: RigidTransform, sight: Visibility) -> Candidate | None:
+    def _align(self, number: int, pose: RigidTransform, sight: Visibility) -> Candidate | None:
         """The alignment of one level; None where there are too few points."""
         problem = self._problem(number, pose, sight)
         if len(problem.chosen.points) < MIN_POINTS:
@@ -193,7 +209,7 @@ class _Refining:
         for step_px in (_COARSE_STEP_PX, _COARSE_STEP_PX if number else _LAST_STEP_PX):
             # what is in front of the scene shows the better the better the pose
             free = self._without_occluders(problem, found)
-            found = minimised(free, found, last_step_px=step_px, rounds=1 if number else 2)
+            found = minimise(free, found, last_step_px=step_px, rounds=1 if number else 2)
         return Candidate(problem, free, found)
 
     def _problem(self, number: int, pose: RigidTransform, sight: Visibility) -> LevelProblem:
@@ -203,9 +219,9 @@ class _Refining:
         chosen = choose_points(self.points, levels, sight.seen, min(self.options.max_points, count))
         return LevelProblem(chosen, level, self.camera, pose)
 
-    def _begun(self, problem: LevelProblem, pose: RigidTransform) -> RigidTransform:
-        """Of the turns of the camera that may be right the one that leads to the best pose."""
-        starts = best_turns(
+    def _best_rotation(self, problem: LevelProblem, pose: RigidTransform) -> RigidTransform:
+        """The rotation of the camera that leads to the best pose, of those that correlate best."""
+        starts = best_rotations(
             problem.chosen.thinned(_SEARCH_POINTS),
             problem.level,
             self.camera,
@@ -216,22 +232,22 @@ class _Refining:
         fewer = problem.thinned(_START_POINTS)
         return self._best(fewer, self.threads.map(fewer.nuisance_at, starts))
 
-    def _begun_beside(self, problem: LevelProblem, pose: RigidTransform) -> RigidTransform:
-        """The same beside it, where the alignment looks much the same and may have stopped."""
+    def _best_perturbation(self, problem: LevelProblem, pose: RigidTransform) -> RigidTransform:
+        """The same of alignments beside it that look much the same, where it may have stopped."""
         fewer = problem.thinned(_START_POINTS)
-        here = minimised(fewer, fewer.nuisance_at(pose), last_step_px=_COARSE_STEP_PX)
-        return self._best(fewer, [here, *beside(fewer, here)[:_MAX_STARTS]])
+        here = minimise(fewer, fewer.nuisance_at(pose), last_step_px=_COARSE_STEP_PX)
+        return self._best(fewer, [here, *perturbed_starts(fewer, here)[:_MAX_STARTS]])
 
     def _best(self, problem: LevelProblem, starts: Iterable[Alignment]) -> RigidTransform:
-        align = partial(minimised, problem, last_step_px=_COARSE_STEP_PX, rounds=1)
+        align = partial(minimise, problem, last_step_px=_COARSE_STEP_PX, rounds=1)
         tried = list(self.threads.map(align, starts))
         return max(tried, key=partial(correlation, problem)).cam_from_world
 
     def _without_occluders(self, problem: LevelProblem, at: Alignment) -> LevelProblem:
-        free = agreeing(problem, at)
+        free = unoccluded_points(problem, at)
         return problem.subset(free) if free.sum() >= MIN_POINTS else problem
 
-    def _judged(
+    def _decide(
         self, start: RigidTransform, old_overlap: float, found: Candidate | None
     ) -> PoseRefinement:
         if found is None:
@@ -239,7 +255,7 @@ class _Refining:
             return PoseRefinement(start, reason, {"overlap_before": old_overlap})
         pose = found.alignment.cam_from_world
         overlap = self._overlap(visibility(self.points, self.camera, pose))
-        return judged(start, found, (old_overlap, overlap), self.options)
+        return accept_or_keep(start, found, (old_overlap, overlap), self.options)
 
     def _overlap(self, sight: Visibility) -> float:
         """Share of the query's usable cells in which references have points."""
@@ -278,9 +294,11 @@ class Rendering:
     def hold_out(
         self, image: str, images: ReferenceImages, scene: RankingScene
     ) -> Displacement | None:
-        """How far a map image would move; see :func:`~.consistency.held_out`."""
+        """Displacement of a map image; see :func:`~.consistency.refine_held_out`."""
         displace = partial(displacement_by_rendering, options=self.options, features=self.features)
-        return held_out(image, images, scene, displace, max_references=self.options.max_references)
+        return refine_held_out(
+            image, images, scene, displace, max_references=self.options.max_references
+        )
 
     def refine(
         self,
@@ -295,18 +313,94 @@ class Rendering:
         for name in references:
             if len(used) == self.options.max_references:
                 break
-            depth = scene.map_depth(name)
-            if depth is not None:
-                used.append(
-                    RenderingReference(
-                        scene.map_image(name),
-                        scene.map_camera(name),
-                        scene.map_pose(name),
-                        depth,
-                        scene.map_mask(name),
-                    )
-                )
+            if (reference := reference_of(name, scene)) is not None:
+                used.append(reference)
         if not used:
             return PoseRefinement(cam_from_world, "no reference image has depth")
         seen = RenderingQuery(scene.query_image(query), camera, scene.query_mask(query))
         return refine_by_rendering(seen, used, cam_from_world, self.options, features=self.features)
+
+
+def best_rotations(
+    chosen: ChosenPoints,
+    level: Level,
+    camera: Camera,
+    cam_from_world: RigidTransform,
+    *,
+    max_deg: float,
+    count: int,
+) -> list[RigidTransform]:
+    """The poses, turned by up to ``max_deg``, under which references and query correlate best.
+
+    Parameters
+    ----------
+    chosen, level : the points of the references, and that level of the query.
+    camera, cam_from_world : of the query.
+
+    Returns
+    -------
+    The given pose, then at most ``count`` turned ones that differ from each other, best first.
+    """
+    from megloc_kapture.refinement.photometric_kernels import camera_of, correlations
+
+    if max_deg <= 0 or len(chosen.points) == 0:
+        return [cam_from_world]
+    vectors = rotation_grid(level, camera, max_deg)
+    quats = _quats(vectors)
+    rotations = np.stack([_rotation(quat).rotation_matrix() for quat in quats])
+    score = np.empty(len(rotations))
+    num_groups = int(chosen.groups.max()) + 1
+    correlations(
+        (cam_from_world.apply(chosen.points), chosen.values, chosen.groups),
+        (
+            level.values,
+            level.valid,
+            np.array([level.scale_x, level.scale_y]),
+            camera_of(camera),
+        ),
+        rotations,
+        np.empty((num_groups, chosen.values.shape[1], 6)),
+        score,
+    )
+    result = [cam_from_world]
+    taken: list[Float64] = []
+    apart = _NEAR_STEPS * _step_rad(level, camera)
+    for row in np.argsort(-score, kind="stable"):
+        if len(taken) == count or score[row] <= 0:
+            break
+        if all(np.linalg.norm(vectors[row] - other) > apart for other in taken):
+            taken.append(vectors[row])
+            result.append(_rotation(quats[row]) @ cam_from_world)
+    return result
+
+
+def rotation_grid(level: Level, camera: Camera, max_deg: float) -> Float64:
+    """Rotation vectors (K, 3) in radians of the turns that are tried, the shortest first."""
+    step = _step_rad(level, camera)
+    # about the optical axis a turn moves the image's sides less than one across it moves all
+    h, w = level.valid.shape
+    steps = np.array([step, step, _STEP_PX / (0.5 * max(h, w))])
+    limit = np.radians(max_deg)
+    # a finer grid than anyone has time for is made coarser
+    volume = 4.0 / 3.0 * np.pi * limit**3 / steps.prod()
+    steps *= max(1.0, (volume / _MAX_ROTATIONS) ** (1 / 3))
+    sides = [each * np.arange(-(n := int(limit / each)), n + 1) for each in steps]
+    vectors = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 3)
+    lengths = np.linalg.norm(vectors, axis=1)
+    vectors, lengths = vectors[lengths <= limit], lengths[lengths <= limit]
+    return np.asarray(vectors[np.argsort(lengths, kind="stable")])
+
+
+def _step_rad(level: Level, camera: Camera) -> float:
+    return _STEP_PX / (focal_px(camera) * level.scale_x)
+
+
+def _quats(vectors: Float64) -> Float64:
+    """Quaternions (K, 4) of rotation vectors (K, 3)."""
+    half = 0.5 * np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.concatenate([np.cos(half), 0.5 * np.sinc(half / np.pi) * vectors], axis=1)
+
+
+def _rotation(quat: Float64) -> RigidTransform:
+    w, x, y, z = quat.tolist()
+    return RigidTransform((w, x, y, z), (0.0, 0.0, 0.0))

@@ -1,4 +1,4 @@
-"""Late fusion: the similarities of several global features become one.
+"""Fusion of several global features: of their vectors, their similarities or their rankings.
 
 The operators are those of Csurka and Clinchant, "An empirical study of fusion operators for
 multimodal image retrieval", CBMI 2012, as kapture-localization has them, which MegLoc uses. With
@@ -15,8 +15,8 @@ min_and_max     ``alpha min + (1 - alpha) max``
 villena_roman   ``(1 - alpha) max + alpha min ** 2 / (max + min)``
 harmonic_mean   ``1 / sum((1 / n) / (w_i s_i))``
 ghm             ``1 / sum((1 / n) / (gamma + w_i s_i)) - gamma``, the generalized harmonic mean
-early           as ``mean``, in one search: the vectors are concatenated, see ``early_fusion``
-round_robin     first of each feature, second of each feature, ...; see ``rank_fusion``
+early           as ``mean``, in one search: the vectors are concatenated, see :func:`concatenate`
+round_robin     first of each feature, second of each feature, ...; see :func:`round_robin`
 ==============  ===================================================================================
 
 They are written for similarities that are not negative, as those of text are. A cosine may be
@@ -35,7 +35,6 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.retrieval.weights import normalized_weights
 from megloc_kapture.values import Options
 
 RankMethod = Literal["round_robin", "reciprocal_rank", "borda"]
@@ -56,7 +55,6 @@ FusionMethod = (
     | RankMethod
 )
 RANK_METHODS: frozenset[str] = frozenset({"round_robin", "reciprocal_rank", "borda"})
-
 # which operators have which option
 _OPTIONS_OF: dict[str, tuple[str, ...]] = {
     "gamma": ("ghm", "mean_and_power", "mean_and_min"),
@@ -64,12 +62,12 @@ _OPTIONS_OF: dict[str, tuple[str, ...]] = {
     "rank_constant": ("reciprocal_rank",),
     "list_length": ("reciprocal_rank", "borda"),
 }
-
 Similarities = NDArray[np.floating[Any]]
+Ranking = tuple[NDArray[np.int64], NDArray[np.float32]]
 
 
 class FusionOptions(Options):
-    """How the similarities, or the rankings, of several global features become one."""
+    """Options of the fusion of several global features' similarities or rankings."""
 
     method: FusionMethod = Field(
         default="ghm",
@@ -112,7 +110,7 @@ class FusionOptions(Options):
         return self
 
     def fuses_ranks(self) -> bool:
-        """Whether only the order of each feature's similarities counts."""
+        """True if only the order of each feature's similarities counts."""
         return self.method in RANK_METHODS
 
 
@@ -232,3 +230,160 @@ def check_features(count: int, databases: int) -> None:
     """Raise OptionError unless queries and database have the same number of features, any."""
     if count == 0 or count != databases:
         raise OptionError(f"{count} global features of the queries, {databases} of the map")
+
+
+def normalized_weights(weights: Sequence[float] | None, count: int) -> NDArray[np.float64]:
+    """Weights (count,) that sum to one; all equal where none are given.
+
+    Raises
+    ------
+    OptionError : another number of weights, or one that is not finite and positive. A feature that
+        is not to count is left out: harmonic means and ranks know no weight of zero.
+    """
+    given = np.ones(count) if weights is None else np.asarray(weights, dtype=np.float64)
+    if count == 0 or given.shape != (count,):
+        raise OptionError(f"{given.size} weights for {count} global features")
+    if not (np.isfinite(given).all() and (given > 0).all()):
+        raise OptionError(f"weights {given.tolist()} are not all finite and positive")
+    normalized: NDArray[np.float64] = given / given.sum()
+    return normalized
+
+
+def concatenate(
+    vectors: Sequence[NDArray[np.float32]],
+    weights: Sequence[float] | None = None,
+    *,
+    out: NDArray[np.float32] | None = None,
+) -> NDArray[np.float32]:
+    """Concatenate the descriptors of several features, row by row.
+
+    The inner product of two rows is the weighted mean of the features' cosines: block i is scaled
+    by the square root of ``w_i / sum(w)``. It is what late fusion by the mean gives, in one search.
+    A row is of unit length where every feature's is; a feature of zeros, of an image that it finds
+    nothing in, takes its share away.
+
+    Parameters
+    ----------
+    vectors : float (N, D_i), rows of unit length or zero.
+    weights : one per feature, positive; all equal by default.
+    out : where to write the result.
+
+    Returns
+    -------
+    float32 (N, sum of D_i).
+
+    Raises
+    ------
+    OptionError : weights that cannot be used, or none of the features.
+    DataError : features of different numbers of images.
+    """
+    scales = np.sqrt(normalized_weights(weights, len(vectors)))
+    if len({len(rows) for rows in vectors}) != 1:
+        raise DataError(f"features of {', '.join(str(len(rows)) for rows in vectors)} images")
+    shape = (len(vectors[0]), sum(rows.shape[1] for rows in vectors))
+    fused = np.empty(shape, dtype=np.float32) if out is None else out
+    left = 0
+    for rows, scale in zip(vectors, scales.tolist(), strict=True):
+        right = left + rows.shape[1]
+        np.multiply(rows, np.float32(scale), out=fused[:, left:right])
+        left = right
+    return fused
+
+
+def round_robin(lists: Sequence[NDArray[np.int64]], top_k: int) -> Ranking:
+    """The first of each list in turn, then the second of each, without what was there already.
+
+    Parameters
+    ----------
+    lists : per feature int64 (Q, K_i).
+    top_k : at most this many per row.
+
+    Returns
+    -------
+    indices : int64 (Q, top_k), best first, -1 where the lists have no more.
+    scores : float32 (Q, top_k), ``top_k`` for the first, then one less each; -inf where -1.
+
+    Raises
+    ------
+    DataError : lists of different numbers of queries.
+    OptionError : no list.
+    """
+    features = max(len(lists), 1)
+    turns = [
+        -(np.arange(ranked.shape[-1]) * features + feature) for feature, ranked in enumerate(lists)
+    ]
+    indices, _ = _best(lists, turns, top_k, np.maximum)
+    scores = np.arange(top_k, 0, -1, dtype=np.float32)
+    return indices, np.where(indices >= 0, scores, np.float32(-np.inf))
+
+
+def reciprocal_rank(
+    lists: Sequence[NDArray[np.int64]],
+    top_k: int,
+    weights: Sequence[float] | None = None,
+    *,
+    constant: float = 60.0,
+) -> Ranking:
+    """Reciprocal rank fusion: ``sum(w_i / (constant + rank_i))``, ranks from 1.
+
+    Cormack, Clarke and Buettcher, "Reciprocal rank fusion outperforms Condorcet and individual
+    rank learning methods", SIGIR 2009, whose constant is 60. A list without the image adds nothing.
+    Equal sums are in the order of the images. Parameters as of :func:`round_robin`; the weights
+    are positive and brought to a sum of one, scores are the sums.
+    """
+    shares = normalized_weights(weights, len(lists))
+    points = [
+        share / (constant + 1 + np.arange(ranked.shape[-1]))
+        for ranked, share in zip(lists, shares, strict=True)
+    ]
+    return _best(lists, points, top_k, np.add)
+
+
+def borda(
+    lists: Sequence[NDArray[np.int64]], top_k: int, weights: Sequence[float] | None = None
+) -> Ranking:
+    """Borda count: the last of the longest list gets one point, each before it one more.
+
+    Parameters and result as of :func:`reciprocal_rank`.
+    """
+    shares = normalized_weights(weights, len(lists))
+    longest = max(ranked.shape[-1] for ranked in lists)
+    points = [
+        share * (longest - np.arange(ranked.shape[-1]))
+        for ranked, share in zip(lists, shares, strict=True)
+    ]
+    return _best(lists, points, top_k, np.add)
+
+
+def _best(
+    lists: Sequence[NDArray[np.int64]],
+    points: Sequence[NDArray[np.float64 | np.int64]],
+    top_k: int,
+    together: np.ufunc,
+) -> Ranking:
+    """The images with most points; ``together`` is what makes one of an image's points."""
+    if not lists:
+        raise OptionError("no ranked list to fuse")
+    if any(ranked.ndim != 2 or len(ranked) != len(lists[0]) for ranked in lists):
+        raise DataError(f"ranked lists of shapes {[ranked.shape for ranked in lists]}")
+    every = np.concatenate(lists, axis=1)
+    rows = np.repeat(np.arange(len(every)), every.shape[1])
+    values = np.tile(np.concatenate(points).astype(np.float64), len(every))
+    images = every.ravel()
+    there = images >= 0
+    rows, values, images = rows[there], values[there], images[there]
+    indices = np.full((len(every), top_k), -1, dtype=np.int64)
+    scores = np.full((len(every), top_k), -np.inf, dtype=np.float32)
+    if len(images) == 0:
+        return indices, scores
+    order = np.lexsort((images, rows))
+    rows, values, images = rows[order], values[order], images[order]
+    starts = np.flatnonzero((np.diff(rows, prepend=-1) != 0) | (np.diff(images, prepend=-1) != 0))
+    rows, images, values = rows[starts], images[starts], together.reduceat(values, starts)
+    order = np.lexsort((images, -values, rows))
+    rows, images, values = rows[order], images[order], values[order]
+    ranks = np.arange(len(rows)) - np.searchsorted(rows, rows)
+    kept = ranks < top_k
+    indices[rows[kept], ranks[kept]] = images[kept]
+    scores[rows[kept], ranks[kept]] = values[kept]
+    return indices, scores

@@ -13,10 +13,10 @@ from pydantic import Field
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.kapture import FeatureReader, KaptureFolder
 from megloc_kapture.io.kapture.vectors import KaptureVectors
-from megloc_kapture.retrieval.blocks import VectorSource, as_blocks, common_length
-from megloc_kapture.retrieval.diversity import DiversityOptions, diversified
 from megloc_kapture.retrieval.fusion import FusionOptions
+from megloc_kapture.retrieval.reranking import DiversityOptions, diversify
 from megloc_kapture.retrieval.search import rank_fused
+from megloc_kapture.retrieval.vectors import VectorSource, as_blocks, common_length
 from megloc_kapture.values import Options, RigidTransform
 
 _QUERY_ELEMENTS = 1 << 27  # of query vectors held at once: 512 MiB of float32
@@ -152,7 +152,7 @@ class Candidates:
         of_kept = np.full((len(index), width), -np.inf, np.float32)
         for row, (ranking, row_scores) in enumerate(zip(index, scores, strict=True)):
             there = ranking >= 0
-            chosen = diversified(ranking[there], centers, directions, top_k, options)
+            chosen = diversify(ranking[there], centers, directions, top_k, options)
             kept[row, : len(chosen)] = ranking[chosen]
             # fillers stand behind what is kept, though they are more similar
             of_kept[row, : len(chosen)] = np.minimum.accumulate(row_scores[chosen])

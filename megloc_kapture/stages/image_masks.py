@@ -16,8 +16,7 @@ from pydantic import Field
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.plugins import PluginChoice
-from megloc_kapture.preprocessing.fixed_masks import FixedMask
-from megloc_kapture.preprocessing.unchanging_region import UnchangingRegion
+from megloc_kapture.preprocessing.masks import FixedMask, UnchangingRegion
 from megloc_kapture.stages.local_features import read_mask
 from megloc_kapture.values import Camera, Options
 

@@ -18,15 +18,17 @@ from megloc_kapture.io.kapture import (
     KaptureFolder,
     write_pairs,
 )
-from megloc_kapture.mapping.frustum_overlap import frustum_overlap
-from megloc_kapture.mapping.pairs import exhaustive_pairs
-from megloc_kapture.mapping.pairs_by_covisibility import (
+from megloc_kapture.mapping.pairs import (
     PairsByCovisibilityOptions,
+    PairsByPosesOptions,
+    PairsBySequenceOptions,
+    exhaustive_pairs,
+    frustum_overlap,
     pairs_by_covisibility,
+    pairs_by_poses,
+    pairs_by_sequence,
 )
-from megloc_kapture.mapping.pairs_by_poses import PairsByPosesOptions, pairs_by_poses
-from megloc_kapture.mapping.pairs_by_sequence import PairsBySequenceOptions, pairs_by_sequence
-from megloc_kapture.retrieval.blocks import VectorSource
+from megloc_kapture.retrieval.vectors import VectorSource
 from megloc_kapture.stages.candidates import (
     Candidates,
     QueryPairsOptions,

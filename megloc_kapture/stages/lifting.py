@@ -24,7 +24,7 @@ from megloc_kapture.io.kapture import (
     write_points3d,
     write_sensors,
 )
-from megloc_kapture.mapping.lifting import LiftingOptions, lift_keypoints
+from megloc_kapture.mapping.depth import LiftingOptions, lift_keypoints
 from megloc_kapture.stages.depth_records import DepthRecord, depth_records
 from megloc_kapture.stages.triangulation import copy_features
 from megloc_kapture.stages.work import HERE, FolderSpec, Work

@@ -16,7 +16,7 @@ from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
 from megloc_kapture.io.tables import write_mask_counts
 from megloc_kapture.plugins import LocalFeatureExtractor
-from megloc_kapture.preprocessing.mask_margin import with_margin
+from megloc_kapture.preprocessing.masks import with_margin
 from megloc_kapture.stages.given_map import has_descriptors
 from megloc_kapture.stages.layout import LOCAL_FEATURES, REFERENCE
 from megloc_kapture.stages.map_points import check_given_type

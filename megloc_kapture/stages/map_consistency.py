@@ -10,8 +10,8 @@ from megloc_kapture.refinement.consistency import (
     Consistency,
     Displacement,
     HoldsOut,
-    consistency,
-    sample,
+    judge_consistency,
+    spread_names,
 )
 from megloc_kapture.refinement.references import ReferenceImages
 from megloc_kapture.stages.ranking_scene import KaptureScene
@@ -47,10 +47,10 @@ def map_consistency(
     DataError : an image or a depth map cannot be read.
     """
     return {
-        frame: consistency(
+        frame: judge_consistency(
             ordered_map(
                 _hold_out,
-                (_Job(mapping, refiner, image, images) for image in sample(images.names)),
+                (_Job(mapping, refiner, image, images) for image in spread_names(images.names)),
                 work.executor,
                 window=_WINDOW,
             )

@@ -31,7 +31,7 @@ from megloc_kapture.io.kapture import (
 )
 from megloc_kapture.io.kapture.points import write_point_covariances
 from megloc_kapture.io.ply import write_ply
-from megloc_kapture.mapping.depth_verification import (
+from megloc_kapture.mapping.depth import (
     DepthVerificationOptions,
     contradicted_by_depth,
 )

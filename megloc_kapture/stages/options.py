@@ -8,7 +8,7 @@ from pydantic import Field, field_validator
 
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.colmap import TriangulationOptions
-from megloc_kapture.mapping.lifting import LiftingOptions
+from megloc_kapture.mapping.depth import LiftingOptions
 from megloc_kapture.matching.guided_pyramid import GuidedPyramidOptions, base_type, pyramid_type
 from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
 from megloc_kapture.plugins import (

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.geometry.warping import WarpedView, WarpSource, warp_to_view
-from megloc_kapture.localization.distinctive_inliers import DistinctiveInliers
+from megloc_kapture.localization.ranking import DistinctiveInliers
 from megloc_kapture.plugins import (
     IMAGE_DISTANCES,
     HypothesisView,

@@ -24,8 +24,8 @@ from megloc_kapture.io.files import (
 from megloc_kapture.io.images import WRITABLE_SUFFIXES
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.plugins import SEGMENTERS, Segmenter, load_plugin
-from megloc_kapture.preprocessing.frame_plan import FrameOptions, FramePlan, plan_frame
-from megloc_kapture.preprocessing.unchanging_region import UnchangingRegion
+from megloc_kapture.preprocessing.frames import FrameOptions, FramePlan, plan_frame
+from megloc_kapture.preprocessing.masks import UnchangingRegion
 from megloc_kapture.stages.class_masks import ClassMasks
 from megloc_kapture.stages.image_masks import MaskOptions, StandingMasks, mask_files
 from megloc_kapture.stages.layout import MAPPING, PREPROCESSED, QUERY

@@ -9,8 +9,8 @@ from pydantic import BaseModel, ConfigDict
 
 from megloc_kapture.io.files import read_json_model
 from megloc_kapture.io.kapture import KaptureData, Sensor
-from megloc_kapture.preprocessing.frame_plan import FramePlan
-from megloc_kapture.preprocessing.pixel_map import PixelMap
+from megloc_kapture.preprocessing.frames import FramePlan
+from megloc_kapture.preprocessing.resampling import PixelMap
 
 REPORT_FILE = "preprocessing.json"
 

@@ -12,8 +12,12 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.files import link_file
 from megloc_kapture.io.images import image_as_read_back, image_size, write_image
-from megloc_kapture.preprocessing.frame_plan import FramePlan
-from megloc_kapture.preprocessing.frames import processed_image, processed_mask, reached_region
+from megloc_kapture.preprocessing.frames import (
+    FramePlan,
+    processed_image,
+    processed_mask,
+    reached_region,
+)
 from megloc_kapture.stages.class_masks import ClassMasks
 from megloc_kapture.stages.image_masks import Mask, MaskFiles
 from megloc_kapture.stages.local_features import read_image_of

@@ -15,7 +15,7 @@ from megloc_kapture.geometry.image_variants import ImageVariant
 from megloc_kapture.matching.guided_pyramid import (
     Extract,
     GuidedPyramidOptions,
-    Judgement,
+    PairVerifier,
     SkippedVariant,
     VariantFeatures,
     VariantMatches,
@@ -23,11 +23,12 @@ from megloc_kapture.matching.guided_pyramid import (
     match_probed,
     match_variants,
 )
-from megloc_kapture.matching.variant_verification import (
+from megloc_kapture.matching.verification import (
+    KnownPoseOptions,
+    TwoViewOptions,
     known_pose_of_variants,
     two_view_of_variants,
 )
-from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
 from megloc_kapture.plugins import LocalFeatureExtractor, Matcher
 from megloc_kapture.stages.local_features import checked_features, read_image_of, read_mask
 from megloc_kapture.stages.matches import (
@@ -143,7 +144,7 @@ def match_in_batches(
     names: Sequence[str],
     load: Callable[[str], Features],
     matcher: Matcher,
-    judge: Callable[[str, Features], Judgement],
+    judge: Callable[[str, Features], PairVerifier],
     options: GuidedPyramidOptions,
 ) -> tuple[list[list[VariantMatches]], int]:
     """The variants that match each of several images, whose features are not all loaded at once.
@@ -183,7 +184,7 @@ def extraction(extractor: LocalFeatureExtractor, name: str) -> Extract:
     return extract
 
 
-def _judgement(job: Retry, itself: Features, name: str, other: Features) -> Judgement:
+def _judgement(job: Retry, itself: Features, name: str, other: Features) -> PairVerifier:
     how, first = job.how, job.how.first.open()
     if isinstance(how.verification, TwoViewOptions):
         base, _ = first.matches(how.first_type).read(job.image, name)

@@ -20,8 +20,12 @@ from megloc_kapture.io.csv_table import write_csv_table
 from megloc_kapture.io.kapture import KaptureFolder, MatchesReader, MatchesWriter
 from megloc_kapture.io.kapture.features import feature_folder
 from megloc_kapture.matching.guided_pyramid import pyramid_type
-from megloc_kapture.matching.keypoint_union import KeypointUnion
-from megloc_kapture.matching.pyramid_combination import Combined, Tried, combine
+from megloc_kapture.matching.pyramid_combination import (
+    Combined,
+    KeypointUnion,
+    TriedVariant,
+    combine,
+)
 from megloc_kapture.stages.pyramid_files import MatchSpool, PyramidFeatures, Spooled
 from megloc_kapture.stages.pyramid_jobs import HowToRetry, Retry, described, retry
 from megloc_kapture.stages.work import Work
@@ -152,7 +156,7 @@ class PyramidPairs:
         added: dict[str, _Added],
     ) -> Combined:
         places = retried.of_pair(pair)
-        tried = [Tried(0 if image == pair[0] else 1, spool.get(at)) for image, at in places]
+        tried = [TriedVariant(0 if image == pair[0] else 1, spool.get(at)) for image, at in places]
         mode = self._how.options.mode
         unions = [
             KeypointUnion(self._keypoints.read(image), added[image].px)

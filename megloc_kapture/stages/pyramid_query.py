@@ -9,13 +9,11 @@ from numpy.typing import NDArray
 
 from megloc_kapture.matching.guided_pyramid import (
     GuidedPyramidOptions,
-    Judgement,
+    PairVerifier,
     extract_variants,
 )
-from megloc_kapture.matching.keypoint_union import KeypointUnion
-from megloc_kapture.matching.pyramid_combination import Tried, combine
-from megloc_kapture.matching.variant_verification import two_view_of_variants
-from megloc_kapture.matching.verification import TwoViewOptions
+from megloc_kapture.matching.pyramid_combination import KeypointUnion, TriedVariant, combine
+from megloc_kapture.matching.verification import TwoViewOptions, two_view_of_variants
 from megloc_kapture.plugins import LocalFeatureExtractor, Matcher
 from megloc_kapture.stages.matches import Features
 from megloc_kapture.stages.pyramid_jobs import extraction, match_in_batches
@@ -69,7 +67,7 @@ def retry_query(
 
     base = {other: pairs for other, pairs, _ in matches}
 
-    def judge(other: str, features: Features) -> Judgement:
+    def judge(other: str, features: Features) -> PairVerifier:
         return two_view_of_variants(
             camera, query.keypoints_px, features.camera, features.keypoints_px, base[other],
             verification,
@@ -81,7 +79,7 @@ def retry_query(
     richer: list[NamedMatches] = []
     for other, pairs, scores in matches:
         if other in found:
-            tried = [Tried(0, each) for each in found[other]]
+            tried = [TriedVariant(0, each) for each in found[other]]
             combined = combine((pairs, scores), tried, options.mode, (keypoints, None))
             pairs, scores = combined.matches, combined.scores
         richer.append((other, pairs, scores))

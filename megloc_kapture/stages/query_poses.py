@@ -18,17 +18,17 @@ from numpy.typing import NDArray
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs
 from megloc_kapture.io.tables import Fallback
-from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions
 from megloc_kapture.localization.cluster_poses import (
     ClusterLocalization,
     QueryView,
     TypedMatches,
-    in_turn,
+    interleave,
     localize_in_clusters,
+    poses_of_cameras,
 )
 from megloc_kapture.localization.clusters import ClusterOptions, cluster_candidates
+from megloc_kapture.localization.estimation import AbsolutePoseOptions
 from megloc_kapture.localization.map_index import MapIndex
-from megloc_kapture.localization.rig_cameras import poses_of_cameras
 from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.plugins import (
     POSE_RANKERS,
@@ -256,7 +256,7 @@ def localize_from_matches(
         jobs = []
         for unit in units:
             own = tuple(candidates.get(image, ()) for image in unit.images)
-            together = tuple(in_turn(own))
+            together = tuple(interleave(own))
             jobs.append(
                 _Job(
                     map=map_spec,

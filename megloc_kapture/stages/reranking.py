@@ -17,7 +17,7 @@ from pydantic import Field
 
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs, write_pairs
 from megloc_kapture.io.tables import read_match_counts
-from megloc_kapture.retrieval.coverage import most_covering
+from megloc_kapture.retrieval.reranking import greedy_coverage
 from megloc_kapture.stages.layout import (
     FEATURES,
     LOCAL_FEATURES,
@@ -127,7 +127,7 @@ def kept_candidates(
             np.concatenate([start + own[at] for start, own in zip(starts, rows, strict=True)])
             for at in range(count)
         ]
-        return most_covering(keypoints, options.keep)[0]
+        return greedy_coverage(keypoints, options.keep)[0]
     by_matches = options.by == "matches"
     counts = [
         sum(own[at].num_found if by_matches else len(own[at].matches) for own in of_types)
@@ -152,7 +152,7 @@ def cover_pairs(
     """
     found = []
     for query, images in iterate_candidates(pairs):
-        order, added = most_covering([matched(query, image) for image in images], keep)
+        order, added = greedy_coverage([matched(query, image) for image in images], keep)
         for place, (at, count) in enumerate(zip(order, added, strict=True)):
             found.append(ImagePair(query, images[at], count + 1.0 / (2.0 + place)))
     return found

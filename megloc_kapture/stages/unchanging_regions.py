@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.preprocessing.unchanging_region import (
+from megloc_kapture.preprocessing.masks import (
     MAX_IMAGES,
     MIN_IMAGES,
     UnchangingRegion,

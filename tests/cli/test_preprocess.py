@@ -15,7 +15,7 @@ from megloc_kapture.cli.preprocess import Preprocess
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.images import image_size, read_image_rgb, write_image
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.preprocessing.fixed_masks import FixedMask
+from megloc_kapture.preprocessing.masks import FixedMask
 
 INLINE = ("--executor", "inline")
 

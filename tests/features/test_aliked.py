@@ -212,10 +212,10 @@ def test_two_runs_give_the_same_also_after_pickling(photograph: Image) -> None:
 def test_many_keypoints_are_described_in_parts(
     photograph: Image, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from megloc_kapture.nets import aliked_descriptors
+    from megloc_kapture.nets import aliked
 
     whole = extractor().extract(photograph)
-    monkeypatch.setitem(aliked_descriptors._VALUES_AT_ONCE, "cpu", 4 * 16 * 128 * 7)
+    monkeypatch.setitem(aliked._VALUES_AT_ONCE, "cpu", 4 * 16 * 128 * 7)
     parts = extractor().extract(photograph)
     np.testing.assert_array_equal(whole.keypoints_px, parts.keypoints_px)
     np.testing.assert_allclose(whole.descriptors, parts.descriptors, atol=1e-5)

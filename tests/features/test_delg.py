@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.features.delg import Delg, DelgOptions, _with_longer_side
+from megloc_kapture.features.global_networks import Delg, DelgOptions, _with_longer_side
 from megloc_kapture.io.weights import MissingWeightsError
 from megloc_kapture.plugins import GlobalFeatureExtractor
 

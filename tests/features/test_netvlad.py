@@ -14,10 +14,10 @@ from pydantic import ValidationError
 from scipy.io import savemat
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.features import netvlad
-from megloc_kapture.features.netvlad import NetVlad, NetVladOptions
+from megloc_kapture.features import global_networks
+from megloc_kapture.features.global_networks import NetVlad, NetVladOptions
 from megloc_kapture.io.weights import MissingWeightsError, convert_weights
-from megloc_kapture.nets.vgg import Vgg16Features
+from megloc_kapture.nets.trunks import Vgg16Features
 from megloc_kapture.plugins import GlobalFeatureExtractor, weights_of
 
 Image = NDArray[np.uint8]
@@ -95,7 +95,7 @@ class Watched:
 @pytest.fixture
 def watched(monkeypatch: pytest.MonkeyPatch) -> Watched:
     network = Watched()
-    monkeypatch.setattr(netvlad, "_network", lambda *_: network)
+    monkeypatch.setattr(global_networks, "_network", lambda *_: network)
     return network
 
 
@@ -133,7 +133,7 @@ def test_vectors_are_those_of_the_network_run_by_hand() -> None:
     found = plugin.describe(image)
     assert found.dtype == np.float32 and found.shape == (OUTPUT,)
     np.testing.assert_allclose(np.linalg.norm(found), 1, atol=1e-6)
-    net = netvlad._network(plugin._weights, torch.device("cpu"))
+    net = global_networks._network(global_networks.netvlad, plugin._weights, torch.device("cpu"))
     planes = torch.from_numpy(image.astype(np.float32).transpose(2, 0, 1))[None]
     with torch.inference_mode():
         features = net.base_model["base"](planes - torch.tensor(MEAN)[:, None, None])

@@ -15,8 +15,7 @@ from transformers import SuperPointConfig, SuperPointForKeypointDetection
 
 from megloc_kapture.errors import DataError, MeglocError, OptionError
 from megloc_kapture.features.superpoint import SuperPoint, SuperPointOptions, gray_tensor
-from megloc_kapture.nets.superpoint import SuperPointNet
-from megloc_kapture.nets.superpoint_batchnorm import SuperPointBatchNormNet
+from megloc_kapture.nets.superpoint import SuperPointBatchNormNet, SuperPointNet
 from megloc_kapture.values import LocalFeatures
 
 Image = NDArray[np.uint8]

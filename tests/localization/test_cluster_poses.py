@@ -10,17 +10,18 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.geometry.cameras import project
-from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions
 from megloc_kapture.localization.cluster_poses import (
     ClusterLocalization,
     ImageMatches,
     QueryView,
     TypedMatches,
-    in_turn,
+    interleave,
     localize_in_clusters,
+    poses_of_cameras,
+    transform_covariance,
 )
+from megloc_kapture.localization.estimation import AbsolutePoseOptions
 from megloc_kapture.localization.map_index import MapIndex
-from megloc_kapture.localization.rig_cameras import moved_covariance, poses_of_cameras
 from megloc_kapture.plugins import PoseHypothesis
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
@@ -216,11 +217,11 @@ def test_a_covariance_moves_with_the_camera() -> None:
         vector = Rotation.from_matrix(own.rotation_matrix()).as_rotvec()
         draws.append(np.concatenate([vector, own.translation]))
     measured = np.cov(np.array(draws).T)
-    moved = moved_covariance(covariance, SIDE)
+    moved = transform_covariance(covariance, SIDE)
     scale = np.sqrt(np.outer(np.diag(moved), np.diag(moved)))
     np.testing.assert_allclose(measured / scale, moved / scale, atol=0.05)
 
 
 def test_rankings_are_taken_in_turn() -> None:
-    assert in_turn([["a", "b", "c"], ["b", "d"], []]) == ["a", "b", "d", "c"]
-    assert in_turn([]) == []
+    assert interleave([["a", "b", "c"], ["b", "d"], []]) == ["a", "b", "d", "c"]
+    assert interleave([]) == []

@@ -16,10 +16,13 @@ from scipy.stats import chi2
 
 from megloc_kapture.geometry.cameras import bearing_rays, focal_px, project, px_from_cam
 from megloc_kapture.localization import pose_kernels
-from megloc_kapture.localization.absolute_pose import absolute_pose
-from megloc_kapture.localization.estimation import AbsolutePoseOptions, PoseEstimate
-from megloc_kapture.localization.pose_refinement import refine_pose
-from megloc_kapture.localization.views import View, stack_views
+from megloc_kapture.localization.absolute_pose import absolute_pose, refine_pose
+from megloc_kapture.localization.estimation import (
+    AbsolutePoseOptions,
+    PoseEstimate,
+    PoseProblem,
+    View,
+)
 from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, Failure, Pose, RigidTransform
 
 Array = NDArray[np.float64]
@@ -73,6 +76,12 @@ def all_good(views: list[View], pose: RigidTransform) -> PoseEstimate:
     return PoseEstimate(pose, every, every, np.zeros(len(every)))
 
 
+def refined(
+    views: list[View], estimate: PoseEstimate, options: AbsolutePoseOptions | None = None
+) -> Pose | Failure:
+    return refine_pose(PoseProblem.of(views), estimate, options)
+
+
 def six(matrices: Array) -> Array:
     """Symmetric (N, 3, 3) as (N, 6): xx, xy, xz, yy, yz, zz."""
     return matrices[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
@@ -108,14 +117,14 @@ def test_derivatives_are_finite_differences(model: str) -> None:
         matrices = random_covariances(rng, 8, 0.02)
         covariances.append(matrices)
         views.append(replace(seen, cam_from_rig=cam_from_rig, point_covariances=six(matrices)))
-    stacked = stack_views(views)
+    stacked = PoseProblem.of(views)
     here = RigidTransform(
         pose.quat_wxyz, tuple(pose.translation + pose.rotation_matrix() @ stacked.offset)
     )
     rotation, translation = here.rotation_matrix(), np.array(here.translation)
     whitening = np.empty((16, 3))
     errors, squared, depths = np.empty(16), np.empty(16), np.empty(16)
-    matches = pose_kernels.matches_of(stacked)
+    matches = stacked.matches
     pose_kernels.measure(
         matches, np.ones(16, bool), rotation, translation, errors, whitening, squared, depths
     )
@@ -221,7 +230,7 @@ def test_without_covariances_it_is_poselibs_refinement(sigma_px: float) -> None:
         view.points_px[:10] += 8.0 * rng.normal(size=(10, 2))
         start = moved(truth, 2e-3 * sigma_px * rng.normal(size=6))
         theirs = refined_by_poselib(view, start)
-        ours = located(refine_pose([view], all_good([view], start)))
+        ours = located(refined([view], all_good([view], start)))
         assert ours.covariance is not None
         apart = error_vector(ours.cam_from_world, theirs)
         # in standard deviations of the pose
@@ -240,7 +249,7 @@ def test_the_minimum_is_found_from_nearby_under_any_model(
     scaled = replace(view, points_world=unit * view.points_world)
     grown = in_unit(start, unit)
     pose = located(
-        refine_pose(
+        refined(
             [scaled],
             all_good([scaled], grown),
             AbsolutePoseOptions(max_error_px=100, map_noise=1.0),
@@ -269,7 +278,7 @@ def normalised_errors(
             point_covariances=six(matrices) if known else None,
         )
         pose = located(
-            refine_pose(
+            refined(
                 [view],
                 all_good([view], truth),
                 AbsolutePoseOptions(max_error_px=100, map_noise=1.0),
@@ -299,7 +308,7 @@ def test_wrong_matches_among_the_inliers_do_not_inflate_the_covariance() -> None
     for _ in range(200):
         view = noisy_view(PINHOLE, truth, rng, 100)
         view.points_px[:10] += rng.uniform(-8, 8, (10, 2))
-        pose = located(refine_pose([view], all_good([view], truth)))
+        pose = located(refined([view], all_good([view], truth)))
         assert pose.covariance is not None
         error = error_vector(pose.cam_from_world, truth)
         squared.append(float(error @ np.linalg.solve(pose.covariance, error)))
@@ -320,7 +329,7 @@ def test_weighting_by_uncertainty_brings_the_pose_closer() -> None:
         known = replace(view, point_covariances=six(matrices))
         for views, distances in (([known], with_weights), ([view], without)):
             pose = located(
-                refine_pose(
+                refined(
                     views,
                     all_good(views, truth),
                     AbsolutePoseOptions(max_error_px=100, map_noise=1.0),
@@ -341,7 +350,7 @@ def test_points_count_by_the_noise_of_the_map() -> None:
 
     def pose(of: View, map_noise: float) -> RigidTransform:
         options = AbsolutePoseOptions(map_noise=map_noise)
-        return located(refine_pose([of], all_good([of], truth), options)).cam_from_world
+        return located(refined([of], all_good([of], truth), options)).cam_from_world
 
     known = replace(view, point_covariances=covariances)
     quarter = replace(view, point_covariances=covariances / 4)
@@ -353,10 +362,10 @@ def test_an_unknown_covariance_counts_as_none() -> None:
     rng = np.random.default_rng(5)
     truth = random_pose(rng)
     view = noisy_view(PINHOLE, truth, rng, 60)
-    plain = located(refine_pose([view], all_good([view], truth)))
+    plain = located(refined([view], all_good([view], truth)))
     for unknown in (np.nan, np.inf, 0.0):
         other = replace(view, point_covariances=np.full((60, 6), unknown))
-        same = located(refine_pose([other], all_good([other], truth)))
+        same = located(refined([other], all_good([other], truth)))
         assert same.cam_from_world == plain.cam_from_world
         np.testing.assert_array_equal(same.covariance, plain.covariance)
     mixed = np.zeros((60, 6))
@@ -364,8 +373,8 @@ def test_an_unknown_covariance_counts_as_none() -> None:
     mixed[::2] = np.nan
     half = replace(view, point_covariances=mixed)
     zero = replace(view, point_covariances=np.nan_to_num(mixed))
-    first = located(refine_pose([half], all_good([half], truth)))
-    second = located(refine_pose([zero], all_good([zero], truth)))
+    first = located(refined([half], all_good([half], truth)))
+    second = located(refined([zero], all_good([zero], truth)))
     assert first.cam_from_world == second.cam_from_world != plain.cam_from_world
 
 
@@ -376,7 +385,7 @@ def test_inliers_are_counted_in_pixels_whatever_the_uncertainty() -> None:
     view.points_px[:5] += 20.0
     vague = np.zeros((80, 6))
     vague[:, [0, 3, 5]] = 0.05
-    pose = located(refine_pose([replace(view, point_covariances=vague)], all_good([view], truth)))
+    pose = located(refined([replace(view, point_covariances=vague)], all_good([view], truth)))
     errors = np.linalg.norm(
         project(PINHOLE, pose.cam_from_world, view.points_world) - view.points_px, axis=1
     )
@@ -390,8 +399,8 @@ def test_what_is_not_usable_takes_no_part() -> None:
     view = noisy_view(PINHOLE, truth, rng, 60)
     usable = np.arange(60) >= 20
     some = replace(view, points_px=view.points_px[20:], points_world=view.points_world[20:])
-    first = located(refine_pose([view], PoseEstimate(truth, usable, usable, np.zeros(60))))
-    second = located(refine_pose([some], all_good([some], truth)))
+    first = located(refined([view], PoseEstimate(truth, usable, usable, np.zeros(60))))
+    second = located(refined([some], all_good([some], truth)))
     assert np.abs(error_vector(first.cam_from_world, second.cam_from_world)).max() < 1e-9
     assert first.inliers is not None and not first.inliers[:20].any()
 
@@ -405,11 +414,11 @@ def test_an_unstable_pose_is_a_failure_that_says_so() -> None:
     world = truth.inverse().apply(in_cam)
     pixels = px_from_cam(PINHOLE, in_cam) + rng.normal(size=(30, 2))
     view = View(PINHOLE, AT_ORIGIN, pixels, world)
-    result = refine_pose([view], all_good([view], truth))
+    result = refined([view], all_good([view], truth))
     assert isinstance(result, Failure)
     assert result.reason.startswith("the pose is unstable: its centre's standard deviation is ")
     assert result.num_matches == result.num_inliers == 30
-    pose = located(refine_pose([view], all_good([view], truth), ANY_DEVIATION))
+    pose = located(refined([view], all_good([view], truth), ANY_DEVIATION))
     assert pose.covariance is not None
     # the criterion: the centre's deviation over the median depth, whatever the unit
     deviation = np.sqrt(np.linalg.eigvalsh(pose.covariance[3:, 3:])[-1])
@@ -419,7 +428,7 @@ def test_an_unstable_pose_is_a_failure_that_says_so() -> None:
         estimate = all_good([scaled], in_unit(truth, unit))
         for factor, stable in ((0.99, False), (1.01, True)):
             options = AbsolutePoseOptions(max_center_deviation=factor * deviation / depth)
-            assert bool(refine_pose([scaled], estimate, options)) == stable
+            assert bool(refined([scaled], estimate, options)) == stable
 
 
 def test_too_few_inliers_after_refinement_say_so() -> None:
@@ -427,7 +436,7 @@ def test_too_few_inliers_after_refinement_say_so() -> None:
     truth = random_pose(rng)
     view = noisy_view(PINHOLE, truth, rng, 20)
     view.points_px[:9] += 30.0
-    result = refine_pose([view], all_good([view], truth))
+    result = refined([view], all_good([view], truth))
     assert isinstance(result, Failure)
     assert result.reason == "11 of 20 2D-3D matches agree, at least 12 are needed"
     assert (result.num_matches, result.num_inliers) == (20, 11)

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from megloc_kapture.localization.ranking import InlierCount, InlierSpread, ReprojectionScore
+from megloc_kapture.geometry.cameras import project
+from megloc_kapture.localization.ranking import (
+    DistinctiveInliers,
+    InlierCount,
+    InlierSpread,
+    ReprojectionScore,
+)
 from megloc_kapture.plugins import (
     POSE_RANKERS,
     HypothesisView,
@@ -17,6 +23,7 @@ from megloc_kapture.plugins import (
 from megloc_kapture.values import Camera, RigidTransform
 
 CAMERA = Camera("SIMPLE_PINHOLE", 640, 480, (500.0, 320.0, 240.0))
+MAX_ERROR_PX = 5.0
 
 
 class NoScene:
@@ -89,3 +96,75 @@ def test_reprojection_prefers_the_better_fit() -> None:
     exact = hypothesis(view(everywhere(10), np.full(10, 1.0)))
     scores = ReprojectionScore().score([many, exact], NoScene())
     np.testing.assert_allclose(scores, [30 * 0.19, 10 * 0.99])
+
+
+def room(count: int, seed: int = 0) -> NDArray[np.float64]:
+    """Points in front of a camera at the origin."""
+    rng = np.random.default_rng(seed)
+    return rng.uniform((-1.5, -1.0, 3.0), (1.5, 1.0, 5.0), (count, 3))
+
+
+def standing(at_x: float, points: NDArray[np.float64]) -> PoseHypothesis:
+    """Somebody in the room at ``at_x`` sees points given in that room's frame."""
+    shift = np.array([at_x, 0.0, 0.0])
+    cam_from_world = RigidTransform((1.0, 0.0, 0.0, 0.0), (-at_x, 0.0, 0.0))
+    view = HypothesisView(
+        name="q",
+        camera=CAMERA,
+        cam_from_world=cam_from_world,
+        points_px=project(CAMERA, cam_from_world, points + shift),
+        points_world=points + shift,
+        errors_px=np.zeros(len(points)),
+        inliers=np.ones(len(points), bool),
+    )
+    return PoseHypothesis((f"room{at_x}",), (view,), MAX_ERROR_PX)
+
+
+def ranker(**options: float) -> DistinctiveInliers:
+    return DistinctiveInliers(DistinctiveInliers.Options(**options))
+
+
+def test_what_only_one_room_has_beats_more_inliers_that_every_room_has() -> None:
+    walls, poster = room(100), room(10, seed=1)
+    right = standing(0.0, np.concatenate([walls[:70], poster]))
+    wrong = [standing(7.0 * number, walls) for number in (1, 2, 3)]
+    hypotheses = [*wrong, right]
+    assert np.argmax(InlierCount().score(hypotheses, NoScene())) == 0
+    scores = ranker(radius=0.0, power=1.0).score(hypotheses, NoScene())
+    # 70 points are in four rooms, 30 in three; ten in one
+    np.testing.assert_allclose(scores, [*[70 / 4 + 30 / 3] * 3, 70 / 4 + 10])
+    assert np.argmax(ranker().score(hypotheses, NoScene())) == 3
+
+
+def test_a_place_counts_where_it_has_an_inlier_nearby() -> None:
+    walls = room(50)
+    beside = walls + (0.01, 0.0, 0.0)  # 1 to 2 px
+    hypotheses = [standing(0.0, walls), standing(7.0, beside)]
+    exact = ranker(radius=0.0, power=1.0).score(hypotheses, NoScene())
+    near = ranker(radius=0.01, power=1.0).score(hypotheses, NoScene())
+    np.testing.assert_allclose(exact, 50.0)
+    np.testing.assert_allclose(near, 25.0)
+
+
+def test_two_clusters_of_one_place_do_not_count_against_each_other() -> None:
+    walls, poster = room(40), room(20, seed=1)
+    everything = np.concatenate([walls, poster])
+    twice = [standing(0.0, everything), standing(0.001, everything)]
+    other = standing(7.0, walls)
+    scores = ranker(radius=0.0, power=1.0).score([*twice, other], NoScene())
+    np.testing.assert_allclose(scores, [40 / 2 + 20, 40 / 2 + 20, 40 / 3])
+
+
+def test_one_hypothesis_or_none() -> None:
+    assert isinstance(ranker(), PoseRanker)
+    assert ranker().score([], NoScene()).shape == (0,)
+    np.testing.assert_allclose(ranker().score([standing(0.0, room(30))], NoScene()), [30.0])
+
+
+@pytest.mark.parametrize("power", [1.0, 4.0])
+def test_the_order_of_hypotheses_does_not_matter(power: float) -> None:
+    hypotheses = [standing(7.0 * at, room(30 + at)[at:]) for at in range(4)]
+    forward = ranker(power=power).score(hypotheses, NoScene())
+    np.testing.assert_allclose(
+        forward, ranker(power=power).score(hypotheses[::-1], NoScene())[::-1]
+    )

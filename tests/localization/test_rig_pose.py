@@ -9,9 +9,8 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from megloc_kapture.geometry.cameras import project
-from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions, absolute_pose
-from megloc_kapture.localization.rig_pose import RigView, rig_pose
-from megloc_kapture.localization.views import split_by_view
+from megloc_kapture.localization.absolute_pose import absolute_pose, rig_pose
+from megloc_kapture.localization.estimation import AbsolutePoseOptions, View, split_by_view
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
 PINHOLE = Camera("PINHOLE", 640, 480, (500.0, 510.0, 320.5, 239.0))
@@ -25,7 +24,7 @@ def transform(vector: list[float], translation: list[float]) -> RigidTransform:
     )
 
 
-def rig(count: int, seed: int = 0, shift: float = 0.0) -> tuple[RigidTransform, list[RigView]]:
+def rig(count: int, seed: int = 0, shift: float = 0.0) -> tuple[RigidTransform, list[View]]:
     """``rig_from_world`` and three different cameras that look to different sides."""
     rng = np.random.default_rng(seed)
     rig_from_world = transform([0.3, -1.2, 0.4], [3.0, -2.0, 1.0]) @ RigidTransform(
@@ -37,7 +36,7 @@ def rig(count: int, seed: int = 0, shift: float = 0.0) -> tuple[RigidTransform, 
         in_cam = rng.uniform((-2, -1.5, 4), (2, 1.5, 9), (count, 3))
         cam_from_world = cam_from_rig @ rig_from_world
         world = cam_from_world.inverse().apply(in_cam)
-        views.append(RigView(camera, cam_from_rig, project(camera, cam_from_world, world), world))
+        views.append(View(camera, cam_from_rig, project(camera, cam_from_world, world), world))
     return rig_from_world, views
 
 
@@ -87,7 +86,7 @@ def test_one_camera_with_matches_is_enough(used: int) -> None:
     truth, views = rig(30)
     for k, view in enumerate(views):
         if k != used:
-            views[k] = RigView(view.camera, view.cam_from_rig, np.zeros((0, 2)), np.zeros((0, 3)))
+            views[k] = View(view.camera, view.cam_from_rig, np.zeros((0, 2)), np.zeros((0, 3)))
     distance, angle = difference(rig_pose(views), truth)
     assert distance < 1e-7 and angle < 1e-8
 
@@ -121,14 +120,11 @@ def test_failures_say_why() -> None:
     truth, views = rig(30)
     rng = np.random.default_rng(2)
     mixed = [
-        RigView(v.camera, v.cam_from_rig, rng.permutation(v.points_px), v.points_world)
-        for v in views
+        View(v.camera, v.cam_from_rig, rng.permutation(v.points_px), v.points_world) for v in views
     ]
     failed = rig_pose(mixed)
     assert isinstance(failed, Failure) and "of 90 2D-3D matches agree" in failed.reason
-    broken = [
-        RigView(v.camera, v.cam_from_rig, v.points_px, np.nan * v.points_world) for v in views
-    ]
+    broken = [View(v.camera, v.cam_from_rig, v.points_px, np.nan * v.points_world) for v in views]
     assert isinstance(rig_pose(broken), Failure)
 
 
@@ -177,7 +173,7 @@ def colmap_rigid(transform: RigidTransform) -> pycolmap.Rigid3d:
     return pycolmap.Rigid3d(rotation, np.array(transform.translation))
 
 
-def colmaps(views: list[RigView]) -> RigidTransform:
+def colmaps(views: list[View]) -> RigidTransform:
     """COLMAP's generalized pose, refined (pycolmap 4.0.4 crashes on computing its covariance)."""
     ransac = pycolmap.RANSACOptions()
     ransac.max_error = 12.0
@@ -256,9 +252,7 @@ def test_the_covariance_is_that_of_repeated_estimates() -> None:
     squared = []
     for _ in range(150):
         noisy = [
-            RigView(
-                v.camera, v.cam_from_rig, v.points_px + rng.normal(size=(30, 2)), v.points_world
-            )
+            View(v.camera, v.cam_from_rig, v.points_px + rng.normal(size=(30, 2)), v.points_world)
             for v in views
         ]
         pose = located(rig_pose(noisy, options))
@@ -275,9 +269,7 @@ def test_a_rig_is_located_better_than_its_best_camera() -> None:
     of_rig, of_camera = [], []
     for _ in range(30):
         noisy = [
-            RigView(
-                v.camera, v.cam_from_rig, v.points_px + rng.normal(size=(30, 2)), v.points_world
-            )
+            View(v.camera, v.cam_from_rig, v.points_px + rng.normal(size=(30, 2)), v.points_world)
             for v in views
         ]
         of_rig.append(difference(located(rig_pose(noisy)), truth)[0])

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.geometry.cameras import bearing_rays, project
-from megloc_kapture.mapping import frustum_overlap as module
-from megloc_kapture.mapping.frustum_overlap import frustum_overlap, views_can_overlap
-from megloc_kapture.mapping.pairs import exhaustive_pairs
+from megloc_kapture.mapping import pairs as module
+from megloc_kapture.mapping.pairs import exhaustive_pairs, frustum_overlap, views_can_overlap
 from megloc_kapture.values import Camera, RigidTransform
 
 CAMERAS = [
@@ -56,7 +55,7 @@ def test_equal_to_projecting_every_point(seed: int, chunk: int) -> None:
         ]
         expected.append(max(shares, default=np.nan))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "_CHUNK", chunk)
+        patch.setattr(module, "_PAIRS_AT_ONCE", chunk)
         found = frustum_overlap(pairs, cameras, poses, xyz, points, images)
     np.testing.assert_array_equal(found, expected)
 

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from megloc_kapture.errors import DataError
@@ -17,7 +15,7 @@ from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.geometry.image_variants import ImageVariant
 from megloc_kapture.matching.guided_pyramid import (
     GuidedPyramidOptions,
-    Judgement,
+    PairVerifier,
     VariantFeatures,
     VariantMatches,
     base_type,
@@ -26,17 +24,13 @@ from megloc_kapture.matching.guided_pyramid import (
     match_variants,
     pyramid_type,
 )
-from megloc_kapture.matching.keypoint_union import KeypointUnion
 from megloc_kapture.matching.nearest_neighbours import match_nearest
-from megloc_kapture.matching.pyramid_combination import Tried, combine
-from megloc_kapture.matching.variant_verification import (
-    known_pose_of_variants,
-    two_view_of_variants,
-)
 from megloc_kapture.matching.verification import (
     KnownPoseOptions,
     TwoViewOptions,
+    known_pose_of_variants,
     ray_slopes,
+    two_view_of_variants,
     verify_two_view,
 )
 from megloc_kapture.values import Camera, ImageFeatures, LocalFeatures, RigidTransform
@@ -212,7 +206,7 @@ def test_the_verified_rows_are_what_is_found() -> None:
         found,
         [LIKE, LIKE, nothing],
         match,
-        [Judgement(every_second), Judgement(none), Judgement(none)],
+        [PairVerifier(every_second), PairVerifier(none), PairVerifier(none)],
     )
     assert refused == empty == []
     (result,) = kept
@@ -224,124 +218,6 @@ def test_the_verified_rows_are_what_is_found() -> None:
         result.descriptors, found[0].features.descriptors[matches[::2, 0]]
     )
     np.testing.assert_array_equal(result.scores, scores[::2])
-
-
-# ---------------------------------------------------------------------------- combination
-
-
-def variant_matches(
-    places: list[tuple[float, float]], others: list[int], scores: list[float] | None = None
-) -> VariantMatches:
-    return VariantMatches(
-        ImageVariant(0.5),
-        np.array(places, np.float32).reshape(-1, 2),
-        np.zeros((len(places), 4), np.float32),
-        np.array(others, np.int64),
-        np.array(scores or [1.0] * len(others), np.float32),
-    )
-
-
-def grid(count: int) -> np.ndarray:
-    """Keypoints ten pixels apart."""
-    return np.stack([np.arange(count) * 10.0, np.zeros(count)], axis=1).astype(np.float32)
-
-
-BASE = (np.array([[0, 0], [1, 1]]), np.array([0.9, 0.8]))
-
-
-def test_all_is_what_was_there_and_what_is_new() -> None:
-    keypoints = KeypointUnion(grid(5))
-    tried = [
-        # at keypoint 2; new; new, but the other one has a match; at keypoint 1, which has one
-        variant_matches([(20.5, 0.5), (5, 5), (6, 50), (10, 0)], [7, 8, 0, 9], [0.1, 0.2, 1, 1]),
-        variant_matches([(5, 5.9)], [10]),  # the poorer one's keypoint is the other's: has a match
-    ]
-    combined = combine(BASE, [Tried(0, each) for each in tried], "all", (keypoints, None))
-    assert combined.matches.tolist() == [[0, 0], [1, 1], [5, 8], [2, 7]]
-    np.testing.assert_allclose(combined.scores, [0.9, 0.8, 0.2, 0.1])
-    assert combined.best == 0
-    assert combined.added[0].tolist() == [[0, 1]] and combined.added[1].tolist() == []
-    np.testing.assert_array_equal(keypoints.keypoints_px(), [*grid(5), (5, 5)])
-
-
-def test_variants_of_both_images_add_to_both() -> None:
-    first, second = KeypointUnion(grid(3)), KeypointUnion(grid(4))
-    tried = [
-        Tried(0, variant_matches([(5, 5)], [3])),
-        Tried(1, variant_matches([(6, 6), (7, 60)], [2, 1])),
-    ]
-    combined = combine(BASE, tried, "all", (first, second))
-    # the richer one first; row 1 of the first image has a match
-    assert combined.matches.tolist() == [[0, 0], [1, 1], [2, 4], [3, 3]]
-    assert combined.added[0].tolist() == [[0, 0]] and combined.added[1].tolist() == [[1, 0]]
-
-
-def test_max_is_the_richest() -> None:
-    rich = variant_matches([(5, 5), (0, 0.5), (15, 5)], [0, 5, 6])
-    richer = variant_matches([(5, 45), (10, 40), (15, 45), (20, 40)], [0, 5, 6, 7])
-    keypoints = KeypointUnion(grid(5))
-    combined = combine(BASE, [Tried(0, rich), Tried(0, richer)], "max", (keypoints, None))
-    assert combined.matches.tolist() == [[5, 0], [6, 5], [7, 6], [8, 7]]
-    assert combined.best == 1
-    combined = combine(BASE, [Tried(0, rich)], "max", (KeypointUnion(grid(5)), None))
-    assert combined.matches.tolist() == [[5, 0], [0, 5], [6, 6]]
-
-
-def test_max_keeps_the_images_as_they_are_where_no_variant_has_more() -> None:
-    keypoints = KeypointUnion(grid(5))
-    as_many = variant_matches([(5, 5), (15, 5)], [4, 5])
-    # three matches, but two of their keypoints are one
-    seemingly = variant_matches([(5, 5), (5, 5.5), (15, 5)], [4, 5, 6])
-    for tried in ([], [as_many], [seemingly]):
-        combined = combine(BASE, [Tried(0, each) for each in tried], "max", (keypoints, None))
-        assert combined.matches.tolist() == BASE[0].tolist()
-        assert combined.best is None
-        assert len(combined.added[0]) == 0 and len(keypoints) == 5
-
-
-@given(
-    mode=st.sampled_from(("all", "max")),
-    seed=st.integers(0, 10_000),
-    sizes=st.lists(st.tuples(st.integers(0, 1), st.integers(0, 12)), max_size=5),
-)
-def test_whatever_is_tried(
-    mode: Literal["all", "max"], seed: int, sizes: list[tuple[Literal[0, 1], int]]
-) -> None:
-    rng = np.random.default_rng(seed)
-    unions = KeypointUnion(grid(8)), KeypointUnion(grid(9))
-    base = (np.stack([rng.permutation(8)[:4], rng.permutation(9)[:4]], axis=1), rng.random(4))
-    tried = [
-        Tried(
-            side,
-            variant_matches(
-                rng.uniform(0, 30, (size, 2)).tolist(),
-                rng.integers(0, 8, size).tolist(),
-                rng.random(size).tolist() or None,
-            ),
-        )
-        for side, size in sizes
-    ]
-    combined = combine(base, tried, mode, unions)
-    found = combined.matches
-    assert len(found) == len(combined.scores) >= 4
-    for side in (0, 1):
-        assert len(set(found[:, side].tolist())) == len(found)  # a keypoint has one match
-        union, added = unions[side], combined.added[side]
-        length = (8, 9)[side]
-        assert len(union) == length + len(added)
-        # every added keypoint is used, and stands where its match says
-        assert set(range(length, len(union))) <= set(found[:, side].tolist())
-        for keypoint, (number, match) in zip(union.added(), added.tolist(), strict=True):
-            assert tried[number].side == side
-            np.testing.assert_array_equal(keypoint, tried[number].matches.keypoints_px[match])
-        all_px = union.keypoints_px().astype(np.float64)
-        gaps = np.linalg.norm(all_px[:, None] - all_px[None], axis=2)
-        assert (gaps[length:] + 9 * np.eye(len(union))[length:] > 1.0).all()
-    if mode == "all" or combined.best is None:
-        assert found[:4].tolist() == base[0].tolist()
-    if mode == "max":
-        most = max([len(each.matches) for each in tried], default=0)
-        assert combined.best is None or len(tried[combined.best].matches) == most > 4
 
 
 # ---------------------------------------------------------------------------- verification

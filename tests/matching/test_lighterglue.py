@@ -20,10 +20,8 @@ from megloc_kapture.features.xfeat import XFeat, XFeatOptions
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.weights import find_weights, read_weights
-from megloc_kapture.matching.learned_pairs import normalised_points
-from megloc_kapture.matching.lighterglue import LighterGlue, LighterGlueOptions
-from megloc_kapture.nets.lighterglue import load_lighterglue
-from megloc_kapture.nets.lightglue import KeypointBatch
+from megloc_kapture.matching.lightglue import LighterGlue, LighterGlueOptions, normalised_points
+from megloc_kapture.nets.lightglue import KeypointBatch, load_lighterglue
 from megloc_kapture.values import Camera, ImageFeatures, RigidTransform
 
 IMAGES = ("0002.jpg", "0003.jpg", "0005.jpg")

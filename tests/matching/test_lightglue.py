@@ -12,8 +12,7 @@ from kornia.feature import LightGlue as KorniaLightGlue
 from transformers import LightGlueConfig, LightGlueForKeypointMatching, SuperPointConfig
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.matching.learned_pairs import LearnedPairs
-from megloc_kapture.matching.lightglue import LightGlue, LightGlueOptions
+from megloc_kapture.matching.lightglue import LightGlue, LightGlueOptions, PairNetwork
 from megloc_kapture.values import ImageFeatures
 
 SIZES = [256, 128]  # SuperPoint's descriptors, ALIKED's
@@ -233,7 +232,7 @@ def test_descriptors_of_other_features_are_refused(checkpoint: Path, size: int) 
 
 def test_it_is_the_matcher_that_lighterglue_is(checkpoint: Path, size: int) -> None:
     one = matcher(checkpoint)
-    assert isinstance(one, LearnedPairs)
+    assert isinstance(one, PairNetwork)
     a = random_image(80, size, seed=1)
     others = [noisy(a, seed=2), random_image(0, size, seed=0), noisy(a, seed=5)]
     for (matches, scores), other in zip(one.match_many(a, others), others, strict=True):

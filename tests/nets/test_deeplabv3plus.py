@@ -20,7 +20,7 @@ from megloc_kapture.nets.deeplabv3plus import (
     backbone_of,
     most_likely,
 )
-from megloc_kapture.nets.loading import load_strictly
+from megloc_kapture.nets.runtime import load_strictly
 
 KEYS = Path(__file__).parent / "keys"
 PUBLISHED = Path(__file__).parent / "data" / "deeplabv3plus"

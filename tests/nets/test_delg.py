@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from torch.nn import functional
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.nets.delg import DelgNet, Form, describe
-from megloc_kapture.nets.delg_variables import delg_from, delg_state
+from megloc_kapture.nets.delg import DelgNet, Form, delg_from, delg_state, describe
 
 # written by TensorFlow, see make_reference.py there
 WRITTEN = Path(__file__).parent / "data" / "delg"

@@ -11,7 +11,7 @@ from torch import nn
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.nets.eigenplaces import EigenPlacesNet, eigenplaces_from
-from megloc_kapture.nets.resnet import Depth, ResNet
+from megloc_kapture.nets.trunks import Depth, ResNet
 
 KEYS = Path(__file__).parent / "keys" / "eigenplaces.txt"
 # place in the published sequence -> torchvision's name

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 from PIL import Image
+from torch import nn
 from torch.nn import functional
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.weights.registry import lookup
 from megloc_kapture.nets import megaloc
 from megloc_kapture.nets.dinov2 import DinoV2
-from megloc_kapture.nets.megaloc import MegaLocNet, megaloc_from, squared
+from megloc_kapture.nets.megaloc import MegaLocNet, Salad, assignment, megaloc_from, squared
 
 KEYS = Path(__file__).parent / "keys" / "megaloc.txt"
+CHANNELS, CLUSTERS, SIZE, TOKEN = 6, 4, 5, 3
 
 
 def frozen_keys() -> dict[str, tuple[int, ...]]:
@@ -125,3 +129,131 @@ def test_a_large_image_is_filtered_before_it_is_made_small() -> None:
     torch.testing.assert_close(inner, torch.full_like(inner, 0.5), rtol=0, atol=0.01)
     plain = functional.interpolate(image, (28, 28), mode="nearest")[..., 2:-2]
     assert (plain - 0.5).abs().min() == 0.5
+
+
+def randomised(seed: int = 0) -> Salad:
+    torch.manual_seed(seed)
+    net = Salad(CHANNELS, clusters=CLUSTERS, cluster_size=SIZE, token_size=TOKEN, hidden=7)
+    with torch.no_grad():
+        for value in net.parameters():
+            value.normal_(0.0, 0.8)
+        net.dust_bin.fill_(0.7)
+    return net.eval()
+
+
+def random_input(seed: int = 1, rows: int = 3, columns: int = 4) -> tuple[torch.Tensor, ...]:
+    generator = torch.Generator().manual_seed(seed)
+    patches = torch.randn(2, CHANNELS, rows, columns, generator=generator)
+    return patches, torch.randn(2, CHANNELS, generator=generator)
+
+
+def sinkhorn_by_loops(scores: NDArray[np.float64], dustbin: float) -> NDArray[np.float64]:
+    """Shares of one image, (clusters, patches), from the plain exponentials.
+
+    Each of N patches has the mass 1 / (N + K), each of K clusters too, the dustbin
+    (N - K) / (N + K); at the end all is multiplied by N + K.
+    """
+    clusters, patches = scores.shape
+    mass = 1 / (patches + clusters)
+    kernel = np.exp(np.vstack([scores, np.full((1, patches), dustbin)]))
+    taken = [mass] * clusters + [mass * (patches - clusters)]
+    u, v = [1.0] * (clusters + 1), [1.0] * patches
+    for _ in range(3):
+        for k in range(clusters + 1):
+            u[k] = taken[k] / sum(kernel[k, i] * v[i] for i in range(patches))
+        for i in range(patches):
+            v[i] = mass / sum(kernel[k, i] * u[k] for k in range(clusters + 1))
+    plan = [[kernel[k, i] * u[k] * v[i] for i in range(patches)] for k in range(clusters)]
+    return np.array(plan) * (patches + clusters)
+
+
+def perceptron(layers: nn.Sequential, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Linear, ReLU, linear, of one vector."""
+    first, last = (layer for layer in layers if hasattr(layer, "weight"))
+    for layer in (first, last):
+        weight = layer.weight.detach().double().numpy().reshape(len(layer.bias), -1)
+        x = weight @ x + layer.bias.detach().double().numpy()
+        if layer is first:
+            x = np.maximum(x, 0)
+    return x
+
+
+def unit(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    return x / math.sqrt((x**2).sum())
+
+
+def test_the_vector_is_the_papers() -> None:
+    net = randomised()
+    patches, whole = random_input()
+    found = net(patches, whole).detach().numpy()
+    assert found.dtype == np.float32 and found.shape == (2, TOKEN + SIZE * CLUSTERS)
+    for image in range(2):
+        rows = patches[image].flatten(1).T.double().numpy()
+        scores = np.array([perceptron(net.score, row) for row in rows]).T
+        features = np.array([perceptron(net.cluster_features, row) for row in rows])
+        shares = sinkhorn_by_loops(scores, net.dust_bin.item())
+        summed = np.zeros((SIZE, CLUSTERS))
+        for k in range(CLUSTERS):
+            for i in range(len(rows)):
+                summed[:, k] += shares[k, i] * features[i]
+            summed[:, k] = unit(summed[:, k])
+        token = unit(perceptron(net.token_features, whole[image].double().numpy()))
+        expected = unit(np.concatenate([token, summed.ravel()]))
+        np.testing.assert_allclose(found[image], expected, atol=2e-6)
+
+
+@pytest.mark.parametrize("scale", [0.1, 3.0, 30.0])
+def test_shares_are_sinkhorns(scale: float) -> None:
+    generator = torch.Generator().manual_seed(2)
+    scores = scale * torch.randn(3, 8, 20, generator=generator, dtype=torch.float64)
+    found = assignment(scores, torch.tensor(1.3)).numpy()
+    for one, of_image in zip(found, scores.numpy(), strict=True):
+        np.testing.assert_allclose(one, sinkhorn_by_loops(of_image, float(np.float32(1.3))))
+    single = assignment(scores.float(), torch.tensor(1.3))
+    torch.testing.assert_close(single.double(), torch.from_numpy(found), rtol=1e-3, atol=1e-5)
+
+
+def test_no_patch_gives_more_than_it_has_and_huge_scores_stay_numbers() -> None:
+    generator = torch.Generator().manual_seed(3)
+    scores = 300 * torch.randn(2, 64, 529, generator=generator)
+    shares = assignment(scores, torch.tensor(-200.0))
+    assert shares.isfinite().all() and (shares >= 0).all()
+    assert shares.sum(1).max() < 1 + 1e-4
+    assert shares.sum() > 10
+
+
+def test_equal_scores_share_equally() -> None:
+    clusters, patches = 6, 30
+    shares = assignment(torch.zeros(1, clusters, patches), torch.tensor(0.0))
+    # each cluster takes the mass 1 of all patches alike
+    torch.testing.assert_close(shares, torch.full((1, clusters, patches), 1 / patches))
+
+
+def test_a_patch_for_the_dustbin_does_not_count() -> None:
+    net = randomised()
+    patches, whole = random_input()
+
+    def with_sixth(value: float, score: float) -> torch.Tensor:
+        changed = net.cluster_features(patches).detach().clone()
+        changed[:, :, 1, 2] = value
+        scores = net.score(patches).detach().clone()
+        scores[:, :, 1, 2] = score
+        scores = scores.flatten(2)
+        return torch.matmul(changed.flatten(2), assignment(scores, net.dust_bin).mT)
+
+    assert (with_sixth(1.0, 0.0) - with_sixth(5.0, 0.0)).abs().max() > 0.1
+    torch.testing.assert_close(with_sixth(1.0, -40.0), with_sixth(5.0, -40.0))
+
+
+def test_the_order_of_patches_does_not_matter() -> None:
+    net = randomised()
+    patches, whole = random_input()
+    turned = patches.flip(2, 3).transpose(2, 3)
+    torch.testing.assert_close(net(patches, whole), net(turned, whole), rtol=1e-4, atol=1e-6)
+
+
+def test_it_needs_more_patches_than_clusters() -> None:
+    net = randomised()
+    with pytest.raises(OptionError, match="an image of 4 patches is too small for 4 clusters"):
+        net(*random_input(rows=2, columns=2))
+    assert net(*random_input(rows=1, columns=5)).isfinite().all()

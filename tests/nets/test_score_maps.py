@@ -10,9 +10,19 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
-from megloc_kapture.nets.score_maps import select_pixels, suppress_non_maxima, window_maximum
+from megloc_kapture.nets.score_maps import (
+    parabola_peak,
+    select_keypoints,
+    select_pixels,
+    soft_argmax,
+    suppress_non_maxima,
+    window_maximum,
+)
 
 Scores = NDArray[np.float32]
+XY = np.array([[3.5, 1.5], [0.5, 1.5], [2.5, 0.5], [1.5, 2.5]], np.float32)
+SCORES = np.array([0.5, 0.5, 0.9, 0.5], np.float32)
+SIZE = (3, 4)
 
 
 def random_scores(seed: int, shape: tuple[int, int]) -> Scores:
@@ -115,3 +125,91 @@ def test_the_mask_comes_before_the_choice_of_the_best() -> None:
     assert found.num_masked == 4
     everything = select_pixels(scores, threshold=0.5)
     assert found.xy.tolist() == everything.xy[4:10].tolist()
+
+
+def blob(x: float, y: float, sigma_px: float, size: tuple[int, int] = (21, 25)) -> torch.Tensor:
+    rows, columns = torch.meshgrid(
+        torch.arange(size[0], dtype=torch.float64),
+        torch.arange(size[1], dtype=torch.float64),
+        indexing="ij",
+    )
+    return torch.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * sigma_px**2))
+
+
+@pytest.mark.parametrize("sigma_px", [1.5, 2.0, 4.0])
+@pytest.mark.parametrize(("dx", "dy"), [(0.0, 0.0), (0.3, -0.4), (-0.45, 0.1), (0.25, 0.25)])
+def test_the_parabola_finds_the_centre_of_a_blob(dx: float, dy: float, sigma_px: float) -> None:
+    found = parabola_peak(blob(12 + dx, 10 + dy, sigma_px), torch.tensor([[12, 10]]))
+    assert (found - torch.tensor([[12 + dx, 10 + dy]])).abs().max() < 0.05
+
+
+def test_the_parabola_is_exact_on_a_tilted_paraboloid() -> None:
+    rows, columns = torch.meshgrid(
+        torch.arange(9, dtype=torch.float64), torch.arange(9, dtype=torch.float64), indexing="ij"
+    )
+    u, v = columns - 4.2, rows - 3.9
+    found = parabola_peak(5 - u * u - 2 * v * v + 0.7 * u * v, torch.tensor([[4, 4]]))
+    torch.testing.assert_close(found, torch.tensor([[4.2, 3.9]], dtype=torch.float64))
+
+
+def test_the_parabola_goes_half_a_pixel_at_most_and_stays_on_flat_ground() -> None:
+    slope = torch.arange(9, dtype=torch.float64).repeat(9, 1) ** 2 * 0.1
+    slope = slope + slope.T * 0.5
+    found = parabola_peak(slope, torch.tensor([[4, 4]]))
+    assert (found - 4).abs().max() <= 0.5
+    flat = parabola_peak(torch.ones(9, 9), torch.tensor([[4, 4]]))
+    assert flat.tolist() == [[4.0, 4.0]]
+
+
+def test_soft_argmax_by_hand() -> None:
+    scores = torch.zeros(7, 8, dtype=torch.float64)
+    scores[3, 4], scores[3, 5], scores[2, 4] = 0.5, 0.3, 0.2
+    e = torch.exp(scores[2:5, 3:6] / 0.1)
+    expected_x = 4 + float((e[:, 2] - e[:, 0]).sum() / e.sum())
+    expected_y = 3 + float((e[2] - e[0]).sum() / e.sum())
+    found = soft_argmax(scores, torch.tensor([[4, 3]]), 1, 0.1)
+    torch.testing.assert_close(found, torch.tensor([[expected_x, expected_y]], dtype=torch.float64))
+    assert expected_x > 4 > 3 > expected_y
+
+
+def test_soft_argmax_of_a_symmetrical_peak_is_its_pixel() -> None:
+    found = soft_argmax(blob(12, 10, 1.0), torch.tensor([[12, 10]]), 2, 0.1)
+    assert (found - torch.tensor([[12.0, 10.0]])).abs().max() < 1e-12
+
+
+def test_no_pixels() -> None:
+    none = torch.zeros(0, 2, dtype=torch.int64)
+    assert soft_argmax(torch.ones(5, 5), none, 2, 0.1).shape == (0, 2)
+    assert parabola_peak(torch.ones(5, 5), none).shape == (0, 2)
+
+
+def test_best_first_and_ties_by_y_then_x() -> None:
+    rows, num_masked = select_keypoints(XY, SCORES, size=SIZE, mask=None, max_keypoints=10)
+    assert rows.tolist() == [2, 1, 0, 3] and num_masked == 0
+    rows, _ = select_keypoints(XY, SCORES, size=SIZE, mask=None, max_keypoints=2)
+    assert rows.tolist() == [2, 1]
+
+
+def test_the_mask_comes_before_the_limit() -> None:
+    mask = np.ones(SIZE, bool)
+    mask[0, 2] = mask[1, 0] = False
+    rows, num_masked = select_keypoints(XY, SCORES, size=SIZE, mask=mask, max_keypoints=1)
+    assert rows.tolist() == [0] and num_masked == 2
+
+
+def test_a_keypoint_stands_in_the_pixel_that_holds_it() -> None:
+    # (2, 1) begins the pixel of column 2 and row 1; the image's far edge belongs to its last pixel
+    xy = np.array([[1.99, 0.99], [2.0, 1.0], [4.0, 3.0]], np.float32)
+    scores = np.array([0.3, 0.2, 0.1], np.float32)
+    for row, pixel in enumerate([(0, 1), (1, 2), (2, 3)]):
+        mask = np.zeros(SIZE, bool)
+        mask[pixel] = True
+        rows, num_masked = select_keypoints(xy, scores, size=SIZE, mask=mask, max_keypoints=9)
+        assert rows.tolist() == [row] and num_masked == 2
+
+
+def test_nothing_to_select_from() -> None:
+    none = np.zeros((0, 2), np.float32)
+    mask = np.zeros(SIZE, bool)
+    rows, num_masked = select_keypoints(none, SCORES[:0], size=SIZE, mask=mask, max_keypoints=9)
+    assert len(rows) == 0 and num_masked == 0

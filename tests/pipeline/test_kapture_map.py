@@ -14,7 +14,7 @@ from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.evaluation.metrics import pose_errors
 from megloc_kapture.geometry.cameras import project, shift_principal_point
 from megloc_kapture.io.kapture import FeatureWriter, KaptureFolder, Sensor, write_sensors
-from megloc_kapture.localization.correspondences import observed_matches
+from megloc_kapture.localization.map_index import observed_matches
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.presets import options_of_preset

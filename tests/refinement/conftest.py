@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.refinement.photometric import LevelProblem
-from megloc_kapture.refinement.photometric_points import ChosenPoints
-from megloc_kapture.refinement.photometric_pyramid import Level
+from megloc_kapture.refinement.pyramid import ChosenPoints, Level
 from megloc_kapture.values import Camera, RigidTransform
 
 Array = NDArray[np.float64]

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.plugins import DepthView
+from megloc_kapture.refinement.acceptance import CHI2_OF_CHANCE
 from megloc_kapture.refinement.consistency import (
     MAX_TESTED,
     MAX_TRIED,
@@ -22,15 +23,16 @@ from megloc_kapture.refinement.consistency import (
     Consistency,
     Displacement,
     HoldsOut,
-    consistency,
-    held_out,
-    sample,
+    judge_consistency,
+    refine_held_out,
+    spread_names,
 )
-from megloc_kapture.refinement.references import ReferenceImages
+from megloc_kapture.refinement.references import (
+    ReferenceImages,
+    RenderingOptions,
+    RenderingReference,
+)
 from megloc_kapture.refinement.rendering import Rendering
-from megloc_kapture.refinement.rendering_acceptance import CHI2_OF_CHANCE
-from megloc_kapture.refinement.rendering_options import RenderingOptions
-from megloc_kapture.refinement.rendering_views import RenderingReference
 from megloc_kapture.values import Camera, RigidTransform
 
 Array = NDArray[np.float64]
@@ -144,7 +146,9 @@ def verdict(images: Map) -> Consistency:
     assert isinstance(rendering, HoldsOut)
     poses = ReferenceImages({name: each.cam_from_world for name, each in images.items()})
     scene = Scene(images)
-    return consistency(rendering.hold_out(name, poses, scene) for name in sample(list(images)))
+    return judge_consistency(
+        rendering.hold_out(name, poses, scene) for name in spread_names(list(images))
+    )
 
 
 def posed(images: Map, change: Callable[[int, RigidTransform], RigidTransform]) -> Map:
@@ -298,7 +302,7 @@ def test_what_a_wall_hides_is_no_reference(corner: Map) -> None:
     def displace(query: object, references: object, given: object) -> None:
         asked.append(len(references))  # type: ignore[arg-type]
 
-    assert held_out("0.png", poses, Scene(images), displace, max_references=4) is None
+    assert refine_held_out("0.png", poses, Scene(images), displace, max_references=4) is None
     assert not asked
 
 
@@ -309,7 +313,7 @@ def known(squared_distance: float, moved_px: float = 0.5) -> Displacement:
 @given(st.lists(st.booleans(), min_size=MIN_TESTED, max_size=MAX_TESTED))
 def test_most_of_the_images_decide(wrong: list[bool]) -> None:
     values = [CHI2_OF_CHANCE * (1.01 if each else 0.99) for each in wrong]
-    found = consistency(map(known, values))
+    found = judge_consistency(map(known, values))
     assert (found.images, found.contradicting) == (len(wrong), sum(wrong))
     assert found.consistent == (sum(wrong) <= len(wrong) / 2)
     assert found.median is not None
@@ -322,21 +326,21 @@ def test_what_alignment_does_not_resolve_contradicts_nothing() -> None:
 
 
 def test_few_images_decide_nothing() -> None:
-    few = consistency([None, *[known(1.0)] * (MIN_TESTED - 1), None])
+    few = judge_consistency([None, *[known(1.0)] * (MIN_TESTED - 1), None])
     assert "not known" in few.reason and few.images == MIN_TESTED - 1
-    assert consistency([None, *[known(1.0)] * MIN_TESTED]).consistent
+    assert judge_consistency([None, *[known(1.0)] * MIN_TESTED]).consistent
 
 
 def test_no_more_is_asked_for_than_is_needed() -> None:
     asked = iter([known(1.0)] * 100)
-    assert consistency(asked).images == MAX_TESTED
+    assert judge_consistency(asked).images == MAX_TESTED
     assert len(list(asked)) == 100 - MAX_TESTED
 
 
 @given(st.integers(0, 3000))
 def test_a_sample_is_bounded_and_spread(count: int) -> None:
     names = [f"{k:05d}" for k in range(count)]
-    found = sample(names[::-1])
+    found = spread_names(names[::-1])
     assert len(found) == min(count, MAX_TRIED) == len(set(found))
     assert set(found) <= set(names)
     for first in (8, 32):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,9 +15,14 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.geometry.cameras import project
-from megloc_kapture.refinement.photometric import Alignment, LevelProblem, perturbed
-from megloc_kapture.refinement.photometric_points import ChosenPoints
-from megloc_kapture.refinement.photometric_pyramid import Level
+from megloc_kapture.refinement.photometric import (
+    Alignment,
+    LevelProblem,
+    minimise,
+    perturbed,
+    unoccluded_points,
+)
+from megloc_kapture.refinement.pyramid import ChosenPoints, Level
 from megloc_kapture.values import Camera, RigidTransform
 
 Array = NDArray[np.float64]
@@ -134,3 +140,68 @@ def test_a_lens_that_folds_back_does_not_show_what_is_outside() -> None:
         Alignment(RigidTransform.identity(), np.ones((1, 1)), np.zeros((1, 1)), 1.0)
     )
     np.testing.assert_array_equal(np.isnan(rows[:, 0, 0]), [True, False])
+
+
+def test_a_step_solves_the_whole_system(problem: Problems) -> None:
+    aligned, truth = problem(channels=2, wrong=0.1)
+    at = aligned.nuisance_at(perturbed(truth, np.array([2e-3, -2e-3, 1e-3, 0.01, -0.01, 0.015])))
+    rows = aligned.rows(at)
+    seen = ~np.isnan(rows[:, 0, 0])
+    rows, groups = rows[seen], aligned.chosen.groups[seen]
+    scale2 = 4.0 * at.deviation**2
+    weights = (1 + (rows[..., 0] ** 2).mean(1) / scale2) ** -2 / 2
+    # unknowns: the pose, then gain and bias of reference 0 channel 0, of reference 0 channel 1 ...
+    jacobian = np.zeros((len(rows), 2, 6 + 8))
+    jacobian[..., :6] = rows[..., 1:7]
+    for c in range(2):
+        first = 6 + 2 * (2 * groups + c)
+        jacobian[np.arange(len(rows)), c, first] = rows[:, c, 7]
+        jacobian[np.arange(len(rows)), c, first + 1] = 1
+    matrix = np.einsum("n,nci,ncj->ij", weights, jacobian, jacobian)
+    gradient = np.einsum("n,nci,nc->i", weights, jacobian, rows[..., 0])
+    expected = np.linalg.solve(matrix, -gradient)
+    step = aligned.system_at(at, scale2).step(0.0)
+    assert step is not None
+    pose_step, gains, biases = step
+    np.testing.assert_allclose(pose_step, expected[:6], rtol=1e-5)
+    own = np.stack([gains, biases], axis=-1).ravel()
+    np.testing.assert_allclose(own, expected[6:], rtol=1e-5, atol=1e-8)
+
+
+def error_vector(found: RigidTransform, truth: RigidTransform) -> Array:
+    true_from_found = truth @ found.inverse()
+    vector = Rotation.from_matrix(true_from_found.rotation_matrix()).as_rotvec()
+    return np.concatenate([vector, true_from_found.translation])
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_the_true_pose_is_found_with_gains_and_biases_among_outliers(
+    problem: Problems, channels: int
+) -> None:
+    aligned, truth = problem("OPENCV", channels=channels, count=1500, wrong=0.3)
+    start = perturbed(truth, np.array([1e-3, -1e-3, 1e-3, 0.006, -0.005, 0.006]))
+    found = minimise(aligned, aligned.nuisance_at(start), last_step_px=1e-4)
+    assert np.abs(error_vector(found.cam_from_world, truth)).max() < 1e-4
+    np.testing.assert_allclose(found.gains, [[0.7] * channels, [1.3] * channels], atol=1e-3)
+    np.testing.assert_allclose(found.biases, [[0.2] * channels, [-0.4] * channels], atol=1e-3)
+
+
+def test_points_behind_something_else_are_left_out(problem: Problems) -> None:
+    aligned, truth = problem(count=6000, noise=0.2)
+    other, _ = problem(count=1, seed=9)
+    values = aligned.level.values.copy()
+    values[:, :80] = other.level.values[:, :80]
+    hidden = LevelProblem(
+        aligned.chosen, replace(aligned.level, values=values), aligned.camera, truth
+    )
+    keep = unoccluded_points(hidden, hidden.nuisance_at(truth))
+    behind = project(aligned.camera, truth, aligned.chosen.points)[:, 0] < 320
+    assert keep[behind].mean() < 0.1
+    assert keep[~behind].mean() > 0.95
+    assert unoccluded_points(aligned, aligned.nuisance_at(truth)).all()
+
+
+def test_points_that_are_not_seen_are_kept(problem: Problems) -> None:
+    aligned, truth = problem()
+    behind = perturbed(truth, np.array([np.pi, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    assert unoccluded_points(aligned, aligned.nuisance_at(behind)).all()

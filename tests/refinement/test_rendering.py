@@ -19,15 +19,29 @@ from megloc_kapture.datasets.synthetic.shots import Shot
 from megloc_kapture.datasets.synthetic.views import PlacePainter, View
 from megloc_kapture.datasets.synthetic.world import SyntheticWorld, build_world
 from megloc_kapture.errors import DataError
+from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.geometry.poses import rotation_angles_deg
 from megloc_kapture.plugins import DepthView, PoseRefinement, PoseRefiner
-from megloc_kapture.refinement.rendering import Rendering, _Refining, refine_by_rendering
-from megloc_kapture.refinement.rendering_options import RenderingOptions
-from megloc_kapture.refinement.rendering_views import RenderingQuery, RenderingReference
+from megloc_kapture.refinement.photometric import perturbed
+from megloc_kapture.refinement.pyramid import ChosenPoints, Level
+from megloc_kapture.refinement.references import (
+    RenderingOptions,
+    RenderingQuery,
+    RenderingReference,
+)
+from megloc_kapture.refinement.rendering import (
+    Rendering,
+    _Refining,
+    best_rotations,
+    refine_by_rendering,
+    rotation_grid,
+)
 from megloc_kapture.values import Camera, RigidTransform
 
 OPTIONS = SyntheticWorldOptions(num_places=1, day_queries=2, night_queries=1)
 HERE = RigidTransform.identity()
+CAMERA = Camera("OPENCV", 640, 480, (500.0, 505.0, 322.0, 239.0, -0.05, 0.01, 1e-3, 0.0))
+TURNED = RigidTransform((0.8, 0.6, 0.0, 0.0), (1.0, -2.0, 0.5))
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,7 +211,9 @@ def test_a_search_that_leads_astray_does_not_spoil_a_good_start(
 ) -> None:
     away = start_from(case.truth, 3, m=0.1, deg=3.0)
     monkeypatch.setattr(
-        _Refining, "_searched", lambda self, coarsest, start, sight: self._aligned(0, away, sight)
+        _Refining,
+        "_align_from_search",
+        lambda self, coarsest, start, sight: self._align(0, away, sight),
     )
     refined = run(case, start_from(case.truth, 4, m=0.01, deg=0.1))
     m, deg = errors(refined.cam_from_world, case.truth)
@@ -372,3 +388,44 @@ def test_images_of_another_size_are_refused(case: Case) -> None:
     small = replace(case.query, image=case.query.image[:100])
     with pytest.raises(DataError, match="does not fit a camera"):
         refine_by_rendering(small, case.references, case.truth)
+
+
+def textured_points() -> tuple[ChosenPoints, Level]:
+    rng = np.random.default_rng(0)
+    image = cv2.GaussianBlur(rng.normal(size=(120, 160)), (0, 0), 2.5).astype(np.float32)
+    rows, columns = rng.integers(5, 115, 1500), rng.integers(5, 155, 1500)
+    rays = bearing_rays(CAMERA, 4.0 * np.stack([columns + 0.5, rows + 0.5], axis=1))
+    points = TURNED.inverse().apply(rays * rng.uniform(3.0, 8.0, (1500, 1)))
+    values = 3.0 * image[rows, columns][:, None].astype(np.float64) + 1.0
+    chosen = ChosenPoints(points, values, np.zeros(1500, np.int64))
+    return chosen, Level(image[..., None], np.ones((120, 160), bool), 0.25, 0.25)
+
+
+@pytest.mark.parametrize(
+    "turn_deg", [(2.0, 0.0, 0.0), (0.0, -3.0, 0.0), (1.5, 2.0, 1.0), (0.0, 0.0, -3.0)]
+)
+def test_the_turn_is_found(turn_deg: tuple[float, float, float]) -> None:
+    chosen, level = textured_points()
+    start = perturbed(TURNED, np.radians([*turn_deg, 0.0, 0.0, 0.0]))
+    found = best_rotations(chosen, level, CAMERA, start, max_deg=4.0, count=3)
+    assert found[0] is start and 2 <= len(found) <= 4
+    left = found[1] @ TURNED.inverse()
+    # within a step of the grid in each direction
+    assert np.degrees(2 * np.linalg.norm(left.quat_wxyz[1:])) < 1.3
+    np.testing.assert_allclose(found[1].center(), start.center(), atol=1e-9)
+    again = best_rotations(chosen, level, CAMERA, start, max_deg=4.0, count=3)
+    assert again == found
+
+
+def test_nothing_is_searched_where_nothing_is_asked_for() -> None:
+    chosen, level = textured_points()
+    assert best_rotations(chosen, level, CAMERA, TURNED, max_deg=0.0, count=3) == [TURNED]
+
+
+def test_the_grid_has_no_turn_beyond_the_limit_and_none_at_all() -> None:
+    _, level = textured_points()
+    for limit in (1.0, 4.0, 20.0):
+        grid = rotation_grid(level, CAMERA, limit)
+        lengths = np.degrees(np.linalg.norm(grid, axis=1))
+        assert lengths[0] == 0.0 and lengths[-1] <= limit + 1e-9
+        assert (np.diff(lengths) >= 0).all() and len(grid) < 6000

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from collections import defaultdict
 from collections.abc import Callable
 from typing import Any
 
@@ -14,7 +15,16 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.retrieval.fusion import FusionOptions, fuse
+from megloc_kapture.retrieval.fusion import (
+    FusionOptions,
+    borda,
+    concatenate,
+    fuse,
+    reciprocal_rank,
+    round_robin,
+)
+from megloc_kapture.retrieval.search import rank_by_similarity, rank_fused
+from megloc_kapture.retrieval.vectors import ConcatenatedBlocks
 
 needs_kapture_localization = pytest.mark.skipif(
     importlib.util.find_spec("kapture_localization") is None,
@@ -249,3 +259,127 @@ def test_what_cannot_be_fused_is_refused() -> None:
         fuse([np.zeros((1, 2)), np.zeros((2, 1))], FusionOptions())
     with pytest.raises(ValidationError, match="gamma is a share"):
         FusionOptions(method="mean_and_min", gamma=1.5)
+
+
+def unit(seed: int, count: int, dimension: int) -> NDArray[np.float32]:
+    rows = np.random.default_rng(seed).normal(size=(count, dimension))
+    return (rows / np.linalg.norm(rows, axis=1)[:, None]).astype(np.float32)
+
+
+@pytest.mark.parametrize("weights", [None, [1.0, 1.0, 1.0], [5.0, 1.0, 0.25]])
+def test_the_inner_product_is_the_weighted_mean_of_cosines(weights: list[float] | None) -> None:
+    a = [unit(k, 6, 3 + k) for k in range(3)]
+    b = [unit(k + 10, 9, 3 + k) for k in range(3)]
+    cosines = [x.astype(np.float64) @ y.T.astype(np.float64) for x, y in zip(a, b, strict=True)]
+    fused = concatenate(a, weights)
+    assert fused.shape == (6, 12) and fused.dtype == np.float32
+    expected = np.average(cosines, axis=0, weights=weights)
+    np.testing.assert_allclose(fused @ concatenate(b, weights).T, expected, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(fused, axis=1), 1, atol=1e-6)
+
+
+def test_a_feature_of_zeros_takes_its_share_away() -> None:
+    a, b = unit(0, 1, 4), unit(1, 1, 5)
+    with_zero = concatenate([a, np.zeros((1, 5), dtype=np.float32)], [3, 1])
+    np.testing.assert_allclose(with_zero @ concatenate([a, b], [3, 1]).T, 0.75, atol=1e-6)
+
+
+def test_blocks_of_several_features_rank_as_the_mean_does() -> None:
+    queries = [unit(1, 20, 16), unit(2, 20, 8)]
+    database = [unit(3, 300, 16), unit(4, 300, 8)]
+    blocks = ConcatenatedBlocks(database, [2, 1])
+    assert len(blocks) == 300 and blocks.dimension == 24
+    early = rank_by_similarity(concatenate(queries, [2, 1]), blocks, 10)
+    mean = FusionOptions(method="mean")
+    late = rank_fused(queries, database, 10, fusion=mean, weights=[2, 1])
+    np.testing.assert_array_equal(early[0], late[0])
+    np.testing.assert_allclose(early[1], late[1], atol=1e-6)
+
+
+def test_what_cannot_be_concatenated_is_refused() -> None:
+    with pytest.raises(DataError, match="2, 3 images"):
+        concatenate([unit(0, 2, 4), unit(0, 3, 4)])
+    with pytest.raises(DataError, match=r"\[2, 3\] rows"):
+        ConcatenatedBlocks([unit(0, 2, 4), unit(0, 3, 4)])
+    with pytest.raises(OptionError, match="weights"):
+        ConcatenatedBlocks([unit(0, 2, 4), unit(0, 2, 4)], [1.0, 0.0])
+    with pytest.raises(OptionError):
+        concatenate([])
+
+
+@st.composite
+def ranked_lists(draw: st.DrawFn) -> list[NDArray[np.int64]]:
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    queries, lists = draw(st.integers(0, 4)), []
+    for _ in range(draw(st.integers(1, 4))):
+        length = draw(st.integers(0, 8))
+        ranked = np.full((queries, length), -1, dtype=np.int64)
+        for row in ranked:
+            there = rng.integers(0, length + 1)
+            row[:there] = rng.permutation(10)[:there]
+        lists.append(ranked)
+    return lists
+
+
+def naive_round_robin(lists: list[list[int]], top_k: int) -> list[int]:
+    taken: list[int] = []
+    for turn in range(max(map(len, lists), default=0)):
+        for ranked in lists:
+            if turn < len(ranked) and ranked[turn] >= 0 and ranked[turn] not in taken:
+                taken.append(ranked[turn])
+    return (taken + [-1] * top_k)[:top_k]
+
+
+@given(ranked_lists(), st.integers(0, 12))
+def test_round_robin(lists: list[NDArray[np.int64]], top_k: int) -> None:
+    indices, scores = round_robin(lists, top_k)
+    assert indices.shape == scores.shape == (len(lists[0]), top_k)
+    for row in range(len(lists[0])):
+        expected = naive_round_robin([ranked[row].tolist() for ranked in lists], top_k)
+        assert indices[row].tolist() == expected
+        points = [float(top_k - k) if i >= 0 else -np.inf for k, i in enumerate(expected)]
+        assert scores[row].tolist() == points
+
+
+@given(ranked_lists(), st.integers(1, 12), st.booleans())
+def test_points_add_up(lists: list[NDArray[np.int64]], top_k: int, reciprocal: bool) -> None:
+    weights = [float(k + 1) for k in range(len(lists))]
+    longest = max(ranked.shape[1] for ranked in lists)
+    fused = (
+        reciprocal_rank(lists, top_k, weights, constant=7)
+        if reciprocal
+        else borda(lists, top_k, weights)
+    )
+    for row in range(len(lists[0])):
+        points: defaultdict[int, float] = defaultdict(float)
+        for ranked, weight in zip(lists, weights, strict=True):
+            for rank, image in enumerate(ranked[row].tolist()):
+                if image >= 0:
+                    point = 1 / (7 + rank + 1) if reciprocal else longest - rank
+                    points[image] += weight / sum(weights) * point
+        best = sorted(points, key=lambda image: (-round(points[image], 12), image))[:top_k]
+        found = [image for image in fused[0][row].tolist() if image >= 0]
+        assert len(found) == len(best)
+        # of equal sums the order may hang on rounding: points are compared, not images
+        np.testing.assert_allclose([points[i] for i in found], [points[i] for i in best])
+        np.testing.assert_allclose(fused[1][row, : len(best)], [points[i] for i in best], rtol=1e-6)
+
+
+def test_equal_sums_keep_the_order_of_the_images() -> None:
+    lists = [np.array([[5, 3, 9]]), np.array([[3, 5, 7]])]
+    assert reciprocal_rank(lists, 4)[0].tolist() == [[3, 5, 7, 9]]
+    assert borda(lists, 4)[0].tolist() == [[3, 5, 7, 9]]
+
+
+def test_the_papers_constant_is_the_default() -> None:
+    _, scores = reciprocal_rank([np.array([[4]]), np.array([[4]])], 1)
+    np.testing.assert_allclose(scores, 1 / 61, rtol=1e-6)
+
+
+def test_lists_that_cannot_be_fused_are_refused() -> None:
+    one, other = np.zeros((1, 2), dtype=np.int64), np.zeros((2, 2), dtype=np.int64)
+    for fused in (round_robin, borda, reciprocal_rank):
+        with pytest.raises(OptionError):
+            fused([], 3)
+        with pytest.raises(DataError, match="shapes"):
+            fused([one, other], 3)

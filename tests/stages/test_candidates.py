@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
-from megloc_kapture.retrieval.diversity import DiversityOptions
 from megloc_kapture.retrieval.fusion import FusionOptions, fuse
+from megloc_kapture.retrieval.reranking import DiversityOptions
 from megloc_kapture.stages import candidates
 from megloc_kapture.stages.candidates import Candidates, QueryPairsOptions, Retrieval
 from megloc_kapture.stages.image_pairs import MappingPairsOptions, pair_map_images, pair_queries

@@ -23,9 +23,11 @@ from megloc_kapture.io.kapture import (
     write_points3d,
     write_sensors,
 )
-from megloc_kapture.mapping.pairs_by_covisibility import PairsByCovisibilityOptions
-from megloc_kapture.mapping.pairs_by_poses import PairsByPosesOptions
-from megloc_kapture.mapping.pairs_by_sequence import PairsBySequenceOptions
+from megloc_kapture.mapping.pairs import (
+    PairsByCovisibilityOptions,
+    PairsByPosesOptions,
+    PairsBySequenceOptions,
+)
 from megloc_kapture.stages.candidates import QueryPairsOptions, Retrieval, vectors_of
 from megloc_kapture.stages.image_pairs import (
     MappingPairsOptions,

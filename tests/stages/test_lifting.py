@@ -14,7 +14,7 @@ from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
 from megloc_kapture.geometry.cameras import px_from_cam
 from megloc_kapture.io.images import read_depth_map
 from megloc_kapture.io.kapture import KaptureFolder, write_sensors
-from megloc_kapture.mapping.lifting import LiftingOptions
+from megloc_kapture.mapping.depth import LiftingOptions
 from megloc_kapture.stages.depth_records import depth_records
 from megloc_kapture.stages.lifting import lift_map
 from megloc_kapture.stages.local_features import extract_local_features

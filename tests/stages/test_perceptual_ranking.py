@@ -11,8 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from megloc_kapture.geometry.cameras import bearing_rays, project
-from megloc_kapture.localization.distinctive_inliers import DistinctiveInliers
-from megloc_kapture.localization.ranking import InlierCount
+from megloc_kapture.localization.ranking import DistinctiveInliers, InlierCount
 from megloc_kapture.localization.structure import StructureDistance
 from megloc_kapture.plugins import DepthView, HypothesisView, PoseHypothesis, PoseRanker
 from megloc_kapture.stages import perceptual_ranking

@@ -16,7 +16,7 @@ from megloc_kapture.datasets.synthetic.shots import Shot
 from megloc_kapture.datasets.synthetic.truth_masks import on_bonnet, on_movers, stands_still
 from megloc_kapture.datasets.synthetic.views import PlacePainter
 from megloc_kapture.features.rootsift import RootSift
-from megloc_kapture.preprocessing.mask_margin import with_margin
+from megloc_kapture.preprocessing.masks import with_margin
 
 OPTIONS = RobotCarTwinOptions(num_locations=1, moments_per_condition=2, size_px=256)
 SEED = OPTIONS.world().seed

@@ -13,8 +13,13 @@ from torch.nn import functional as F
 
 from espnetv2_segmenter.network import EspNetV2Network
 from megloc_kapture.io.weights import WeightsFile, find_weights, read_weights, sha256_of
-from megloc_kapture.nets.loading import load_strictly
-from megloc_kapture.nets.runtime import NetworkOptions, image_tensor, inference, pick_device
+from megloc_kapture.nets.runtime import (
+    NetworkOptions,
+    image_tensor,
+    inference,
+    load_strictly,
+    pick_device,
+)
 
 # Cityscapes' train ids, and one for everything else
 CLASSES = (

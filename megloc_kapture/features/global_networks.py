@@ -1,0 +1,391 @@
+"""Global features by networks: NetVLAD, OpenIBL, AP-GeM, DELG, EigenPlaces and MegaLoc.
+
+Plugins of group ``megloc_kapture.global_features`` with their authors' weights: NetVLAD
+(Arandjelovic et al., CVPR 2016), OpenIBL (Ge et al., ECCV 2020, "SFRS"), AP-GeM (Revaud et al.,
+ICCV 2019), DELG (Cao et al., ECCV 2020), EigenPlaces (Berton et al., ICCV 2023) and MegaLoc (Berton
+and Masone, CVPR Workshops 2025).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+from pydantic import Field
+from torch import nn
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.weights import WeightsFile, find_weights, read_weights, sha256_of
+from megloc_kapture.nets.apgem import apgem_from, whitening_from
+from megloc_kapture.nets.delg import delg_from, describe
+from megloc_kapture.nets.dinov2 import PATCH_PX
+from megloc_kapture.nets.eigenplaces import eigenplaces_from
+from megloc_kapture.nets.megaloc import megaloc_from, squared
+from megloc_kapture.nets.netvlad import STRIDE_PX, VggNetVlad, netvlad, openibl
+from megloc_kapture.nets.runtime import (
+    NetworkOptions,
+    image_tensor,
+    inference,
+    pick_device,
+    sized_tensor,
+)
+
+Images = Sequence[NDArray[np.uint8]]
+Tensors = Mapping[str, torch.Tensor]
+
+_OPENIBL_WIDTH_PX, _OPENIBL_HEIGHT_PX = 640, 480
+_MEGALOC_SIZE_PX = 322  # the paper's, section 4
+
+
+class GlobalNetworkOptions(NetworkOptions):
+    """Options that these features share."""
+
+    weights: str
+
+
+class GlobalNetwork(ABC):
+    """Global features by a network with a checkpoint.
+
+    The type's name carries the model as well as the method, since vectors of different ones cannot
+    be compared.
+
+    Raises
+    ------
+    MissingWeightsError : the checkpoint is not there.
+    """
+
+    name: str
+    method: ClassVar[str]
+
+    def __init__(self, options: GlobalNetworkOptions) -> None:
+        self._device_name = options.device
+        self._weights = find_weights(options.weights)
+        stem = Path(self._weights.name.removesuffix(".gz")).stem
+        self.name = stem if self.method in stem else f"{self.method}-{stem}"
+
+    def weights(self) -> dict[str, str]:
+        """sha256 of the checkpoint by its file's name."""
+        return {self._weights.path.name: sha256_of(self._weights)}
+
+    def describe(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """The vector of an RGB image, uint8 (H, W, 3): float32 (D,), unit length.
+
+        Raises
+        ------
+        DataError : the checkpoint does not fit, or the image is too small.
+        OptionError : the device is not there.
+        """
+        return self.describe_many([image])[0]
+
+    @abstractmethod
+    def describe_many(self, images: Images) -> NDArray[np.float32]:
+        """The vectors of images of one size, float32 (B, D), as one by one but for rounding.
+
+        Raises as :meth:`describe`.
+        """
+
+    def _network(self, load: Callable[..., nn.Module], *arguments: Any) -> tuple[Any, torch.device]:
+        """The network that ``load`` makes of the checkpoint, and the device it is on."""
+        device = pick_device(self._device_name)
+        return _network(load, self._weights, device, *arguments), device
+
+
+# a run may use all of these features
+@lru_cache(maxsize=8)
+def _network(
+    load: Callable[..., nn.Module], weights: WeightsFile, device: torch.device, *arguments: Any
+) -> nn.Module:
+    return load(read_weights(weights), str(weights.path), *arguments).to(device)
+
+
+class NetVladOptions(GlobalNetworkOptions):
+    """Options of NetVLAD."""
+
+    weights: str = Field(
+        default="netvlad-pitts30k", description="netvlad-pitts30k, netvlad-tokyotm, or a file"
+    )
+    max_size_px: int = Field(
+        default=1024, ge=STRIDE_PX, description="longer side; smaller images stay as they are"
+    )
+
+
+class NetVlad(GlobalNetwork):
+    """NetVLAD on VGG-16 with its whitening: one vector of unit length, float32 (4096,)."""
+
+    name = method = "netvlad"
+    Options = NetVladOptions
+
+    def __init__(self, options: NetVladOptions | None = None) -> None:
+        self.options = options or NetVladOptions()
+        super().__init__(self.options)
+
+    def describe_many(self, images: Images) -> NDArray[np.float32]:
+        network, device = self._network(netvlad)
+        planes = [sized_tensor(image, self.options.max_size_px, device) for image in images]
+        return netvlad_vectors(network, planes, self.options.half_precision)
+
+
+def netvlad_vectors(
+    network: VggNetVlad,
+    images: Sequence[torch.Tensor],
+    half_precision: bool,
+) -> NDArray[np.float32]:
+    """Vectors (B, D) of unit length, of RGB images (1, 3, H, W) of one size, in [0, 1].
+
+    Only the convolutions are made in half precision; sums and whitening stay in float32.
+
+    Raises
+    ------
+    DataError : the images are less than 16 pixels a side.
+    """
+    device, (height, width) = images[0].device, images[0].shape[-2:]
+    if min(height, width) < STRIDE_PX:
+        raise DataError(
+            f"an image of {width}x{height} pixels as the network sees it cannot be described: "
+            f"it needs {STRIDE_PX} a side"
+        )
+    batch = torch.cat(list(images))
+    with inference(device, half_precision):
+        features = network.features(batch).float()
+        # colours of 0 to 255 can take this trunk beyond what float16 holds
+        overflow = half_precision and not bool(features.isfinite().all())
+    with inference(device):
+        if overflow:
+            features = network.features(batch)
+        return network.vectors(features).cpu().numpy()
+
+
+class OpenIblOptions(GlobalNetworkOptions):
+    """Options of OpenIBL."""
+
+    weights: str = Field(default="openibl", description="openibl, or a file")
+    max_size_px: int | None = Field(
+        default=None,
+        ge=STRIDE_PX,
+        description="longer side, ratio kept, smaller images as they are; None: all images are "
+        "made 640 x 480 whatever their ratio, as in training",
+    )
+
+
+class OpenIbl(GlobalNetwork):
+    """OpenIBL's VGG-16 with NetVLAD and PCA: one vector of unit length, float32 (4096,)."""
+
+    name = method = "openibl"
+    Options = OpenIblOptions
+
+    def __init__(self, options: OpenIblOptions | None = None) -> None:
+        self.options = options or OpenIblOptions()
+        super().__init__(self.options)
+
+    def describe_many(self, images: Images) -> NDArray[np.float32]:
+        network, device = self._network(openibl)
+        planes = [self._resized(image, device) for image in images]
+        return netvlad_vectors(network, planes, self.options.half_precision)
+
+    def _resized(self, image: NDArray[np.uint8], device: torch.device) -> torch.Tensor:
+        if self.options.max_size_px is None:
+            return image_tensor(official_size(image), device)
+        return sized_tensor(image, self.options.max_size_px, device)
+
+
+def official_size(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The image, uint8 (480, 640, 3), as the authors resize it.
+
+    Bilinear over all pixels that a smaller one covers, rounded to 8 bits.
+    """
+    size = (_OPENIBL_WIDTH_PX, _OPENIBL_HEIGHT_PX)
+    return np.asarray(Image.fromarray(image).resize(size, Image.Resampling.BILINEAR))
+
+
+class ApGemOptions(GlobalNetworkOptions):
+    """Options of AP-GeM."""
+
+    weights: str = Field(
+        default="apgem-resnet101-lm18",
+        description="apgem-resnet101-lm18 (Google-Landmarks), apgem-resnet101, or a file",
+    )
+    whitening: str = Field(
+        default="Landmarks_clean",
+        pattern=r"^[\w-]*$",
+        description="name of a PCA in the checkpoint, as the authors evaluate with it; empty: the "
+        "network's vectors as they are, which is what their tool for kapture writes by default",
+    )
+    whitening_power: float = Field(
+        default=0.25, ge=0, le=1, description="of the variances that components are divided by"
+    )
+    max_size_px: int | None = Field(
+        default=1024,
+        ge=32,
+        description="longer side that the network sees, as hloc has it; none: the image's own, as "
+        "the authors evaluate",
+    )
+
+
+class ApGem(GlobalNetwork):
+    """AP-GeM vectors of unit length, float32 (2048,).
+
+    The name tells the checkpoint and, with one, the whitening and its power: vectors of different
+    ones do not compare.
+    """
+
+    name = method = "apgem"
+    Options = ApGemOptions
+
+    def __init__(self, options: ApGemOptions | None = None) -> None:
+        self.options = options or ApGemOptions()
+        super().__init__(self.options)
+        if self.options.whitening:
+            self.name += f"-{self.options.whitening}-{self.options.whitening_power:g}"
+
+    def describe_many(self, images: Images) -> NDArray[np.float32]:
+        options = self.options
+        (net, *whitening), device = self._network(
+            _apgem_with_whitening, options.whitening, options.whitening_power
+        )
+        batch = torch.cat([sized_tensor(image, options.max_size_px, device) for image in images])
+        with inference(device, options.half_precision):
+            vectors = net.describe(batch)
+        with inference(device):
+            for whiten in whitening:
+                vectors = whiten(vectors)
+        return vectors.cpu().numpy()
+
+
+def _apgem_with_whitening(
+    tensors: Tensors, where: str, whitening: str, power: float
+) -> nn.ModuleList:
+    """The network, then the whitening of that name, if there is a name."""
+    modules: list[nn.Module] = [apgem_from(tensors, where)]
+    if whitening:
+        modules.append(whitening_from(tensors, whitening, where, power=power))
+    return nn.ModuleList(modules)
+
+
+class DelgOptions(GlobalNetworkOptions):
+    """Options of DELG; the defaults are the authors'."""
+
+    weights: str = Field(
+        default="delg-r101-gldv2clean",
+        description="delg-{r50,r101}-{gld,gldv2clean}, or a file: a SavedModel's tar, or the "
+        ".index in its folder variables",
+    )
+    max_size_px: int | None = Field(
+        default=1024, ge=32, description="longer side that scale 1 is of; none: the image's own"
+    )
+    scales: tuple[float, ...] = Field(
+        default=(0.70710677, 1.0, 1.4142135),
+        min_length=1,
+        description="whose vectors are summed; each is a run of the network",
+    )
+
+
+class Delg(GlobalNetwork):
+    """DELG vectors of unit length, float32 (2048,)."""
+
+    name = method = "delg"
+    Options = DelgOptions
+
+    def __init__(self, options: DelgOptions | None = None) -> None:
+        self.options = options or DelgOptions()
+        super().__init__(self.options)
+
+    def describe_many(self, images: Images) -> NDArray[np.float32]:
+        options = self.options
+        net, device = self._network(delg_from)
+        sized = np.stack([_with_longer_side(image, options.max_size_px) for image in images])
+        batch = torch.from_numpy(sized).to(device).permute(0, 3, 1, 2).float()
+        with inference(device, options.half_precision):
+            return describe(net, batch, options.scales).cpu().numpy()
+
+
+def _with_longer_side(image: NDArray[np.uint8], max_size_px: int | None) -> NDArray[np.uint8]:
+    """Made smaller as the authors do: Pillow's bilinear filter, which covers what it leaves out."""
+    height, width = image.shape[:2]
+    if max_size_px is None or max(height, width) <= max_size_px:
+        return image
+    scale = max_size_px / max(height, width)
+    size = max(round(width * scale), 1), max(round(height * scale), 1)
+    return np.asarray(Image.fromarray(image).resize(size, Image.Resampling.BILINEAR), np.uint8)
+
+
+class EigenPlacesOptions(GlobalNetworkOptions):
+    """Options of EigenPlaces."""
+
+    weights: str = Field(
+        default="eigenplaces",
+        description="eigenplaces (ResNet-50, 2048-d), or a file, also of ResNet-101, of fewer "
+        "components, or CosPlace's",
+    )
+    max_size_px: int | None = Field(
+        default=1024,
+        ge=32,
+        description="longer side that the network sees; none: the image's own, as the authors "
+        "evaluate",
+    )
+
+
+class EigenPlaces(GlobalNetwork):
+    """EigenPlaces' vector of an image, float32 (D,), unit length; D is 2048 or the checkpoint's."""
+
+    name = method = "eigenplaces"
+    Options = EigenPlacesOptions
+
+    def __init__(self, options: EigenPlacesOptions | None = None) -> None:
+        self.options = options or EigenPlacesOptions()
+        super().__init__(self.options)
+
+    def describe_many(self, images: Images) -> NDArray[np.float32]:
+        options = self.options
+        network, device = self._network(_eigenplaces_channels_last)
+        batch = torch.cat([sized_tensor(image, options.max_size_px, device) for image in images])
+        with inference(device, options.half_precision):
+            return network(batch).cpu().numpy()
+
+
+def _eigenplaces_channels_last(tensors: Tensors, where: str) -> nn.Module:
+    """The network with channels last, which is faster on a processor."""
+    network = eigenplaces_from(tensors, where)
+    return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+
+class MegaLocOptions(GlobalNetworkOptions):
+    """Options of MegaLoc."""
+
+    weights: str = Field(default="megaloc", description="name in the registry, or a file")
+    size_px: int = Field(
+        default=_MEGALOC_SIZE_PX,
+        ge=9 * PATCH_PX,  # with fewer patches not every cluster gets one
+        multiple_of=PATCH_PX,
+        description="both sides that the network sees; the map's must be the queries'",
+    )
+
+
+class MegaLoc(GlobalNetwork):
+    """MegaLoc's vector of an image, float32 (8448,), unit length.
+
+    The image is scaled to a square, its shape is not kept: so the paper evaluates.
+    """
+
+    name = method = "megaloc"
+    Options = MegaLocOptions
+
+    def __init__(self, options: MegaLocOptions | None = None) -> None:
+        self.options = options or MegaLocOptions()
+        super().__init__(self.options)
+        if self.options.size_px != _MEGALOC_SIZE_PX:
+            self.name += f"-{self.options.size_px}px"
+
+    def describe_many(self, images: Images) -> NDArray[np.float32]:
+        options = self.options
+        network, device = self._network(megaloc_from)
+        with inference(device):
+            batch = [squared(image_tensor(image, device), options.size_px) for image in images]
+        with inference(device, options.half_precision):
+            return network(torch.cat(batch)).cpu().numpy()

@@ -1,0 +1,225 @@
+"""Depth maps of map images: keypoints lifted to 3D points, and points verified by depth.
+
+An observation says that an image sees a point. Where the image has a depth map, the point must then
+lie on the surface that the sensor saw there. A surface is not known better than the sensor's noise,
+and near an edge not better than to some pixels; a triangulated point not better than its images
+determine it. So the point's depth is compared with the least and the greatest depth in a small
+window, widened by some standard deviations of both. Where the sensor has no depth, nothing is said.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, field_validator
+
+from megloc_kapture.geometry.cameras import bearing_rays, px_from_cam
+from megloc_kapture.values import Camera, Options, RigidTransform
+
+Floats = NDArray[np.float64]
+# a depth sensor beside the camera sees each point at a pixel that depends on its depth; a few
+# rounds find it, and what has not settled to a hundredth of its depth lies behind an edge
+_ROUNDS = 6
+_SETTLED = 0.01
+_SAME_CENTRE_M = 1e-9  # an offset that is left over from composing transforms
+# coefficients of z^0, z^1, z^2 of 0.0012 + 0.0019 (z - 0.4)^2
+_STRUCTURED_LIGHT = (0.001504, -0.00152, 0.0019)
+
+
+class LiftingOptions(Options):
+    """Options of lifting."""
+
+    max_jump: float = Field(
+        default=0.1,
+        gt=0,
+        description="the four depths around a keypoint may differ by this share of the smallest; "
+        "beyond, it lies on an edge and has no depth",
+    )
+
+
+def lift_keypoints(
+    keypoints_px: NDArray[np.floating[Any]],
+    depth_m: NDArray[np.float32],
+    image_camera: Camera,
+    depth_camera: Camera,
+    image_from_depth: RigidTransform,
+    options: LiftingOptions | None = None,
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """3D points of an image's keypoints, through a depth map of the same moment.
+
+    Depth is interpolated between the four pixels around a keypoint; where some of them have none,
+    the nearest that has counts.
+
+    Parameters
+    ----------
+    keypoints_px : (N, 2 or more), x and y first, in the image; COLMAP's pixel origin.
+    depth_m : float32 (H, W), along the depth camera's axis, 0 or less where unknown.
+    image_from_depth : from the depth camera's frame to the image camera's, metres.
+
+    Returns
+    -------
+    points : float64 (N, 3) in the image camera's frame, metres; NaN where there is no depth.
+    valid : bool (N,).
+    """
+    options = options or LiftingOptions()
+    rays = bearing_rays(image_camera, np.asarray(keypoints_px, np.float64)[:, :2])
+    depth_from_image = image_from_depth.inverse()
+    known = depth_m[depth_m > 0]
+    points = np.full(rays.shape, np.nan)
+    if not len(known) or not len(rays):
+        return points, np.zeros(len(rays), bool)
+    same_centre = bool(np.linalg.norm(image_from_depth.translation) < _SAME_CENTRE_M)
+    z = np.full(len(rays), float(np.median(known)))
+    settled = np.zeros(len(rays), bool)
+    for _ in range(1 if same_centre else _ROUNDS):
+        in_depth = depth_from_image.apply(rays * z[:, None])
+        depth = _sample(depth_m, px_from_cam(depth_camera, in_depth), options.max_jump)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            lifted = image_from_depth.apply(in_depth * (depth / in_depth[:, 2])[:, None])
+            change = np.abs(lifted[:, 2] - z)
+            settled = np.isfinite(depth) & (in_depth[:, 2] > 0) & (lifted[:, 2] > 0)
+            if not same_centre:
+                settled &= change <= _SETTLED * z
+        z = np.where(np.isfinite(lifted[:, 2]) & (lifted[:, 2] > 0), lifted[:, 2], z)
+    points[settled] = (rays * z[:, None])[settled]
+    return points, settled
+
+
+def _sample(depth_m: NDArray[np.float32], pixels: Floats, max_jump: float) -> Floats:
+    """Depth at pixels (N, 2), float64 (N,); NaN where it is unknown or jumps."""
+    height, width = depth_m.shape
+    result = np.full(len(pixels), np.nan)
+    inside = np.isfinite(pixels).all(axis=1)
+    inside &= (pixels >= 0).all(axis=1) & (pixels[:, 0] <= width) & (pixels[:, 1] <= height)
+    # in array coordinates the centre of the first pixel is (0, 0)
+    x, y = (pixels[inside] - 0.5).T
+    left, top = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
+    columns = np.clip(np.stack([left, left + 1, left, left + 1]), 0, width - 1)
+    rows = np.clip(np.stack([top, top, top + 1, top + 1]), 0, height - 1)
+    corners = depth_m[rows, columns].astype(np.float64)
+    right, bottom = x - left, y - top
+    weights = np.stack(
+        [
+            (1 - right) * (1 - bottom),
+            right * (1 - bottom),
+            (1 - right) * bottom,
+            right * bottom,
+        ]
+    )
+    there = np.isfinite(corners) & (corners > 0)
+    smooth = (weights * corners).sum(axis=0)
+    nearest = np.take_along_axis(corners, np.where(there, weights, -1.0).argmax(0)[None], 0)[0]
+    depth = np.where(there.all(axis=0), smooth, nearest)
+    low = np.where(there, corners, np.inf).min(axis=0)
+    high = np.where(there, corners, -np.inf).max(axis=0)
+    usable = there.any(axis=0) & (high - low <= max_jump * low)
+    result[inside] = np.where(usable, depth, np.nan)
+    return result
+
+
+class DepthVerificationOptions(Options):
+    """Options of depth verification: the noise of the sensor, and the allowed distance from it.
+
+    The default noise is that of a structured-light sensor (Kinect): 0.0012 + 0.0019 (z - 0.4)^2,
+    Nguyen, Izadi and Lovell, Modeling Kinect Sensor Noise for Improved 3D Reconstruction and
+    Tracking, 3DIMPVT 2012, eq. 4; Khoshelham and Elberink, Sensors 12(2), 2012, find 0.0014 z^2. A
+    laser scan has about ``[0.003, 0, 0]``.
+    """
+
+    max_sigmas: float | None = Field(
+        default=3.0,
+        gt=0,
+        description="distance from the sensor's depth, in standard deviations, beyond which an "
+        "observation is dropped; none: depth maps are not looked at",
+    )
+    noise: tuple[float, float, float] = Field(
+        default=_STRUCTURED_LIGHT,
+        description="a, b, c of the noise a + b z + c z^2 at depth z, in the map's unit",
+    )
+    keypoint_noise_px: float = Field(
+        default=2.0,
+        ge=0,
+        description="noise of keypoints, and of poses as seen in the images: times a point's "
+        "deviation, what it may be off by itself; 0: only the sensor's noise counts",
+    )
+    window_px: int = Field(
+        default=3,
+        ge=0,
+        description="a point agrees with any depth that lies this near, in pixels of the depth "
+        "map: allows for edges, and for what image and depth are registered by",
+    )
+
+    @field_validator("noise")
+    @classmethod
+    def _positive(cls, noise: tuple[float, float, float]) -> tuple[float, float, float]:
+        a, b, c = noise
+        # least where z = -b / 2c, if that lies before the sensor, else at the sensor itself
+        lowest = a - b * b / (4.0 * c) if c > 0 and b < 0 else a
+        if not np.isfinite(noise).all() or lowest <= 0 or c < 0 or (c == 0 and b < 0):
+            raise ValueError("noise is not positive at every depth")
+        return noise
+
+
+def depth_noise(depth: Floats, noise: tuple[float, float, float]) -> Floats:
+    """Standard deviation of a sensor's depth (...), in its unit, by a + b z + c z^2."""
+    a, b, c = noise
+    return a + depth * (b + depth * c)
+
+
+def contradicted_by_depth(
+    points_in_image: Floats,
+    depth_m: NDArray[np.float32],
+    depth_camera: Camera,
+    image_from_depth: RigidTransform,
+    options: DepthVerificationOptions | None = None,
+    *,
+    deviations: Floats | None = None,
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Mask of the points that do not lie on the surface of a depth map.
+
+    Parameters
+    ----------
+    points_in_image : float64 (N, 3) in the image camera's frame, metres.
+    depth_m : float32 (H, W) along the depth camera's axis, 0 or less or not finite where unknown.
+    image_from_depth : from the depth camera's frame to the image camera's, metres.
+    deviations : float64 (N,), standard deviations of the points along the depth camera's axis for a
+        noise of 1 px; NaN where unknown, which counts as none.
+
+    Returns
+    -------
+    contradicted : bool (N,); never where there is no depth.
+    checked : bool (N,), where there is depth to compare with.
+    """
+    options = options or DepthVerificationOptions()
+    points = image_from_depth.inverse().apply(np.asarray(points_in_image, np.float64))
+    contradicted, checked = np.zeros(len(points), bool), np.zeros(len(points), bool)
+    if options.max_sigmas is None or not len(points):
+        return contradicted, checked
+    height, width = depth_m.shape
+    pixels = px_from_cam(depth_camera, points)
+    with np.errstate(invalid="ignore"):
+        inside = (pixels >= 0).all(axis=1) & (pixels[:, 0] < width) & (pixels[:, 1] < height)
+    rows = np.flatnonzero(inside)
+    # the centre of the first pixel is (0.5, 0.5): the whole part is the pixel
+    column, line = np.floor(pixels[rows]).astype(np.int64).T
+    reach = np.arange(-options.window_px, options.window_px + 1)
+    columns = np.clip(column[:, None, None] + reach[None, None, :], 0, width - 1)
+    lines = np.clip(line[:, None, None] + reach[None, :, None], 0, height - 1)
+    window = depth_m[lines, columns].reshape(len(rows), len(reach) ** 2).astype(np.float64)
+    known = np.isfinite(window) & (window > 0)
+    # beside a hole the surface may be the one that the sensor has not seen
+    whole = known.all(axis=1)
+    rows, window = rows[whole], window[whole]
+    z, low, high = points[rows, 2], window.min(axis=1), window.max(axis=1)
+    own = np.zeros(len(rows)) if deviations is None else np.nan_to_num(deviations[rows])
+    own = own * options.keypoint_noise_px
+    checked[rows] = True
+    contradicted[rows] = z < low - options.max_sigmas * np.hypot(
+        depth_noise(low, options.noise), own
+    )
+    contradicted[rows] |= z > high + options.max_sigmas * np.hypot(
+        depth_noise(high, options.noise), own
+    )
+    return contradicted, checked

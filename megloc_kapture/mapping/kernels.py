@@ -1,0 +1,271 @@
+"""Compiled loops over a map's observations: arrays in, arrays out.
+
+Imported where they are called, not where their module is: numba costs half a second to import.
+"""
+
+# mypy: allow-untyped-defs, allow-untyped-calls, allow-untyped-decorators
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+from megloc_kapture.compiling import compiled_loop
+from megloc_kapture.geometry.projection import PINHOLES, distorted, project_point
+
+# information whose pivots are this far apart does not determine its point
+_MIN_RATIO = 1e-13
+_MAX_SWEEPS = 16
+_SMALL = 2.3e-16
+
+
+def in_chunks(count: int, size: int, work: Callable[[int, int], object]) -> None:
+    """Call ``work(first, last)`` for parts of ``range(count)``, which must not mind the order."""
+    chunks = [(first, min(first + size, count)) for first in range(0, count, size)]
+    if len(chunks) < 2:
+        for first, last in chunks:
+            work(first, last)
+        return
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as executor:
+        for done in [executor.submit(work, first, last) for first, last in chunks]:
+            done.result()
+
+
+@compiled_loop
+def most_shared(
+    first, last, starts, of_image, images, track, track_starts, window, min_shared, best
+):
+    """Images that share most points with each of ``first`` to ``last``, rows of ``best`` (I, K).
+
+    Parameters
+    ----------
+    starts, of_image : observations of image i, ``of_image[starts[i]:starts[i + 1]]``.
+    images, track : of each observation; sorted by track, then image.
+    track_starts : observations of track t, from ``track_starts[t]`` to ``track_starts[t + 1]``.
+    window : how far in a track an image looks before and after itself.
+    """
+    shared = np.zeros(len(best), np.int64)
+    touched = np.empty(len(best), np.int64)
+    for image in range(first, last):
+        count = 0
+        for k in range(starts[image], starts[image + 1]):
+            own = of_image[k]
+            begin = max(track_starts[track[own]], own - window)
+            end = min(track_starts[track[own] + 1], own + window + 1)
+            for i in range(begin, end):
+                other = images[i]
+                if shared[other] == 0:
+                    touched[count] = other
+                    count += 1
+                shared[other] += 1
+        enough = 0
+        for k in range(count):
+            other = touched[k]
+            if other != image and shared[other] >= min_shared:
+                # most shared first, then the first image, as one number that ascends
+                touched[enough] = (-shared[other] << 32) | other
+                enough += 1
+            shared[other] = 0
+        ranked = np.sort(touched[:enough])
+        for k in range(min(enough, best.shape[1])):
+            best[image, k] = ranked[k] & 0xFFFFFFFF
+
+
+@compiled_loop
+def shares_seen(
+    first, last, pairs, starts, points, xyz, rotations, translations, models, params, sizes, shares
+):
+    """Share of one image's points in the other's frustum, the larger of the two; ``shares`` (P,).
+
+    NaN where neither image has points.
+    """
+    out = np.empty(8)
+    for pair in range(first, last):
+        shares[pair] = np.nan
+        for side in range(2):
+            begin, end = starts[pairs[pair, side]], starts[pairs[pair, side] + 1]
+            if begin == end:
+                continue
+            other = pairs[pair, 1 - side]
+            r, t, p = rotations[other], translations[other], params[other]
+            seen = 0
+            for k in range(begin, end):
+                x, y, z = xyz[points[k], 0], xyz[points[k], 1], xyz[points[k], 2]
+                project_point(
+                    models[other],
+                    p,
+                    r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + t[0],
+                    r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + t[1],
+                    r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + t[2],
+                    out,
+                )
+                inside = 0.0 <= out[0] < sizes[other, 0] and 0.0 <= out[1] < sizes[other, 1]
+                if inside and out[2] * out[6] > out[3] * out[5]:
+                    seen += 1
+            share = seen / (end - begin)
+            if not shares[pair] >= share:
+                shares[pair] = share
+
+
+@compiled_loop
+def reprojection_errors(
+    point_ids, image_ids, keypoints, xyz, rotations, translations, models, params, out
+):
+    """Distances (O,) in pixels of keypoints (O, 2) from their points; infinite behind."""
+    p = np.empty(8)
+    for o in range(len(point_ids)):
+        k = image_ids[o]
+        r = rotations[k]
+        x, y, z = xyz[point_ids[o], 0], xyz[point_ids[o], 1], xyz[point_ids[o], 2]
+        project_point(
+            models[k],
+            params[k],
+            r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + translations[k, 0],
+            r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + translations[k, 1],
+            r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + translations[k, 2],
+            p,
+        )
+        du, dv = p[0] - keypoints[o, 0], p[1] - keypoints[o, 1]
+        error = math.sqrt(du * du + dv * dv)
+        out[o] = error if error == error else math.inf
+
+
+@compiled_loop
+def mean_depths(starts, image_ids, xyz, rotations, translations, out):
+    """Mean depths (N,) of points in their images; NaN where no image observes one."""
+    for i in range(len(xyz)):
+        total = 0.0
+        for o in range(starts[i], starts[i + 1]):
+            k = image_ids[o]
+            r = rotations[k]
+            total += r[2, 0] * xyz[i, 0] + r[2, 1] * xyz[i, 1] + r[2, 2] * xyz[i, 2]
+            total += translations[k, 2]
+        count = starts[i + 1] - starts[i]
+        out[i] = total / count if count > 0 else math.nan
+
+
+@compiled_loop
+def seen_at_angle(starts, image_ids, xyz, centers, max_cosine, out):
+    """Mask (N,) of points seen under an angle whose cosine is at most ``max_cosine``."""
+    for i in range(len(xyz)):
+        x, y, z = xyz[i, 0], xyz[i, 1], xyz[i, 2]
+        wide = False
+        for o in range(starts[i], starts[i + 1]):
+            a = image_ids[o]
+            ax, ay, az = x - centers[a, 0], y - centers[a, 1], z - centers[a, 2]
+            for other in range(o + 1, starts[i + 1]):
+                b = image_ids[other]
+                bx, by, bz = x - centers[b, 0], y - centers[b, 1], z - centers[b, 2]
+                product = ax * bx + ay * by + az * bz
+                lengths = math.sqrt((ax * ax + ay * ay + az * az) * (bx * bx + by * by + bz * bz))
+                # of a centre that is the point itself there is no angle
+                if lengths > 0.0 and abs(product) <= max_cosine * lengths:
+                    wide = True
+                    break
+            if wide:
+                break
+        out[i] = wide
+
+
+@compiled_loop
+def covariances_of_points(
+    first, last, starts, image_ids, xyz, rotations, translations, models, params, out
+):
+    """Covariances of the points ``first`` to ``last``, rows of ``out`` (N, 6)."""
+    for i in range(first, last):
+        xx = xy = xz = yy = yz = zz = 0.0
+        px, py, pz = xyz[i, 0], xyz[i, 1], xyz[i, 2]
+        for o in range(starts[i], starts[i + 1]):
+            k = image_ids[o]
+            r00, r01, r02 = rotations[k, 0, 0], rotations[k, 0, 1], rotations[k, 0, 2]
+            r10, r11, r12 = rotations[k, 1, 0], rotations[k, 1, 1], rotations[k, 1, 2]
+            r20, r21, r22 = rotations[k, 2, 0], rotations[k, 2, 1], rotations[k, 2, 2]
+            x = r00 * px + r01 * py + r02 * pz + translations[k, 0]
+            y = r10 * px + r11 * py + r12 * pz + translations[k, 1]
+            z = r20 * px + r21 * py + r22 * pz + translations[k, 2]
+            if not z > 0.0:
+                continue  # behind the camera: such an observation says nothing
+            inverse = 1.0 / z
+            u, v = x * inverse, y * inverse
+            au, av, bu, bv = 1.0, 0.0, 0.0, 1.0
+            if models[k] > PINHOLES:  # to ask a pinhole too makes its loop twice as slow
+                _, _, au, av, bu, bv = distorted(models[k], params[k], u, v)
+            fx, fy = params[k, 0] * inverse, params[k, 1] * inverse
+            # z times the derivatives of u and v by the point in the world
+            u0, u1, u2 = r00 - u * r20, r01 - u * r21, r02 - u * r22
+            v0, v1, v2 = r10 - v * r20, r11 - v * r21, r12 - v * r22
+            a, b, c = fx * (au * u0 + av * v0), fx * (au * u1 + av * v1), fx * (au * u2 + av * v2)
+            d, e, f = fy * (bu * u0 + bv * v0), fy * (bu * u1 + bv * v1), fy * (bu * u2 + bv * v2)
+            xx += a * a + d * d
+            xy += a * b + d * e
+            xz += a * c + d * f
+            yy += b * b + e * e
+            yz += b * c + e * f
+            zz += c * c + f * f
+        # M = L D L^T, and its inverse from that
+        least = _MIN_RATIO * (xx + yy + zz)
+        determined = xx > least and xx < math.inf
+        if determined:
+            l10, l20 = xy / xx, xz / xx
+            d1 = yy - l10 * xy
+            determined = d1 > least
+        if determined:
+            l21 = (yz - l20 * xy) / d1
+            d2 = zz - l20 * xz - l21 * l21 * d1
+            determined = d2 > least
+        if not determined:
+            for column in range(6):
+                out[i, column] = math.nan
+            continue
+        czz = 1.0 / d2
+        cyz = -l21 * czz
+        cyy = 1.0 / d1 - l21 * cyz
+        cxz = -l10 * cyz - l20 * czz
+        cxy = -l10 * cyy - l20 * cyz
+        out[i, 0] = 1.0 / xx - l10 * cxy - l20 * cxz
+        out[i, 1], out[i, 2], out[i, 3], out[i, 4], out[i, 5] = cxy, cxz, cyy, cyz, czz
+
+
+@compiled_loop
+def _rotated(a, b, ab, ac, bc):
+    """One Jacobi rotation of axes a and b, c the third: the new entries, the new ``ab`` is zero."""
+    if ab == 0.0:
+        return a, b, ab, ac, bc
+    theta = (b - a) / (2.0 * ab)
+    t = 1.0 / (abs(theta) + math.sqrt(theta * theta + 1.0))
+    if theta < 0.0:
+        t = -t
+    cosine = 1.0 / math.sqrt(t * t + 1.0)
+    sine = t * cosine
+    return a - t * ab, b + t * ab, 0.0, cosine * ac - sine * bc, sine * ac + cosine * bc
+
+
+@compiled_loop
+def deviations_of_points(first, last, covariances, out):
+    """Square roots of the eigenvalues of covariances (N, 6), ascending, rows of ``out`` (N, 3).
+
+    Cyclic Jacobi: slower than the closed formula, and accurate in the small eigenvalues too, where
+    that is not (Golub and van Loan, Matrix Computations, section 8.5).
+    """
+    for i in range(first, last):
+        a, b, c = covariances[i, 0], covariances[i, 3], covariances[i, 5]
+        ab, ac, bc = covariances[i, 1], covariances[i, 2], covariances[i, 4]
+        for _ in range(_MAX_SWEEPS):
+            # each off-diagonal entry against its own diagonal: a small eigenvalue counts as much
+            if (
+                ab * ab <= _SMALL * _SMALL * a * b
+                and ac * ac <= _SMALL * _SMALL * a * c
+                and bc * bc <= _SMALL * _SMALL * b * c
+            ):
+                break
+            a, b, ab, ac, bc = _rotated(a, b, ab, ac, bc)
+            a, c, ac, ab, bc = _rotated(a, c, ac, ab, bc)
+            b, c, bc, ab, ac = _rotated(b, c, bc, ab, ac)
+        low, high = min(a, b), max(a, b)
+        out[i, 0] = math.sqrt(min(low, c))
+        out[i, 1] = math.sqrt(max(low, min(high, c)))
+        out[i, 2] = math.sqrt(max(high, c))

@@ -1,0 +1,276 @@
+"""Masks: fixed ones, regions that never change (a car's bonnet), and margins around them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from megloc_kapture.values import Options
+
+# more pixels than this times the edges of a polygon are not tested at once
+_ROWS_AT_ONCE = 256
+# images a camera needs: of fewer, chance makes edges agree
+MIN_IMAGES = 10
+# more tell nothing new
+MAX_IMAGES = 60
+_WORKING_SIZE_PX = 256
+_NOISE_PER_PX = 3.0  # grey levels per working px; weaker edges count less
+# mean agreement of two images' edges, -1 to 1: what stays has 0.5 and more, what passes 0.1 at most
+_MIN_AGREEMENT = 0.3
+_WIDE_PX, _NARROW_PX = 9, 3  # windows in which it is averaged
+# a pixel changes where there are edges that do not agree
+_CHANGING_AGREEMENT, _CHANGING_STRENGTH = 0.1, 0.5
+_MAX_CHANGING = 0.4  # share of a column below the frontier
+_MIN_RUN = 0.1  # of the width; narrower is no bonnet
+_MAX_GAP = 0.05  # of the width, closed between two parts
+# where light comes and goes the frontier is found this much too low
+_MARGIN_PX = 4
+_MAX_AREA = 0.6  # of the image; more, and it is the camera that does not move
+Float32 = NDArray[np.float32]
+
+
+class FixedMask(Options):
+    """Mask of every image of a camera: one of ``file``, ``polygon``, ``bottom_share``.
+
+    All of them refer to the original images, before they are undistorted and resized.
+    """
+
+    camera: str = Field(
+        min_length=1, description="a sensor's id, or a pattern of image names (left/*.jpg)"
+    )
+    file: Path | None = Field(
+        default=None, description="an image of the camera's size, 0 where it is ignored"
+    )
+    polygon: tuple[tuple[float, float], ...] | None = Field(
+        default=None,
+        min_length=3,
+        description="corners (x, y) of what is ignored, in shares of the width and the height",
+    )
+    bottom_share: float | None = Field(
+        default=None, gt=0, lt=1, description="share of the height, from the bottom"
+    )
+    fallback: bool = Field(
+        default=False,
+        description="only for cameras whose unchanging region was not looked for or not found",
+    )
+
+    @model_validator(mode="after")
+    def _exactly_one(self) -> FixedMask:
+        given = [self.file, self.polygon, self.bottom_share]
+        if sum(value is not None for value in given) != 1:
+            raise ValueError("a fixed mask takes one of file, polygon and bottom_share")
+        if any(not 0 <= share <= 1 for corner in self.polygon or () for share in corner):
+            raise ValueError("a polygon's corners are shares between 0 and 1")
+        return self
+
+    def is_for(self, sensor_id: str, image: str) -> bool:
+        """True if it applies to an image of a sensor."""
+        return self.camera == sensor_id or fnmatchcase(image, self.camera)
+
+    def drawn(self, width: int, height: int) -> NDArray[np.bool_]:
+        """The mask bool (H, W), True = use, of a polygon or a bottom share.
+
+        Raises
+        ------
+        ValueError : it is a file.
+        """
+        if self.polygon is not None:
+            return outside_polygon(np.array(self.polygon), width, height)
+        if self.bottom_share is None:
+            raise ValueError("the mask is a file, it is not drawn")
+        rows = (np.arange(height) + 0.5) / height < 1 - self.bottom_share
+        return np.repeat(rows[:, None], width, axis=1)
+
+
+def outside_polygon(corners: NDArray[np.floating], width: int, height: int) -> NDArray[np.bool_]:
+    """Mask (H, W) of the pixels whose centres are not in a polygon.
+
+    Parameters
+    ----------
+    corners : (N, 2) x and y in shares of width and height; even-odd where edges cross.
+    """
+    x0, y0 = (np.asarray(corners, np.float64) * [width, height]).T
+    x1, y1 = np.roll(x0, -1), np.roll(y0, -1)
+    x = np.arange(width) + 0.5
+    outside = np.ones((height, width), dtype=bool)
+    for start in range(0, height, _ROWS_AT_ONCE):
+        rows = outside[start : start + _ROWS_AT_ONCE]
+        y = np.arange(start, start + len(rows)) + 0.5
+        for ax, ay, bx, by in zip(x0, y0, x1, y1, strict=True):
+            # edges that a ray to the left crosses; half open, so that a corner counts once
+            crossed = (ay <= y) != (by <= y)
+            if crossed.any():
+                at = ax + (y[crossed] - ay) * ((bx - ax) / (by - ay))
+                rows[crossed] ^= at[:, None] <= x
+    return outside
+
+
+def with_margin(mask: NDArray[np.bool_], margin_px: float) -> NDArray[np.bool_]:
+    """The mask without the pixels that are near what it ignores.
+
+    The border of the image is no edge of the mask: nothing is taken away along it.
+
+    Parameters
+    ----------
+    mask : bool (H, W), True = use.
+    margin_px : a pixel is used where the nearest ignored one is farther away than this, between
+        the centres of the two (Euclidean); 0 and less leave the mask as it is.
+
+    Returns
+    -------
+    bool (H, W); the argument itself where there is nothing to do.
+    """
+    if margin_px <= 0 or mask.all():
+        return mask
+    import cv2  # 0.1 s, and most commands never get here
+
+    distances = cv2.distanceTransform(
+        mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE, dstType=cv2.CV_32F
+    )
+    return np.asarray(distances > margin_px)
+
+
+@dataclass(frozen=True)
+class UnchangingRegion:
+    """Region below a frontier across the image; falsy where it is empty.
+
+    Parameters
+    ----------
+    frontier : where the region starts, from the top in shares of the height, at the middles of
+        equally wide columns; 1: nowhere.
+    reason : why there is none, or "".
+    """
+
+    frontier: tuple[float, ...]
+    reason: str = ""
+
+    def __bool__(self) -> bool:
+        return not self.reason
+
+    def mask(self, width: int, height: int) -> NDArray[np.bool_]:
+        """The mask bool (H, W), True = use."""
+        if not self:
+            return np.ones((height, width), dtype=bool)
+        columns = np.arange(width) * len(self.frontier) // width
+        limit = np.array(self.frontier)[columns]
+        return np.asarray(((np.arange(height) + 0.5) / height)[:, None] < limit[None])
+
+
+def edge_directions(image: NDArray[np.uint8]) -> Float32:
+    """Directions of an image's edges, small: float32 (h, w, 2), x and y, of length 0 to 1.
+
+    Parameters
+    ----------
+    image : uint8 (H, W, 3) RGB.
+    """
+    import cv2
+
+    height, width = image.shape[:2]
+    scale = min(1.0, _WORKING_SIZE_PX / max(height, width))
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    # Sobel's kernel sums to 8 times the slope
+    slopes = [
+        cv2.Sobel(small, cv2.CV_32F, *axis, ksize=3, scale=1 / 8) for axis in ((1, 0), (0, 1))
+    ]
+    directions = np.stack(slopes, axis=-1)
+    strength = np.linalg.norm(directions, axis=-1, keepdims=True)
+    return np.asarray(directions / (strength + np.float32(_NOISE_PER_PX)), np.float32)
+
+
+def find_unchanging_region(sequence: Iterable[Float32]) -> UnchangingRegion:
+    """The region at the bottom that never changes.
+
+    Parameters
+    ----------
+    sequence : :func:`edge_directions` of at least MIN_IMAGES images of one camera that moved
+        between them.
+
+    Raises
+    ------
+    ValueError : fewer images.
+    """
+    total, lengths, squares, count = _sums(sequence)
+    if count < MIN_IMAGES:
+        raise ValueError(f"{count} images; at least {MIN_IMAGES} are needed")
+    # of all pairs of different images: products of their directions, and of the lengths alone
+    agreeing = np.square(total).sum(axis=-1) - squares
+    present = np.square(lengths) - squares
+    wide, narrow = (_share(agreeing, present, window) for window in (_WIDE_PX, _NARROW_PX))
+    persistent = np.minimum(wide, narrow) >= _MIN_AGREEMENT
+    strength = _mean(present, _WIDE_PX)
+    changing = (wide < _CHANGING_AGREEMENT) & (strength > _CHANGING_STRENGTH * np.median(strength))
+    tops = _column_tops(persistent, changing)
+    height, width = persistent.shape
+    tops = _without_slivers(tops, height)
+    nothing = (1.0,) * width
+    if (tops == height).all():
+        return UnchangingRegion(nothing, "nothing stays the same at the bottom of its images")
+    if 1 - tops.mean() / height > _MAX_AREA:
+        return UnchangingRegion(nothing, "nearly all of its images stays the same: it hardly moves")
+    tops = np.where(tops < height, np.maximum(tops - _MARGIN_PX, 0), tops)
+    return UnchangingRegion(tuple(float(top) for top in tops / height))
+
+
+def _sums(sequence: Iterable[Float32]) -> tuple[Float32, Float32, Float32, int]:
+    """Sums over the images: directions (h, w, 2), their lengths (h, w), lengths squared."""
+    total = lengths = squares = np.zeros(0, np.float32)
+    count = 0
+    for directions in sequence:
+        length = np.linalg.norm(directions, axis=-1)
+        if count == 0:
+            total, lengths = np.zeros_like(directions), np.zeros_like(length)
+            squares = np.zeros_like(length)
+        total = total + directions
+        lengths = lengths + length
+        squares = squares + length**2
+        count += 1
+    return total, lengths, squares, count
+
+
+def _mean(values: Float32, window: int) -> Float32:
+    import cv2
+
+    return np.asarray(cv2.blur(values, (window, window)))
+
+
+def _share(part: Float32, whole: Float32, window: int) -> Float32:
+    return np.asarray(_mean(part, window) / np.maximum(_mean(whole, window), 1e-6))
+
+
+def _column_tops(persistent: NDArray[np.bool_], changing: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Per column the highest persistent row below which hardly anything changes; int64 (w,).
+
+    The height where there is none.
+    """
+    height = len(persistent)
+    below = np.arange(height, 0, -1)[:, None]
+    share = np.cumsum(changing[::-1], axis=0)[::-1] / below
+    frontier = persistent & (share <= _MAX_CHANGING)
+    return np.where(frontier.any(axis=0), frontier.argmax(axis=0), height)
+
+
+def _without_slivers(tops: NDArray[np.int64], height: int) -> NDArray[np.int64]:
+    """Gaps closed, single columns smoothed, and what is too narrow taken out."""
+    width = len(tops)
+    inside = np.flatnonzero(tops < height)
+    if len(inside) == 0:
+        return tops
+    tops = tops.copy()
+    for left, right in zip(inside[:-1], inside[1:], strict=True):
+        if 1 < right - left <= _MAX_GAP * width:
+            tops[left + 1 : right] = max(tops[left], tops[right])
+    padded = np.pad(tops, 2, mode="edge")
+    tops = np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1).astype(np.int64)
+    runs = np.flatnonzero(np.diff(np.concatenate([[0], tops < height, [0]])))
+    for start, stop in runs.reshape(-1, 2):
+        if stop - start < _MIN_RUN * width:
+            tops[start:stop] = height
+    return tops

@@ -1,0 +1,384 @@
+"""Acceptance of a pose found by rendering: its fit, its covariance, and the decision.
+
+It must look more like the query than the old one, in most parts of the query, and it must differ
+from the old one by more than its own uncertainty: images say where a camera is to some millimetres,
+and a pose that is as good as that gains nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.geometry.cameras import project
+from megloc_kapture.geometry.poses import movement
+from megloc_kapture.plugins import PoseRefinement
+from megloc_kapture.refinement.photometric import (
+    LOSS_SCALE,
+    MIN_POINTS,
+    Alignment,
+    LevelProblem,
+    NormalEquations,
+    perturbed,
+)
+from megloc_kapture.refinement.pyramid import ChosenPoints
+from megloc_kapture.refinement.references import RenderingOptions
+from megloc_kapture.values import RigidTransform
+
+# squared distance between two poses over the covariance of one that chance exceeds once in a
+# thousand times: the chi-squared distribution of six degrees of freedom
+CHI2_OF_CHANCE = 22.46
+Float64 = NDArray[np.float64]
+_CHANGE = 0.5  # of the residuals by a difference at most, in their deviations
+# of the normal equations, that the objective's own curvature must have
+_LEAST_SHARE = 0.02
+# by about how many pixels of the level points move to either side of a difference
+_CURVATURE_PX = 0.5
+# how far alignments are tried again, in steps that change the image by that much
+_BESIDE = (-4.0, -2.0, 0.0, 2.0, 4.0)
+# eigenvalue over the largest, in units that move points as far, from which a pose is determined
+_LEAST_CURVATURE = 1e-7
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A pose that may replace the old one.
+
+    Attributes
+    ----------
+    problem : at the finest level, with all points.
+    free : the same without what something else hides.
+    alignment : of ``free``.
+    """
+
+    problem: LevelProblem
+    free: LevelProblem
+    alignment: Alignment
+
+
+def accept_or_keep(
+    start: RigidTransform,
+    found: Candidate,
+    overlaps: tuple[float, float],
+    options: RenderingOptions,
+) -> PoseRefinement:
+    """The new pose with its covariance, or the old one and why.
+
+    Both are compared on all points, also those that something may hide.
+
+    Parameters
+    ----------
+    start : the old ``cam_from_world``.
+    overlaps : shares of the query that references cover, at the old pose and at the new one.
+    """
+    pose = found.alignment.cam_from_world
+    comparison = compare_poses(found.problem, start, pose)
+    moved_m, turned_deg = movement(start, pose)
+    measures = {
+        "cost_before": comparison.before.cost,
+        "cost_after": comparison.after.cost,
+        "significance": comparison.significance,
+        "correlation_before": comparison.before.correlation,
+        "correlation_after": comparison.after.correlation,
+        "overlap_before": overlaps[0],
+        "overlap_after": overlaps[1],
+        "moved_m": moved_m,
+        "turned_deg": turned_deg,
+        "moved_px": _moved_px(found.problem, start, pose),
+        "points": float(comparison.after.count),
+        "references": float(len(np.unique(found.problem.chosen.groups))),
+    }
+    uncertainty = covariance(found.free, found.alignment)
+    if uncertainty is not None:
+        measures["claimed_m"] = float(np.sqrt(np.trace(uncertainty[3:, 3:])))
+        measures["claimed_deg"] = float(np.degrees(np.sqrt(np.trace(uncertainty[:3, :3]))))
+        measures["squared_distance"] = squared_distance(start, pose, uncertainty)
+    reason = _too_far(moved_m, turned_deg, options) or _no_better(comparison, overlaps, options)
+    if reason:
+        return PoseRefinement(start, reason, measures)
+    if uncertainty is None:
+        return PoseRefinement(start, "the images do not determine the pose", measures)
+    if not measures["squared_distance"] > CHI2_OF_CHANCE:
+        return PoseRefinement(start, "it is as near as the images can tell", measures)
+    return PoseRefinement(pose, "", measures, uncertainty)
+
+
+def squared_distance(
+    old: RigidTransform, new: RigidTransform, covariance: NDArray[np.float64]
+) -> float:
+    """Squared Mahalanobis distance of two poses by the covariance (6, 6) of the new one.
+
+    The covariance is as of ``Pose``; exact where the distance is small.
+    """
+    old_from_new = old @ new.inverse()
+    w, x, y, z = old_from_new.quat_wxyz
+    turn = 2.0 * np.copysign(1.0, w) * np.array([x, y, z])
+    step = np.concatenate([turn, old_from_new.translation])
+    return float(step @ np.linalg.solve(covariance, step))
+
+
+def _moved_px(problem: LevelProblem, old: RigidTransform, new: RigidTransform) -> float:
+    """Median displacement of the points in the image, in pixels of the level."""
+    points = problem.chosen.points
+    ahead = (old.apply(points)[:, 2] > 0) & (new.apply(points)[:, 2] > 0)
+    if not ahead.any():
+        return float("inf")
+    scale = np.array([problem.level.scale_x, problem.level.scale_y])
+    px = [project(problem.camera, pose, points[ahead]) * scale for pose in (old, new)]
+    return float(np.median(np.linalg.norm(px[1] - px[0], axis=1)))
+
+
+def _too_far(moved_m: float, turned_deg: float, options: RenderingOptions) -> str:
+    if moved_m > options.max_translation_m:
+        return f"would move {moved_m:.2f} m, more than {options.max_translation_m:g} m"
+    if turned_deg > options.max_rotation_deg:
+        return f"would turn {turned_deg:.2f} deg, more than {options.max_rotation_deg:g} deg"
+    return ""
+
+
+def _no_better(
+    comparison: Comparison, overlaps: tuple[float, float], options: RenderingOptions
+) -> str:
+    after, significance = comparison.after, comparison.significance
+    if after.count < MIN_POINTS:
+        return f"only {after.count} points are seen from both poses"
+    if after.correlation < options.min_correlation:
+        return (
+            f"references and query correlate by {after.correlation:.2f}, "
+            f"less than {options.min_correlation:g}"
+        )
+    if significance < options.min_significance:
+        return (
+            f"the cost improves by {significance:.1f} of its standard errors, "
+            f"less than {options.min_significance:g}"
+        )
+    if overlaps[1] < (1.0 - options.max_overlap_loss) * overlaps[0]:
+        return f"the overlap falls from {overlaps[0]:.0%} to {overlaps[1]:.0%}"
+    return ""
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Fit of the query to the warped references under one pose.
+
+    Attributes
+    ----------
+    cost : mean of the robust loss, over the square of its scale: 0 to 0.5.
+    correlation : of the query's values with the references', over all points and channels.
+    count : of points that are seen.
+    """
+
+    cost: float
+    correlation: float
+    count: int
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """An old pose and a new one on the points that both see.
+
+    Attributes
+    ----------
+    before, after : how well they fit.
+    significance : by how many of its standard errors the cost falls. Cells of the query count as
+        one observation each: a pose that is better shows it in most of them, one that was tuned to
+        noise, or to what looks alike by chance, in some.
+    """
+
+    before: Fit
+    after: Fit
+    significance: float
+
+
+def compare_poses(problem: LevelProblem, old: RigidTransform, new: RigidTransform) -> Comparison:
+    """Compare two poses on the points that both see, each with its own gains and biases.
+
+    Both with the loss' scale of the new one.
+    """
+    aligned = [problem.nuisance_at(pose) for pose in (old, new)]
+    rows = [problem.rows(at) for at in aligned]
+    hidden = np.isnan(rows[0][:, 0, 0]) | np.isnan(rows[1][:, 0, 0])
+    for each in rows:
+        each[hidden, :, 0] = np.nan
+    deviation = aligned[1].deviation
+    cells = problem.cells(new, ~hidden)
+    gained = _losses(rows[0][~hidden], deviation) - _losses(rows[1][~hidden], deviation)
+    before, after = (_fit(problem, each, deviation) for each in rows)
+    return Comparison(before, after, _significance(gained, cells))
+
+
+def _losses(rows: Float64, deviation: float) -> Float64:
+    """Robust loss of each point, over the square of its scale: 0 to 0.5."""
+    squared = np.square(rows[..., 0]).mean(1) / (LOSS_SCALE * max(deviation, 1e-12)) ** 2
+    return np.asarray(0.5 * squared / (1.0 + squared))
+
+
+def _significance(gained: Float64, cells: NDArray[np.int64]) -> float:
+    """Sum of the gains over its standard error, if the cells' gains were independent, of mean 0."""
+    sums = np.bincount(cells, gained)
+    error = float(np.sqrt(np.square(sums).sum()))
+    return float(sums.sum()) / error if error > 0 else 0.0
+
+
+def correlation(problem: LevelProblem, at: Alignment) -> float:
+    """Of the query's values with the references'; see :class:`Fit`."""
+    return _correlation(problem.rows(at), problem.chosen, problem.num_groups)
+
+
+def _fit(problem: LevelProblem, rows: Float64, deviation: float) -> Fit:
+    squared_scale = (LOSS_SCALE * max(deviation, 1e-12)) ** 2
+    system = problem.system_of(rows, squared_scale)
+    return Fit(
+        system.mean_cost / squared_scale,
+        _correlation(rows, problem.chosen, problem.num_groups),
+        system.count,
+    )
+
+
+def _correlation(rows: Float64, chosen: ChosenPoints, num_groups: int) -> float:
+    """Correlation of two sets of values whose means are those of each reference and channel."""
+    seen = ~np.isnan(rows[:, 0, 0])
+    query, reference, groups = (
+        rows[seen][..., 7],
+        chosen.values[seen],
+        chosen.groups[seen],
+    )
+    together = apart_query = apart_reference = 0.0
+    for group in range(num_groups):
+        ours = groups == group
+        if not ours.any():
+            continue
+        a = query[ours] - query[ours].mean(0)
+        b = reference[ours] - reference[ours].mean(0)
+        together += float((a * b).sum())
+        apart_query += float((a * a).sum())
+        apart_reference += float((b * b).sum())
+    product = apart_query * apart_reference
+    return together / float(np.sqrt(product)) if product > 0 else 0.0
+
+
+def covariance(problem: LevelProblem, at: Alignment) -> Float64 | None:
+    """Covariance (6, 6) of the pose, as of ``Pose``; None where it is not determined.
+
+    The sandwich of the objective's curvature with the scores of cells of the query, each taken as
+    one observation (Liang and Zeger, Biometrika 1986): what neighbouring residuals have in common
+    (blur, light, the query's noise seen by several references) makes it larger as it must. The
+    curvature is that of the objective about the pose and not of its normal equations, in which the
+    query's noise passes for gradients. Errors that the whole image shares, of the map's poses and
+    depths or of the calibration, are not in the residuals and thus not in the covariance.
+    """
+    rows = problem.rows(at)
+    scale2 = max(at.squared_scale, 1e-24)
+    system = problem.system_of(rows, scale2)
+    reduced = system.reduced()
+    if system.count < MIN_POINTS or reduced is None:
+        return None
+    inverse = _inverse_curvature(problem, at, scale2, system)
+    if inverse is None:
+        return None
+    scatter = _scatter(problem, at, rows, scale2, reduced[2])
+    return None if scatter is None else np.asarray(inverse @ scatter @ inverse)
+
+
+def _scatter(
+    problem: LevelProblem,
+    at: Alignment,
+    rows: Float64,
+    squared_scale: float,
+    projection: Float64,
+) -> Float64 | None:
+    """Squared scores (6, 6) of the cells; None where there are too few."""
+    seen = ~np.isnan(rows[:, 0, 0])
+    rows, groups = rows[seen], problem.chosen.groups[seen]
+    weight = (1.0 + np.square(rows[..., 0]).mean(1) / squared_scale) ** -2 / rows.shape[1]
+    # the derivative by the pose where gain and bias follow it
+    own = np.stack([rows[..., 7], np.ones(rows.shape[:2])], axis=-1)
+    derivative = rows[..., 1:7] - np.einsum("ncpi,nci->ncp", projection[groups], own)
+    score = np.einsum("n,nc,ncp->np", weight, rows[..., 0], derivative)
+    cells = problem.cells(at.cam_from_world, seen)
+    sums = np.zeros((int(cells.max()) + 1, 6))
+    np.add.at(sums, cells, score)
+    occupied = len(np.unique(cells))
+    return sums.T @ sums * occupied / (occupied - 6) if occupied > 6 else None
+
+
+def _inverse_curvature(
+    problem: LevelProblem, at: Alignment, squared_scale: float, system: NormalEquations
+) -> Float64 | None:
+    """Inverse (6, 6) of the second derivatives by the pose; None where it is no minimum.
+
+    Differences are taken along the whitened directions.
+    """
+    found = whitened_directions(problem, system)
+    if found is None:
+        return None
+    steps, change = found
+    # not so far that the loss takes the change for outliers
+    weights = float(system.own[..., 2].sum())
+    nearer = min(1.0, (_CHANGE * at.deviation) ** 2 * weights / change)
+    steps, change = steps * np.sqrt(nearer), change * nearer
+    columns = []
+    for step in steps.T:
+        ends = []
+        for sign in (1.0, -1.0):
+            moved = replace(at, cam_from_world=perturbed(at.cam_from_world, sign * step))
+            reduced = problem.system_at(moved, squared_scale).reduced()
+            if reduced is None:
+                return None
+            ends.append(reduced[1])
+        columns.append(steps.T @ (ends[0] - ends[1]) / 2.0)
+    curvature = 0.5 * (np.array(columns) + np.array(columns).T)
+    values, vectors = np.linalg.eigh(curvature)
+    # normal equations would have six values of ``change``
+    if not values[0] > _LEAST_SHARE * change:
+        return None
+    half = steps @ (vectors / np.sqrt(values))
+    return np.asarray(half @ half.T)
+
+
+def whitened_directions(
+    problem: LevelProblem, system: NormalEquations
+) -> tuple[Float64, float] | None:
+    """Steps of the pose that are uncorrelated by the normal equations and change the image alike.
+
+    Returns
+    -------
+    steps : float64 (6, 6), in columns, each as large as half a pixel of the level; the first is
+        along the direction that the image determines least.
+    change : of the weighted sum of squared residuals, by each step.
+
+    None where the image leaves a direction free.
+    """
+    reduced = system.reduced()
+    if reduced is None:
+        return None
+    usual = _CURVATURE_PX / problem.px_per_step()
+    scaled = reduced[0] * np.outer(usual, usual)
+    values, vectors = np.linalg.eigh(scaled)
+    if not values[0] > _LEAST_CURVATURE * values[-1]:
+        return None
+    change = float(np.trace(scaled)) / 6.0
+    return usual[:, None] * vectors * np.sqrt(change / values), change
+
+
+def perturbed_starts(problem: LevelProblem, at: Alignment) -> list[Alignment]:
+    """Alignments that look much the same, those of the least cost first.
+
+    They are off by pixels along the two directions that the image determines least.
+    """
+    scale2 = at.squared_scale
+    found = whitened_directions(problem, problem.system_at(at, scale2)) if scale2 > 0 else None
+    if found is None:
+        return []
+    first, second = found[0][:, 0], found[0][:, 1]
+    poses = [
+        perturbed(at.cam_from_world, a * first + b * second)
+        for a in _BESIDE
+        for b in _BESIDE
+        if a or b
+    ]
+    others = [replace(at, cam_from_world=pose) for pose in poses]
+    costs = [problem.system_at(each, scale2).mean_cost for each in others]
+    return [others[k] for k in np.argsort(costs, kind="stable")]

@@ -1,0 +1,246 @@
+"""Images as photometric alignment compares them: pyramids of values, and the points chosen of them.
+
+What a mask leaves out never enters a value: every mean is taken over the pixels that are used
+(normalised convolution, Knutsson and Westin, CVPR 1993). A reference image is compared at points
+and not at all its pixels: those with the strongest gradient in the cells of a grid, as direct
+odometry chooses them (Engel et al., "Direct Sparse Odometry", PAMI 2018, section 3.2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.refinement.depth_points import DepthPoints
+
+Appearance = Literal["normalised", "intensity", "gradients"]
+FeatureMaps = Callable[[NDArray[np.uint8]], NDArray[np.floating[Any]]]
+_BLUR_PX = 0.8  # before each halving, and of the values: bilinear reading needs smooth ones
+_WINDOW_PX = 17  # in which contrast is normalised
+# of the mean local variance, which local variances are raised by: flat areas stay flat
+_FLAT = 0.1
+_SMALLEST_SIDE_PX = 16
+_HALF = 0.5  # share of a pixel that must be used
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+
+"""A dense network: RGB image, uint8 (H, W, 3), to feature maps (C, h, w) over the same view."""
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """One level of an image's pyramid.
+
+    Attributes
+    ----------
+    values : float32 (h, w, C).
+    valid : bool (h, w), where the values may be used.
+    scale_x, scale_y : pixels of the level per pixel of the image: a pixel (u, v) of the image, the
+        first pixel's centre at (0.5, 0.5), is (u scale_x, v scale_y) of the level.
+    """
+
+    values: Float32
+    valid: NDArray[np.bool_]
+    scale_x: float
+    scale_y: float
+
+    @cached_property
+    def gradient_energy(self) -> Float32:
+        """Squared gradient by central differences, summed over channels: float32 (h, w).
+
+        Zero on the border and where a pixel or one beside it is not valid.
+        """
+        values, valid = self.values, self.valid
+        energy = np.zeros(valid.shape, np.float32)
+        across = values[1:-1, 2:] - values[1:-1, :-2]
+        down = values[2:, 1:-1] - values[:-2, 1:-1]
+        energy[1:-1, 1:-1] = np.square(across).sum(2) + np.square(down).sum(2)
+        inside = valid[1:-1, 1:-1] & valid[1:-1, 2:] & valid[1:-1, :-2] & valid[2:, 1:-1]
+        energy[1:-1, 1:-1] *= inside & valid[:-2, 1:-1]
+        return energy
+
+
+def build_pyramid(
+    image: NDArray[np.uint8],
+    mask: NDArray[np.bool_] | None = None,
+    *,
+    levels: int = 5,
+    max_side_px: int = 640,
+    appearance: Appearance = "normalised",
+    features: FeatureMaps | None = None,
+) -> list[Level]:
+    """The levels of an image, finest first.
+
+    Parameters
+    ----------
+    image : uint8 (H, W, 3), RGB.
+    mask : bool (H, W), True = use.
+    levels : at most; none is smaller than 16 px.
+    max_side_px : longer side of the finest level; larger images are reduced.
+    appearance : ``intensity`` is brightness in [0, 1]; ``normalised`` is brightness of zero mean
+        and unit deviation in a window about each pixel; ``gradients`` is the magnitude of the
+        gradient of brightness.
+    features : compare these maps of the image instead; masked pixels are shown to it in the mean
+        colour of the others.
+
+    Raises
+    ------
+    DataError : mask or feature maps of a shape that does not fit.
+    """
+    height, width = image.shape[:2]
+    if mask is not None and mask.shape != (height, width):
+        raise DataError(f"a mask of {mask.shape} does not fit an image of {(height, width)}")
+    used = np.ones((height, width), np.float32) if mask is None else mask.astype(np.float32)
+    if features is not None:
+        values = _feature_values(image, used, features)
+        used = _resized(used, values.shape[1], values.shape[0])
+    else:
+        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        values = (grey.astype(np.float32) * np.float32(1 / 255))[..., None]
+    values = values * used[..., None]
+    longer = max(values.shape[:2])
+    if longer > max_side_px:
+        size = [max(1, round(side * max_side_px / longer)) for side in values.shape[1::-1]]
+        values, used = _resized(values, *size), _resized(used, *size)
+    result: list[Level] = []
+    while True:
+        values, smooth_used = _blurred(values, _BLUR_PX), _blurred(used, _BLUR_PX)
+        h, w = used.shape
+        known = smooth_used > 1e-3
+        mean = np.where(
+            known[..., None], values / np.where(known, smooth_used, 1.0)[..., None], 0.0
+        ).astype(np.float32)
+        valid = used > _HALF
+        if features is None and appearance == "normalised":
+            mean = _normalised(mean, used)
+        elif features is None and appearance == "gradients":
+            mean, valid = _gradient_magnitude(mean, valid)
+        result.append(Level(np.ascontiguousarray(mean), valid, w / width, h / height))
+        if len(result) == levels or min(h, w) < 2 * _SMALLEST_SIDE_PX:
+            return result
+        values, used = (_resized(each, w // 2, h // 2) for each in (values, smooth_used))
+
+
+def _feature_values(image: NDArray[np.uint8], used: Float32, features: FeatureMaps) -> Float32:
+    if not used.all():
+        keep = used > 0
+        colour = image[keep].mean(0) if keep.any() else np.zeros(3)
+        image = np.where(keep[..., None], image, colour.round().astype(np.uint8))
+    maps = np.asarray(features(image), dtype=np.float32)
+    if maps.ndim != 3 or min(maps.shape) < 1 or not np.isfinite(maps).all():
+        raise DataError(f"feature maps must be finite and (C, h, w), got {maps.shape}")
+    return np.ascontiguousarray(maps.transpose(1, 2, 0))
+
+
+def _resized(values: Float32, width: int, height: int) -> Float32:
+    if values.shape[1::-1] == (width, height):
+        return values
+    smaller = cv2.resize(values, (width, height), interpolation=cv2.INTER_AREA)
+    return np.asarray(smaller, np.float32).reshape(height, width, *values.shape[2:])
+
+
+def _blurred(values: Float32, deviation_px: float) -> Float32:
+    blurred = cv2.GaussianBlur(values, (0, 0), deviation_px)
+    return np.asarray(blurred, np.float32).reshape(values.shape)
+
+
+def _box_mean(values: Float32) -> Float32:
+    return np.asarray(cv2.blur(values, (_WINDOW_PX, _WINDOW_PX)), np.float32)
+
+
+def _normalised(values: Float32, used: Float32) -> Float32:
+    """Values (h, w, 1) with zero mean and unit deviation in the window about each pixel."""
+    plane = values[..., 0]
+    share = np.maximum(_box_mean(used), np.float32(1e-3))
+    mean = _box_mean(plane * used) / share
+    centred = np.asarray(plane - mean, np.float32)
+    # about the pixel's own mean, which differs little from that of its neighbours
+    variance = _box_mean(centred * centred * used) / share
+    floor = _FLAT * float(np.average(variance, weights=used)) if used.any() else 0.0
+    result = centred / np.sqrt(variance + np.float32(max(floor, 1e-8)))
+    return np.asarray(result, np.float32)[..., None]
+
+
+def _gradient_magnitude(
+    values: Float32, valid: NDArray[np.bool_]
+) -> tuple[Float32, NDArray[np.bool_]]:
+    plane = values[..., 0]
+    # a level has at least 8 rows and columns
+    down, across = np.gradient(plane)
+    magnitude = np.sqrt(down * down + across * across).astype(np.float32)
+    eroded = cv2.erode(
+        valid.astype(np.uint8),
+        np.ones((3, 3), np.uint8),
+        borderType=cv2.BORDER_REPLICATE,
+    )
+    return magnitude[..., None], eroded.astype(bool)
+
+
+@dataclass(frozen=True, eq=False)
+class ChosenPoints:
+    """Points of several references at one level of their pyramids.
+
+    Attributes
+    ----------
+    points : float64 (N, 3), in the world.
+    values : float64 (N, C), in their reference.
+    groups : int64 (N,), of which reference each is.
+    """
+
+    points: Float64
+    values: Float64
+    groups: NDArray[np.int64]
+
+    def thinned(self, most: int) -> ChosenPoints:
+        """At most so many of them, still evenly spread."""
+        step = max(1, -(-len(self.points) // most))
+        return self.subset(np.arange(0, len(self.points), step))
+
+    def subset(self, which: NDArray[Any]) -> ChosenPoints:
+        """Those of a mask (N,) or of rows."""
+        return ChosenPoints(self.points[which], self.values[which], self.groups[which])
+
+
+def choose_points(
+    references: Sequence[DepthPoints],
+    levels: Sequence[Level],
+    wanted: Sequence[NDArray[np.bool_]],
+    max_points: int,
+) -> ChosenPoints:
+    """At most ``max_points`` of each reference, evenly spread, with their values at a level.
+
+    Parameters
+    ----------
+    levels : of each reference, of one kind.
+    wanted : bool (N,) of each reference: those to choose from.
+    """
+    from megloc_kapture.refinement.photometric_kernels import (
+        read_values,
+        strongest_per_cell,
+    )
+
+    points, values, groups = [], [], []
+    for group, (reference, level, ours) in enumerate(zip(references, levels, wanted, strict=True)):
+        h, w = level.valid.shape
+        cell_px = max(1.0, float(np.sqrt(h * w / max_points)))
+        best = np.empty((int(np.ceil(h / cell_px)), int(np.ceil(w / cell_px))), np.int64)
+        x, y = reference.px[:, 0] * level.scale_x, reference.px[:, 1] * level.scale_y
+        strongest_per_cell(x, y, level.gradient_energy, ours, cell_px, best)
+        rows = best[best >= 0]
+        read, found = (
+            np.empty((len(rows), level.values.shape[2])),
+            np.empty(len(rows), np.bool_),
+        )
+        read_values(level.values, level.valid, x[rows] - 0.5, y[rows] - 0.5, read, found)
+        points.append(reference.points[rows[found]])
+        values.append(read[found])
+        groups.append(np.full(int(found.sum()), group, np.int64))
+    return ChosenPoints(np.concatenate(points), np.concatenate(values), np.concatenate(groups))

@@ -1,0 +1,194 @@
+"""Keypoints lifted by depth, and points verified by it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from megloc_kapture.mapping.depth import (
+    DepthVerificationOptions,
+    LiftingOptions,
+    contradicted_by_depth,
+    depth_noise,
+    lift_keypoints,
+)
+from megloc_kapture.values import Camera, RigidTransform
+
+IMAGE = Camera("SIMPLE_RADIAL", 640, 480, (520.0, 321.0, 238.0, -0.05))
+DEPTH = Camera("PINHOLE", 320, 240, (290.0, 292.0, 160.0, 120.0))
+IDENTITY = RigidTransform.identity()
+BESIDE = RigidTransform.from_matrix(
+    np.array([[0.9998, -0.02, 0.0], [0.02, 0.9998, 0.0], [0.0, 0.0, 1.0]]),
+    np.array([0.04, 0.01, 0]),
+)
+SMALL = Camera("PINHOLE", 64, 48, (60.0, 60.0, 32.0, 24.0))
+ASIDE = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.05, 0.0, 0.0))
+EXACT = DepthVerificationOptions(
+    max_sigmas=3.0, noise=(0.01, 0.0, 0.0), keypoint_noise_px=0.0, window_px=0
+)
+
+
+def plane_depth(camera: Camera) -> NDArray[np.float32]:
+    """Depth of the plane z = 2 + 0.3 x in the camera's frame."""
+    fx, _, cx, _ = camera.params
+    x = (np.arange(camera.width) + 0.5 - cx) / fx
+    return np.tile((2 / (1 - 0.3 * x)).astype(np.float32), (camera.height, 1))
+
+
+@pytest.mark.parametrize("image_from_depth", [IDENTITY, BESIDE], ids=["registered", "beside"])
+def test_points_lie_on_the_plane_and_on_their_rays(image_from_depth: RigidTransform) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    keypoints = np.random.default_rng(0).uniform([180, 120], [460, 360], (500, 2))
+    points, valid = lift_keypoints(
+        keypoints.astype(np.float32), plane_depth(DEPTH), IMAGE, DEPTH, image_from_depth
+    )
+    assert valid.all()
+    in_depth = image_from_depth.inverse().apply(points)
+    np.testing.assert_allclose(in_depth[:, 2], 2 + 0.3 * in_depth[:, 0], atol=2e-3)
+    camera = pycolmap.Camera(
+        model=IMAGE.model, width=IMAGE.width, height=IMAGE.height, params=IMAGE.params
+    )
+    np.testing.assert_allclose(camera.img_from_cam(points), keypoints, atol=1e-3)
+
+
+def test_the_centre_of_the_first_pixel_is_half() -> None:
+    depth = np.full((2, 3), 5.0, np.float32)
+    depth[0, 0] = 4.9
+    camera = Camera("PINHOLE", 3, 2, (10.0, 10.0, 1.5, 1.0))
+    keypoints = np.array([[0.5, 0.5], [1.0, 0.5], [2.5, 1.5]])
+    points, valid = lift_keypoints(keypoints, depth, camera, camera, IDENTITY)
+    assert valid.all()
+    np.testing.assert_allclose(points[:, 2], [4.9, 4.95, 5.0], rtol=1e-6)
+
+
+def test_an_edge_has_no_depth() -> None:
+    depth = np.full((100, 100), 2.0, np.float32)
+    depth[:, 50:] = 4.0
+    camera = Camera("PINHOLE", 100, 100, (100.0, 100.0, 50.0, 50.0))
+    keypoints = np.array([[48.0, 20.0], [50.0, 20.0], [52.0, 20.0]])
+    points, valid = lift_keypoints(keypoints, depth, camera, camera, IDENTITY)
+    assert valid.tolist() == [True, False, True]
+    assert np.isnan(points[1]).all()
+    loose = LiftingOptions(max_jump=1.5)
+    assert lift_keypoints(keypoints, depth, camera, camera, IDENTITY, loose)[1].all()
+
+
+def test_missing_depth_falls_back_to_the_nearest_that_is_there() -> None:
+    depth = np.full((4, 4), 3.0, np.float32)
+    depth[1, 2], depth[2, 1], depth[2, 2] = 0.0, np.nan, -1.0
+    depth[1, 1] = 2.9
+    camera = Camera("PINHOLE", 4, 4, (10.0, 10.0, 2.0, 2.0))
+    points, valid = lift_keypoints(np.array([[1.6, 1.6]]), depth, camera, camera, IDENTITY)
+    assert valid.all()
+    np.testing.assert_allclose(points[0, 2], 2.9, rtol=1e-6)
+    nothing = np.zeros((4, 4), np.float32)
+    assert not lift_keypoints(np.array([[1.6, 1.6]]), nothing, camera, camera, IDENTITY)[1].any()
+
+
+def test_what_the_depth_camera_does_not_see_has_none() -> None:
+    wide = Camera("PINHOLE", 640, 480, (300.0, 300.0, 320.0, 240.0))
+    keypoints = np.array([[5.0, 240.0], [320.0, 240.0]])
+    _, valid = lift_keypoints(keypoints, plane_depth(DEPTH), wide, DEPTH, IDENTITY)
+    assert valid.tolist() == [False, True]
+    empty, none = lift_keypoints(np.zeros((0, 2)), plane_depth(DEPTH), wide, DEPTH, IDENTITY)
+    assert empty.shape == (0, 3) and none.shape == (0,)
+
+
+def tilted_plane() -> tuple[np.ndarray, np.ndarray]:
+    """A depth map of the plane z = 2 + 0.3 x, and a normal form n . X = 2 of it."""
+    x = (np.arange(64) + 0.5 - 32.0) / 60.0
+    depth = np.broadcast_to(2.0 / (1.0 - 0.3 * x), (48, 64)).astype(np.float32)
+    return depth, np.array([-0.3, 0.0, 1.0])
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    off=st.floats(-0.2, 0.2).filter(lambda off: abs(abs(off) - 0.03) > 0.02),
+)
+def test_points_off_the_plane_by_more_than_the_noise_contradict(seed: int, off: float) -> None:
+    depth, normal = tilted_plane()
+    rng = np.random.default_rng(seed)
+    rays = np.column_stack([rng.uniform(-0.4, 0.4, 50), rng.uniform(-0.3, 0.3, 50), np.ones(50)])
+    on_plane = rays * (2.0 / (rays @ normal))[:, None]
+    # within a pixel the plane's depth changes by less than 0.02
+    in_depth = on_plane * ((on_plane[:, 2] + off) / on_plane[:, 2])[:, None]
+    points = ASIDE.apply(in_depth)
+    contradicted, checked = contradicted_by_depth(points, depth, SMALL, ASIDE, EXACT)
+    assert checked.all()
+    assert contradicted.all() if abs(off) > 0.03 else not contradicted.any()
+
+
+def test_the_offset_between_the_cameras_counts() -> None:
+    depth = np.full((48, 64), 2.0, np.float32)
+    depth[:, 32:] = 1.0
+    # in the depth camera the point is left of the step, where the surface is 2 away
+    point = np.array([[0.02, 0.0, 2.0]])
+    assert contradicted_by_depth(point, depth, SMALL, IDENTITY, EXACT)[0].all()
+    assert not contradicted_by_depth(point, depth, SMALL, ASIDE, EXACT)[0].any()
+
+
+def test_near_an_edge_either_surface_may_be_meant() -> None:
+    depth = np.full((48, 64), 2.0, np.float32)
+    depth[:, 32:] = 1.0
+    options = EXACT.model_copy(update={"window_px": 2})
+    # pixel columns 28 to 35: one metre away is right from column 30 on
+    columns = np.arange(28, 36) + 0.5
+    near = np.column_stack([(columns - 32.0) / 60.0, np.zeros(8), np.ones(8)])
+    found, checked = contradicted_by_depth(near, depth, SMALL, IDENTITY, options)
+    assert checked.all()
+    assert found.tolist() == [True, True] + [False] * 6
+    found, _ = contradicted_by_depth(near * 2.0, depth, SMALL, IDENTITY, options)
+    assert found.tolist() == [False] * 6 + [True, True]
+    # and behind both there is nothing
+    assert contradicted_by_depth(near * 2.5, depth, SMALL, IDENTITY, options)[0].all()
+
+
+@pytest.mark.parametrize("missing", [0.0, -1.0, np.nan, np.inf])
+def test_missing_depth_says_nothing(missing: float) -> None:
+    depth = np.full((48, 64), 2.0, np.float32)
+    depth[20:28, 28:36] = missing
+    wrong = np.array([[0.0, 0.0, 5.0]])
+    options = EXACT.model_copy(update={"window_px": 1})
+    for point in (wrong, wrong + [0.3, 0.0, 0.0]):  # in the hole, and one pixel beside it
+        contradicted, checked = contradicted_by_depth(point, depth, SMALL, IDENTITY, options)
+        assert not contradicted.any()
+        assert not checked.any()
+    far_from_it = wrong + [1.0, 0.0, 0.0]
+    assert contradicted_by_depth(far_from_it, depth, SMALL, IDENTITY, options)[0].all()
+
+
+def test_points_outside_and_behind_are_not_judged() -> None:
+    depth = np.full((48, 64), 2.0, np.float32)
+    points = np.array([[0.0, 0.0, -2.0], [10.0, 0.0, 2.0], [0.0, -10.0, 2.0], [0.0, 0.0, 0.0]])
+    contradicted, checked = contradicted_by_depth(points, depth, SMALL, IDENTITY, EXACT)
+    assert not contradicted.any()
+    assert not checked.any()
+
+
+def test_an_uncertain_point_may_be_farther_off() -> None:
+    depth = np.full((48, 64), 2.0, np.float32)
+    points = np.repeat([[0.0, 0.0, 2.5]], 4, axis=0)
+    options = EXACT.model_copy(update={"keypoint_noise_px": 2.0})
+    # 0.5 off: 3 sigmas of hypot(0.01, 2 * deviation)
+    least = np.sqrt((0.5 / 3) ** 2 - 0.01**2) / 2.0
+    deviations = np.array([0.0, np.nan, 0.999 * least, 1.001 * least])
+    contradicted, _ = contradicted_by_depth(
+        points, depth, SMALL, IDENTITY, options, deviations=deviations
+    )
+    assert contradicted.tolist() == [True, True, True, False]
+
+
+def test_default_noise_is_that_of_the_source() -> None:
+    z = np.linspace(0.4, 5.0, 20)
+    published = 0.0012 + 0.0019 * (z - 0.4) ** 2
+    np.testing.assert_allclose(depth_noise(z, DepthVerificationOptions().noise), published)
+
+
+@pytest.mark.parametrize("noise", [(0.0, 0.0, 0.1), (0.001, -0.01, 0.001), (0.01, -0.1, 0.0)])
+def test_noise_that_is_not_positive_is_refused(noise: tuple[float, float, float]) -> None:
+    with pytest.raises(ValidationError, match="not positive at every depth"):
+        DepthVerificationOptions(noise=noise)

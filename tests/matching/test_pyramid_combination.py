@@ -1,0 +1,209 @@
+"""Keypoints that grow, and the matches of a pair put together with those of its variants."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from megloc_kapture.geometry.image_variants import ImageVariant
+from megloc_kapture.matching.guided_pyramid import (
+    VariantMatches,
+)
+from megloc_kapture.matching.pyramid_combination import (
+    SAME_KEYPOINT_PX,
+    KeypointUnion,
+    TriedVariant,
+    combine,
+)
+
+# a grid of quarter pixels: distances of exactly one pixel, and equal ones, are common
+POSITIONS = st.lists(
+    st.tuples(st.integers(-20, 20), st.integers(-20, 20)).map(lambda xy: (xy[0] / 4, xy[1] / 4)),
+    max_size=25,
+)
+
+
+def array(positions: list[tuple[float, float]]) -> np.ndarray:
+    xy = np.array(positions, np.float32).reshape(-1, 2)
+    return np.concatenate([xy, np.arange(len(xy), dtype=np.float32)[:, None]], axis=1)
+
+
+def nearest(keypoint: np.ndarray, among: np.ndarray) -> int:
+    if len(among) == 0:
+        return -1
+    distance = np.linalg.norm(among[:, :2].astype(np.float64) - keypoint[:2], axis=1)
+    row = int(distance.argmin())
+    return row if distance[row] <= SAME_KEYPOINT_PX else -1
+
+
+@given(base=POSITIONS, more=POSITIONS)
+def test_against_looking_at_all_of_them(
+    base: list[tuple[float, float]], more: list[tuple[float, float]]
+) -> None:
+    union = KeypointUnion(array(base))
+    kept = array(base)
+    for keypoint in array(more):
+        expected = nearest(keypoint, kept[: len(base)])  # those that were there come first
+        if expected < 0:
+            behind = nearest(keypoint, kept[len(base) :])
+            expected = behind if behind < 0 else behind + len(base)
+        (found,) = union.find(keypoint[None]).tolist()
+        assert found == expected
+        if found < 0:
+            assert union.append(keypoint) == len(kept)
+            kept = np.concatenate([kept, keypoint[None]])
+    np.testing.assert_array_equal(union.keypoints_px(), kept)
+    np.testing.assert_array_equal(union.keypoints_px()[: len(base)], array(base))
+    np.testing.assert_array_equal(union.added(), kept[len(base) :])
+    # opened again with what was added, it finds the same
+    again = KeypointUnion(array(base), union.added())
+    np.testing.assert_array_equal(again.find(array(more)), union.find(array(more)))
+
+
+@given(base=POSITIONS, more=POSITIONS, taken_back=st.integers(0, 25))
+def test_what_is_taken_back_was_never_there(
+    base: list[tuple[float, float]], more: list[tuple[float, float]], taken_back: int
+) -> None:
+    union = KeypointUnion(array(base))
+    for keypoint in array(more):
+        if union.find(keypoint[None])[0] < 0:
+            union.append(keypoint)
+    length = max(len(base), len(union) - taken_back)
+    expected = KeypointUnion(array(base), union.added()[: length - len(base)])
+    union.truncate(length)
+    np.testing.assert_array_equal(union.keypoints_px(), expected.keypoints_px())
+    np.testing.assert_array_equal(union.find(array(more)), expected.find(array(more)))
+
+
+def test_of_several_at_one_place_the_first_is_meant() -> None:
+    # SIFT has a keypoint for each orientation
+    union = KeypointUnion(array([(9.0, 9.0), (5.0, 5.0), (5.0, 5.0)]))
+    assert union.find(array([(5.3, 5.0)])).tolist() == [1]
+
+
+def test_no_keypoints_at_all() -> None:
+    union = KeypointUnion(np.zeros((0, 2), np.float32))
+    assert union.find(np.zeros((0, 2), np.float32)).shape == (0,)
+    assert union.keypoints_px().shape == union.added().shape == (0, 2)
+
+
+def variant_matches(
+    positions: list[tuple[float, float]], others: list[int], scores: list[float] | None = None
+) -> VariantMatches:
+    return VariantMatches(
+        ImageVariant(0.5),
+        np.array(positions, np.float32).reshape(-1, 2),
+        np.zeros((len(positions), 4), np.float32),
+        np.array(others, np.int64),
+        np.array(scores or [1.0] * len(others), np.float32),
+    )
+
+
+def grid(count: int) -> np.ndarray:
+    """Keypoints ten pixels apart."""
+    return np.stack([np.arange(count) * 10.0, np.zeros(count)], axis=1).astype(np.float32)
+
+
+BASE = (np.array([[0, 0], [1, 1]]), np.array([0.9, 0.8]))
+
+
+def test_all_is_what_was_there_and_what_is_new() -> None:
+    keypoints = KeypointUnion(grid(5))
+    tried = [
+        # at keypoint 2; new; new, but the other one has a match; at keypoint 1, which has one
+        variant_matches([(20.5, 0.5), (5, 5), (6, 50), (10, 0)], [7, 8, 0, 9], [0.1, 0.2, 1, 1]),
+        variant_matches([(5, 5.9)], [10]),  # the poorer one's keypoint is the other's: has a match
+    ]
+    combined = combine(BASE, [TriedVariant(0, each) for each in tried], "all", (keypoints, None))
+    assert combined.matches.tolist() == [[0, 0], [1, 1], [5, 8], [2, 7]]
+    np.testing.assert_allclose(combined.scores, [0.9, 0.8, 0.2, 0.1])
+    assert combined.best == 0
+    assert combined.added[0].tolist() == [[0, 1]] and combined.added[1].tolist() == []
+    np.testing.assert_array_equal(keypoints.keypoints_px(), [*grid(5), (5, 5)])
+
+
+def test_variants_of_both_images_add_to_both() -> None:
+    first, second = KeypointUnion(grid(3)), KeypointUnion(grid(4))
+    tried = [
+        TriedVariant(0, variant_matches([(5, 5)], [3])),
+        TriedVariant(1, variant_matches([(6, 6), (7, 60)], [2, 1])),
+    ]
+    combined = combine(BASE, tried, "all", (first, second))
+    # the richer one first; row 1 of the first image has a match
+    assert combined.matches.tolist() == [[0, 0], [1, 1], [2, 4], [3, 3]]
+    assert combined.added[0].tolist() == [[0, 0]] and combined.added[1].tolist() == [[1, 0]]
+
+
+def test_max_is_the_richest() -> None:
+    rich = variant_matches([(5, 5), (0, 0.5), (15, 5)], [0, 5, 6])
+    richer = variant_matches([(5, 45), (10, 40), (15, 45), (20, 40)], [0, 5, 6, 7])
+    keypoints = KeypointUnion(grid(5))
+    combined = combine(
+        BASE, [TriedVariant(0, rich), TriedVariant(0, richer)], "max", (keypoints, None)
+    )
+    assert combined.matches.tolist() == [[5, 0], [6, 5], [7, 6], [8, 7]]
+    assert combined.best == 1
+    combined = combine(BASE, [TriedVariant(0, rich)], "max", (KeypointUnion(grid(5)), None))
+    assert combined.matches.tolist() == [[5, 0], [0, 5], [6, 6]]
+
+
+def test_max_keeps_the_images_as_they_are_where_no_variant_has_more() -> None:
+    keypoints = KeypointUnion(grid(5))
+    as_many = variant_matches([(5, 5), (15, 5)], [4, 5])
+    # three matches, but two of their keypoints are one
+    seemingly = variant_matches([(5, 5), (5, 5.5), (15, 5)], [4, 5, 6])
+    for tried in ([], [as_many], [seemingly]):
+        combined = combine(
+            BASE, [TriedVariant(0, each) for each in tried], "max", (keypoints, None)
+        )
+        assert combined.matches.tolist() == BASE[0].tolist()
+        assert combined.best is None
+        assert len(combined.added[0]) == 0 and len(keypoints) == 5
+
+
+@given(
+    mode=st.sampled_from(("all", "max")),
+    seed=st.integers(0, 10_000),
+    sizes=st.lists(st.tuples(st.integers(0, 1), st.integers(0, 12)), max_size=5),
+)
+def test_whatever_is_tried(
+    mode: Literal["all", "max"], seed: int, sizes: list[tuple[Literal[0, 1], int]]
+) -> None:
+    rng = np.random.default_rng(seed)
+    unions = KeypointUnion(grid(8)), KeypointUnion(grid(9))
+    base = (np.stack([rng.permutation(8)[:4], rng.permutation(9)[:4]], axis=1), rng.random(4))
+    tried = [
+        TriedVariant(
+            side,
+            variant_matches(
+                rng.uniform(0, 30, (size, 2)).tolist(),
+                rng.integers(0, 8, size).tolist(),
+                rng.random(size).tolist() or None,
+            ),
+        )
+        for side, size in sizes
+    ]
+    combined = combine(base, tried, mode, unions)
+    found = combined.matches
+    assert len(found) == len(combined.scores) >= 4
+    for side in (0, 1):
+        assert len(set(found[:, side].tolist())) == len(found)  # a keypoint has one match
+        union, added = unions[side], combined.added[side]
+        length = (8, 9)[side]
+        assert len(union) == length + len(added)
+        # every added keypoint is used, and stands where its match says
+        assert set(range(length, len(union))) <= set(found[:, side].tolist())
+        for keypoint, (number, match) in zip(union.added(), added.tolist(), strict=True):
+            assert tried[number].side == side
+            np.testing.assert_array_equal(keypoint, tried[number].matches.keypoints_px[match])
+        all_px = union.keypoints_px().astype(np.float64)
+        gaps = np.linalg.norm(all_px[:, None] - all_px[None], axis=2)
+        assert (gaps[length:] + 9 * np.eye(len(union))[length:] > 1.0).all()
+    if mode == "all" or combined.best is None:
+        assert found[:4].tolist() == base[0].tolist()
+    if mode == "max":
+        most = max([len(each.matches) for each in tried], default=0)
+        assert combined.best is None or len(tried[combined.best].matches) == most > 4

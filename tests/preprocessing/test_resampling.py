@@ -1,0 +1,420 @@
+"""Sizes, cameras that follow exactly, and resampling that is right to the half pixel."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from megloc_kapture.errors import OptionError
+from megloc_kapture.io.colmap import px_from_cam
+from megloc_kapture.preprocessing.frames import (
+    FrameOptions,
+    FramePlan,
+    plan_frame,
+    processed_image,
+    processed_mask,
+    reached_region,
+)
+from megloc_kapture.preprocessing.resampling import (
+    PixelMap,
+    cropped_size,
+    fitted_size,
+    resized,
+    scaled_camera,
+    undistorted_camera,
+    with_two_focals,
+)
+from megloc_kapture.values import Camera
+
+UNDISTORT = FrameOptions(undistort=True, multiple_of=1)
+WHOLE = FrameOptions(undistort=True, blank_pixels=1.0)
+SMALL = FrameOptions(undistort=True, blank_pixels=1.0, max_size_px=200)
+FOLDING = Camera("SIMPLE_RADIAL", 480, 360, (240.0, 240.0, 180.0, -0.4))
+
+
+@pytest.mark.parametrize(
+    ("size", "expected"),
+    [
+        ((4032, 3024), (1600, 1200)),
+        ((3024, 4032), (1200, 1600)),
+        ((1536, 1024), (1536, 1024)),
+        ((1920, 1080), (1600, 900)),
+        ((2000, 1333), (1600, 1066)),
+        ((1601, 3), (1600, 3)),
+        ((100_000, 1), (1600, 1)),
+    ],
+)
+def test_the_larger_side_fits(size: tuple[int, int], expected: tuple[int, int]) -> None:
+    assert fitted_size(*size, 1600) == expected
+
+
+def test_small_images_are_enlarged_only_when_asked() -> None:
+    assert fitted_size(1024, 1024, 1600) == (1024, 1024)
+    assert fitted_size(1024, 1024, 1600, upscale=True) == (1600, 1600)
+    assert fitted_size(512, 768, 1600, upscale=True) == (1067, 1600)
+
+
+@given(st.integers(1, 6000), st.integers(1, 6000), st.integers(1, 6000))
+def test_the_ratio_is_kept_as_whole_pixels_allow(width: int, height: int, target: int) -> None:
+    new_width, new_height = fitted_size(width, height, target, upscale=True)
+    assert max(new_width, new_height) == target
+    exact = min(width, height) * target / max(width, height)
+    assert abs(min(new_width, new_height) - max(exact, 1)) <= 0.5 + 1e-9
+
+
+@given(st.integers(8, 6000), st.integers(8, 6000))
+def test_both_sides_become_multiples(width: int, height: int) -> None:
+    cropped = cropped_size(width, height, 8)
+    assert all(
+        new % 8 == 0 and 0 <= old - new < 8
+        for old, new in zip((width, height), cropped, strict=True)
+    )
+    assert cropped_size(width, height, 1) == (width, height)
+
+
+def test_an_image_too_small_to_crop_is_refused() -> None:
+    with pytest.raises(OptionError, match="100x7 cannot be cropped to multiples of 8"):
+        cropped_size(100, 7, 8)
+
+
+def points_seen(camera: Camera, seed: int = 0, count: int = 200) -> np.ndarray:
+    """3D points in front of a camera, within its view."""
+    rng = np.random.default_rng(seed)
+    rays = np.concatenate([rng.uniform(-0.6, 0.6, (count, 2)), np.ones((count, 1))], axis=1)
+    return rays * rng.uniform(0.5, 50, (count, 1))
+
+
+@pytest.mark.parametrize("size", [(240, 180), (161, 120), (1000, 749)])
+def test_points_project_to_where_the_resized_image_shows_them(
+    camera: Camera, size: tuple[int, int]
+) -> None:
+    points = points_seen(camera)
+    scaled = scaled_camera(camera, *size)
+    assert (scaled.width, scaled.height) == size
+    expected = px_from_cam(camera, points) * [size[0] / camera.width, size[1] / camera.height]
+    np.testing.assert_allclose(px_from_cam(scaled, points), expected, rtol=0, atol=1e-9)
+
+
+def test_the_same_scale_on_both_axes_keeps_the_model(camera: Camera) -> None:
+    twice = scaled_camera(camera, 2 * camera.width, 2 * camera.height)
+    assert twice.model == camera.model
+    one = with_two_focals(camera).params
+    np.testing.assert_array_equal(
+        np.array(with_two_focals(twice).params[:4]), 2 * np.array(one[:4])
+    )
+    assert with_two_focals(twice).params[4:] == one[4:]
+
+
+def test_a_second_focal_length_changes_no_projection(camera: Camera) -> None:
+    points = points_seen(camera, seed=1)
+    np.testing.assert_allclose(
+        px_from_cam(with_two_focals(camera), points), px_from_cam(camera, points), atol=1e-10
+    )
+
+
+@pytest.mark.parametrize("max_size_px", [97, 160, 241, 480])
+def test_a_ramp_stays_the_same_function_of_the_ray(
+    painted: Callable[..., Any], max_size_px: int
+) -> None:
+    """Half a pixel's error would be seen as 0.5 (1/s - 1) pixels' worth of the slope."""
+    slope_x, slope_y = 1.6, 0.9
+    image = painted(lambda x, y: slope_x * x + slope_y * y, 96, 81)
+    camera = Camera("PINHOLE", 96, 81, (90.0, 90.0, 48.0, 40.5))
+    plan = plan_frame(camera, FrameOptions(max_size_px=max_size_px, upscale=True, multiple_of=1))
+    found = processed_image(image, plan)[..., 0].astype(float)
+    assert found.shape == (plan.processed.height, plan.processed.width)
+    x, y = np.meshgrid(np.arange(found.shape[1]) + 0.5, np.arange(found.shape[0]) + 0.5)
+    points = np.stack([x.ravel(), y.ravel()], axis=1)
+    at = plan.pixel_map().original_from_processed(points).reshape(*found.shape, 2)
+    expected = slope_x * at[..., 0] + slope_y * at[..., 1]
+    # cubics need two pixels beside the one that is asked for
+    inner = ((at > 3) & (at < [93, 78])).all(axis=2)
+    error = (found - expected)[inner]
+    assert np.abs(error.mean()) < 0.1
+    assert np.abs(error).max() < 1.2
+
+
+@pytest.mark.parametrize("max_size_px", [121, 200, 333, 900])
+def test_a_blob_is_where_the_pixel_map_says(painted: Callable[..., Any], max_size_px: int) -> None:
+    centre = np.array([201.3, 120.8])
+    image = painted(
+        lambda x, y: 250 * np.exp(-((x - centre[0]) ** 2 + (y - centre[1]) ** 2) / (2 * 8.0**2))
+    )
+    camera = Camera("PINHOLE", 483, 362, (330.0, 330.0, 243.0, 181.0))
+    plan = plan_frame(camera, FrameOptions(max_size_px=max_size_px, upscale=True))
+    found = processed_image(image, plan)[..., 0].astype(float)
+    y, x = np.indices(found.shape) + 0.5
+    centroid = np.array([[(found * x).sum(), (found * y).sum()]]) / found.sum()
+    back = plan.pixel_map().original_from_processed(centroid)
+    np.testing.assert_allclose(back[0], centre, atol=0.03)
+
+
+def test_smaller_pixels_are_means(painted: Callable[..., Any]) -> None:
+    board = painted(lambda x, y: 255.0 * ((np.floor(x) + np.floor(y)) % 2), 64, 64)
+    np.testing.assert_array_equal(resized(board, 16, 16), np.full((16, 16, 3), 128))
+
+
+def test_what_is_cropped_moves_nothing(painted: Callable[..., Any]) -> None:
+    image = painted(lambda x, y: x + y / 2, 123, 61)
+    camera = Camera("SIMPLE_RADIAL", 123, 61, (100.0, 60.0, 30.0, 0.1))
+    plan = plan_frame(camera, FrameOptions(max_size_px=1600))
+    assert (plan.processed.width, plan.processed.height) == (120, 56)
+    assert (plan.processed.model, plan.processed.params) == (camera.model, camera.params)
+    np.testing.assert_array_equal(processed_image(image, plan), image[:56, :120])
+
+
+def test_nothing_to_do_changes_nothing(camera: Camera) -> None:
+    plan = plan_frame(camera, FrameOptions())
+    assert plan.processed == camera and not plan.changes_pixels
+    mask = np.ones((camera.height, camera.width), bool)
+    assert processed_mask(mask, plan) is mask
+
+
+@pytest.mark.parametrize("max_size_px", [60, 97, 200, 480])
+def test_a_mask_is_that_of_the_pixel_under_each_centre(max_size_px: int) -> None:
+    mask = np.random.default_rng(0).random((61, 123)) > 0.5
+    camera = Camera("PINHOLE", 123, 61, (100.0, 100.0, 60.0, 30.0))
+    plan = plan_frame(camera, FrameOptions(max_size_px=max_size_px, upscale=True))
+    found = processed_mask(mask, plan)
+    assert found.shape == (plan.processed.height, plan.processed.width)
+    rows, columns = np.indices(found.shape)
+    centres = np.stack([columns.ravel(), rows.ravel()], axis=1) + 0.5
+    at = plan.pixel_map().original_from_processed(centres)
+    # where a centre falls on the edge between two pixels, either is right
+    clear = (np.abs(at - np.rint(at)) > 1e-9).all(axis=1)
+    assert clear.mean() > 0.5
+    column, row = np.floor(at[clear]).astype(int).T
+    np.testing.assert_array_equal(found.ravel()[clear], mask[row, column])
+
+
+def cloudy(height: int = 362, width: int = 483) -> NDArray[np.uint8]:
+    """Smooth noise: interpolation of any kind gives nearly the same."""
+    noise = np.random.default_rng(3).normal(size=(height, width, 3))
+    smooth = cv2.GaussianBlur(noise, (0, 0), 8.0)
+    return np.clip(128 + 45 * smooth / smooth.std(), 0, 255).astype(np.uint8)
+
+
+def opencv_matrix(camera: Camera) -> NDArray[np.float64]:
+    """Calibration with the first pixel's centre at (0, 0), as OpenCV has it."""
+    fx, fy, cx, cy = camera.params[:4]
+    return np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]])
+
+
+def assert_same_picture(found: NDArray[np.uint8], expected: NDArray[np.uint8]) -> None:
+    difference = np.abs(found.astype(int) - expected.astype(int))[3:-3, 3:-3]
+    assert difference.max() <= 4
+    assert difference.mean() < 0.6
+
+
+def random_pixels(camera: Camera, count: int = 500) -> NDArray[np.float64]:
+    return np.random.default_rng(5).random((count, 2)) * [camera.width, camera.height]
+
+
+def test_opencvs_model_as_opencv_undistorts_it(lens: Callable[[str], Camera]) -> None:
+    camera, image = lens("OPENCV"), cloudy()
+    plan = plan_frame(camera, UNDISTORT)
+    size = (plan.processed.width, plan.processed.height)
+    maps = cv2.initUndistortRectifyMap(
+        opencv_matrix(camera),
+        np.array(camera.params[4:]),
+        np.eye(3),
+        opencv_matrix(plan.processed),
+        size,
+        cv2.CV_32FC1,
+    )
+    expected = cv2.remap(image, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    assert_same_picture(processed_image(image, plan), expected)
+
+
+def test_same_size_and_centre_as_opencvs_own_function(lens: Callable[[str], Camera]) -> None:
+    camera, image = lens("OPENCV"), cloudy()
+    pinhole = Camera("PINHOLE", camera.width, camera.height, camera.params[:4])
+    plan = FramePlan(camera, pinhole, (camera.width, camera.height), 1.0)
+    expected = cv2.undistort(image, opencv_matrix(camera), np.array(camera.params[4:]))
+    assert_same_picture(processed_image(image, plan), expected)
+
+
+def test_fisheye_as_opencv_undistorts_it(lens: Callable[[str], Camera]) -> None:
+    camera, image = lens("OPENCV_FISHEYE"), cloudy()
+    plan = plan_frame(camera, UNDISTORT)
+    expected = cv2.fisheye.undistortImage(
+        image,
+        opencv_matrix(camera),
+        np.array(camera.params[4:]),
+        Knew=opencv_matrix(plan.processed),
+        new_size=(plan.processed.width, plan.processed.height),
+    )
+    assert_same_picture(processed_image(image, plan), expected)
+
+
+@pytest.mark.parametrize("blank_pixels", [0.0, 1.0])
+def test_every_model_as_colmap_undistorts_it(distorted: Camera, blank_pixels: float) -> None:
+    image = cloudy()
+    theirs = pycolmap.Camera(
+        model=distorted.model,
+        width=distorted.width,
+        height=distorted.height,
+        params=list(distorted.params),
+    )
+    options = pycolmap.UndistortCameraOptions()
+    options.blank_pixels = blank_pixels
+    picture, camera = pycolmap.undistort_image(options, pycolmap.Bitmap.from_array(image), theirs)
+    changes = {"blank_pixels": blank_pixels, "multiple_of": 1}
+    plan = plan_frame(distorted, FrameOptions(undistort=True, **changes))
+    assert plan.processed.model == "PINHOLE"
+    assert (plan.processed.width, plan.processed.height) == (camera.width, camera.height)
+    np.testing.assert_allclose(plan.processed.params, camera.params, rtol=1e-12)
+    # COLMAP blends the outermost pixels of the original with black
+    y, x = np.indices((camera.height, camera.width)) + 0.5
+    at = plan.pixel_map().original_from_processed(np.stack([x.ravel(), y.ravel()], axis=1))
+    limit = np.array([distorted.width, distorted.height]) - 2
+    inner = ((at > 2) & (at < limit)).all(axis=1).reshape(x.shape)
+    difference = np.abs(processed_image(image, plan).astype(int) - picture.to_array())[inner]
+    assert inner.mean() > 0.5
+    assert difference.max() <= 6
+    assert difference.mean() < 0.6
+
+
+@pytest.mark.parametrize("options", [UNDISTORT, WHOLE, SMALL])
+def test_points_project_to_where_they_are_carried(distorted: Camera, options: FrameOptions) -> None:
+    """The pose stays: a 3D point's pixel in one image is carried to its pixel in the other."""
+    pixels = plan_frame(distorted, options).pixel_map()
+    rng = np.random.default_rng(1)
+    points = np.concatenate([rng.uniform(-0.5, 0.5, (300, 2)), np.ones((300, 1))], axis=1)
+    points *= rng.uniform(1, 30, (300, 1))
+    before, after = (px_from_cam(c, points) for c in (pixels.original, pixels.processed))
+    carried = pixels.processed_from_original(before)
+    inside = np.isfinite(carried).all(axis=1)
+    assert inside.mean() > 0.8
+    np.testing.assert_allclose(carried[inside], after[inside], rtol=0, atol=1e-6)
+    back = pixels.original_from_processed(after[inside])
+    np.testing.assert_allclose(back, before[inside], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("options", [UNDISTORT, WHOLE, SMALL, FrameOptions(max_size_px=200)])
+def test_keypoints_come_back_exactly(camera: Camera, options: FrameOptions) -> None:
+    pixels = plan_frame(camera, options).pixel_map()
+    points = random_pixels(pixels.processed)
+    original = pixels.original_from_processed(points)
+    reached = np.isfinite(original).all(axis=1)
+    assert reached.all() if options.blank_pixels == 0 else reached.mean() > 0.6
+    back = pixels.processed_from_original(original[reached])
+    np.testing.assert_allclose(back, points[reached], rtol=0, atol=1e-6)
+
+
+def test_what_the_other_image_does_not_show_is_nan(lens: Callable[[str], Camera]) -> None:
+    pixels = plan_frame(lens("OPENCV"), UNDISTORT).pixel_map()
+    corner = pixels.processed_from_original(np.array([[0.5, 0.5], [240.0, 180.0]]))
+    assert np.isnan(corner[0]).all() and np.isfinite(corner[1]).all()
+    cropped = plan_frame(lens("PINHOLE"), FrameOptions(max_size_px=1600)).pixel_map()
+    edge = cropped.processed_from_original(np.array([[482.5, 100.0], [479.5, 100.0]]))
+    assert np.isnan(edge[0]).all()
+    np.testing.assert_array_equal(edge[1], [479.5, 100.0])
+
+
+def test_beyond_where_a_model_folds_nothing_is_seen() -> None:
+    """k = -0.4 bends rays beyond tan = 0.91 back; a second copy of the image must not appear."""
+    plan = plan_frame(FOLDING, FrameOptions(undistort=True))
+    reached = reached_region(plan)
+    assert reached is not None
+    fx, fy, cx, cy = plan.processed.params
+    y, x = np.indices(reached.shape) + 0.5
+    tangent = np.hypot((x - cx) / fx, (y - cy) / fy)
+    fold = np.sqrt(1 / 1.2)
+    assert not reached[tangent > fold * 1.01].any()
+    assert reached[tangent < 0.4].all()
+    image = np.full((FOLDING.height, FOLDING.width, 3), 200, np.uint8)
+    shown = processed_image(image, plan)
+    assert (shown[reached] == 200).all() and (shown[~reached] == 0).all()
+    lost = plan.pixel_map().original_from_processed(np.array([[cx + fx, cy]]))
+    assert np.isnan(lost).all()
+
+
+def test_a_fisheye_beyond_half_a_sphere_is_undistorted() -> None:
+    camera = Camera("OPENCV_FISHEYE", 400, 400, (112.0, 112.0, 200.0, 200.0, 0.0, 0.0, 0.0, 0.0))
+    plan = plan_frame(camera, FrameOptions(undistort=True))
+    pixels = plan.pixel_map()
+    # 101 degrees off the axis is behind a pinhole
+    behind = pixels.processed_from_original(np.array([[200.0 + 112.0 * np.radians(101), 200.0]]))
+    assert np.isnan(behind).all()
+    at = pixels.processed_from_original(np.array([[200.0 + 112.0 * np.radians(30), 200.0]]))
+    fx, _, cx, cy = plan.processed.params
+    np.testing.assert_allclose(at, [[cx + fx * np.tan(np.radians(30)), cy]], atol=1e-6)
+
+
+@pytest.mark.parametrize("model", ["SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"])
+def test_without_coefficients_only_the_model_changes(
+    lens: Callable[[str], Camera], model: str
+) -> None:
+    full = lens(model)
+    count = 3 if model in ("SIMPLE_RADIAL", "RADIAL") else 4
+    params = full.params[:count] + (0.0,) * (len(full.params) - count)
+    camera = Camera(model, full.width, full.height, params)
+    pinhole = undistorted_camera(camera)
+    assert pinhole.model == "PINHOLE"
+    points = np.random.default_rng(2).uniform(-1, 1, (50, 3)) + [0, 0, 2.5]
+    np.testing.assert_allclose(px_from_cam(pinhole, points), px_from_cam(camera, points))
+
+
+@pytest.mark.parametrize("model", ["PINHOLE", "SIMPLE_PINHOLE"])
+def test_a_pinhole_stays_what_it_is(lens: Callable[[str], Camera], model: str) -> None:
+    plan = plan_frame(lens(model), FrameOptions(undistort=True))
+    assert plan.processed == lens(model) and not plan.changes_pixels
+
+
+@pytest.mark.parametrize("options", [UNDISTORT, SMALL])
+def test_masks_go_where_their_pixels_go(distorted: Camera, options: FrameOptions) -> None:
+    """A disc of the original is a mask and a picture at once."""
+    y, x = np.indices((distorted.height, distorted.width)) + 0.5
+    disc = np.hypot(x - 300, y - 150) < 60
+    plan = plan_frame(distorted, options)
+    mask = processed_mask(disc, plan)
+    image = processed_image(np.repeat(disc[..., None] * np.uint8(255), 3, axis=2), plan)
+    sure = (image[..., 0] < 20) | (image[..., 0] > 235)
+    np.testing.assert_array_equal(mask[sure], image[..., 0][sure] > 128)
+    assert sure.mean() > 0.97 and 0 < mask.mean() < 0.5
+
+
+def test_shrunken_detail_is_averaged_not_picked(painted: Callable[..., Any]) -> None:
+    """Stripes finer than the new pixels turn grey; samples between them would alias."""
+    camera = Camera("SIMPLE_RADIAL", 483, 362, (330.0, 243.0, 181.0, -0.08))
+    stripes = painted(lambda x, y: 255.0 * (np.floor(x) % 2))
+    plan = plan_frame(camera, FrameOptions(undistort=True, max_size_px=120))
+    found = processed_image(stripes, plan)[2:-2, 2:-2].astype(float)
+    assert plan.shrink > 4
+    assert np.abs(found - 127.5).max() < 45
+    assert found.std() < 12
+
+
+@pytest.mark.parametrize("options", [UNDISTORT, FrameOptions(undistort=True, max_size_px=180)])
+def test_a_blob_of_an_undistorted_image_is_where_the_pixel_map_says(
+    distorted: Camera, painted: Callable[..., Any], options: FrameOptions
+) -> None:
+    centre = np.array([[262.4, 170.3]])
+    image = painted(
+        lambda x, y: 250 * np.exp(-((x - 262.4) ** 2 + (y - 170.3) ** 2) / (2 * 4.0**2))
+    )
+    plan = plan_frame(distorted, options)
+    found = processed_image(image, plan)[..., 0].astype(float)
+    y, x = np.indices(found.shape) + 0.5
+    centroid = np.array([[(found * x).sum(), (found * y).sum()]]) / found.sum()
+    np.testing.assert_allclose(
+        centroid, plan.pixel_map().processed_from_original(centre), atol=0.08
+    )
+
+
+def test_a_pixel_map_of_two_cameras_alone() -> None:
+    before = Camera("SIMPLE_RADIAL", 1000, 800, (900.0, 500.0, 400.0, 0.1))
+    after = Camera("SIMPLE_RADIAL", 500, 400, (450.0, 250.0, 200.0, 0.1))
+    points = np.array([[10.0, 20.0], [999.0, 799.0]], np.float32)
+    found = PixelMap(before, after).processed_from_original(points)
+    assert found.dtype == np.float64
+    np.testing.assert_array_equal(found, points / 2)

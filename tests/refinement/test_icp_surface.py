@@ -1,0 +1,334 @@
+"""Clouds, surfaces and their fits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from megloc_kapture.plugins import DepthView
+from megloc_kapture.refinement.depth_points import DepthCloudOptions, depth_cloud
+from megloc_kapture.refinement.icp_surface import (
+    NORMAL_NEIGHBOURS,
+    MapCloudOptions,
+    Surface,
+    SurfaceFit,
+    condition_number,
+    downsample,
+    fit_covariance,
+    fit_to_surface,
+    fit_weighted,
+    map_cloud,
+    surface_fit,
+    surface_of,
+)
+from megloc_kapture.values import Camera, RigidTransform
+
+IDENTITY = RigidTransform.identity()
+CAMERA = Camera("PINHOLE", 64, 48, (60.0, 60.0, 32.0, 24.0))
+OPTIONS = MapCloudOptions(DepthCloudOptions(), max_references=2, voxel_m=0.05, margin_m=0.3)
+QUERY = DepthView(CAMERA, np.full((48, 64), 2.0, np.float32), RigidTransform.identity())
+
+
+def walls(seed: int, count: int) -> np.ndarray:
+    points = np.random.default_rng(seed).uniform(0.0, 2.0, (count, 3))
+    points[np.arange(count), np.arange(count) % 3] = 0.0
+    return points
+
+
+def test_thinned_points_are_means_of_voxels() -> None:
+    points = np.random.default_rng(0).uniform(-1.0, 1.0, (5000, 3)) + [1e6, -2e6, 3e5]
+    found = downsample(points, 0.25)
+    local = points - points.mean(axis=0)
+    _, voxel = np.unique(np.floor(local / 0.25), axis=0, return_inverse=True)
+    counts = np.bincount(voxel.ravel())
+    means = np.stack([np.bincount(voxel.ravel(), points[:, k]) / counts for k in range(3)], axis=1)
+    assert len(found) == len(means)
+    np.testing.assert_allclose(
+        found[np.lexsort(found.round(4).T)], means[np.lexsort(means.round(4).T)], atol=1e-6
+    )
+    assert downsample(np.zeros((0, 3)), 0.1).shape == (0, 3)
+
+
+def test_normals_are_the_least_varying_directions() -> None:
+    points = downsample(walls(1, 20000) + 0.002 * np.random.default_rng(1).standard_normal(3), 0.05)
+    surface = surface_of(points)
+    np.testing.assert_array_equal(surface.points, points)
+    _, rows = cKDTree(points).query(points, NORMAL_NEIGHBOURS)
+    around = points[rows] - points[rows].mean(axis=1, keepdims=True)
+    values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
+    clear = values[:, 0] < 0.1 * values[:, 1]
+    along = np.abs((surface.normals * vectors[:, :, 0]).sum(axis=1))
+    assert clear.mean() > 0.8
+    np.testing.assert_allclose(along[clear], 1.0, atol=1e-6)
+
+
+def test_nearest_and_spacing() -> None:
+    points = downsample(walls(2, 20000), 0.05)
+    surface, tree = surface_of(points), cKDTree(points)
+    asked = np.random.default_rng(2).uniform(-0.5, 2.5, (300, 3))
+    expected, expected_rows = tree.query(asked)
+    rows, distances = surface.nearest(asked)
+    np.testing.assert_array_equal(rows, expected_rows)
+    np.testing.assert_allclose(distances, expected, atol=1e-12)
+    last = tree.query(points, NORMAL_NEIGHBOURS)[0][:, -1]
+    assert surface.spacing() == pytest.approx(np.median(last))
+
+
+def test_a_corner_is_found_again() -> None:
+    surface = surface_of(downsample(walls(3, 60000), 0.05))
+    points = downsample(walls(4, 6000), 0.1)
+    turn = Rotation.from_rotvec(np.radians([2.0, -1.5, 1.0])).as_matrix()
+    start = RigidTransform.from_matrix(turn, np.array([0.03, -0.02, 0.04]))
+    found = fit_to_surface(surface, points, start, 0.3)
+    assert found is not None
+    assert np.linalg.norm(found.translation) < 2e-3
+    assert np.degrees(Rotation.from_matrix(found.rotation_matrix()).magnitude()) < 0.1
+
+
+def fit_of(points: np.ndarray, normals: np.ndarray) -> SurfaceFit:
+    return SurfaceFit(1.0, 1.0, 0.0, points, normals, np.zeros(len(points)))
+
+
+def corner(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points on three walls, and the walls' normals."""
+    points = rng.uniform(0.1, 2.0, (count, 3))
+    walls = np.arange(count) % 3
+    points[np.arange(count), walls] = 0.0
+    return points, np.eye(3)[walls]
+
+
+def directions(rng: np.random.Generator, count: int) -> np.ndarray:
+    vectors = rng.standard_normal((count, 3))
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def test_what_slides_has_no_finite_condition() -> None:
+    rng = np.random.default_rng(0)
+    around = directions(rng, 500)
+    plane = np.column_stack([rng.uniform(-1, 1, (500, 2)), np.full(500, 3.0)])
+    cylinder = np.column_stack([around[:, :2] / np.hypot(*around[:, :2].T)[:, None], around[:, 2]])
+    assert condition_number(fit_of(plane, np.tile([0.0, 0.0, 1.0], (500, 1)))) > 1e12
+    assert condition_number(fit_of(around * 2.0 + 5.0, around)) > 1e12
+    assert condition_number(fit_of(cylinder, cylinder * [1, 1, 0])) > 1e12
+    assert condition_number(fit_of(plane[:5], directions(rng, 5))) == np.inf
+
+
+def test_the_condition_of_a_cube() -> None:
+    """On the faces of a cube all directions are alike, and all turns."""
+    grid = (np.arange(40) + 0.5) / 20 - 1
+    u, v = (each.ravel() for each in np.meshgrid(grid, grid))
+    faces, normals = [], []
+    for axis in range(3):
+        for side in (-1.0, 1.0):
+            face = np.insert(np.column_stack([u, v]), axis, side, axis=1)
+            faces.append(face)
+            normals.append(np.tile(side * np.eye(3)[axis], (len(u), 1)))
+    points, outward = np.concatenate(faces), np.concatenate(normals)
+    scale = np.linalg.norm(points, axis=1).mean()
+    # a turn about x moves the faces +-y by z and +-z by y: 4 of 6 faces, mean square u^2 each
+    turning, moving = 4 / 6 * np.mean(u**2) / scale**2, 2 / 6
+    expected = max(turning, moving) / min(turning, moving)
+    assert condition_number(fit_of(points, outward)) == pytest.approx(expected, rel=1e-9)
+    # where it lies and how large it is do not matter
+    assert condition_number(fit_of(7.0 * points + 100.0, outward)) == pytest.approx(expected)
+
+
+def test_the_fit_is_that_of_the_nearest_planes() -> None:
+    rng = np.random.default_rng(1)
+    surface = surface_of(downsample(corner(rng, 20000)[0], 0.05))
+    points = rng.uniform(-0.2, 1.0, (400, 3))
+    turn = Rotation.from_rotvec([0.1, 0.2, -0.1]).as_matrix()
+    surface_from_points = RigidTransform.from_matrix(turn, np.array([0.05, 0.0, -0.05]))
+    fit = surface_fit(surface, points, surface_from_points, near_m=0.1, far_m=0.3)
+    moved = points @ turn.T + [0.05, 0.0, -0.05]
+    distances, rows = cKDTree(surface.points).query(moved)
+    residuals = ((moved - surface.points[rows]) * surface.normals[rows]).sum(axis=1)
+    assert fit.overlap == np.mean(distances <= 0.1)
+    assert fit.reach == np.mean(distances <= 0.3)
+    assert 0.0 < fit.overlap < fit.reach < 1.0
+    assert fit.residual_m == pytest.approx(np.median(np.abs(residuals[distances <= 0.3])))
+    np.testing.assert_allclose(fit.residuals_m, residuals[distances <= 0.1])
+    np.testing.assert_allclose(fit.points, points[distances <= 0.1])
+    np.testing.assert_allclose(
+        fit.normals @ turn.T, surface.normals[rows[distances <= 0.1]], atol=1e-12
+    )
+
+
+def test_no_overlap_where_nothing_is_near() -> None:
+    surface = surface_of(downsample(corner(np.random.default_rng(0), 5000)[0], 0.05))
+    far = RigidTransform((1.0, 0.0, 0.0, 0.0), (50.0, 0.0, 0.0))
+    fit = surface_fit(surface, np.zeros((30, 3)), far, near_m=0.1, far_m=0.3)
+    assert (fit.overlap, fit.reach, fit.residual_m) == (0.0, 0.0, np.inf)
+
+
+def test_the_covariance_is_that_of_many_trials() -> None:
+    """Left perturbation of ``cam_from_world``, the camera two metres away from the corner."""
+    rng = np.random.default_rng(2)
+    surface = surface_of(downsample(corner(rng, 60000)[0], 0.05))
+    truth = RigidTransform.from_matrix(
+        Rotation.from_euler("xyz", [0.4, -0.3, 0.2]).as_matrix(), np.array([0.3, -0.4, 2.0])
+    )
+    errors, predicted = [], []
+    for _ in range(60):
+        world, normals = corner(rng, 600)
+        seen = truth.apply(world + 0.01 * rng.standard_normal((600, 1)) * normals)
+        found = fit_weighted(surface, seen, np.ones(600), truth.inverse(), 0.2)
+        assert found is not None
+        delta = found.inverse() @ truth.inverse()
+        turn = Rotation.from_matrix(delta.rotation_matrix()).as_rotvec()
+        errors.append([*turn, *delta.translation])
+        fit = surface_fit(surface, seen, found, near_m=0.2, far_m=0.3)
+        predicted.append(fit_covariance(fit))
+    measured = np.cov(np.array(errors).T)
+    # along every direction of the mean prediction's, within what 60 trials tell
+    values, vectors = np.linalg.eigh(np.mean(predicted, axis=0))
+    ratio = np.diag(vectors.T @ measured @ vectors) / values
+    assert (ratio > 0.5).all() and (ratio < 2.0).all()
+
+
+@pytest.fixture(scope="module")
+def surface() -> Surface:
+    return surface_of(downsample(corner(np.random.default_rng(0), 60000)[0], 0.05))
+
+
+def moved_and_turned(found: RigidTransform | None) -> tuple[float, float]:
+    assert found is not None
+    turn = Rotation.from_matrix(found.rotation_matrix()).magnitude()
+    # of the points' middle: what the origin does depends on the turn
+    middle = np.ones((1, 3))
+    return float(np.linalg.norm(found.apply(middle) - middle)), float(np.degrees(turn))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_exact_points_come_back(surface: Surface, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    turn = Rotation.from_rotvec(np.radians(rng.uniform(-0.5, 0.5, 3))).as_matrix()
+    start = RigidTransform.from_matrix(turn, rng.uniform(-0.01, 0.01, 3))
+    found = fit_weighted(surface, corner(rng, 3000)[0], np.ones(3000), start, 0.1)
+    assert moved_and_turned(found)[0] < 1e-4
+    assert moved_and_turned(found)[1] < 1e-2
+
+
+def test_outliers_hardly_count(surface: Surface) -> None:
+    rng = np.random.default_rng(1)
+    points = corner(rng, 3000)[0] + 0.002 * rng.standard_normal((3000, 3))
+    # a fifth of the floor has 5 cm on it that the map does not
+    covered = (np.arange(3000) % 3 == 2) & (points[:, 0] < 0.5)
+    points[covered, 2] += 0.05
+    found = fit_weighted(surface, points, np.ones(3000), IDENTITY, 0.1)
+    squares = fit_to_surface(surface, points, IDENTITY, 0.1)
+    assert moved_and_turned(found)[0] < 0.001
+    assert moved_and_turned(found)[1] < 0.05
+    assert moved_and_turned(squares)[0] > 3 * moved_and_turned(found)[0]
+
+
+def test_noise_weighs(surface: Surface) -> None:
+    """Half of the points are ten times worse, and wrong by 1 cm: what the noise says of them."""
+    rng = np.random.default_rng(2)
+    noise = np.where(rng.random(3000) < 0.5, 0.02, 0.002)
+    points = corner(rng, 3000)[0] + noise[:, None] * rng.standard_normal((3000, 3))
+    points[noise > 0.01] += 0.01
+    weighted = moved_and_turned(fit_weighted(surface, points, noise, IDENTITY, 0.2))[0]
+    alike = moved_and_turned(fit_weighted(surface, points, np.ones(3000), IDENTITY, 0.2))[0]
+    assert weighted < 0.001
+    assert alike > 2 * weighted
+
+
+def test_the_scale_of_the_noise_does_not_matter(surface: Surface) -> None:
+    rng = np.random.default_rng(3)
+    points = corner(rng, 1000)[0] + 0.005 * rng.standard_normal((1000, 3))
+    noise = rng.uniform(0.5, 2.0, 1000)
+    first = fit_weighted(surface, points, noise, IDENTITY, 0.1)
+    second = fit_weighted(surface, points, 64.0 * noise, IDENTITY, 0.1)
+    assert first is not None and second is not None
+    np.testing.assert_allclose(first.translation, second.translation, atol=1e-12)
+
+
+def test_no_transform_where_nothing_is_near(surface: Surface) -> None:
+    far = RigidTransform((1.0, 0.0, 0.0, 0.0), (9.0, 9.0, 9.0))
+    points = corner(np.random.default_rng(0), 100)[0]
+    assert fit_weighted(surface, points, np.ones(100), far, 0.1) is None
+    assert fit_to_surface(surface, points, far, 0.1) is None
+
+
+def shifted(x: float, z: float = 0.0) -> RigidTransform:
+    """A camera at (x, 0, z) that looks along z."""
+    return RigidTransform((1.0, 0.0, 0.0, 0.0), (-x, 0.0, -z))
+
+
+@dataclass
+class Scene:
+    """Every image sees a wall at z = 2, and one with an x of its own can be told by it."""
+
+    poses: dict[str, RigidTransform]
+    points: np.ndarray | None = None
+
+    def map_depth(self, name: str) -> DepthView | None:
+        if self.points is not None:
+            return None
+        depth = 2.0 - self.poses[name].center()[2]
+        return DepthView(CAMERA, np.full((48, 64), depth, np.float32), RigidTransform.identity())
+
+    def map_mask(self, name: str) -> None:
+        return None
+
+    def map_camera(self, name: str) -> Camera:
+        return CAMERA
+
+    def map_pose(self, name: str) -> RigidTransform:
+        return self.poses[name]
+
+    def map_points(self, name: str) -> np.ndarray:
+        assert self.points is not None
+        return self.points
+
+
+def cloud_of(scene: Any, references: list[str]) -> np.ndarray:
+    points = depth_cloud(QUERY)
+    return map_cloud(QUERY, points, RigidTransform.identity(), references, scene, OPTIONS)
+
+
+def test_those_that_overlap_most_one_of_each_view() -> None:
+    scene = Scene(
+        {
+            "beside": shifted(1.8),
+            "near": shifted(0.3),
+            "same": shifted(0.35),
+            "left": shifted(-0.5),
+            "away": shifted(9.0),
+        }
+    )
+    found = cloud_of(scene, list(scene.poses))
+    # near and left: a wall from -0.5 - 1.07 m to 0.3 + 1.07 m, of which the query's box takes all
+    assert found[:, 0].min() == pytest.approx(-1.37, abs=0.06)
+    assert found[:, 0].max() == pytest.approx(1.37, abs=0.06)
+    np.testing.assert_allclose(found[:, 2], 2.0, atol=1e-6)
+    only = cloud_of(scene, ["beside", "near", "same", "away"])
+    np.testing.assert_array_equal(only, cloud_of(scene, ["near", "beside"]))
+
+
+def test_depth_that_contradicts_the_querys_is_no_overlap() -> None:
+    """A wall in another room, seen through ours."""
+    behind = Scene({"behind": shifted(0.0, z=-1.0)})
+    behind.map_depth = lambda name: DepthView(  # type: ignore[method-assign]
+        CAMERA, np.full((48, 64), 3.9, np.float32), RigidTransform.identity()
+    )
+    assert cloud_of(behind, ["behind"]).shape == (0, 3)
+
+
+def test_points_where_no_reference_has_depth() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-5.0, 5.0, (5000, 3))
+    scene = Scene({"a": shifted(0.0), "b": shifted(1.0)}, points)
+    found = cloud_of(scene, ["a", "b"])
+    query = depth_cloud(QUERY)
+    low, high = query.min(axis=0) - 0.3, query.max(axis=0) + 0.3
+    inside = ((points >= low) & (points <= high)).all(axis=1)
+    # each point once, although both images observe it
+    assert len(found) == inside.sum() > 0
+    assert cloud_of(scene, []).shape == (0, 3)
