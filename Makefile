@@ -24,7 +24,7 @@ TORCH_INDEX ?=
 VENV ?= .venv
 BIN := $(VENV)/bin
 # named by content, not by date: a checkout alone installs nothing again
-STAMP := $(VENV)/.installed-$(shell cat pyproject.toml constraints.txt | cksum | cut -d ' ' -f 1)
+STAMP := $(VENV)/.installed-$(shell cat pyproject.toml $(wildcard twins/pyproject.toml) constraints.txt | cksum | cut -d ' ' -f 1)
 INSTALL := $(BIN)/python -m pip install -qq --disable-pip-version-check
 
 help:
@@ -78,7 +78,7 @@ kloc-env:
 
 clean:
 	@rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache build dist
-	@find megloc_kapture tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +
+	@find megloc_kapture $(wildcard twins) tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # torch first: the other packages then take the one that is there. kapture-localization is the
 # tests' oracle; its own requirements (opencv-python, cvxpy) would break the environment.
@@ -87,6 +87,6 @@ $(STAMP):
 		{ test -x $(BIN)/python || "$$python" -m venv $(VENV); }
 	@echo 'Setting up $(VENV), once: about 2 GB of packages, a few minutes.'
 	@$(INSTALL) $(if $(TORCH_INDEX),--index-url '$(TORCH_INDEX)') -c constraints.txt torch
-	@$(INSTALL) -c constraints.txt -e '.[dev,docs]'
+	@$(INSTALL) -c constraints.txt -e '.[dev,docs]' $(addprefix -e ,$(wildcard twins))
 	@$(INSTALL) -c constraints.txt --no-deps kapture-localization
 	@rm -f $(VENV)/.installed-* && touch $@

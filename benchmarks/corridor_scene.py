@@ -1,7 +1,7 @@
 """A corridor of offices that are alike, rendered: map images, and queries from elsewhere in them.
 
 Plain kapture: ``mapping/`` with depth, ``query/`` and ``query_gt/``, for ``megloc eval kapture``.
-The offices are those of the InLoc twin, :mod:`megloc_kapture.datasets.synthetic.indoor_rooms`:
+The offices are those of the InLoc twin, :mod:`megloc_twins.indoor_rooms`:
 posters, a rug and a cupboard are a room's own, all else, dirt included, every room has.
 """
 
@@ -13,31 +13,29 @@ from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
-
-from megloc_kapture.datasets.synthetic.cameras import looking_at, reduced
-from megloc_kapture.datasets.synthetic.floor_plans import FloorPlan
-from megloc_kapture.datasets.synthetic.indoor import WALL_THICKNESS_M, Recipes
-from megloc_kapture.datasets.synthetic.indoor_rooms import (
+from megloc_twins.frames import Frame, looking_at, noise_seed, reduced
+from megloc_twins.indoor_floors import lamp_lighting, phone_camera
+from megloc_twins.indoor_rooms import (
     CORRIDOR_M,
     MODULE_M,
     ROOM_M,
+    WALL_THICKNESS_M,
+    Recipes,
     build_module,
     build_room,
 )
-from megloc_kapture.datasets.synthetic.indoor_shots import lamp_light, phone_camera
-from megloc_kapture.datasets.synthetic.movers import mover_recipes
-from megloc_kapture.datasets.synthetic.options import SyntheticWorldOptions, stream
-from megloc_kapture.datasets.synthetic.places import Place
-from megloc_kapture.datasets.synthetic.render import (
+from megloc_twins.moving_objects import FloorPlan, moving_object_recipes
+from megloc_twins.options import SyntheticWorldOptions, stream
+from megloc_twins.rasterization import (
     NO_SURFACE,
     depth_map,
     sample_grid,
     visible_surfaces,
 )
-from megloc_kapture.datasets.synthetic.shots import Shot, noise_seed
-from megloc_kapture.datasets.synthetic.studio import draw_shots
-from megloc_kapture.datasets.synthetic.views import View
+from megloc_twins.render import RenderedFrame, render_frames
+from megloc_twins.squares import Place
+from numpy.typing import NDArray
+
 from megloc_kapture.io.images import write_depth_map, write_image
 from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
 from megloc_kapture.values import RigidTransform
@@ -89,7 +87,7 @@ class Seen:
 @lru_cache(maxsize=ROOMS)
 def build(seed: int, index: int) -> Room:
     """Room ``index`` along the corridor, in a frame of its own, and the room across."""
-    recipes = Recipes(seed, list(mover_recipes(seed)))
+    recipes = Recipes(seed, list(moving_object_recipes(seed)))
     room = build_room(recipes, _KIND, f"room{index}")
     any_room = build_room(recipes, _KIND, "any")
     surfaces, alike = room.surfaces()[0], any_room.surfaces()[0]
@@ -125,7 +123,7 @@ def write_corridor(root: Path, seed: int) -> Seen:
     """Draw the corridor of a seed and write it below ``root``."""
     mapping, map_views = _mapping(seed)
     queries, query_views = _queries(seed)
-    draw_shots(
+    render_frames(
         _world(seed),
         [*mapping, *queries],
         partial(_write_view, root),
@@ -143,9 +141,9 @@ def _world(seed: int) -> SyntheticWorldOptions:
     return SyntheticWorldOptions(seed=seed, num_places=ROOMS, supersampling=1)
 
 
-def _mapping(seed: int) -> tuple[list[Shot], list[float]]:
+def _mapping(seed: int) -> tuple[list[Frame], list[float]]:
     """Shots of all rooms, and the share of each view that only its room has."""
-    shots: list[Shot] = []
+    shots: list[Frame] = []
     own: list[float] = []
     frames = stream(seed, "corridor", "frames").permutation(np.resize(_FRAMES, ROOMS)).tolist()
     for index in range(ROOMS):
@@ -170,9 +168,9 @@ def _mapping(seed: int) -> tuple[list[Shot], list[float]]:
     return shots, own
 
 
-def _queries(seed: int) -> tuple[list[Shot], list[float]]:
+def _queries(seed: int) -> tuple[list[Frame], list[float]]:
     """Shots from anywhere in the rooms, looking anywhere; the share of each that is the room's."""
-    shots: list[Shot] = []
+    shots: list[Frame] = []
     own: list[float] = []
     for index in range(ROOMS):
         room = build(seed, index)
@@ -215,15 +213,15 @@ def _shot(
     timestamp: int,
     cam_from_place: RigidTransform,
     rng: np.random.Generator,
-) -> Shot:
+) -> Frame:
     query = role == "query"
-    look = lamp_light(
+    look = lamp_lighting(
         rng,
         noise=3.0 if query else 1.0,
         noise_seed=noise_seed(_world(seed), name),
         spread=0.15 if query else 0.05,
     )
-    return Shot(
+    return Frame(
         name=name,
         role="query" if query else "mapping",
         condition=_KIND,
@@ -232,13 +230,13 @@ def _shot(
         sensor_id=role,
         camera=_CAMERA,
         cam_from_world=cam_from_place @ room.place.place_from_world,
-        look=look,
-        movers=(),
+        lighting=look,
+        moving_objects=(),
         bonnet=False,
     )
 
 
-def _records(shots: Sequence[Shot], *, poses: bool) -> KaptureData:
+def _records(shots: Sequence[Frame], *, poses: bool) -> KaptureData:
     data = KaptureData()
     for shot in shots:
         data.sensors[shot.sensor_id] = Sensor.from_camera(shot.camera, name=shot.sensor_id)
@@ -268,7 +266,7 @@ def _depth_record(name: str) -> str:
     return f"depth/{name.removesuffix('.jpg')}.depth"
 
 
-def _write_view(root: Path, shot: Shot, view: View) -> None:
+def _write_view(root: Path, shot: Frame, view: RenderedFrame) -> None:
     folder = root / shot.role / "sensors" / "records_data"
     write_image(folder / shot.name, view.image, jpeg_quality=92)
     if view.depth_m is not None:

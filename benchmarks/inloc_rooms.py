@@ -14,9 +14,9 @@ from functools import cached_property
 from pathlib import Path
 
 from mapped_scene import Query, Scene, errors, hypotheses
+from megloc_twins.indoor_rooms import MODULE_M
 from scenes import megloc
 
-from megloc_kapture.datasets.synthetic.indoor_rooms import MODULE_M
 from megloc_kapture.pipeline.benchmarks import find_benchmark
 from megloc_kapture.pipeline.datasets import TWIN_PREFIX
 from megloc_kapture.plugins import PoseHypothesis

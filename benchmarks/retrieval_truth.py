@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+from megloc_twins.aachen import AachenTwinOptions, build_aachen_frames
+from megloc_twins.frames import Frame
+from megloc_twins.squares import build_place
+from megloc_twins.viewpoints import CoarseView, coarse_view, overlap
 from numpy.typing import NDArray
-
-from megloc_kapture.datasets.synthetic.aachen_shots import AachenTwinOptions, build_aachen_shots
-from megloc_kapture.datasets.synthetic.covisibility import CoarseView, coarse_view, overlap
-from megloc_kapture.datasets.synthetic.places import build_place
-from megloc_kapture.datasets.synthetic.shots import Shot
 
 MIN_OVERLAP = 0.3  # share of the surface points of the query that a right image sees
 
@@ -21,7 +20,7 @@ def twin_overlaps(
     Both may be any images of the twin. Images of different places share nothing.
     """
     options = options or AachenTwinOptions()
-    shots = build_aachen_shots(options)
+    shots = build_aachen_frames(options)
     named = {shot.name: shot for shot in (*shots.mapping(), *shots.queries())}
     world = options.world()
     surfaces = [
@@ -29,7 +28,7 @@ def twin_overlaps(
     ]
     views: dict[str, CoarseView] = {}
 
-    def view(shot: Shot) -> CoarseView:
+    def view(shot: Frame) -> CoarseView:
         if shot.name not in views:
             views[shot.name] = coarse_view(surfaces[shot.place], shot.camera, shot.cam_from_world)
         return views[shot.name]

@@ -12,18 +12,17 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-
-from megloc_kapture.datasets.synthetic.options import SyntheticWorldOptions
-from megloc_kapture.datasets.synthetic.shots import Shot, noise_seed
-from megloc_kapture.datasets.synthetic.studio import draw_shots
-from megloc_kapture.datasets.synthetic.views import View
-from megloc_kapture.datasets.synthetic.world import SyntheticWorld, build_world
-from megloc_kapture.datasets.synthetic.writing import (
+from megloc_twins.frames import Frame, kapture_records, noise_seed
+from megloc_twins.options import SyntheticWorldOptions
+from megloc_twins.render import RenderedFrame, render_frames
+from megloc_twins.synthetic_kapture import (
+    SyntheticWorld,
+    build_world,
     depth_name,
     mapping_data,
-    query_data,
     write_side_tables,
 )
+
 from megloc_kapture.io.files import link_images
 from megloc_kapture.io.images import write_depth_map, write_image
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
@@ -80,13 +79,13 @@ def write_scene(root: Path, scene: Scene) -> None:
     world = _stepped(world, scene.steps)
     if scene.beside:
         world = _queries_beside(world)
-    names = [shot.name for shot in world.shots()]
-    draw_shots(
-        world.options, world.shots(), partial(_write_view, root, world.options), with_depth=names
+    names = [shot.name for shot in world.frames()]
+    render_frames(
+        world.options, world.frames(), partial(_write_view, root, world.options), with_depth=names
     )
     write_sensors(root / "mapping", mapping_data(world))
-    write_sensors(root / "query", _with_depth(query_data(world, poses=False)))
-    write_sensors(root / "query_gt", query_data(world, poses=True))
+    write_sensors(root / "query", _with_depth(kapture_records(world.queries, poses=False)))
+    write_sensors(root / "query_gt", kapture_records(world.queries))
     write_side_tables(root / "megloc", world)
 
 
@@ -107,7 +106,7 @@ def _stepped(world: SyntheticWorld, steps: int) -> SyntheticWorld:
                     name=name,
                     timestamp=timestamp,
                     cam_from_world=world.sensor_from_rig[shot.sensor_id] @ pose,
-                    look=replace(shot.look, noise_seed=noise_seed(world.options, name)),
+                    lighting=replace(shot.lighting, noise_seed=noise_seed(world.options, name)),
                 )
             )
     return replace(world, mapping=tuple(mapping), rig_from_world=rig_from_world)
@@ -124,7 +123,9 @@ def _queries_beside(world: SyntheticWorld) -> SyntheticWorld:
     return replace(world, queries=tuple(queries))
 
 
-def _write_view(root: Path, options: SyntheticWorldOptions, shot: Shot, view: View) -> None:
+def _write_view(
+    root: Path, options: SyntheticWorldOptions, shot: Frame, view: RenderedFrame
+) -> None:
     if view.depth_m is None:
         raise ValueError(f"{shot.name} was drawn without depth")
     sensors = root / shot.role / "sensors"

@@ -36,6 +36,7 @@ POSE_RANKERS = "megloc_kapture.pose_rankers"
 IMAGE_DISTANCES = "megloc_kapture.image_distances"
 POSE_REFINERS = "megloc_kapture.pose_refiners"
 DATASETS = "megloc_kapture.datasets"
+RENDERED_DATASETS = "megloc_kapture.rendered_datasets"
 STAGES = "megloc_kapture.stages"
 
 
@@ -307,6 +308,30 @@ class DatasetAdapter(Protocol):
 
 
 @runtime_checkable
+class RenderedDataset(Protocol):
+    """Group ``megloc_kapture.rendered_datasets``: a dataset that is drawn, its true poses with it.
+
+    Registered under the name of the dataset in whose official layout it is written, or
+    ``synthetic`` for kapture folders.
+    """
+
+    version: int
+    """Of the files; raised when the same options draw others than before."""
+
+    @property
+    def options(self) -> Options:
+        """Everything that determines its files."""
+        ...
+
+    def write(self, root: Path, work: Any) -> Mapping[str, float]:
+        """Render it below ``root``, with a ``megloc_kapture.stages.work.Work``; returns counts.
+
+        The bytes depend on the options alone. Raises OutputError where nothing can be written.
+        """
+        ...
+
+
+@runtime_checkable
 class StageOfAPlan(Protocol):
     """Group ``megloc_kapture.stages``: a step of a run, see ``megloc_kapture.stages.stage.Stage``.
 
@@ -335,6 +360,7 @@ _PROTOCOLS: dict[str, type] = {
     IMAGE_DISTANCES: ImageDistance,
     POSE_REFINERS: PoseRefiner,
     DATASETS: DatasetAdapter,
+    RENDERED_DATASETS: RenderedDataset,
     STAGES: StageOfAPlan,
 }
 

@@ -15,7 +15,10 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 REPOSITORY = Path(__file__).resolve().parent.parent
-PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
+PROJECT, TWINS = (
+    tomllib.loads((REPOSITORY / folder / "pyproject.toml").read_text())["project"]
+    for folder in ("", "twins")
+)
 REQUIREMENTS = [
     Requirement(text)
     for texts in (PROJECT["dependencies"], *PROJECT["optional-dependencies"].values())
@@ -52,17 +55,34 @@ def test_no_top_level_tools() -> None:
     assert not (REPOSITORY / "tools").exists()
 
 
+def test_the_twins_need_what_the_package_has() -> None:
+    own, *others = (Requirement(text) for text in TWINS["dependencies"])
+    assert own.name == PROJECT["name"] and own.specifier.contains(PROJECT["version"])
+    assert TWINS["version"] == PROJECT["version"]
+    assert {str(other) for other in others} <= set(PROJECT["dependencies"])
+    for key in ("requires-python", "license", "authors"):
+        assert TWINS[key] == PROJECT[key]
+
+
 def test_registered_plugins_and_command_exist() -> None:
-    registered = list(importlib.metadata.distribution("megloc-kapture").entry_points)
-    assert "megloc" in {entry.name for entry in registered}
+    registered = [
+        entry
+        for name in ("megloc-kapture", "megloc-twins")
+        for entry in importlib.metadata.distribution(name).entry_points
+    ]
+    assert {"megloc", "synthetic"} <= {entry.name for entry in registered}
     for entry in registered:
         assert callable(entry.load()), entry
 
 
 def test_importing_every_module_has_no_side_effect() -> None:
     names = sorted(
-        ".".join(path.relative_to(REPOSITORY).with_suffix("").parts)
-        for path in (REPOSITORY / "megloc_kapture").rglob("*.py")
+        ".".join(path.relative_to(folder).with_suffix("").parts)
+        for folder, package in (
+            (REPOSITORY, "megloc_kapture"),
+            (REPOSITORY / "twins", "megloc_twins"),
+        )
+        for path in (folder / package).rglob("*.py")
         if path.stem != "__main__"
     )
     names = [name.removesuffix(".__init__") for name in names]

@@ -31,14 +31,14 @@ os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
 
 import cv2  # noqa: E402
 import numpy as np  # noqa: E402
+from megloc_twins.frames import Frame  # noqa: E402
+from megloc_twins.options import SyntheticWorldOptions  # noqa: E402
+from megloc_twins.render import PlaceRenderer  # noqa: E402
+from megloc_twins.synthetic_kapture import build_world  # noqa: E402
+from megloc_twins.viewpoints import overlap  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
 from timing import table  # noqa: E402
 
-from megloc_kapture.datasets.synthetic.covisibility import overlap  # noqa: E402
-from megloc_kapture.datasets.synthetic.options import SyntheticWorldOptions  # noqa: E402
-from megloc_kapture.datasets.synthetic.shots import Shot  # noqa: E402
-from megloc_kapture.datasets.synthetic.views import PlacePainter  # noqa: E402
-from megloc_kapture.datasets.synthetic.world import build_world  # noqa: E402
 from megloc_kapture.geometry.poses import rotation_angles_deg  # noqa: E402
 from megloc_kapture.plugins import DepthView, PoseRefinement  # noqa: E402
 from megloc_kapture.refinement.acceptance import squared_distance  # noqa: E402
@@ -116,9 +116,9 @@ class Results:
         ]
 
 
-def darkened(shot: Shot) -> Shot:
+def darkened(shot: Frame) -> Frame:
     """The shot in its own light by a camera with a night's gain, colours and noise."""
-    look = shot.look
+    look = shot.lighting
     red, green, blue = look.white_balance
     night = replace(
         look,
@@ -129,7 +129,7 @@ def darkened(shot: Shot) -> Shot:
         blur_px=0.9,
         vignetting=0.3,
     )
-    return replace(shot, look=night)
+    return replace(shot, lighting=night)
 
 
 def occluded(image: NDArray[np.uint8], seed: int) -> NDArray[np.uint8]:
@@ -151,7 +151,7 @@ def cases(
     """Kind, query, references and true pose."""
     options = SyntheticWorldOptions(seed=seed, num_places=1, day_queries=6, night_queries=6)
     world = build_world(options)
-    painter = PlacePainter(world.places[0], seed=seed, supersampling=options.supersampling)
+    painter = PlaceRenderer(world.places[0], seed=seed, supersampling=options.supersampling)
     views = world.coarse_views()
     drawn: dict[str, RenderingReference] = {}
     for number, query in enumerate(world.queries):
@@ -159,16 +159,16 @@ def cases(
         near = sorted(world.mapping, key=lambda shot: -shares[shot.name])[:max_references]
         for shot in near:
             if shot.name not in drawn:
-                view = painter.draw(shot, depth=True)
+                view = painter.render(shot, depth=True)
                 if view.depth_m is None:
                     raise RuntimeError(f"{shot.name} was drawn without depth")
                 depth = DepthView(shot.camera, view.depth_m, RigidTransform.identity())
                 drawn[shot.name] = RenderingReference(
                     view.image, shot.camera, shot.cam_from_world, depth, view.mask
                 )
-        images = {query.condition: painter.draw(query).image}
+        images = {query.condition: painter.render(query).image}
         if query.condition == "day":
-            dark = painter.draw(darkened(query)).image
+            dark = painter.render(darkened(query)).image
             images["gain, colour, noise"] = dark
             images["the same, 30 % hidden"] = occluded(dark, 100 * seed + number)
         references = [drawn[shot.name] for shot in near]

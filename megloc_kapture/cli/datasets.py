@@ -6,10 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import tyro
-from pydantic import ValidationError
 
 from megloc_kapture.cli.common import Common, Force, Output, Working
-from megloc_kapture.errors import OptionError
 from megloc_kapture.io.files import staged_output
 from megloc_kapture.pipeline.datasets import (
     KAPTURE,
@@ -21,6 +19,7 @@ from megloc_kapture.pipeline.datasets import (
 )
 from megloc_kapture.pipeline.executors import open_executor
 from megloc_kapture.pipeline.presets import assigned
+from megloc_kapture.stages.work import Work
 
 DATASET = "dataset"
 
@@ -86,17 +85,12 @@ class Synth(Working, Common):
         """Run it."""
         console = self.console()
         changes = {"seed": self.seed, **assigned(self.set)}
-        try:
-            twin = twin_of(self.dataset.removeprefix(TWIN_PREFIX), **changes)
-        except ValidationError as error:
-            problem = error.errors()[0]
-            where = ".".join(str(part) for part in problem["loc"])
-            raise OptionError(f"option {where}: {problem['msg']}") from error
+        twin = twin_of(self.dataset.removeprefix(TWIN_PREFIX), **changes)
         with (
             staged_output(self.output, kind=DATASET, force=self.force) as out,
             open_executor(self.executor, self.workers) as executor,
         ):
-            counts = twin.write(out, twin.options, executor, track=console.track)
+            counts = twin.write(out, Work(executor, console.track))
         for what, value in counts.items():
             console.result(f"{what.replace('_', ' '):44s}{value:>8g}")
         console.result(f"rendered: {self.output}")

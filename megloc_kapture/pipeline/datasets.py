@@ -1,7 +1,8 @@
 """The datasets that ``megloc eval`` and ``megloc import`` know, by name.
 
 ``kapture`` is any pair of kapture folders; an adapter (group ``megloc_kapture.datasets``) knows an
-official layout; ``synthetic`` and ``synthetic-X`` are rendered, the latter in the layout of X.
+official layout; ``synthetic`` and ``synthetic-X`` (group ``megloc_kapture.rendered_datasets``) are
+rendered, the latter in the layout of X.
 """
 
 from __future__ import annotations
@@ -26,24 +27,21 @@ from megloc_kapture.evaluation.protocols import TWIN_PREFIX
 from megloc_kapture.io.dataset_tables import SIDE_TABLES, Protocol
 from megloc_kapture.io.files import write_bytes
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.plugins import DATASETS, DatasetAdapter, load_plugin, plugin_names
+from megloc_kapture.plugins import (
+    DATASETS,
+    RENDERED_DATASETS,
+    DatasetAdapter,
+    RenderedDataset,
+    load_plugin,
+    plugin_names,
+)
 from megloc_kapture.stages.work import Work
-from megloc_kapture.values import Options
 
 KAPTURE, SYNTHETIC = "kapture", "synthetic"
 DATA_VARIABLE = "MEGLOC_DATA"
 SUMMARY_FILE = f"{SIDE_TABLES}/summary.txt"
 
 ProtocolChange = Callable[[Protocol], Protocol]
-
-
-@dataclass(frozen=True)
-class Twin:
-    """A rendered dataset: its options, the version of what draws it, and its writer."""
-
-    options: Options
-    version: int
-    write: Callable[..., Mapping[str, float]]
 
 
 @dataclass(frozen=True)
@@ -62,7 +60,7 @@ class DatasetChoice:
     root: Path | None
     adapter: DatasetAdapter | None = None
     import_options: Mapping[str, Any] = field(default_factory=dict)
-    twin: Twin | None = None
+    twin: RenderedDataset | None = None
     query_prefix: str = ""
     allow_missing: bool = False
 
@@ -154,7 +152,7 @@ class DatasetChoice:
         """Write the rendered dataset; only where there is no root."""
         if self.twin is None:
             raise ValueError(f"dataset {self.name} is given, not rendered")
-        return self.twin.write(output, self.twin.options, work.executor, track=work.track)
+        return self.twin.write(output, work)
 
     def render_options(self) -> dict[str, Any]:
         """What determines the rendered dataset."""
@@ -177,7 +175,7 @@ def summary_text(dataset: OfficialDataset) -> str:
 def dataset_names() -> list[str]:
     """Every name that :func:`choose_dataset` takes."""
     official = plugin_names(DATASETS)
-    return [KAPTURE, *official, SYNTHETIC, *(f"{TWIN_PREFIX}{n}" for n in official if n in _TWINS)]
+    return [KAPTURE, *official, SYNTHETIC, *(f"{TWIN_PREFIX}{name}" for name in official)]
 
 
 def choose_dataset(
@@ -279,70 +277,29 @@ def _root_in_environment(name: str, adapter: DatasetAdapter | None) -> Path:
     raise OptionError(
         f"dataset {name} needs --root or {DATA_VARIABLE}{looked}: {card.title} is published at "
         f"{card.published_at} ({card.size}) and has to lie as {card.layout}"
-        + (twin if name in _TWINS else "")
+        + (twin if name in plugin_names(RENDERED_DATASETS) else "")
     )
 
 
-def twin_of(layout: str, **changes: Any) -> Twin:
-    """What renders the world in a layout, by the layout's name, with changed options.
+def twin_of(layout: str, **options: Any) -> RenderedDataset:
+    """The rendered dataset in a layout, by the layout's name, with options other than the defaults.
 
     Raises
     ------
-    OptionError : no such twin.
+    OptionError : no such twin, or no package that renders any.
+    PluginError : it refuses its options.
     """
-    if layout not in _TWINS:
-        raise OptionError(f"nothing renders {layout!r}; known: {', '.join(_TWINS)}")
-    return _TWINS[layout](changes)
+    known = plugin_names(RENDERED_DATASETS)
+    if not known:
+        raise OptionError(
+            "rendered datasets (synthetic, synthetic-aachen ...) come with a package of their own: "
+            "pip install megloc-twins"
+        )
+    if layout not in known:
+        raise OptionError(f"nothing renders {layout!r}; known: {', '.join(known)}")
+    twin: RenderedDataset = load_plugin(RENDERED_DATASETS, layout, options)
+    return twin
 
-
-# each imports its renderer only when it is asked for
-def _world(changes: Mapping[str, Any]) -> Twin:
-    from megloc_kapture.datasets.synthetic.options import (
-        SYNTHETIC_VERSION,
-        SyntheticWorldOptions,
-    )
-    from megloc_kapture.datasets.synthetic.writing import write_synthetic_kapture
-
-    return Twin(SyntheticWorldOptions(**changes), SYNTHETIC_VERSION, write_synthetic_kapture)
-
-
-def _aachen(changes: Mapping[str, Any]) -> Twin:
-    from megloc_kapture.datasets.synthetic import aachen_twin as twin
-
-    return Twin(twin.AachenTwinOptions(**changes), twin.AACHEN_TWIN_VERSION, twin.write_aachen_twin)
-
-
-def _robotcar(changes: Mapping[str, Any]) -> Twin:
-    from megloc_kapture.datasets.synthetic import robotcar_twin as twin
-
-    return Twin(
-        twin.RobotCarTwinOptions(**changes), twin.ROBOTCAR_TWIN_VERSION, twin.write_robotcar_twin
-    )
-
-
-def _fourseasons(changes: Mapping[str, Any]) -> Twin:
-    from megloc_kapture.datasets.synthetic import fourseasons_twin as twin
-
-    return Twin(
-        twin.FourSeasonsTwinOptions(**changes),
-        twin.FOURSEASONS_TWIN_VERSION,
-        twin.write_fourseasons_twin,
-    )
-
-
-def _inloc(changes: Mapping[str, Any]) -> Twin:
-    from megloc_kapture.datasets.synthetic import inloc_twin as twin
-
-    return Twin(twin.InLocTwinOptions(**changes), twin.INLOC_TWIN_VERSION, twin.write_inloc_twin)
-
-
-_TWINS: dict[str, Callable[[Mapping[str, Any]], Twin]] = {
-    SYNTHETIC: _world,
-    "aachen": _aachen,
-    "robotcar": _robotcar,
-    "4seasons": _fourseasons,
-    "inloc": _inloc,
-}
 
 __all__ = [
     "KAPTURE",
@@ -351,7 +308,6 @@ __all__ = [
     "TWIN_PREFIX",
     "DatasetChoice",
     "ProtocolChange",
-    "Twin",
     "choose_dataset",
     "dataset_names",
     "summary_text",

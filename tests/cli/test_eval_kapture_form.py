@@ -9,8 +9,7 @@ from typing import Any
 
 import pytest
 from kapture_forms import aachen_with_kapture
-
-from megloc_kapture.datasets.synthetic.aachen_twin import AachenTwinOptions, write_aachen_twin
+from megloc_twins.aachen import AachenTwin, AachenTwinOptions
 
 NAME = "submissions/Aachen_v1_1_eval_megloc-classic.txt"
 SMALL = AachenTwinOptions(
@@ -30,7 +29,7 @@ def test_aachen_in_both_forms_gives_the_same_pose_file(
     megloc: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     official = tmp_path / "official"
-    write_aachen_twin(official, SMALL)
+    AachenTwin(SMALL).write(official)
     downloaded = aachen_with_kapture(official, tmp_path / "downloaded")
     shutil.copytree(official / "ground_truth", downloaded / "ground_truth")
     monkeypatch.chdir(tmp_path)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from importlib.metadata import EntryPoints
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from megloc_kapture import plugins
 from megloc_kapture.cli.arguments import summary
 from megloc_kapture.cli.main import COMMANDS, command_class
 
@@ -100,6 +102,20 @@ def test_help(megloc: Any, command: str | None, flag: str) -> None:
         assert all(name in done.out for name in COMMANDS)
     else:
         assert done.out.startswith(f"usage: megloc {command} ")
+
+
+def test_a_rendered_dataset_is_refused_in_one_line(
+    megloc: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    megloc("synth", "venice", "-o", out).refused(
+        "nothing renders 'venice'; known: 4seasons, aachen"
+    )
+    megloc("synth", "aachen", "-o", out, "--set", "width=3").refused("'aachen' .* width: .* 64")
+    monkeypatch.setattr(plugins, "entry_points", lambda group: EntryPoints())
+    megloc("synth", "aachen", "-o", out).refused("pip install megloc-twins")
+    monkeypatch.undo()
+    assert not out.exists()
 
 
 def test_the_list_says_of_each_command_what_its_own_help_says() -> None:

@@ -8,13 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from megloc_twins.frames import Frame, looking_at
+from megloc_twins.indoor_floors import FloorBuilder, lamp_lighting
+from megloc_twins.render import PlaceRenderer
 from numpy.typing import NDArray
 
-from megloc_kapture.datasets.synthetic.cameras import looking_at
-from megloc_kapture.datasets.synthetic.indoor_floors import FloorBuilder
-from megloc_kapture.datasets.synthetic.indoor_shots import lamp_light
-from megloc_kapture.datasets.synthetic.shots import Shot
-from megloc_kapture.datasets.synthetic.views import PlacePainter
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import bearing_rays, project
 from megloc_kapture.geometry.warping import (
@@ -350,12 +348,12 @@ def room() -> Callable[[float, float, float, int], WarpSource]:
     """Draws an office from a spot (x, y), metres, along a direction, with noise of a seed."""
     floor = FloorBuilder(1).floor(0, 0)
     office = floor.zones[0].place_from_zone.inverse()
-    painter = PlacePainter(floor.place, seed=0, supersampling=2)
+    painter = PlaceRenderer(floor.place, seed=0, supersampling=2)
     camera = Camera("SIMPLE_PINHOLE", 200, 150, (155.0, 100.0, 75.0))
 
     def draw(x: float, y: float, yaw_deg: float, noise_seed: int) -> WarpSource:
         cam_from_office = looking_at(np.array([x, y, 1.5]), np.radians(yaw_deg), -0.03, 0.01)
-        shot = Shot(
+        shot = Frame(
             name="view",
             role="mapping",
             condition="office",
@@ -364,11 +362,11 @@ def room() -> Callable[[float, float, float, int], WarpSource]:
             sensor_id="camera",
             camera=camera,
             cam_from_world=cam_from_office @ office @ floor.place.place_from_world,
-            look=lamp_light(np.random.default_rng(0), noise=1.0, noise_seed=noise_seed),
-            movers=(),
+            lighting=lamp_lighting(np.random.default_rng(0), noise=1.0, noise_seed=noise_seed),
+            moving_objects=(),
             bonnet=False,
         )
-        view = painter.draw(shot, depth=True)
+        view = painter.render(shot, depth=True)
         assert view.depth_m is not None
         return WarpSource(view.image, camera, shot.cam_from_world, view.depth_m, camera)
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from importlib.metadata import EntryPoints, entry_points
 from pathlib import Path
 
 import pytest
 
+from megloc_kapture import plugins
 from megloc_kapture.datasets.official import Count, DatasetCard, Missing, OfficialDataset
 from megloc_kapture.errors import DataError, OptionError, PluginError
 from megloc_kapture.io.dataset_tables import Protocol, read_protocol
@@ -18,7 +20,13 @@ from megloc_kapture.pipeline.datasets import (
     dataset_names,
     twin_of,
 )
-from megloc_kapture.plugins import DATASETS, DatasetAdapter, plugin_names
+from megloc_kapture.plugins import (
+    DATASETS,
+    RENDERED_DATASETS,
+    DatasetAdapter,
+    RenderedDataset,
+    plugin_names,
+)
 from megloc_kapture.values import Camera, RigidTransform
 
 OFFICIAL = ("4seasons", "aachen", "inloc", "robotcar")
@@ -107,7 +115,24 @@ def test_a_twin_is_rendered_and_imported_by_the_adapter_of_its_layout(name: str)
     assert choice.adapter is not None and choice.adapter.name == name
     assert isinstance(choice.adapter, DatasetAdapter)
     assert choice.render_options()["world"]["seed"] == 0
+    assert isinstance(choice.twin, RenderedDataset)
     assert twin_of(name, seed=3).options != choice.twin.options
+
+
+def test_without_the_twins_one_line_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    others = {group: entry_points(group=group) for group in (DATASETS, RENDERED_DATASETS)}
+    others[RENDERED_DATASETS] = EntryPoints()
+    monkeypatch.setattr(plugins, "entry_points", lambda group: others[group])
+    for name in ("synthetic", "synthetic-aachen"):
+        with pytest.raises(OptionError, match="pip install megloc-twins"):
+            choose_dataset(name, None)
+        # one that somebody else has rendered needs no renderer
+        assert choose_dataset(name, tmp_path).twin is None
+    with pytest.raises(OptionError, match="--root or MEGLOC_DATA") as refused:
+        choose_dataset("aachen", None)
+    assert "synthetic" not in str(refused.value)
 
 
 def test_an_import_leaves_a_summary_and_takes_a_changed_protocol(tmp_path: Path) -> None:

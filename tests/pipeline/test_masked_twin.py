@@ -9,14 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from megloc_kapture.datasets.synthetic.places import build_place
-from megloc_kapture.datasets.synthetic.robotcar_shots import (
+from megloc_twins.frames import Frame
+from megloc_twins.render import on_bonnet, on_moving_objects
+from megloc_twins.robotcar import (
     RobotCarTwinOptions,
     build_robotcar_moments,
 )
-from megloc_kapture.datasets.synthetic.shots import Shot
-from megloc_kapture.datasets.synthetic.truth_masks import on_bonnet, on_movers
+from megloc_twins.squares import build_place
+
 from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.tables import read_mask_counts
@@ -52,10 +52,10 @@ def localized(folder: Path, changes: Sequence[str]) -> Workspace:
     return workspace
 
 
-def shots_of(workspace: Workspace) -> dict[str, Shot]:
+def shots_of(workspace: Workspace) -> dict[str, Frame]:
     """Image of the workspace to what was drawn."""
     moments = build_robotcar_moments(OPTIONS)
-    drawn = {shot.name: shot for shot in (*moments.mapping_shots(), *moments.query_shots())}
+    drawn = {shot.name: shot for shot in (*moments.mapping_frames(), *moments.query_frames())}
     images = [
         name
         for part in ("mapping", "query")
@@ -82,7 +82,7 @@ def masked(plain: Workspace, tmp_path_factory: pytest.TempPathFactory) -> Worksp
     masks = tmp_path_factory.mktemp("masks")
     places = {place: build_place(OPTIONS.world(), place) for place in range(2)}
     for name, shot in shots_of(plain).items():
-        still = ~on_movers(shot, places[shot.place])
+        still = ~on_moving_objects(shot, places[shot.place])
         path = masks / f"{name}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
         write_image(path, np.repeat(255 * still[:, :, None].astype(np.uint8), 3, axis=2))
@@ -102,7 +102,7 @@ def test_no_keypoint_lies_on_the_bonnet_or_on_what_moves(
     hidden = {"plain": 0, "masked": 0}
     places = {place: build_place(OPTIONS.world(), place) for place in range(2)}
     for name, shot in shots_of(plain).items():
-        covered = on_bonnet(shot, SEED) | on_movers(shot, places[shot.place])
+        covered = on_bonnet(shot, SEED) | on_moving_objects(shot, places[shot.place])
         for label, workspace in (("plain", plain), ("masked", masked)):
             found = workspace.folder("query", "").keypoints("rootsift").read(name)
             column, row = np.floor(found[:, :2]).astype(int).T

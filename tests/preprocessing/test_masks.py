@@ -11,15 +11,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from matplotlib.path import Path as Outline
-from numpy.typing import NDArray
-from pydantic import ValidationError
-
-from megloc_kapture.datasets.synthetic.places import build_place
-from megloc_kapture.datasets.synthetic.robotcar_shots import (
+from megloc_twins.render import PlaceRenderer
+from megloc_twins.robotcar import (
     RobotCarTwinOptions,
     build_robotcar_moments,
 )
-from megloc_kapture.datasets.synthetic.views import PlacePainter
+from megloc_twins.squares import build_place
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.preprocessing.masks import (
     MIN_IMAGES,
@@ -125,13 +125,13 @@ def drive() -> dict[str, list[tuple[Image, NDArray[np.bool_]]]]:
         num_locations=1, stops_per_location=12, moments_per_condition=2, size_px=192
     )
     world = options.world()
-    painter = PlacePainter(build_place(world, 0), seed=world.seed, supersampling=1)
+    painter = PlaceRenderer(build_place(world, 0), seed=world.seed, supersampling=1)
     drawn: dict[str, list[tuple[Image, NDArray[np.bool_]]]] = {"rear": [], "right": []}
     for moment in build_robotcar_moments(options).reference:
-        for shot in moment.shots:
+        for shot in moment.frames:
             camera = shot.name.split("/")[-2]
             if camera in drawn:
-                view = painter.draw(shot)
+                view = painter.render(shot)
                 drawn[camera].append((view.image, view.mask))
     return drawn
 

@@ -8,13 +8,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
+from megloc_twins.frames import looking_at
+from megloc_twins.rasterization import depth_map, sample_grid, visible_surfaces
+from megloc_twins.surfaces import SurfaceBuilder, Surfaces
 from numpy.typing import NDArray
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.datasets.synthetic.cameras import looking_at
-from megloc_kapture.datasets.synthetic.render import depth_map, sample_grid, visible_surfaces
-from megloc_kapture.datasets.synthetic.surfaces import SurfaceBuilder, Surfaces
 from megloc_kapture.plugins import DepthView, PoseRefinement, PoseRefiner
 from megloc_kapture.refinement.icp import Icp, IcpOptions, refine_by_icp
 from megloc_kapture.values import Camera, RigidTransform

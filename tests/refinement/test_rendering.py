@@ -9,15 +9,15 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import pytest
+from megloc_twins.frames import Frame
+from megloc_twins.lighting import Lighting
+from megloc_twins.options import SyntheticWorldOptions
+from megloc_twins.render import PlaceRenderer, RenderedFrame
+from megloc_twins.synthetic_kapture import SyntheticWorld, build_world
+from megloc_twins.viewpoints import overlap
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.datasets.synthetic.covisibility import overlap
-from megloc_kapture.datasets.synthetic.looks import Look
-from megloc_kapture.datasets.synthetic.options import SyntheticWorldOptions
-from megloc_kapture.datasets.synthetic.shots import Shot
-from megloc_kapture.datasets.synthetic.views import PlacePainter, View
-from megloc_kapture.datasets.synthetic.world import SyntheticWorld, build_world
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.geometry.poses import rotation_angles_deg
@@ -57,11 +57,11 @@ def world() -> SyntheticWorld:
 
 
 @pytest.fixture(scope="module")
-def painter(world: SyntheticWorld) -> PlacePainter:
-    return PlacePainter(world.places[0], seed=OPTIONS.seed, supersampling=OPTIONS.supersampling)
+def painter(world: SyntheticWorld) -> PlaceRenderer:
+    return PlaceRenderer(world.places[0], seed=OPTIONS.seed, supersampling=OPTIONS.supersampling)
 
 
-def darkened(look: Look) -> Look:
+def darkened(look: Lighting) -> Lighting:
     """The same scene as a camera of the night sees it: a fifth of the light, its colours, noise."""
     red, green, blue = look.white_balance
     return replace(
@@ -75,29 +75,29 @@ def darkened(look: Look) -> Look:
     )
 
 
-def neighbours(world: SyntheticWorld, query: Shot, count: int) -> list[Shot]:
+def neighbours(world: SyntheticWorld, query: Frame, count: int) -> list[Frame]:
     views = world.coarse_views()
     shares = {shot.name: overlap(views[query.name], views[shot.name]) for shot in world.mapping}
     return sorted(world.mapping, key=lambda shot: -shares[shot.name])[:count]
 
 
-def reference(shot: Shot, view: View) -> RenderingReference:
+def reference(shot: Frame, view: RenderedFrame) -> RenderingReference:
     assert view.depth_m is not None
     depth = DepthView(shot.camera, view.depth_m, HERE)
     return RenderingReference(view.image, shot.camera, shot.cam_from_world, depth, view.mask)
 
 
 @pytest.fixture(scope="module")
-def shots(world: SyntheticWorld) -> tuple[Shot, list[Shot]]:
+def shots(world: SyntheticWorld) -> tuple[Frame, list[Frame]]:
     query = next(shot for shot in world.queries if shot.condition == "day")
     return query, neighbours(world, query, 4)
 
 
 @pytest.fixture(scope="module")
-def case(painter: PlacePainter, shots: tuple[Shot, list[Shot]]) -> Case:
+def case(painter: PlaceRenderer, shots: tuple[Frame, list[Frame]]) -> Case:
     query, near = shots
-    image = painter.draw(replace(query, look=darkened(query.look))).image
-    references = [reference(shot, painter.draw(shot, depth=True)) for shot in near]
+    image = painter.render(replace(query, lighting=darkened(query.lighting))).image
+    references = [reference(shot, painter.render(shot, depth=True)) for shot in near]
     return Case(RenderingQuery(image, query.camera), query.cam_from_world, tuple(references))
 
 
@@ -154,11 +154,11 @@ def test_gain_colour_and_noise_of_the_night_do_not_matter(case: Case, seed: int)
 
 
 def test_lamps_instead_of_the_sun_still_let_it_improve(
-    world: SyntheticWorld, painter: PlacePainter
+    world: SyntheticWorld, painter: PlaceRenderer
 ) -> None:
     query = next(shot for shot in world.queries if shot.condition == "night")
-    near = [reference(s, painter.draw(s, depth=True)) for s in neighbours(world, query, 4)]
-    night = RenderingQuery(painter.draw(query).image, query.camera)
+    near = [reference(s, painter.render(s, depth=True)) for s in neighbours(world, query, 4)]
+    night = RenderingQuery(painter.render(query).image, query.camera)
     truth = query.cam_from_world
     refined = refine_by_rendering(night, near, start_from(truth, 3))
     m, deg = errors(refined.cam_from_world, truth)
@@ -278,7 +278,7 @@ def test_the_same_twice(case: Case) -> None:
 
 
 def test_a_depth_camera_beside_the_image_is_honoured(
-    case: Case, painter: PlacePainter, shots: tuple[Shot, list[Shot]]
+    case: Case, painter: PlaceRenderer, shots: tuple[Frame, list[Frame]]
 ) -> None:
     depth_camera = Camera("PINHOLE", 320, 240, (220.0, 221.0, 160.5, 119.0))
     depth_from_image = RigidTransform.from_matrix(
@@ -288,7 +288,7 @@ def test_a_depth_camera_beside_the_image_is_honoured(
     for shot, each in zip(shots[1], case.references, strict=True):
         pose = depth_from_image @ shot.cam_from_world
         beside = replace(shot, camera=depth_camera, cam_from_world=pose, bonnet=False)
-        depth_m = painter.draw(beside, depth=True).depth_m
+        depth_m = painter.render(beside, depth=True).depth_m
         assert depth_m is not None
         view = DepthView(depth_camera, depth_m, depth_from_image.inverse())
         references.append(replace(each, depth=view))
@@ -303,9 +303,9 @@ def test_a_depth_camera_beside_the_image_is_honoured(
 
 @pytest.mark.parametrize("appearance", ["intensity", "gradients"])
 def test_other_appearances_find_a_day_query(
-    case: Case, painter: PlacePainter, shots: tuple[Shot, list[Shot]], appearance: str
+    case: Case, painter: PlaceRenderer, shots: tuple[Frame, list[Frame]], appearance: str
 ) -> None:
-    day = replace(case, query=replace(case.query, image=painter.draw(shots[0]).image))
+    day = replace(case, query=replace(case.query, image=painter.render(shots[0]).image))
     refined = run(day, start_from(case.truth, 6), appearance=appearance)
     m, deg = errors(refined.cam_from_world, case.truth)
     assert refined.accepted and m < 0.02 and deg < 0.1

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from megloc_twins.options import SyntheticWorldOptions
+from megloc_twins.synthetic_kapture import SyntheticKapture
 
-from megloc_kapture.datasets.synthetic.options import SyntheticWorldOptions
-from megloc_kapture.datasets.synthetic.writing import write_synthetic_kapture
 from megloc_kapture.errors import DataError
 from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
 from megloc_kapture.geometry.cameras import px_from_cam
@@ -37,7 +37,7 @@ OPTIONS = SyntheticWorldOptions(
 def lifted(tmp_path_factory: pytest.TempPathFactory) -> tuple[KaptureFolder, Path]:
     """A mapping folder with depth and features, and the map made of it."""
     root = tmp_path_factory.mktemp("lifting")
-    write_synthetic_kapture(root, OPTIONS)
+    SyntheticKapture(OPTIONS).write(root)
     mapping = KaptureFolder(root / "mapping", features_dirs=[root])
     extract_local_features([mapping], RootSift(RootSiftOptions(max_keypoints=300)), root)
     counts = lift_map(mapping, ["rootsift"], root / "map", LiftingOptions())

@@ -1,0 +1,64 @@
+"""Fixtures that every test may use, those of megloc-twins too, and hypothesis' profiles."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from corner import write_scene
+from hypothesis import settings
+
+REPOSITORY = Path(__file__).resolve().parent
+
+# no test depends on how fast the machine is. The quick tier draws the same few examples every time,
+# `make test-all` many new ones (--hypothesis-profile=thorough).
+settings.register_profile(
+    "fast", deadline=None, print_blob=True, max_examples=20, derandomize=True, database=None
+)
+settings.register_profile("thorough", deadline=None, print_blob=True)
+settings.load_profile("fast")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--time-budget-s", type=float, help="skip the tests that would begin after so many seconds"
+    )
+
+
+_BEGIN_S = time.monotonic()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    budget_s = item.config.getoption("--time-budget-s")
+    if budget_s is not None and time.monotonic() - _BEGIN_S > budget_s:
+        pytest.skip(f"left out, {budget_s:.0f} s are over: {item.nodeid}")
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Folder of the shared test data; the test is skipped where it is absent."""
+    place = os.environ.get("MEGLOC_SHARED_DATA")
+    folder = Path(place) if place else REPOSITORY.parent / "shared" / "data"
+    if not folder.is_dir():
+        pytest.skip(f"no shared test data at {folder} (set MEGLOC_SHARED_DATA)")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A rendered scene: mapping/, query/ and query_gt/; not to be written into."""
+    root = tmp_path_factory.mktemp("scene")
+    write_scene(root)
+    return root
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_weights(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """What the machine's user has of weights changes nothing; tests that need some say where."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MEGLOC_WEIGHTS", str(tmp_path_factory.mktemp("no-weights")))
+        yield

@@ -1,0 +1,415 @@
+"""A rendered twin of Aachen Day-Night: photographs of many people, sequences, telephone queries.
+
+The frames' names are those of the official layout. Their poses are in the world's coordinates
+until they are written in those that the twin publishes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from operator import attrgetter
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, field_validator
+
+from megloc_kapture.datasets.aachen.layout import Layout
+from megloc_kapture.datasets.formats.colmap_model import (
+    ColmapImage,
+    ColmapModel,
+    write_colmap_binary,
+)
+from megloc_kapture.datasets.formats.nvm import NvmModel, write_nvm
+from megloc_kapture.datasets.formats.query_list import write_query_list
+from megloc_kapture.datasets.official import GROUND_TRUTH
+from megloc_kapture.io.kapture import write_sensors
+from megloc_kapture.stages.work import HERE, Work
+from megloc_kapture.values import Camera
+from megloc_twins.dataset import ModelTwinOptions, SyntheticDataset, shuffled, write_lines
+from megloc_twins.frames import Frame, in_frame, kapture_records, looking_at, noise_seed
+from megloc_twins.lighting import Condition, day_lighting
+from megloc_twins.moving_objects import place_moving_objects
+from megloc_twins.options import SyntheticWorldOptions, stream
+from megloc_twins.portable import settled_pose
+from megloc_twins.sparse_models import MapFrames, render_map_and_queries, write_sift_database
+from megloc_twins.squares import Place, build_place
+from megloc_twins.viewpoints import query_frames
+
+# the published model lies some hundred metres from its origin, with y down
+OFFICIAL_FROM_WORLD = settled_pose(
+    np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]), np.array([738.5, -6.25, -41.75])
+)
+NUM_UNLISTED = 2  # query images on disk that no list names
+_PORTRAIT_SHARE = 1 / 6
+_YAWS_DEG = (0.0, 62.0, -62.0)  # photographs taken from about the same spot
+_DEVICES = ("nexus4", "milestone", "nexus4", "milestone", "nexus5x")
+_IMAGES = "images_upright"
+_MODELS = "3D-models"
+_WRONG_IMAGE = 1228  # db/1228.jpg has a wrong pose in the published model; ours have none
+
+
+class AachenTwinOptions(ModelTwinOptions):
+    """Contents of Aachen's twin; the defaults are what ``make eval`` localizes in."""
+
+    version: Literal["1.0", "1.1"] = Field(
+        default="1.1",
+        description="1.1 adds sequences, a COLMAP model and more night queries to 1.0",
+    )
+    num_places: int = Field(default=4, ge=1, description="places, at least 60 m apart")
+    stations_per_place: int = Field(
+        default=8, ge=3, description="spots in each place where three photographs are taken"
+    )
+    sequence_images: int = Field(
+        default=5, ge=2, description="images of the sequence through each place (v1.1)"
+    )
+    day_queries: int = Field(default=24, ge=1, description="query images by day, all places")
+    night_queries: int = Field(default=16, ge=1, description="query images at night, all places")
+    additional_night_queries: int = Field(
+        default=8, ge=1, description="more query images at night (v1.1)"
+    )
+    width: int = Field(default=640, ge=64, description="image width in px; a portrait's height")
+    height: int = Field(default=480, ge=48, description="image height in px")
+
+    @field_validator("version", mode="before")
+    @classmethod
+    def _as_text(cls, version: Any) -> Any:
+        # on the command line and in TOML 1.1 is a number
+        return str(version) if isinstance(version, float) else version
+
+    def world(self) -> SyntheticWorldOptions:
+        """The rendered world this is a photograph album of."""
+        return self.rendered_world(self.num_places, self.width, self.height)
+
+
+class AachenTwin(SyntheticDataset[AachenTwinOptions]):
+    """Aachen Day-Night as it is published, with its truth.
+
+    ``images_upright/``, ``3D-models/`` (NVM, its list and ``database_intrinsics.txt``; for v1.1
+    also ``aachen_v_1_1/`` with a binary COLMAP model), ``queries/`` and ``ground_truth/``. Quirks
+    of the original: database images are numbered without order and the NVM has an order of its
+    own, features of the NVM are not numbered densely, v1.1's night list stands in the place of
+    v1.0's, lists end without a line end, and some images below ``query/`` are in no list. With
+    ``model_features`` also ``aachen.db``, the features of v1.0's model; none of v1.1's are
+    published.
+    """
+
+    Options = AachenTwinOptions
+    version = 2
+
+    def write(self, root: Path, work: Work = HERE) -> dict[str, int]:
+        root, options = Path(root), self.options
+        frames = build_aachen_frames(options)
+        mapping = in_frame(frames.mapping(), OFFICIAL_FROM_WORLD)
+        database = mapping[: len(frames.database)]
+        drawn = render_map_and_queries(
+            options.world(),
+            frames.mapping(),
+            [*frames.queries(), *frames.unlisted],
+            root / _IMAGES,
+            model_features=options.model_features,
+            work=work,
+        )
+        _write_nvm_model(root / _MODELS, options, database, drawn)
+        if options.model_features:
+            by_name = {frame.name: frame for frame in sorted(database, key=attrgetter("name"))}
+            write_sift_database(Layout(root).feature_database, by_name, drawn.features)
+        if options.version == "1.1":
+            _write_colmap_model(root / _MODELS / "aachen_v_1_1", options, mapping, drawn)
+        _write_lists(root / "queries", frames)
+        queries = in_frame(frames.queries(), OFFICIAL_FROM_WORLD)
+        for role, some in (("mapping", mapping), ("query", queries)):
+            # nothing was taken at the same time
+            timed = [replace(frame, timestamp=time) for time, frame in enumerate(some)]
+            write_sensors(root / GROUND_TRUTH / role, kapture_records(timed, named=False))
+        return {
+            "places": options.num_places,
+            "mapping images": len(mapping),
+            "query images": len(queries),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class AachenFrames:
+    """All images of the twin; poses in the world's frame.
+
+    Parameters
+    ----------
+    database : map images with a camera each, in the order of the NVM.
+    sequences : map images of v1.1, those of a sequence with the same ``sensor_id`` and camera.
+    day, night, additional_night : queries in the order of the lists.
+    unlisted : images below ``query/`` that are in no list.
+    """
+
+    database: tuple[Frame, ...]
+    sequences: tuple[Frame, ...]
+    day: tuple[Frame, ...]
+    night: tuple[Frame, ...]
+    additional_night: tuple[Frame, ...]
+    unlisted: tuple[Frame, ...]
+
+    def mapping(self) -> tuple[Frame, ...]:
+        """All map images."""
+        return self.database + self.sequences
+
+    def queries(self) -> tuple[Frame, ...]:
+        """All queries that are in a list."""
+        return self.day + self.night + self.additional_night
+
+
+def build_aachen_frames(options: AachenTwinOptions) -> AachenFrames:
+    """Choose all images of the twin; the same options give the same images."""
+    world = options.world()
+    places = [build_place(world, index) for index in range(options.num_places)]
+    numbers = _database_numbers(options)
+    added = options.version == "1.1"
+    database: list[Frame] = []
+    sequences: list[Frame] = []
+    day: list[Frame] = []
+    night: list[Frame] = []
+    num_night = options.night_queries + options.additional_night_queries * added
+    for place in places:
+        album = _photographs(options, world, place, numbers[len(database) :])
+        database += album
+        if added:
+            sequences += _sequence(options, world, place)
+        day += query_frames(world, place, album, "day", options.day_queries + NUM_UNLISTED)
+        night += query_frames(world, place, album, "night", num_night)
+    day, night = _as_telephones(day, "day", options), _as_telephones(night, "night", options)
+    last_day, last_night = options.day_queries, options.night_queries
+    return AachenFrames(
+        database=_shuffled(database, options, "nvm"),
+        sequences=tuple(sequences),
+        day=_shuffled(day[:last_day], options, "day"),
+        night=_shuffled(night[:last_night], options, "night"),
+        additional_night=tuple(
+            shuffled(night[last_night:], options.seed, "aachen", "order", "additional")
+        ),
+        unlisted=tuple(day[last_day:]),
+    )
+
+
+def _database_numbers(options: AachenTwinOptions) -> NDArray[np.int64]:
+    """Numbers of the database images, in no order and with gaps."""
+    count = options.num_places * options.stations_per_place * len(_YAWS_DEG)
+    drawn = stream(options.seed, "aachen", "numbers").permutation(2 * count + 50) + 1
+    return drawn[drawn != _WRONG_IMAGE][:count]
+
+
+def _photographs(
+    options: AachenTwinOptions,
+    world: SyntheticWorldOptions,
+    place: Place,
+    numbers: NDArray[np.int64],
+) -> list[Frame]:
+    """Map images of a place, each with a camera of its own, taken on two sunny days."""
+    rng = stream(options.seed, "aachen", "database", place.index)
+    suns = [(rng.uniform(-np.pi, np.pi), np.radians(rng.uniform(40, 60))) for _ in range(2)]
+    frames: list[Frame] = []
+    for station, (spot, heading) in enumerate(place.plan.stops(options.stations_per_place)):
+        # of one place, those of a day behind one another: its shadows are cast once
+        sun = suns[2 * station // options.stations_per_place]
+        for yaw_deg in _YAWS_DEG:
+            number = int(numbers[len(frames)])
+            name = f"db/{number}.jpg"
+            at = np.array([*spot + rng.normal(0, 0.15, 2), rng.uniform(1.5, 1.9)])
+            yaw = heading + np.radians(yaw_deg) + float(rng.normal(0, 0.1))
+            frames.append(
+                _map_frame(
+                    world,
+                    place,
+                    name,
+                    sensor_id=f"db_{number}",
+                    camera=_photo_camera(options, rng),
+                    at=at,
+                    yaw=yaw,
+                    sun=sun,
+                    rng=rng,
+                )
+            )
+    return frames
+
+
+def _sequence(
+    options: AachenTwinOptions, world: SyntheticWorldOptions, place: Place
+) -> list[Frame]:
+    """A few steps through a place with one camera, looking to the left."""
+    rng = stream(options.seed, "aachen", "sequence", place.index)
+    sun = (float(rng.uniform(-np.pi, np.pi)), float(np.radians(rng.uniform(40, 60))))
+    width, height = options.width, options.height
+    if place.index == 0:
+        folder, file = "sequences/gopro3_undistorted", "gopro_{:05d}.png"
+        camera = Camera("PINHOLE", width, height, (0.7 * width,) * 2 + (width / 2, height / 2))
+    else:
+        folder = f"sequences/nexus4_sequences/sequence_{place.index}"
+        file = "frame_{:06d}.jpg"
+        camera = _photo_camera(options, rng, portraits=False)
+    # steps of half the distance between the spots of the photographs
+    steps = place.plan.stops(max(2 * options.stations_per_place, options.sequence_images))
+    return [
+        _map_frame(
+            world,
+            place,
+            f"{folder}/{file.format(30 * step + 1)}",
+            sensor_id=folder,
+            camera=camera,
+            at=np.array([*spot, 1.6 + rng.normal(0, 0.02)]),
+            yaw=heading + np.pi / 2 + float(rng.normal(0, 0.05)),
+            sun=sun,
+            rng=rng,
+        )
+        for step, (spot, heading) in enumerate(steps[: options.sequence_images])
+    ]
+
+
+def _map_frame(
+    world: SyntheticWorldOptions,
+    place: Place,
+    name: str,
+    *,
+    sensor_id: str,
+    camera: Camera,
+    at: NDArray[np.float64],
+    yaw: float,
+    sun: tuple[float, float],
+    rng: np.random.Generator,
+) -> Frame:
+    """A map image taken by hand from ``at`` (place's frame, metres) with the sun at ``sun``."""
+    azimuth, elevation = sun
+    pitch, roll = (float(a) for a in rng.normal(0.02, 0.03, 2))
+    return Frame(
+        name=name,
+        role="mapping",
+        condition="day",
+        place=place.index,
+        timestamp=0,  # nothing was taken at the same time
+        sensor_id=sensor_id,
+        camera=camera,
+        cam_from_world=looking_at(at, yaw, pitch, roll) @ place.place_from_world,
+        lighting=day_lighting(
+            rng,
+            azimuth=azimuth,
+            elevation=elevation,
+            overcast=0.15,
+            noise_seed=noise_seed(world, name),
+        ),
+        moving_objects=place_moving_objects(place.plan, rng, world.moving_objects, at, yaw=None),
+        bonnet=False,
+    )
+
+
+def _photo_camera(
+    options: AachenTwinOptions, rng: np.random.Generator, *, portraits: bool = True
+) -> Camera:
+    """SIMPLE_RADIAL with its principal point in the middle; some are portraits."""
+    width, height = options.width, options.height
+    focal, k = rng.uniform(0.7, 0.9) * width, rng.uniform(-0.1, 0.02)
+    if rng.random() < _PORTRAIT_SHARE and portraits:
+        width, height = height, width
+    return _simple_radial(width, height, focal, k)
+
+
+def _simple_radial(width: int, height: int, focal: float, k: float) -> Camera:
+    """With the six digits that the published lists have."""
+    params = (float(f"{focal:.6g}"), width / 2, height / 2, float(f"{k:.6g}"))
+    return Camera("SIMPLE_RADIAL", width, height, params)
+
+
+def _as_telephones(
+    frames: Sequence[Frame], condition: Condition, options: AachenTwinOptions
+) -> list[Frame]:
+    """Queries sorted by their number, with names of telephones and cameras as in the lists."""
+    renamed = []
+    for number, frame in enumerate(sorted(frames, key=lambda frame: frame.timestamp)):
+        focal, _, _, k = frame.camera.params
+        camera = _simple_radial(frame.camera.width, frame.camera.height, focal, k)
+        night = condition == "night"
+        name = _night_name(number, options) if night else _day_name(number)
+        renamed.append(replace(frame, name=name, camera=camera))
+    return renamed
+
+
+def _day_name(number: int) -> str:
+    device = _DEVICES[number % len(_DEVICES)]
+    hour, minute, second = _clock(number)
+    if device == "milestone":
+        file = f"2011-12-17_{hour:02d}-{minute:02d}-{second:02d}_{257 + number}.jpg"
+    else:
+        date = {"nexus4": "20140520", "nexus5x": "20160914"}[device]
+        file = f"IMG_{date}_{hour:02d}{minute:02d}{second:02d}.jpg"
+    return f"query/day/{device}/{file}"
+
+
+def _night_name(number: int, options: AachenTwinOptions) -> str:
+    folder, date = "nexus5x", "20161227"
+    if number >= options.night_queries:
+        folder, date = "nexus5x_additional_night", "20180115"
+    hour, minute, second = _clock(number)
+    return f"query/night/{folder}/IMG_{date}_{hour + 4:02d}{minute:02d}{second:02d}.jpg"
+
+
+def _clock(number: int) -> tuple[int, int, int]:
+    """When the query of a number was taken: each at another time."""
+    second = 37 * number
+    return 14 + second // 3600, second // 60 % 60, second % 60
+
+
+def _write_nvm_model(
+    folder: Path, options: AachenTwinOptions, frames: Sequence[Frame], drawn: MapFrames
+) -> None:
+    """v1.0's model, which knows only focal lengths, and the list that has the whole cameras."""
+    rng = stream(options.seed, "aachen", "points", "1.0")
+    points = drawn.points(frames, points_per_frame=options.points_per_image, rng=rng)
+    if not drawn.features:
+        # as if the images had more features than see a point
+        points = replace(points, feature_ids=3 * points.feature_ids + 1)
+    cameras = {frame.name: frame.camera for frame in frames}
+    model = NvmModel(
+        names=tuple(cameras),
+        focal_px=np.array([camera.params[0] for camera in cameras.values()]),
+        quat_wxyz=np.array([frame.cam_from_world.quat_wxyz for frame in frames]),
+        centers=np.array([frame.cam_from_world.center() for frame in frames]),
+        k_colmap=np.array([camera.params[3] for camera in cameras.values()]),
+        points=points,
+    )
+    write_nvm(folder / "aachen_cvpr2018_db.nvm", model)
+    write_lines(folder / "aachen_cvpr2018_db.list.txt", model.names)
+    write_query_list(folder / "database_intrinsics.txt", dict(sorted(cameras.items())))
+
+
+def _write_colmap_model(
+    folder: Path, options: AachenTwinOptions, frames: Sequence[Frame], drawn: MapFrames
+) -> None:
+    """v1.1's model: image and camera ids have no order, and a sequence shares its camera."""
+    rng = stream(options.seed, "aachen", "points", "1.1")
+    frames = [frames[index] for index in rng.permutation(len(frames))]
+    cameras = {frame.sensor_id: frame.camera for frame in frames}
+    camera_ids = dict(zip(cameras, (rng.permutation(len(cameras)) + 1).tolist(), strict=True))
+    image_ids = (rng.permutation(2 * len(frames)) + 1).tolist()
+    model = ColmapModel(
+        cameras={camera_ids[sensor]: camera for sensor, camera in cameras.items()},
+        images=tuple(
+            ColmapImage(image_id, frame.name, camera_ids[frame.sensor_id], frame.cam_from_world)
+            for image_id, frame in zip(image_ids, frames, strict=False)
+        ),
+        points=drawn.points(frames, points_per_frame=options.points_per_image, rng=rng),
+    )
+    write_colmap_binary(folder, model)
+
+
+def _write_lists(folder: Path, frames: AachenFrames) -> None:
+    night = frames.night + frames.additional_night
+    for when, some in (("day", frames.day), ("night", night)):
+        write_query_list(
+            folder / f"{when}_time_queries_with_intrinsics.txt",
+            {frame.name: frame.camera for frame in some},
+            last_line_ends=False,
+        )
+    names = [frame.name for frame in frames.day]
+    write_lines(folder / "day_time_queries_without_intrinsics.txt", names)
+
+
+def _shuffled(frames: Sequence[Frame], options: AachenTwinOptions, label: str) -> tuple[Frame, ...]:
+    return tuple(shuffled(frames, options.seed, "aachen", "order", label))

@@ -1,0 +1,225 @@
+"""Noise, colours, letters, shapes, cracks and tiles of masonry to paint textures with."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_twins.options import stream
+from megloc_twins.portable import exp, resized
+
+Field2D = NDArray[np.float32]
+
+Rgb = NDArray[np.uint8]
+Colour = NDArray[np.float32]  # (3,), 0..255
+Picture = NDArray[np.float32]  # (H, W, 3), 0..255
+TILE = 512  # texels; the period of a material
+
+
+def smooth_noise(
+    rng: np.random.Generator, height: int, width: int, *, cell: float, octaves: int = 4
+) -> Field2D:
+    """Multi-octave noise, zero mean and unit deviation; ``cell`` is the coarsest octave, texels."""
+    total = np.zeros((height, width), np.float32)
+    amplitude = 1.0
+    for _ in range(octaves):
+        rows, cols = int(np.ceil(height / cell)) + 2, int(np.ceil(width / cell)) + 2
+        grid = rng.standard_normal((rows, cols), dtype=np.float32)
+        fine_height, fine_width = int(round(rows * cell)), int(round(cols * cell))
+        fine = resized(grid, fine_width, fine_height, cubic=True)
+        top, left = (fine_height - height) // 2, (fine_width - width) // 2
+        total += np.float32(amplitude) * fine[top : top + height, left : left + width]
+        amplitude *= 0.65
+        cell = cell / 2
+        if cell < 1.5:
+            break
+    return (total - total.mean()) / max(float(total.std()), 1e-6)
+
+
+def periodic_noise(
+    rng: np.random.Generator, size: int, *, cell: float, octaves: int = 4
+) -> Field2D:
+    """Like :func:`smooth_noise`, square and seamless when tiled."""
+    white = rng.standard_normal((size, size))
+    rows, columns = np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)[None]
+    freq = np.sqrt(rows * rows + columns * columns) * cell
+    upper = 2.0 ** (octaves - 1)
+    gain = np.where(freq > 0, 1 / (0.3 + freq), 0) * exp(-((freq / upper) ** 2))
+    out = np.fft.irfft2(np.fft.rfft2(white) * gain, (size, size)).astype(np.float32)
+    return out / max(float(out.std()), 1e-6)
+
+
+def random_colour(
+    rng: np.random.Generator, low: float = 30, high: float = 225, *, chroma: float = 0.75
+) -> Colour:
+    """A random colour; ``chroma`` 0 is grey, 1 as strong as its channels' range allows."""
+    channels = rng.uniform(low, high, 3)
+    return (channels.mean() + chroma * (channels - channels.mean())).astype(np.float32)
+
+
+def to_rgb(image: Picture) -> Rgb:
+    """Round to uint8, cutting off what is below 0 or above 255."""
+    return np.clip(image + 0.5, 0, 255).astype(np.uint8)
+
+
+def shade(image: Picture, factor: Field2D) -> Picture:
+    """The picture times a field (H, W)."""
+    return image * factor[..., None]
+
+
+def cv_colour(colour: Colour) -> tuple[float, float, float]:
+    """A colour as OpenCV's drawing functions take it."""
+    return float(colour[0]), float(colour[1]), float(colour[2])
+
+
+def draw_glyphs(
+    rng: np.random.Generator,
+    image: Rgb,
+    box: tuple[int, int, int, int],
+    colour: Colour,
+    *,
+    rows: int,
+) -> None:
+    """Fill ``box`` (x0, y0, x1, y1 texels) with lines of random letter-like strokes, in place."""
+    x0, y0, x1, y1 = box
+    line = (y1 - y0) / rows
+    size = 0.72 * line
+    thickness = max(1, int(size * 0.16))
+    for row in range(rows):
+        x = float(x0)
+        end = x1 - rng.uniform(0, 0.35) * (x1 - x0) * (rows > 1)
+        y = y0 + row * line + 0.1 * line
+        while x + 0.6 * size < end:
+            if rng.random() < 0.14:
+                x += 0.5 * size
+                continue
+            nodes = np.array([[i, j] for j in range(3) for i in range(2)], np.float32)
+            picks = rng.permutation(6)[: int(rng.integers(3, 6))]
+            points = nodes[picks] * (0.55 * size, 0.5 * size) + (x, y)
+            stroke = np.round(points * 16).astype(np.int32)
+            cv2.polylines(
+                image,
+                [stroke],
+                bool(rng.random() < 0.3),
+                cv_colour(colour),
+                thickness,
+                cv2.LINE_AA,
+                4,
+            )
+            x += 0.85 * size
+
+
+def draw_shapes(rng: np.random.Generator, image: Rgb, count: int) -> None:
+    """Draw random discs, polygons, rings and bars over the image, in place."""
+    height, width = image.shape[:2]
+    extent = min(height, width)
+    for _ in range(count):
+        kind = int(rng.integers(0, 4))
+        colour = cv_colour(random_colour(rng, 10, 245))
+        center = (int(rng.uniform(0, width) * 16), int(rng.uniform(0, height) * 16))
+        radius = rng.uniform(0.06, 0.3) * extent
+        if kind == 0:
+            cv2.circle(image, center, int(radius * 16), colour, -1, cv2.LINE_AA, 4)
+        elif kind == 1:
+            cv2.circle(
+                image, center, int(radius * 16), colour, max(1, int(radius / 4)), cv2.LINE_AA, 4
+            )
+        elif kind == 2:
+            angles = np.sort(rng.uniform(0, 2 * np.pi, int(rng.integers(3, 6))))
+            ring = np.stack([np.cos(angles), np.sin(angles)], 1) * radius * 16 * 1.4
+            points = np.round(ring + center).astype(np.int32)
+            cv2.fillPoly(image, [points], colour, cv2.LINE_AA, 4)
+        else:
+            angle = rng.uniform(0, np.pi)
+            along = np.array([np.cos(angle), np.sin(angle)]) * extent * 12
+            start = np.round(center - along).astype(int)
+            stop = np.round(center + along).astype(int)
+            cv2.line(
+                image,
+                (int(start[0]), int(start[1])),
+                (int(stop[0]), int(stop[1])),
+                colour,
+                max(1, int(radius * 0.3)),
+                cv2.LINE_AA,
+                4,
+            )
+
+
+def draw_cracks(rng: np.random.Generator, image: Rgb, count: int) -> None:
+    """Draw thin dark wandering lines over the image, in place."""
+    height, width = image.shape[:2]
+    for _ in range(count):
+        steps = rng.normal(0, 5, (int(rng.integers(10, 40)), 2)) + rng.normal(0, 3, 2)
+        start = rng.uniform((0, 0), (width, height))
+        points = np.round((start + np.cumsum(steps, 0)) * 16).astype(np.int32)
+        tone = float(rng.uniform(30, 80))
+        cv2.polylines(image, [points], False, (tone, tone, tone), 1, cv2.LINE_AA, 4)
+
+
+def _blocks(
+    rng: np.random.Generator,
+    *,
+    base: Colour,
+    rows: int,
+    cols: int,
+    spread: float,
+    joint: float,
+    joint_colour: Colour,
+) -> Picture:
+    """Masonry of ``rows`` x ``cols`` blocks per tile, every second row shifted by half a block."""
+    y, x = np.mgrid[0:TILE, 0:TILE].astype(np.float32)
+    v = (y + 0.5) / TILE * rows
+    row = np.floor(v).astype(int)
+    u = (x + 0.5) / TILE * cols + 0.5 * (row % 2)
+    col = np.floor(u).astype(int) % cols
+    tone = rng.normal(0, spread, (rows, cols)).astype(np.float32)
+    tint = rng.normal(0, spread * 0.3, (rows, cols, 3)).astype(np.float32)
+    to_edge_x = np.abs(u - np.floor(u) - 0.5) * TILE / cols
+    to_edge_y = np.abs(v - np.floor(v) - 0.5) * TILE / rows
+    edge = np.minimum(TILE / cols / 2 - to_edge_x, TILE / rows / 2 - to_edge_y)
+    mortar = np.clip(joint - edge + 0.5, 0, 1)[..., None]
+    blocks = base * (1 + tone[row, col][..., None] + tint[row, col])
+    blocks = shade(blocks, 1 + 0.10 * periodic_noise(rng, TILE, cell=40, octaves=2))
+    return blocks * (1 - mortar) + joint_colour * mortar
+
+
+@lru_cache(maxsize=32)
+def material_tile(kind: str, seed: int) -> Picture:
+    """A seamless tile (TILE, TILE, 3) float32 of the material, RGB 0..255; not to be written to."""
+    rng = stream(seed, "material", kind)
+    if kind == "brick":
+        base = np.array([150, 84, 66], np.float32) * rng.uniform(0.8, 1.1, 3).astype(np.float32)
+        grey = np.full(3, 168, np.float32)
+        tile = _blocks(rng, base=base, rows=30, cols=12, spread=0.16, joint=1.2, joint_colour=grey)
+    elif kind == "stone":
+        base = np.array([172, 160, 136], np.float32) * rng.uniform(0.85, 1.1, 3).astype(np.float32)
+        dark = np.full(3, 92, np.float32)
+        tile = _blocks(rng, base=base, rows=12, cols=6, spread=0.12, joint=1.5, joint_colour=dark)
+        tile = shade(tile, 1 + 0.07 * periodic_noise(rng, TILE, cell=24, octaves=2))
+    elif kind == "plaster":
+        base = np.array([196, 176, 138], np.float32) * rng.uniform(0.75, 1.1, 3).astype(np.float32)
+        tile = np.broadcast_to(base, (TILE, TILE, 3))
+        tile = shade(tile, 1 + 0.08 * periodic_noise(rng, TILE, cell=64, octaves=3))
+        pits = np.clip(periodic_noise(rng, TILE, cell=28, octaves=2) - 1.6, 0, 1)
+        tile = shade(tile, 1 - 0.35 * pits)
+    elif kind == "paving":
+        base = np.array([142, 138, 130], np.float32) * rng.uniform(0.9, 1.1, 3).astype(np.float32)
+        dark = np.full(3, 70, np.float32)
+        tile = _blocks(rng, base=base, rows=16, cols=16, spread=0.14, joint=1.6, joint_colour=dark)
+    elif kind == "asphalt":
+        base = np.array([104, 104, 106], np.float32)
+        tile = np.broadcast_to(base, (TILE, TILE, 3))
+        tile = shade(tile, 1 + 0.14 * periodic_noise(rng, TILE, cell=24, octaves=2))
+    else:
+        raise ValueError(f"no material {kind!r}")
+    return np.ascontiguousarray(tile, dtype=np.float32)
+
+
+def tiled(kind: str, seed: int, height: int, width: int, shift: tuple[int, int]) -> Picture:
+    """A surface (height, width, 3) of the material, its tile moved by ``shift`` rows, columns."""
+    tile = np.roll(material_tile(kind, seed), shift, axis=(0, 1))
+    repeats = (-(-height // TILE), -(-width // TILE), 1)
+    return np.tile(tile, repeats)[:height, :width]

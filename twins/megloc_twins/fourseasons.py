@@ -1,0 +1,441 @@
+"""The rendered world in 4Seasons' layout: three recordings of one route, with their truth.
+
+The map is driven on a summer's day; queries ask for their place in winter, whose poses are
+published, and at dusk, whose poses a challenge withholds. Relocalization files name the keyframes
+that are asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from megloc_kapture.datasets.formats.sparse_points import SparsePoints
+from megloc_kapture.datasets.fourseasons.poses import earth_from_enu, geodetic
+from megloc_kapture.datasets.official import GROUND_TRUTH
+from megloc_kapture.io.files import write_bytes
+from megloc_kapture.io.images import write_image
+from megloc_kapture.io.kapture import write_sensors
+from megloc_kapture.stages.work import HERE, Work
+from megloc_kapture.values import Camera, Options, RigidTransform
+from megloc_twins.dataset import SyntheticDataset
+from megloc_twins.fourseasons_drive import (
+    CAM1_FROM_CAM0,
+    CAMERAS,
+    Drive,
+    Moment,
+    SeasonBuilder,
+    drive_moments,
+    stereo_camera,
+)
+from megloc_twins.frames import Frame, kapture_records
+from megloc_twins.options import SyntheticWorldOptions, stream
+from megloc_twins.portable import settled, settled_pose
+from megloc_twins.render import RenderedFrame, render_frames
+from megloc_twins.sparse_models import exact_tracks
+
+REFERENCE = "recording_2020-06-18_10-12-33"
+WINTER = "recording_2021-01-15_13-04-17"
+DUSK = "recording_2021-03-22_18-41-05"
+
+_EXPOSURE_MS = {REFERENCE: 0.2457180023, WINTER: 1.9, DUSK: 10.0}
+_GREY = np.array([299, 587, 114])  # thousandths
+
+Drawn = tuple[NDArray[np.uint8], NDArray[np.float32]] | None
+
+# between the published calibrations of the distorted and the undistorted left camera
+_RECTIFICATION_DEG = 2.2
+_TAGS = "translation vector, rotation quaternion"
+# pixels of the patch whose grey values stand with a point
+_PATTERN = ((0, -2), (-1, -1), (1, -1), (-2, 0), (0, 0), (2, 0), (-1, 1), (0, 2))
+
+
+def _settled_earth_from_enu(
+    latitude_deg: float, longitude_deg: float, height_m: float
+) -> RigidTransform:
+    exact = earth_from_enu(latitude_deg, longitude_deg, height_m)
+    # to the micrometre: at the earth's surface a float64 holds no nanometres
+    return settled_pose(exact.rotation_matrix(), np.round(exact.translation, 6))
+
+
+# the world's origin: near Munich, its axes east, north and up
+EARTH_FROM_WORLD = _settled_earth_from_enu(48.1861, 11.6197, 540.0)
+
+
+class FourSeasonsTwinOptions(Options):
+    """Contents of 4Seasons' twin."""
+
+    seed: int = Field(default=0, ge=0, description="every random choice hangs on it")
+    num_places: int = Field(default=4, ge=1, description="places on the route")
+    map_keyframes: int = Field(
+        default=12, ge=3, description="keyframes of the map's recording in each place"
+    )
+    winter_keyframes: int = Field(
+        default=6, ge=1, description="keyframes of the winter's recording in each place"
+    )
+    dusk_keyframes: int = Field(
+        default=4, ge=1, description="keyframes of the recording at dusk in each place"
+    )
+    width: int = Field(default=800, ge=64, description="image width in px")
+    height: int = Field(default=400, ge=48, description="image height in px")
+    supersampling: int = Field(default=2, ge=1, le=4, description="samples per px and axis")
+    cloud_points: int = Field(
+        default=150, ge=0, description="pixels tried for each keyframe's point cloud"
+    )
+
+    def world(self) -> SyntheticWorldOptions:
+        """The options of the world that is driven through."""
+        names = {"seed", "num_places", "width", "height", "supersampling"}
+        return SyntheticWorldOptions(**self.model_dump(include=names))
+
+    def drives(self) -> tuple[Drive, Drive, Drive]:
+        """The recordings, the map's first."""
+        return (
+            Drive(REFERENCE, "summer", start_of(REFERENCE), self.map_keyframes, "mapping", 0.1, 2),
+            Drive(WINTER, "winter", start_of(WINTER), self.winter_keyframes, "query", 0.6, 8),
+            Drive(DUSK, "dusk", start_of(DUSK), self.dusk_keyframes, "query", 0.9, 12),
+        )
+
+
+class FourSeasonsTwin(SyntheticDataset[FourSeasonsTwinOptions]):
+    """4Seasons as it is published, with its truth.
+
+    ``calibration/``, three recordings, relocalization files as in 2021, and the true poses (ECEF)
+    in ``ground_truth/``.
+    """
+
+    Options = FourSeasonsTwinOptions
+    version = 2
+
+    def write(self, root: Path, work: Work = HERE) -> dict[str, int]:
+        options, drives = self.options, self.options.drives()
+        driven = {drive.name: drive_moments(options.world(), drive) for drive in drives}
+        keyframes = {name: [m for m in moments if m.keyframe] for name, moments in driven.items()}
+        for name, text in calibration_texts(stereo_camera(options.width, options.height)).items():
+            _write_text(root / "calibration" / name, text)
+        for drive in drives:
+            _write_recording(root, options, drive, driven[drive.name], work)
+            if drive.role == "query":
+                _write_text(
+                    root / f"relocalizationFile_{REFERENCE}_to_{drive.name}.txt",
+                    relocalization_text(keyframes[REFERENCE], keyframes[drive.name]),
+                )
+        asked = [*keyframes[WINTER], *keyframes[DUSK]]
+        for role, some in (("mapping", keyframes[REFERENCE]), ("query", asked)):
+            write_sensors(root / GROUND_TRUTH / role, kapture_records(_on_earth(some)))
+        return {
+            "places": options.num_places,
+            "mapping images": len(CAMERAS) * len(keyframes[REFERENCE]),
+            "query images": len(CAMERAS) * len(asked),
+        }
+
+
+def _write_recording(
+    root: Path, options: FourSeasonsTwinOptions, drive: Drive, moments: list[Moment], work: Work
+) -> None:
+    folder, exposure_ms = root / drive.name, _EXPOSURE_MS[drive.name]
+    season = SeasonBuilder(drive.season)
+    published = drive.name != DUSK  # the poses of a challenge's test recording are withheld
+    keyframes = [moment for moment in moments if moment.keyframe]
+    # the odometry sees depth by stereo and by motion
+    seeing = [frame for moment in keyframes for frame in moment.frames] if published else []
+    drawn = render_frames(
+        options.world(),
+        [frame for moment in moments for frame in moment.frames],
+        partial(_write_files, root),
+        with_depth=[frame.name for frame in seeing],
+        build=season,
+        sky_seed=season.sky_seed(options.world()),
+        work=work,
+    )
+    _write_text(folder / "times.txt", times_text(moments, exposure_ms))
+    if not published:
+        return
+    slam = SlamFrames.drawn(options.seed, drive.name, blank_lines=drive.name == REFERENCE)
+    _write_text(folder / "GNSSPoses.txt", gnss_poses_text(slam, keyframes))
+    _write_text(folder / "Transformations.txt", transformations_text(slam))
+    _write_text(folder / "result.txt", result_text(slam, moments))
+    _write_text(folder / "septentrio.nmea", nmea_text(keyframes))
+    images = {name: result for name, result in drawn.items() if result is not None}
+    tracks = exact_tracks(
+        seeing,
+        {name: depth for name, (_, depth) in images.items()},
+        points_per_frame=options.cloud_points,
+        rng=stream(options.seed, "cloud", drive.name),
+    )
+    for index, moment in enumerate(keyframes):
+        left = moment.frames[0]
+        points = cloud_of(tracks, len(CAMERAS) * index, left.cam_from_world)
+        text = keyframe_text(slam, moment, left.camera, points, images[left.name][0], exposure_ms)
+        _write_text(folder / "KeyFrameData" / f"KeyFrame_{moment.timestamp}.txt", text)
+
+
+def _write_files(root: Path, frame: Frame, view: RenderedFrame) -> Drawn:
+    """Write the image, grey as the camera's; returned where it has depth, with that."""
+    grey = ((view.image @ _GREY + 500) // 1000).astype(np.uint8)
+    write_image(root / frame.name, grey)
+    return None if view.depth_m is None else (grey, view.depth_m)
+
+
+def _on_earth(moments: Iterable[Moment]) -> Iterator[Frame]:
+    """The moments' frames with their poses in ECEF, each camera's its own."""
+    world_from_earth = EARTH_FROM_WORLD.inverse()
+    cams_from_cam0 = (RigidTransform.identity(), CAM1_FROM_CAM0)
+    for moment in moments:
+        for frame, cam_from_cam0 in zip(moment.frames, cams_from_cam0, strict=True):
+            pose = cam_from_cam0 @ moment.cam0_from_world @ world_from_earth
+            yield replace(frame, cam_from_world=pose)
+
+
+def _write_text(path: Path, text: str) -> None:
+    write_bytes(path, text.encode())
+
+
+@dataclass(frozen=True)
+class SlamFrames:
+    """How a recording's frames lie to one another; all as its files have them.
+
+    Parameters
+    ----------
+    s_from_as, w_from_gpsw, e_from_gpsw : as in ``Transformations.txt``.
+    scale : metres per unit of the SLAM world.
+    odometry_from_as : the world of the keyframe files and ``result.txt``.
+    blank_lines : whether ``Transformations.txt`` has them between its blocks.
+    """
+
+    s_from_as: RigidTransform
+    w_from_gpsw: RigidTransform
+    e_from_gpsw: RigidTransform
+    scale: float
+    odometry_from_as: RigidTransform
+    blank_lines: bool
+
+    @classmethod
+    def drawn(cls, seed: int, recording: str, *, blank_lines: bool) -> SlamFrames:
+        """The frames of a recording, at random."""
+        rng = stream(seed, "frames", recording)
+        # each scene has its own origin, some hundred metres away
+        east, north, up = rng.uniform(-300, 300, 2).tolist() + [float(rng.uniform(-5, 5))]
+        origin = RigidTransform((1.0, 0.0, 0.0, 0.0), (east, north, up))
+        place = geodetic(np.array((EARTH_FROM_WORLD @ origin).translation))
+        return cls(
+            s_from_as=_as_written(_random_transform(rng, 0.03, 3.2e-2, 0.0)),
+            w_from_gpsw=_as_written(_random_transform(rng, np.pi, 2e-2, 0.4)),
+            e_from_gpsw=_as_written(_settled_earth_from_enu(*place)),
+            scale=round(float(rng.uniform(0.96, 0.97)), 6),
+            odometry_from_as=_random_transform(rng, np.pi, 0.1, 0.3),
+            blank_lines=blank_lines,
+        )
+
+    def slam_from_cam(self, cam_from_world: RigidTransform) -> RigidTransform:
+        """A pose as ``GNSSPoses.txt`` has it, its translation in units of the SLAM world."""
+        s_from_world = self.w_from_gpsw @ self.e_from_gpsw.inverse() @ EARTH_FROM_WORLD
+        metric = self.s_from_as.inverse() @ s_from_world @ cam_from_world.inverse()
+        x, y, z = (value / self.scale for value in metric.translation)
+        return RigidTransform(metric.quat_wxyz, (x, y, z))
+
+
+def transformations_text(slam: SlamFrames) -> str:
+    """``Transformations.txt``."""
+    cam_from_imu = RigidTransform(
+        (-0.002350, -0.007202, 0.708623, -0.705546), (0.175412, 0.003689, -0.058106)
+    )
+    blocks = [
+        f"# {name}: {_TAGS}\n{_pose_fields(transform, ',', 6)}\n"
+        for name, transform in (
+            ("transform_S_AS", slam.s_from_as),
+            ("TS_cam_imu", cam_from_imu),
+            ("transform_w_gpsw", slam.w_from_gpsw),
+            ("transform_gps_imu", RigidTransform.identity()),
+            ("transform_e_gpsw", slam.e_from_gpsw),
+        )
+    ]
+    blocks.append(f"# GNSS scale\n{slam.scale:.6f}\n")
+    return ("\n" if slam.blank_lines else "").join(blocks)
+
+
+def gnss_poses_text(slam: SlamFrames, keyframes: Iterable[Moment]) -> str:
+    """``GNSSPoses.txt``; its header announces a column more than its rows have."""
+    lines = [
+        "# timestamp_ns, tran_x, tran_y, tran_z, quat_x, quat_y, quat_z, quat_w, scale, "
+        "fusion_quality, v3"
+    ]
+    for moment in keyframes:
+        pose = _pose_fields(slam.slam_from_cam(moment.cam0_from_world), ",", 12)
+        lines.append(f"{moment.timestamp},{pose},{slam.scale:.6f},2")
+    return "\n".join(lines) + "\n"
+
+
+def times_text(moments: Iterable[Moment], exposure_ms: float) -> str:
+    """``times.txt``, all frames, most without images."""
+    return "".join(f"{f.timestamp} {f.timestamp / 1e9:.10f} {exposure_ms:.10f}\n" for f in moments)
+
+
+def result_text(slam: SlamFrames, moments: Iterable[Moment]) -> str:
+    """``result.txt``: the odometry's poses of all slam, level, of the unrectified camera."""
+    half = np.radians(_RECTIFICATION_DEG) / 2
+    w, y = settled((np.cos(half), np.sin(half))).tolist()
+    rectification = RigidTransform((w, 0.0, y, 0.0), (0.0, 0.0, 0.0))
+    lines = []
+    for moment in moments:
+        pose = slam.s_from_as @ _odometry_pose(slam, moment) @ rectification
+        lines.append(f"{moment.timestamp / 1e9:.5f}   {_pose_fields(pose, ' ', 15)}\n")
+    return "".join(lines)
+
+
+def keyframe_text(
+    slam: SlamFrames,
+    moment: Moment,
+    camera: Camera,
+    points: NDArray[np.float64],
+    image: NDArray[np.uint8],
+    exposure_ms: float,
+) -> str:
+    """``KeyFrame_<timestamp>.txt``.
+
+    Parameters
+    ----------
+    points : float64 (P, 3): u and v in pixels, depth in metres.
+    image : grey, uint8 (H, W).
+    """
+    fx, fy, cx, cy = camera.params
+    lines = [
+        "# timestamp",
+        f"{moment.timestamp}",
+        "",
+        "# fx, fy, cx, cy, width, height, npoints",
+        f"{fx:.12f},{fy:.12f},{cx:.12f},{cy:.12f},{camera.width},{camera.height},{len(points)}",
+        "",
+        f"# camToWorld: {_TAGS}",
+        _pose_fields(_odometry_pose(slam, moment), ",", 12),
+        "",
+        "# Exposure time (ms)",
+        f"{exposure_ms:.6f}",
+        "",
+        "# Point Cloud Data : ",
+        "# u,v,idepth_scaled,idepth_hessian,maxRelBaseline,numGoodRes,status ",
+        "# color information ",
+    ]
+    for u, v, depth_m in points.tolist():
+        inverse_depth = slam.scale / depth_m
+        lines.append(f"{u:.9f},{v:.9f},{inverse_depth:.12f},900000000.000000,0.050000,0,1")
+        lines.append("".join(f"{grey}," for grey in _patch(image, u, v)))
+    return "\n".join(lines) + "\n\n"
+
+
+def cloud_of(
+    tracks: SparsePoints, image: int, cam_from_world: RigidTransform
+) -> NDArray[np.float64]:
+    """Points of the tracks in one image: u and v in pixels, depth in metres, float64 (P, 3)."""
+    seen = tracks.image_ids == image
+    depth = cam_from_world.apply(tracks.xyz[tracks.point_ids[seen]])[:, 2]
+    return np.column_stack([tracks.xy_px[seen].astype(np.float64), depth])
+
+
+def nmea_text(keyframes: Sequence[Moment]) -> str:
+    """``septentrio.nmea``: a fix for each keyframe behind the rest of a line."""
+    lines = [",D*1C"]
+    for moment in keyframes:
+        clock = datetime.fromtimestamp(moment.timestamp // 10**9, UTC)
+        hundredths = moment.timestamp // 10**7 % 100
+        position = (EARTH_FROM_WORLD @ moment.cam0_from_world.inverse()).translation
+        latitude, longitude, height = geodetic(np.array(position))
+        time = f"{clock:%H%M%S}.{hundredths:02d}"
+        place = f"{_degrees_minutes(latitude, 2)},N,{_degrees_minutes(longitude, 3)},E"
+        for content in (
+            f"GPRMC,{time},A,{place},7.0,251.7,{clock:%d%m%y},3.5,W,D",
+            f"GPGGA,{time},{place},4,09,1.1,{height:.4f},M,0.0000,M,0.6,3119",
+        ):
+            checksum = 0
+            for byte in content.encode():
+                checksum ^= byte
+            lines.append(f"${content}*{checksum:02X}")
+    return "\n".join(lines) + "\n"
+
+
+def calibration_texts(camera: Camera) -> dict[str, str]:
+    """The files of ``calibration/`` that undistorted images need, by name."""
+    fx, fy, cx, cy = camera.params
+    size = f"{camera.width} {camera.height}"
+    pinhole = f"Pinhole {fx!r} {fy!r} {cx!r} {cy!r} 0.0 0.0 0.0 0.0\n{size}\ncrop\n{size}\n"
+    matrix = np.eye(4)
+    matrix[:3, :3] = CAM1_FROM_CAM0.rotation_matrix()
+    matrix[:3, 3] = CAM1_FROM_CAM0.translation
+    rows = (" ".join(map(repr, row)) for row in matrix.tolist())
+    return {
+        "undistorted_calib_0.txt": pinhole,
+        "undistorted_calib_1.txt": pinhole,
+        "undistorted_calib_stereo.txt": "\n".join(rows) + "\n",
+    }
+
+
+def relocalization_text(reference: Sequence[Moment], queries: Sequence[Moment]) -> str:
+    """Pairs of the challenge: each query behind the keyframe of the map that is nearest to it."""
+    centers = np.array([moment.cam0_from_world.center() for moment in reference])
+    lines = []
+    for moment in queries:
+        distances = np.linalg.norm(centers - moment.cam0_from_world.center(), axis=1)
+        lines.append(f"{reference[int(distances.argmin())].timestamp} {moment.timestamp}\n")
+    return "".join(lines)
+
+
+def start_of(recording: str) -> int:
+    """The time in a recording's name, nanoseconds."""
+    moment = datetime.strptime(recording, "recording_%Y-%m-%d_%H-%M-%S").replace(tzinfo=UTC)
+    return int(moment.timestamp()) * 10**9
+
+
+def _odometry_pose(slam: SlamFrames, moment: Moment) -> RigidTransform:
+    return slam.odometry_from_as @ slam.slam_from_cam(moment.cam0_from_world)
+
+
+def _patch(image: NDArray[np.uint8], u: float, v: float) -> list[int]:
+    height, width = image.shape
+    column, row = int(u), int(v)
+    return [
+        int(image[min(max(row + dy, 0), height - 1), min(max(column + dx, 0), width - 1)])
+        for dx, dy in _PATTERN
+    ]
+
+
+def _random_transform(
+    rng: np.random.Generator, yaw: float, tilt: float, reach_m: float
+) -> RigidTransform:
+    """A turn about z by up to ``yaw`` and about x and y by up to ``tilt`` radians, and a shift."""
+    ax, ay, az = (float(a) / 2 for a in rng.uniform(-1, 1, 3) * (tilt, tilt, yaw))
+    cos_x, cos_y, cos_z = settled(np.cos((ax, ay, az))).tolist()
+    sin_x, sin_y, sin_z = settled(np.sin((ax, ay, az))).tolist()
+    turns = (
+        RigidTransform((cos_z, 0.0, 0.0, sin_z), (0.0, 0.0, 0.0)),
+        RigidTransform((cos_y, 0.0, sin_y, 0.0), (0.0, 0.0, 0.0)),
+        RigidTransform((cos_x, sin_x, 0.0, 0.0), (0.0, 0.0, 0.0)),
+    )
+    x, y, z = (float(v) for v in rng.uniform(-1, 1, 3) * reach_m)
+    shift = RigidTransform((1.0, 0.0, 0.0, 0.0), (x, y, z))
+    return shift @ turns[0] @ turns[1] @ turns[2]
+
+
+def _as_written(transform: RigidTransform) -> RigidTransform:
+    """The transform that six decimals stand for."""
+    quat = np.round(transform.quat_wxyz, 6)
+    w, x, y, z = (quat / np.sqrt((quat * quat).sum())).tolist()
+    tx, ty, tz = np.round(transform.translation, 6).tolist()
+    return RigidTransform((w, x, y, z), (tx, ty, tz))
+
+
+def _pose_fields(pose: RigidTransform, separator: str, decimals: int) -> str:
+    """Translation, then rotation x y z w."""
+    w, x, y, z = pose.quat_wxyz
+    return separator.join(f"{value:.{decimals}f}" for value in (*pose.translation, x, y, z, w))
+
+
+def _degrees_minutes(angle_deg: float, digits: int) -> str:
+    degrees = int(angle_deg)
+    return f"{degrees:0{digits}d}{(angle_deg - degrees) * 60:010.7f}"

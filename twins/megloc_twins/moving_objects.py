@@ -1,0 +1,198 @@
+"""Floor plans, and the people and cars on them: there in one image, gone in the next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_twins.options import stream
+from megloc_twins.surfaces import SurfaceBuilder, Surfaces
+from megloc_twins.textures import TextureRecipe
+
+Floats = NDArray[np.float64]
+
+# outlines (counter-clockwise) and the closed path of the mapping rig, metres
+_SHAPES: tuple[tuple[tuple[tuple[float, float], ...], tuple[tuple[float, float], ...]], ...] = (
+    (  # a courtyard
+        ((-8.5, -6.5), (8.5, -6.5), (8.5, 6.5), (-8.5, 6.5)),
+        ((-4.0, -2.3), (4.0, -2.3), (4.0, 2.3), (-4.0, 2.3)),
+    ),
+    (  # a street corner
+        ((-9.0, -8.0), (9.0, -8.0), (9.0, 0.5), (1.0, 0.5), (1.0, 8.0), (-9.0, 8.0)),
+        ((-5.5, -4.5), (4.5, -4.8), (4.5, -2.6), (-2.8, -2.4), (-2.8, 4.5), (-5.2, 4.5)),
+    ),
+    (  # a square with six sides
+        ((-7.5, -5.0), (0.0, -8.5), (8.0, -5.0), (7.5, 4.5), (0.5, 8.0), (-8.5, 5.0)),
+        ((-3.6, -2.2), (0.0, -3.8), (3.6, -2.2), (3.4, 2.2), (0.3, 3.7), (-3.9, 2.3)),
+    ),
+    (  # a street that bends
+        ((-12.0, -5.5), (0.0, -4.0), (12.0, -6.5), (12.0, 2.5), (0.0, 4.5), (-12.0, 3.0)),
+        ((-7.5, -2.2), (0.0, -1.2), (7.5, -3.4), (7.5, 0.0), (0.0, 1.6), (-7.5, 0.4)),
+    ),
+)
+
+NUM_PEOPLE = 6
+NUM_CARS = 3
+_HEAD = 0.13  # part of a person's texture that is the head
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """Something that stands in a place: a circle on the ground, metres."""
+
+    x: float
+    y: float
+    radius: float
+
+
+@dataclass(frozen=True, eq=False)
+class FloorPlan:
+    """A place seen from above, in its own frame, metres.
+
+    Parameters
+    ----------
+    outline : float64 (N, 2), its walls' feet, counter-clockwise.
+    path : float64 (M, 2), the closed path of the mapping rig.
+    obstacles : what stands inside.
+    """
+
+    outline: Floats
+    path: Floats
+    obstacles: tuple[Obstacle, ...] = ()
+
+    def is_free(self, x: float, y: float, margin: float) -> bool:
+        """A circle of radius ``margin`` around (x, y) meets no wall and no obstacle."""
+        if not self._is_inside(x, y) or _distance_to_ring(x, y, self.outline) < margin:
+            return False
+        return all(np.hypot(x - o.x, y - o.y) >= o.radius + margin for o in self.obstacles)
+
+    def distance_to_path(self, x: float, y: float) -> float:
+        """Distance of (x, y) from the mapping rig's path."""
+        return _distance_to_ring(x, y, self.path)
+
+    def stops(self, count: int) -> list[tuple[Floats, float]]:
+        """Positions (2,) at equal distances along the path, with the headings there (radians)."""
+        along = np.roll(self.path, -1, axis=0) - self.path
+        lengths = np.hypot(*along.T)
+        ends = np.cumsum(lengths)
+        result = []
+        for distance in (np.arange(count) + 0.5) / count * ends[-1]:
+            leg = int(np.searchsorted(ends, distance))
+            part = (distance - ends[leg] + lengths[leg]) / lengths[leg]
+            heading = float(np.arctan2(along[leg, 1], along[leg, 0]))
+            result.append((self.path[leg] + part * along[leg], heading))
+        return result
+
+    def _is_inside(self, x: float, y: float) -> bool:
+        start, end = self.outline, np.roll(self.outline, -1, axis=0)
+        crosses = (start[:, 1] > y) != (end[:, 1] > y)
+        rise = np.where(crosses, end[:, 1] - start[:, 1], 1.0)
+        at = start[:, 0] + (y - start[:, 1]) / rise * (end[:, 0] - start[:, 0])
+        return np.count_nonzero(crosses & (x < at)) % 2 == 1
+
+
+def draw_floor_plan(rng: np.random.Generator, index: int) -> FloorPlan:
+    """The empty floor plan of place ``index``: one of four shapes, a little stretched."""
+    outline, path = (np.array(shape) for shape in _SHAPES[index % len(_SHAPES)])
+    stretch = rng.uniform(0.94, 1.06, 2)
+    return FloorPlan(outline * stretch, path * stretch)
+
+
+def _distance_to_ring(x: float, y: float, ring: Floats) -> float:
+    along = np.roll(ring, -1, axis=0) - ring
+    part = np.clip((((x, y) - ring) * along).sum(1) / (along**2).sum(1), 0, 1)
+    return float(np.hypot(*(ring + part[:, None] * along - (x, y)).T).min())
+
+
+@dataclass(frozen=True)
+class MovingObject:
+    """A person or car at one moment.
+
+    Parameters
+    ----------
+    kind : what it is.
+    variant : which of the kind, from 0.
+    position : x, y in the place's frame, metres.
+    yaw : radians in the place's frame.
+    """
+
+    kind: Literal["person", "car"]
+    variant: int
+    position: tuple[float, float]
+    yaw: float
+
+    @property
+    def radius_m(self) -> float:
+        """Radius of the circle on the ground that holds it."""
+        return 0.4 if self.kind == "person" else 2.2
+
+
+def moving_object_recipes(seed: int) -> list[TextureRecipe]:
+    """Textures of all moving objects; a place puts them first, their indices are the same."""
+    number = int(stream(seed, "movers").integers(2**31))
+    recipes = [TextureRecipe("cloth", 120, 360, number + i) for i in range(NUM_PEOPLE)]
+    for i in range(NUM_CARS):
+        recipes.append(TextureRecipe("car", 420, 90, number + 100 + i, (("side", 1.0),)))
+        recipes.append(TextureRecipe("car", 180, 90, number + 100 + i, (("side", 0.0),)))
+    recipes.append(TextureRecipe("window", 220, 60, number + 200))
+    return recipes
+
+
+def place_moving_objects(
+    plan: FloorPlan,
+    rng: np.random.Generator,
+    count: int,
+    position: NDArray[np.float64],
+    *,
+    yaw: float | None,
+) -> tuple[MovingObject, ...]:
+    """At most ``count`` people and cars near a position (x, y first; metres, place's frame).
+
+    They stand in front of it where ``yaw`` (radians) is given, else all around.
+    """
+    moving_objects: list[MovingObject] = []
+    for _ in range(60):
+        if len(moving_objects) >= count:
+            break
+        kind: Literal["person", "car"] = "car" if rng.random() < 0.3 else "person"
+        distance = rng.uniform(4.5, 8.0) if kind == "car" else rng.uniform(2.5, 7.0)
+        angle = rng.uniform(-np.pi, np.pi) if yaw is None else yaw + rng.uniform(-0.5, 0.5)
+        x = float(position[0] + distance * np.cos(angle))
+        y = float(position[1] + distance * np.sin(angle))
+        variant = int(rng.integers(NUM_CARS if kind == "car" else NUM_PEOPLE))
+        item = MovingObject(kind, variant, (x, y), float(rng.uniform(-np.pi, np.pi)))
+        apart = all(
+            np.hypot(x - m.position[0], y - m.position[1]) > item.radius_m + m.radius_m
+            for m in moving_objects
+        )
+        if apart and plan.is_free(x, y, 0.6 * item.radius_m):
+            moving_objects.append(item)
+    return tuple(moving_objects)
+
+
+def moving_object_surfaces(moving_objects: tuple[MovingObject, ...]) -> Surfaces:
+    """Their surfaces in the place's frame; textures as in :func:`moving_object_recipes`."""
+    builder = SurfaceBuilder()
+    for item in moving_objects:
+        if item.kind == "person":
+            cloth = item.variant % NUM_PEOPLE
+            sides = (cloth,) * 4
+            body, head = (0.0, _HEAD, 1.0, 1.0), (0.3, 0.0, 0.7, _HEAD)
+            builder.add_box(item.position, (0.5, 0.32, 1.5), item.yaw, sides, cloth, uv=body)
+            builder.add_box(
+                item.position, (0.2, 0.24, 0.26), item.yaw, sides, cloth, base=1.5, uv=head
+            )
+        else:
+            side = NUM_PEOPLE + 2 * (item.variant % NUM_CARS)
+            glass = NUM_PEOPLE + 2 * NUM_CARS
+            body_sides = (side, side + 1, side, side + 1)
+            builder.add_box(
+                item.position, (4.2, 1.75, 0.8), item.yaw, body_sides, side + 1, base=0.1
+            )
+            builder.add_box(
+                item.position, (2.3, 1.5, 0.55), item.yaw, (glass,) * 4, side + 1, base=0.9
+            )
+    return builder.build()

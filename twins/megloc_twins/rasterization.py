@@ -1,0 +1,293 @@
+"""Exact images of textured parallelograms: which surface each sample sees, how far, what colour.
+
+A sample's ray is ``(x_n, y_n, 1)`` in the camera; on the plane of a surface the inverse depth and
+the two texture coordinates over depth are linear in it, so each surface costs three planes and a
+few comparisons over its bounding box. Depth is z along the optical axis, metres.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.compiling import compiled_loop
+from megloc_kapture.errors import DataError
+from megloc_kapture.values import Camera, RigidTransform
+from megloc_twins.portable import log2
+from megloc_twins.surfaces import NUM_LEVELS, Atlas, Surfaces
+
+NEAR_M = 0.05
+NO_SURFACE = -1
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class SampleGrid:
+    """The rays of a camera's samples, ``supersampling`` per pixel and axis.
+
+    Parameters
+    ----------
+    camera : PINHOLE, SIMPLE_PINHOLE or SIMPLE_RADIAL.
+    supersampling : samples per pixel along each axis, at the centres of equal cells.
+    x, y : float64, broadcasting to (H * supersampling, W * supersampling): normalised coordinates
+        of the rays. For cameras without distortion, (1, columns) and (rows, 1).
+    """
+
+    camera: Camera
+    supersampling: int
+    x: Float64
+    y: Float64
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of samples."""
+        ss = self.supersampling
+        return self.camera.height * ss, self.camera.width * ss
+
+
+@dataclass(frozen=True, eq=False)
+class Visibility:
+    """The nearest surface along each sample's ray.
+
+    Parameters
+    ----------
+    grid : the samples.
+    surface : int16 (rows, columns), index of the surface or NO_SURFACE.
+    inverse_depth : float32 (rows, columns), 1/m, 0 where there is no surface.
+    planes : float64 (N, 3, 3): per surface the linear forms, in the ray (x_n, y_n, 1), of 1/z and
+        of its two coordinates (0..1 inside the surface) over z.
+    """
+
+    grid: SampleGrid
+    surface: NDArray[np.int16]
+    inverse_depth: Float32
+    planes: Float64
+
+
+def intrinsics(camera: Camera) -> tuple[float, float, float, float, float]:
+    """(fx, fy, cx, cy, k) of a camera; k is SIMPLE_RADIAL's distortion, else 0.
+
+    Raises
+    ------
+    DataError : the renderer has no such camera model.
+    """
+    p = camera.params
+    if camera.model == "PINHOLE":
+        return p[0], p[1], p[2], p[3], 0.0
+    if camera.model == "SIMPLE_PINHOLE":
+        return p[0], p[0], p[1], p[2], 0.0
+    if camera.model == "SIMPLE_RADIAL":
+        return p[0], p[0], p[1], p[2], p[3]
+    raise DataError(f"the renderer has no camera model {camera.model}")
+
+
+def sample_grid(camera: Camera, supersampling: int) -> SampleGrid:
+    """The rays of all samples of a camera; the centre of the first pixel is (0.5, 0.5)."""
+    fx, fy, cx, cy, k = intrinsics(camera)
+    columns = (np.arange(camera.width * supersampling) + 0.5) / supersampling
+    rows = (np.arange(camera.height * supersampling) + 0.5) / supersampling
+    x, y = ((columns - cx) / fx)[None], ((rows - cy) / fy)[:, None]
+    if k:
+        squared = x * x + y * y
+        # radius shrinks by the same factor for all rays of a radius: solve r (1 + k r^2) = r_d
+        # on a fine table, then interpolate (error below 1e-9)
+        table = np.linspace(0.0, float(squared.max()) * (1 + 1e-9), 8193)
+        factor = np.ones_like(table)
+        for _ in range(30):
+            value = factor * (1 + k * factor**2 * table) - 1
+            factor -= value / (1 + 3 * k * factor**2 * table)
+        factor_of = np.interp(squared.ravel(), table, factor).reshape(squared.shape)
+        x, y = x * factor_of, y * factor_of
+    return SampleGrid(camera, supersampling, x, y)
+
+
+def project(camera: Camera, points: Float64) -> Float64:
+    """Pixels (N, 2) of points (N, 3) in the camera's frame, in front of it."""
+    fx, fy, cx, cy, k = intrinsics(camera)
+    xy = points[:, :2] / points[:, 2:]
+    xy = xy * (1 + k * (xy**2).sum(1, keepdims=True))
+    return xy * (fx, fy) + (cx, cy)
+
+
+def visible_surfaces(
+    surfaces: Surfaces, cam_from_world: RigidTransform, grid: SampleGrid
+) -> Visibility:
+    """Find the nearest surface along each sample's ray."""
+    rotation = cam_from_world.rotation_matrix()
+    seen_from = surfaces.moved(rotation, np.array(cam_from_world.translation))
+    origin, edge_u, edge_v = seen_from.origin, seen_from.edge_u, seen_from.edge_v
+    planes, facing = _planes(origin, edge_u, edge_v)
+    boxes = _bounding_boxes(origin, edge_u, edge_v, grid)
+    rows, columns = grid.shape
+    nearest = np.zeros((rows, columns), np.float32)
+    surface = np.full((rows, columns), NO_SURFACE, np.int16)
+    forms = planes.astype(np.float32)
+    gx, gy = grid.x.astype(np.float32), grid.y.astype(np.float32)
+    candidates = np.flatnonzero(facing & (boxes[:, 0] < boxes[:, 1]) & (boxes[:, 2] < boxes[:, 3]))
+    for index in candidates:
+        left, right, top, bottom = boxes[index]
+        window = np.s_[top:bottom, left:right]
+        if gx.shape[0] == 1:
+            x, y = gx[:, left:right], gy[top:bottom]
+        else:
+            x, y = gx[window], gy[window]
+        inv, u, v = (form[0] * x + (form[1] * y + form[2]) for form in forms[index])
+        seen = inv > nearest[window]
+        seen &= u >= 0
+        seen &= u <= inv
+        seen &= v >= 0
+        seen &= v <= inv
+        np.copyto(nearest[window], inv, where=seen)
+        np.copyto(surface[window], np.int16(index), where=seen)
+    return Visibility(grid, surface, nearest, planes)
+
+
+def _planes(origin: Float64, edge_u: Float64, edge_v: Float64) -> tuple[Float64, NDArray[np.bool_]]:
+    """Linear forms (N, 3, 3) of 1/z, u/z, v/z in the ray, and which surfaces face the camera."""
+    normal = np.cross(edge_u, edge_v)  # away from a viewer in front
+    offset = np.einsum("ni,ni->n", normal, origin)
+    facing = offset > 1e-9
+    safe = np.where(facing, offset, 1.0)[:, None]
+    inverse_depth = normal / safe
+    dual_u = np.cross(edge_v, normal)
+    dual_u /= np.einsum("ni,ni->n", dual_u, edge_u)[:, None]
+    dual_v = np.cross(normal, edge_u)
+    dual_v /= np.einsum("ni,ni->n", dual_v, edge_v)[:, None]
+    u = dual_u - np.einsum("ni,ni->n", dual_u, origin)[:, None] * inverse_depth
+    v = dual_v - np.einsum("ni,ni->n", dual_v, origin)[:, None] * inverse_depth
+    return np.stack([inverse_depth, u, v], axis=1), facing
+
+
+def _bounding_boxes(
+    origin: Float64, edge_u: Float64, edge_v: Float64, grid: SampleGrid
+) -> NDArray[np.int64]:
+    """Sample ranges (N, 4): left, right, top, bottom (ends exclusive) that hold each surface."""
+    corners = np.stack([origin, origin + edge_u, origin + edge_u + edge_v, origin + edge_v], 1)
+    following = np.roll(corners, -1, axis=1)
+    z, z_next = corners[..., 2], following[..., 2]
+    crosses = (z < NEAR_M) != (z_next < NEAR_M)
+    part = np.where(crosses, (NEAR_M - z) / np.where(crosses, z_next - z, 1.0), 0.0)
+    crossing = corners + part[..., None] * (following - corners)
+    points = np.concatenate([corners, crossing], axis=1)  # (N, 8, 3)
+    valid = np.concatenate([z >= NEAR_M, crosses], axis=1)
+    depth = np.where(valid, points[..., 2], 1.0)
+    result = np.zeros((len(origin), 4), np.int64)
+    for first, rays in ((0, grid.x), (2, grid.y)):
+        axis = first // 2
+        along = points[..., axis] / depth
+        low, high = (np.where(valid, along, end).T for end in (np.inf, -np.inf))
+        # a ray's coordinate grows along its row or column, whatever the distortion; a sample on
+        # the edge of the range may be lost to rounding: one more on each side
+        least, most = rays.min(axis), rays.max(axis)
+        result[:, first] = np.searchsorted(most, low.min(0)) - 1
+        result[:, first + 1] = np.searchsorted(least, high.max(0), side="right") + 1
+        result[:, first : first + 2] = result[:, first : first + 2].clip(0, len(least))
+    result[~valid.any(1)] = 0
+    return result
+
+
+def depth_map(seen: Visibility) -> Float32:
+    """Depth along the optical axis in metres, float32 (rows, columns), 0 where nothing is seen.
+
+    Computed in float64 from the surface's plane; exact at the samples' centres.
+    """
+    flat = np.maximum(seen.surface, 0)
+    form = seen.planes[:, 0][flat]
+    inverse = form[..., 0] * seen.grid.x + form[..., 1] * seen.grid.y + form[..., 2]
+    hit = seen.surface != NO_SURFACE
+    return np.where(hit, 1.0 / np.where(hit, inverse, 1.0), 0.0).astype(np.float32)
+
+
+def sample_colour(seen: Visibility, surfaces: Surfaces, atlas: Atlas) -> Float32:
+    """Colour of each sample, float32 (rows, columns, 3), RGB 0..255; 0 where nothing is seen.
+
+    The texture's level is chosen by the area of a sample in texels, and two levels are blended.
+    """
+    index = np.maximum(seen.surface, 0).astype(np.int32)
+    hit = seen.surface != NO_SURFACE
+    inverse = np.where(hit, seen.inverse_depth, np.float32(1.0))
+    gx, gy = seen.grid.x.astype(np.float32), seen.grid.y.astype(np.float32)
+    forms = np.ascontiguousarray(seen.planes[:, 1:].reshape(len(surfaces), 6), np.float32)
+    per_sample = np.take(forms, index, axis=0)
+    z = (1 / inverse).astype(np.float32)
+    u, v = (
+        (form[..., 0] * gx + form[..., 1] * gy + form[..., 2]) * z
+        for form in (per_sample[..., :3], per_sample[..., 3:])
+    )
+    level = _level(seen, surfaces, atlas, index, inverse)
+    low = np.minimum(level.astype(np.int32), NUM_LEVELS - 2)
+    weight = (level - low.astype(np.float32))[..., None]
+    table = _lookup_table(surfaces, atlas)
+    fine = _lookup(atlas, table, index * NUM_LEVELS + low, u, v)
+    coarse = _lookup(atlas, table, index * NUM_LEVELS + low + 1, u, v)
+    colour = fine + weight * (coarse - fine)
+    colour[~hit] = 0
+    return np.asarray(colour, np.float32)
+
+
+def _level(
+    seen: Visibility, surfaces: Surfaces, atlas: Atlas, index: NDArray[np.int32], inverse: Float32
+) -> Float32:
+    """Texture level (0 finest, fractional) where one sample covers about one texel in area."""
+    fx, fy, _, _, _ = intrinsics(seen.grid.camera)
+    size = atlas.size[surfaces.texture, 0].astype(np.float64)
+    part = np.abs(surfaces.uv[:, 2:] - surfaces.uv[:, :2])
+    texels = (size * part).prod(1)
+    # the Jacobian of a projective map is its determinant over the cube of the denominator
+    determinant = (seen.planes[:, 0] * np.cross(seen.planes[:, 1], seen.planes[:, 2])).sum(1)
+    scale = np.abs(determinant) * texels / (fx * fy * seen.grid.supersampling**2)
+    constant = np.float32(0.5) * log2(np.maximum(scale, 1e-30))
+    level = np.take(constant, index) - np.float32(1.5) * log2(inverse)
+    return np.clip(level, 0, NUM_LEVELS - 1 - 1e-3)
+
+
+def _lookup_table(surfaces: Surfaces, atlas: Atlas) -> Float32:
+    """(N * NUM_LEVELS, 4): atlas x = t0 + u t1, y = t2 + v t3 for OpenCV's pixel centres."""
+    corner, size = atlas.corner[surfaces.texture], atlas.size[surfaces.texture]
+    start, part = surfaces.uv[:, None, :2], (surfaces.uv[:, 2:] - surfaces.uv[:, :2])[:, None]
+    base = corner + start * size - 0.5
+    step = part * size
+    table = np.stack([base[..., 0], step[..., 0], base[..., 1], step[..., 1]], axis=-1)
+    return np.ascontiguousarray(table.reshape(-1, 4), np.float32)
+
+
+def _lookup(
+    atlas: Atlas, table: Float32, row: NDArray[np.int32], u: Float32, v: Float32
+) -> Float32:
+    affine = np.take(table, row, axis=0)
+    x = affine[..., 0] + affine[..., 1] * u
+    y = affine[..., 2] + affine[..., 3] * v
+    texels: Float32 = bilinear(atlas.image, x, y)
+    return texels
+
+
+@compiled_loop
+def bilinear(image: NDArray[Any], x: Float32, y: Float32) -> Float32:
+    """Values of an image (H, W, C) at ``x``, ``y``, float32 (R, S) each: float32 (R, S, C).
+
+    The first pixel's centre is (0, 0); beyond the edge is what lies on it, at NaN the first pixel.
+    OpenCV's lookups have fused multiplications on some processors; a compiled loop has none.
+    """
+    height, width, channels = image.shape
+    rows, columns = x.shape
+    result = np.empty((rows, columns, channels), np.float32)
+    for row in range(rows):
+        for column in range(columns):
+            at_x, at_y = x[row, column], y[row, column]
+            at_x = min(at_x, np.float32(width - 1)) if at_x > 0 else np.float32(0)
+            at_y = min(at_y, np.float32(height - 1)) if at_y > 0 else np.float32(0)
+            left, top = int(at_x), int(at_y)
+            right, bottom = min(left + 1, width - 1), min(top + 1, height - 1)
+            part_x, part_y = at_x - np.float32(left), at_y - np.float32(top)
+            for channel in range(channels):
+                upper = np.float32(image[top, left, channel])
+                upper += part_x * (np.float32(image[top, right, channel]) - upper)
+                lower = np.float32(image[bottom, left, channel])
+                lower += part_x * (np.float32(image[bottom, right, channel]) - lower)
+                result[row, column, channel] = upper + part_y * (lower - upper)
+    return result

@@ -1,0 +1,446 @@
+"""A rendered twin of RobotCar Seasons: a car with three cameras, streets in all weathers.
+
+The frames' names are those of the official layout. Their poses are in the world's coordinates
+until they are written in those that the twin publishes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from megloc_kapture.datasets.formats.colmap_model import (
+    ColmapImage,
+    ColmapModel,
+    write_colmap_text,
+)
+from megloc_kapture.datasets.formats.nvm import NvmModel, write_nvm
+from megloc_kapture.datasets.formats.sparse_points import SparsePoints
+from megloc_kapture.datasets.official import GROUND_TRUTH
+from megloc_kapture.datasets.robotcar.images import RIG_ID
+from megloc_kapture.datasets.robotcar.layout import Layout
+from megloc_kapture.io.kapture import write_sensors
+from megloc_kapture.stages.work import HERE, Work
+from megloc_kapture.values import Camera, RigidTransform
+from megloc_twins.dataset import ModelTwinOptions, SyntheticDataset, shuffled, write_lines
+from megloc_twins.frames import (
+    Frame,
+    cam_from_rig,
+    in_frame,
+    kapture_records,
+    looking_at,
+    noise_seed,
+)
+from megloc_twins.lighting import road_lighting
+from megloc_twins.moving_objects import place_moving_objects
+from megloc_twins.options import SyntheticWorldOptions, stream
+from megloc_twins.portable import settled_pose
+from megloc_twins.sparse_models import MapFrames, render_map_and_queries, write_sift_database
+from megloc_twins.squares import Place, build_place
+from megloc_twins.viewpoints import CoarseView, coarse_view, first_fitting, misfit
+
+REFERENCE_CONDITION = "overcast-reference"
+CONDITIONS = ("dawn", "overcast-winter", "rain", "sun", "night", "night-rain")
+CAMERAS = ("left", "rear", "right")
+SCORED_CAMERA = "rear"  # it sees the car's boot too
+
+# the published world is metric with z up; this one lies elsewhere than the rendered one
+OFFICIAL_FROM_WORLD = settled_pose(
+    np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
+    np.array([-412.25, 1381.5, 62.75]),
+)
+# microseconds, of the first image of each traversal
+_STARTS_US = {
+    "overcast-reference": 1417176458999821,
+    "dawn": 1418721355075498,
+    "overcast-winter": 1423840721124367,
+    "rain": 1416908241836249,
+    "sun": 1425990211450168,
+    "night": 1418235223450115,
+    "night-rain": 1418840689734892,
+}
+_PLACE_US, _STOP_US = 60_000_000, 1_062_501
+_CAMERA_HEIGHT_M = 1.6
+# where the cameras look, degrees to the right of the driver and up, and where they are on the
+# car, metres to the right, down and ahead of its origin
+_ON_CAR = {
+    "left": (-84.0, 3.0, (-0.35, 0.02, -0.1)),
+    "rear": (179.2, -4.0, (0.06, 0.15, -1.1)),
+    "right": (86.0, 2.0, (0.34, 0.03, -0.1)),
+}
+_CENTRES = {"left": (0.4884, 0.4995), "rear": (0.4963, 0.4865), "right": (0.4907, 0.4788)}
+_FOCAL = 0.6  # of the width
+_MIN_OVERLAP = 0.1  # of a map image that supports a query
+_ATTEMPTS = 50
+_STEPS = 997  # of the path, that a query may be at
+# moments of these traversals, the last of each, are in neither list of version 2
+_UNLISTED_CONDITIONS = ("rain", "night-rain")
+
+
+class RobotCarTwinOptions(ModelTwinOptions):
+    """Contents of RobotCar Seasons' twin; the defaults are what ``make eval`` localizes in."""
+
+    num_locations: int = Field(default=3, ge=1, description="locations, at least 60 m apart")
+    stops_per_location: int = Field(
+        default=12, ge=3, description="moments of the reference traversal in each location"
+    )
+    moments_per_condition: int = Field(
+        default=8, ge=2, description="moments of each other traversal, all locations"
+    )
+    size_px: int = Field(default=512, ge=64, description="width and height of an image")
+
+    def world(self) -> SyntheticWorldOptions:
+        """The rendered world the car drives through."""
+        return self.rendered_world(self.num_locations, self.size_px, self.size_px)
+
+
+class RobotCarTwin(SyntheticDataset[RobotCarTwinOptions]):
+    """RobotCar Seasons as it is published, with its truth.
+
+    ``images/``, ``intrinsics/``, ``extrinsics/``, ``3D-models/`` (the merged NVM, text models and
+    lists of queries by location), version 2's lists and ``ground_truth/``. Quirks of the original:
+    the models say ``.png`` where the images are ``.jpg``, the NVM puts ``./`` before them, the
+    test list leaves out the conditions, some reference images are in no model and some queries
+    in neither list of version 2; and lists end in a blank line, with CRLF or without a line end.
+    With ``model_features`` also ``3D-models/overcast-reference.db``, the features of the models.
+    """
+
+    Options = RobotCarTwinOptions
+    version = 2
+
+    def write(self, root: Path, work: Work = HERE) -> dict[str, int]:
+        layout, options = Layout(Path(root)), self.options
+        moments = build_robotcar_moments(options)
+        mapping, queries = moments.mapping_frames(), moments.query_frames()
+        drawn = render_map_and_queries(
+            options.world(),
+            mapping,
+            queries,
+            layout.images,
+            model_features=options.model_features,
+            work=work,
+        )
+        registered = in_frame(_registered(moments), OFFICIAL_FROM_WORLD)
+        _write_models(layout, options, registered, drawn)
+        if options.model_features:
+            named = {_png(frame.name): frame for frame in mapping}
+            write_sift_database(
+                layout.feature_database, dict(sorted(named.items())), drawn.features
+            )
+        _write_car(layout, options)
+        _write_query_lists(layout, queries)
+        _write_version_2(layout, options, moments)
+        for role, some in (
+            ("mapping", registered),
+            ("query", in_frame(queries, OFFICIAL_FROM_WORLD)),
+        ):
+            truth = kapture_records(some)
+            truth.rigs[RIG_ID] = cam_from_car()
+            write_sensors(layout.root / GROUND_TRUTH / role, truth)
+        return {
+            "places": options.num_locations,
+            "mapping images": len(registered),
+            "query images": len(queries),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """One moment of a traversal: what its three cameras take, in the order of CAMERAS."""
+
+    condition: str
+    place: int
+    timestamp: int
+    frames: tuple[Frame, ...]
+
+    @property
+    def scored(self) -> Frame:
+        """The image of the camera that the challenge asks for."""
+        return self.frames[CAMERAS.index(SCORED_CAMERA)]
+
+
+@dataclass(frozen=True, eq=False)
+class RobotCarMoments:
+    """All moments of the twin; poses in the world's frame.
+
+    Parameters
+    ----------
+    reference : of the map, by location, then time.
+    queries : by condition, then time.
+    """
+
+    reference: tuple[Moment, ...]
+    queries: tuple[Moment, ...]
+
+    def mapping_frames(self) -> list[Frame]:
+        """The reference images."""
+        return [frame for moment in self.reference for frame in moment.frames]
+
+    def query_frames(self) -> list[Frame]:
+        """The queries."""
+        return [frame for moment in self.queries for frame in moment.frames]
+
+
+def build_robotcar_moments(options: RobotCarTwinOptions) -> RobotCarMoments:
+    """Choose all images of the twin; the same options give the same images."""
+    world = options.world()
+    reference: list[Moment] = []
+    queries: list[Moment] = []
+    for index in range(options.num_locations):
+        place = build_place(world, index)
+        here = _reference_moments(options, world, place)
+        world_from_place = place.place_from_world.inverse()
+        views = [
+            coarse_view(place.surfaces, frame.camera, frame.cam_from_world @ world_from_place)
+            for moment in here
+            for frame in moment.frames
+        ]
+        for condition in CONDITIONS:
+            queries += _query_moments(options, world, place, views, condition)
+        reference += here
+    return RobotCarMoments(
+        tuple(reference),
+        tuple(sorted(queries, key=lambda moment: (moment.condition, moment.timestamp))),
+    )
+
+
+def car_cameras(size_px: int) -> dict[str, Camera]:
+    """The cameras by name, PINHOLE with the six decimals of the published files."""
+    focal = round(_FOCAL * size_px, 6)
+    return {
+        name: Camera(
+            "PINHOLE",
+            size_px,
+            size_px,
+            (focal, focal, round(cx * size_px, 6), round(cy * size_px, 6)),
+        )
+        for name, (cx, cy) in _CENTRES.items()
+    }
+
+
+def cam_from_car() -> dict[str, RigidTransform]:
+    """Poses of the cameras; the car's frame has x to the right, y down and z ahead, metres."""
+    return {name: cam_from_rig(*on_car) for name, on_car in _ON_CAR.items()}
+
+
+def _reference_moments(
+    options: RobotCarTwinOptions, world: SyntheticWorldOptions, place: Place
+) -> list[Moment]:
+    rng = stream(options.seed, "robotcar", REFERENCE_CONDITION, place.index)
+    azimuth = float(rng.uniform(-np.pi, np.pi))
+    moments = []
+    for number, (spot, heading) in enumerate(place.plan.stops(options.stops_per_location)):
+        pose = _car_from_place(spot + rng.normal(0, 0.15, 2), heading + rng.normal(0, 0.1), rng)
+        moments.append(
+            _moment(options, world, place, REFERENCE_CONDITION, number, pose, azimuth, rng)
+        )
+    return moments
+
+
+def _query_moments(
+    options: RobotCarTwinOptions,
+    world: SyntheticWorldOptions,
+    place: Place,
+    map_views: list[CoarseView],
+    condition: str,
+) -> list[Moment]:
+    """This location's share of a traversal's moments."""
+    azimuth = float(stream(options.seed, "robotcar", condition, place.index).uniform(-np.pi, np.pi))
+    moments = []
+    for number in range(place.index, options.moments_per_condition, options.num_locations):
+        rng = stream(options.seed, "robotcar", condition, place.index, number)
+        pose = first_fitting(_query_poses(options, place, map_views, rng), place.name)
+        moments.append(_moment(options, world, place, condition, number, pose, azimuth, rng))
+    return moments
+
+
+def _moment(
+    options: RobotCarTwinOptions,
+    world: SyntheticWorldOptions,
+    place: Place,
+    condition: str,
+    number: int,
+    car_from_place: RigidTransform,
+    azimuth: float,
+    rng: np.random.Generator,
+) -> Moment:
+    jitter = int(rng.integers(0, 1000))
+    timestamp = _STARTS_US[condition] + place.index * _PLACE_US + number * _STOP_US + jitter
+    car_from_world = car_from_place @ place.place_from_world
+    moving_objects = place_moving_objects(
+        place.plan, rng, world.moving_objects, car_from_place.center(), yaw=None
+    )
+    on_car = cam_from_car()
+    frames = []
+    for camera, intrinsics in car_cameras(options.size_px).items():
+        name = f"{condition}/{camera}/{timestamp}.jpg"
+        lighting = road_lighting(
+            condition,
+            rng,
+            azimuth=azimuth,
+            noise_seed=noise_seed(world, name),
+            night_exposure=options.night_exposure,
+        )
+        frames.append(
+            Frame(
+                name=name,
+                role="mapping" if condition == REFERENCE_CONDITION else "query",
+                condition=condition,
+                place=place.index,
+                timestamp=timestamp,
+                sensor_id=camera,
+                camera=intrinsics,
+                cam_from_world=on_car[camera] @ car_from_world,
+                lighting=lighting,
+                moving_objects=moving_objects,
+                bonnet=camera == SCORED_CAMERA,
+            )
+        )
+    return Moment(condition, place.index, timestamp, tuple(frames))
+
+
+def _query_poses(
+    options: RobotCarTwinOptions,
+    place: Place,
+    map_views: list[CoarseView],
+    rng: np.random.Generator,
+) -> Iterator[tuple[float, RigidTransform]]:
+    """``car_from_place`` on the reference traversal's way, a little beside it, each with the
+    misfit of what the scored camera sees."""
+    camera, cam_on_car = car_cameras(options.size_px)[SCORED_CAMERA], cam_from_car()[SCORED_CAMERA]
+    path = place.plan.stops(_STEPS)
+    for _ in range(_ATTEMPTS):
+        spot, heading = path[int(rng.integers(_STEPS))]
+        aside = np.clip(rng.normal(0, 0.6), -1.2, 1.2)
+        spot = spot + aside * np.array([-np.sin(heading), np.cos(heading)])
+        yaw = heading + rng.normal(0, 0.12)
+        if place.plan.is_free(float(spot[0]), float(spot[1]), 0.9):
+            pose = _car_from_place(spot, yaw, rng)
+            view = coarse_view(place.surfaces, camera, cam_on_car @ pose)
+            yield misfit(view, map_views, min_overlap=_MIN_OVERLAP), pose
+
+
+def _car_from_place(
+    spot: NDArray[np.float64], yaw: float, rng: np.random.Generator
+) -> RigidTransform:
+    """Of a car at a spot (2,), metres, that drives along ``yaw``, a little tilted."""
+    pitch, roll = (float(a) for a in rng.normal(0, 0.012, 2))
+    height = _CAMERA_HEIGHT_M + float(rng.normal(0, 0.02))
+    return looking_at(np.array([*spot, height]), float(yaw), pitch, roll)
+
+
+def _registered(moments: RobotCarMoments) -> list[Frame]:
+    """The reference images that the models have: of each location one is left out."""
+    last = {moment.place: moment.timestamp for moment in moments.reference}
+    return [
+        frame
+        for frame in moments.mapping_frames()
+        if (frame.sensor_id, frame.timestamp) != ("right", last[frame.place])
+    ]
+
+
+def _write_models(
+    layout: Layout, options: RobotCarTwinOptions, frames: Sequence[Frame], drawn: MapFrames
+) -> None:
+    """One model per location, and all of them in one, in the same world."""
+    places = np.array([frame.place for frame in frames])
+    parts = []
+    for place in range(options.num_locations):
+        positions = np.flatnonzero(places == place).tolist()
+        here = [frames[position] for position in positions]
+        rng = stream(options.seed, "robotcar", "points", place)
+        points = drawn.points(here, points_per_frame=options.points_per_image, rng=rng)
+        write_colmap_text(layout.individual_model(_location(place)), _colmap_model(here, points))
+        parts.append((points, positions))
+    merged = NvmModel(
+        names=tuple(f"./{_png(frame.name)}" for frame in frames),
+        focal_px=np.array([frame.camera.params[0] for frame in frames]),
+        quat_wxyz=np.array([frame.cam_from_world.quat_wxyz for frame in frames]),
+        centers=np.array([frame.cam_from_world.center() for frame in frames]),
+        k_colmap=np.zeros(len(frames)),
+        points=SparsePoints.joined(parts),
+    )
+    write_nvm(layout.merged_model, merged)
+
+
+def _colmap_model(frames: Sequence[Frame], points: SparsePoints) -> ColmapModel:
+    """With the published models' cameras: 1 left, 2 rear, 3 right, SIMPLE_RADIAL."""
+    ids = {name: number for number, name in enumerate(CAMERAS, start=1)}
+    cameras = {}
+    for frame in frames:
+        fx, _, cx, cy = frame.camera.params
+        size = (frame.camera.width, frame.camera.height)
+        cameras[ids[frame.sensor_id]] = Camera("SIMPLE_RADIAL", *size, (fx, cx, cy, 0.0))
+    images = tuple(
+        ColmapImage(number, _png(frame.name), ids[frame.sensor_id], frame.cam_from_world)
+        for number, frame in enumerate(frames, start=1)
+    )
+    return ColmapModel(cameras, images, points)
+
+
+def _write_car(layout: Layout, options: RobotCarTwinOptions) -> None:
+    for name, camera in car_cameras(options.size_px).items():
+        lines = [
+            f"{key} {value:f}"
+            for key, value in zip(("fx", "fy", "cx", "cy"), camera.params, strict=True)
+        ]
+        write_lines(layout.intrinsics(name), lines)
+    for name, pose in cam_from_car().items():
+        rows = [",".join(map(repr, row)) for row in _matrix(pose.inverse()).tolist()]
+        write_lines(layout.extrinsics(name), rows)
+
+
+def _write_query_lists(layout: Layout, queries: Sequence[Frame]) -> None:
+    """All cameras' queries; the files' ends are as different as tools have left them."""
+    for place in sorted({frame.place for frame in queries}):
+        names = [frame.name for frame in queries if frame.place == place]
+        path = layout.query_list(_location(place))
+        if place % 3 == 0:
+            write_lines(path, [*names, ""])
+        elif place % 3 == 1:
+            write_lines(path, names, line_end="\r\n")
+        else:
+            write_lines(path, names, last_line_ends=False)
+
+
+def _write_version_2(
+    layout: Layout, options: RobotCarTwinOptions, moments: RobotCarMoments
+) -> None:
+    """Half of each traversal's moments with poses, half without; a few in neither list."""
+    train: list[Frame] = []
+    test: list[Frame] = []
+    for condition in dict.fromkeys(moment.condition for moment in moments.queries):
+        here = [moment.scored for moment in moments.queries if moment.condition == condition]
+        # by turns, so that both lists have moments of all locations
+        listed = here[:-1] if condition in _UNLISTED_CONDITIONS else here
+        train += listed[::2]
+        test += listed[1::2]
+    rows = []
+    for frame in shuffled(train, options.seed, "robotcar", "order", "train"):
+        (frame,) = in_frame([frame], OFFICIAL_FROM_WORLD)
+        matrix = _matrix(frame.cam_from_world.inverse()).ravel().tolist()
+        rows.append(" ".join([_png(frame.name), *map(repr, matrix)]))
+    write_lines(layout.train_list, rows)
+    names = [f"{frame.sensor_id}/{frame.timestamp}.png" for frame in test]
+    write_lines(layout.test_list, shuffled(names, options.seed, "robotcar", "order", "test"))
+
+
+def _matrix(pose: RigidTransform) -> NDArray[np.float64]:
+    """float64 (4, 4)."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = pose.rotation_matrix(), pose.translation
+    return matrix
+
+
+def _location(place: int) -> str:
+    """Number of a location as file names have it."""
+    return f"{place + 1:03d}"
+
+
+def _png(name: str) -> str:
+    return name.removesuffix(".jpg") + ".png"

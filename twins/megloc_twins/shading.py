@@ -1,0 +1,270 @@
+"""From what samples see to pixels: sun, shadows, sky, lamps, bonnet, lens and sensor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.values import RigidTransform
+from megloc_twins.drawing import periodic_noise
+from megloc_twins.lighting import Lighting, as_array
+from megloc_twins.options import stream
+from megloc_twins.portable import arctan2, averaged, blurred, exp, product, resized
+from megloc_twins.rasterization import NO_SURFACE, Visibility, bilinear
+from megloc_twins.surfaces import Surfaces
+
+_SIZE = 1024
+_BIAS_M = 0.05  # surfaces must not shade themselves
+_NOTHING = np.float32(-1e9)
+
+Float32 = NDArray[np.float32]
+
+_LAMP_RANGE_M = 14.0
+_CLOUD_SIZE = 512
+
+
+@dataclass(frozen=True, eq=False)
+class ShadowMap:
+    """Greatest height along the sun's direction over a grid of lines parallel to it.
+
+    Parameters
+    ----------
+    axes : float64 (3, 3), rows: the grid's x and y directions and the sun's.
+    low : float64 (2,), the grid's corner; ``step`` : metres between its lines.
+    height : float32 (_SIZE, _SIZE), metres along the sun's direction.
+    """
+
+    axes: NDArray[np.float64]
+    low: NDArray[np.float64]
+    step: float
+    height: Float32
+
+    def lit(self, x: Float32, y: Float32, z: Float32) -> Float32:
+        """1 where the sun reaches a point, else 0; arrays of one shape, metres."""
+        a = self.axes.astype(np.float32)
+        gx, gy, up = (row[0] * x + row[1] * y + row[2] * z for row in a)
+        gx = (gx - np.float32(self.low[0])) / np.float32(self.step) - np.float32(0.5)
+        gy = (gy - np.float32(self.low[1])) / np.float32(self.step) - np.float32(0.5)
+        top = cv2.remap(
+            self.height,
+            gx,
+            gy,
+            cv2.INTER_NEAREST,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=float(_NOTHING),
+        )
+        return (up + np.float32(_BIAS_M) > top).astype(np.float32)
+
+
+def cast_shadows(surfaces: Surfaces, sun_direction: tuple[float, float, float]) -> ShadowMap:
+    """The shadow map of the surfaces (both sides cast shadows)."""
+    sun = np.array(sun_direction)
+    side = np.cross([0.0, 0.0, 1.0] if abs(sun[2]) < 0.99 else [1.0, 0.0, 0.0], sun)
+    side /= np.sqrt((side * side).sum())
+    axes = np.stack([side, np.cross(sun, side), sun])
+    flat = product(surfaces.corners(), axes.T)[..., :2]
+    low, high = flat.min((0, 1)) - 0.1, flat.max((0, 1)) + 0.1
+    step = float((high - low).max() / _SIZE)
+    nothing = ShadowMap(axes, low, step, np.full((_SIZE, _SIZE), _NOTHING, np.float32))
+    return add_shadows(nothing, surfaces)
+
+
+def add_shadows(shadows: ShadowMap, surfaces: Surfaces) -> ShadowMap:
+    """The map with the shadows of more surfaces, where they lie on its grid."""
+    axes, low, step = shadows.axes, shadows.low, shadows.step
+    height = shadows.height.copy()
+    outline = (product(surfaces.corners(), axes.T)[..., :2] - low) / step
+    first = np.clip(np.floor(outline.min(1)) - 1, 0, _SIZE).astype(int)
+    last = np.clip(np.ceil(outline.max(1)) + 1, 0, _SIZE).astype(int)
+    along = surfaces.moved(axes, np.zeros(3))
+    origin, edge_u, edge_v = along.origin, along.edge_u, along.edge_v
+    across = edge_u[:, 0] * edge_v[:, 1] - edge_u[:, 1] * edge_v[:, 0]
+    for index in np.flatnonzero((np.abs(across) > 1e-6) & (first < last).all(1)):
+        (left, top), (right, bottom) = first[index], last[index]
+        x = (low[0] + (np.arange(left, right) + 0.5) * step - origin[index, 0])[None]
+        y = (low[1] + (np.arange(top, bottom) + 0.5) * step - origin[index, 1])[:, None]
+        x, y = x.astype(np.float32), y.astype(np.float32)
+        eu, ev = edge_u[index].astype(np.float32), edge_v[index].astype(np.float32)
+        area = np.float32(across[index])
+        u = x * (ev[1] / area) - y * (ev[0] / area)
+        v = y * (eu[0] / area) - x * (eu[1] / area)
+        up = np.float32(origin[index, 2]) + u * eu[2] + v * ev[2]
+        window = height[top:bottom, left:right]
+        inside = (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1) & (up > window)
+        np.copyto(window, up, where=inside)
+    return ShadowMap(axes, low, step, height)
+
+
+def cloud_texture(seed: int) -> Float32:
+    """Clouds, float32 (_CLOUD_SIZE, _CLOUD_SIZE) 0..1, seamless from left to right."""
+    noise = periodic_noise(stream(seed, "clouds"), _CLOUD_SIZE, cell=160, octaves=5)
+    return np.clip(0.5 + 0.5 * noise, 0, 1).astype(np.float32)
+
+
+def radiance(
+    seen: Visibility,
+    surfaces: Surfaces,
+    colour: Float32,
+    lighting: Lighting,
+    *,
+    cam_from_place: RigidTransform,
+    lamps: NDArray[np.float64],
+    shadows: ShadowMap | None,
+    clouds: Float32,
+) -> Float32:
+    """Light that each sample receives, float32 (rows, columns, 3), linear.
+
+    Parameters
+    ----------
+    seen, surfaces : what the samples see, in the place's frame.
+    colour : float32 (rows, columns, 3), 0..255, gamma 2 (as a texture is painted).
+    lamps : float64 (L, 3), metres, in the place's frame.
+    shadows : of the sun, None where there is none.
+    """
+    index = np.maximum(seen.surface, 0).astype(np.int32)
+    hit = seen.surface != NO_SURFACE
+    albedo = (colour * np.float32(1 / 255)) ** 2
+    normals = surfaces.normals()
+    ambient = 0.62 + 0.38 * normals[:, 2]
+    light = np.take(ambient.astype(np.float32), index)[..., None] * as_array(lighting.sky)
+    has_sun, has_lamps = any(lighting.sun), any(lighting.lamps) and len(lamps) > 0
+    if has_sun or has_lamps:
+        x, y, z = _positions(seen, cam_from_place)
+    if has_sun:
+        facing = np.clip(product(normals, np.array(lighting.sun_direction)), 0, None).astype(
+            np.float32
+        )
+        sun = np.take(facing, index)
+        if shadows is not None:
+            sun = sun * shadows.lit(x, y, z)
+        light += sun[..., None] * as_array(lighting.sun)
+    if has_lamps:
+        normal = np.take(normals.astype(np.float32), index, axis=0)
+        lamp_lighting = _lamp_light((x, y, z), normal, lamps.astype(np.float32))
+        light += lamp_lighting[..., None] * as_array(lighting.lamps)
+    light += np.take(surfaces.glow, index)[..., None] * as_array(lighting.glow)
+    result = albedo * light
+    sky = ~hit
+    if sky.any():
+        result[sky] = _sky(seen, sky, lighting, cam_from_place, clouds)
+    return result
+
+
+def _positions(seen: Visibility, cam_from_place: RigidTransform) -> tuple[Float32, ...]:
+    """x, y, z of what each sample sees, place's frame, metres; the camera where it sees nothing."""
+    rotation = cam_from_place.rotation_matrix().astype(np.float32)
+    center = cam_from_place.center().astype(np.float32)
+    hit = seen.inverse_depth > 0
+    depth = np.where(hit, 1 / np.where(hit, seen.inverse_depth, 1), 0).astype(np.float32)
+    gx, gy = seen.grid.x.astype(np.float32), seen.grid.y.astype(np.float32)
+    return tuple(
+        center[i] + depth * (rotation[0, i] * gx + rotation[1, i] * gy + rotation[2, i])
+        for i in range(3)
+    )
+
+
+def _lamp_light(position: tuple[Float32, ...], normal: Float32, lamps: Float32) -> Float32:
+    """Sum over lamps of cosine over squared distance, cut off smoothly at _LAMP_RANGE_M."""
+    total = np.zeros_like(position[0])
+    for lamp in lamps:
+        dx, dy, dz = (lamp[i] - position[i] for i in range(3))
+        squared = dx * dx + dy * dy + dz * dz
+        facing = dx * normal[..., 0] + dy * normal[..., 1] + dz * normal[..., 2]
+        fade = np.clip(1 - squared * np.float32(_LAMP_RANGE_M**-2), 0, None)
+        total += np.clip(facing, 0, None) * fade / (squared * np.sqrt(squared) + np.float32(0.3))
+    return total
+
+
+def _sky(
+    seen: Visibility,
+    where: NDArray[np.bool_],
+    lighting: Lighting,
+    cam_from_place: RigidTransform,
+    clouds: Float32,
+) -> Float32:
+    rotation = cam_from_place.rotation_matrix().astype(np.float32)
+    gx = np.broadcast_to(seen.grid.x, where.shape)[where].astype(np.float32)
+    gy = np.broadcast_to(seen.grid.y, where.shape)[where].astype(np.float32)
+    rays = gx[:, None] * rotation[0] + gy[:, None] * rotation[1] + rotation[2]
+    azimuth = arctan2(rays[:, 1], rays[:, 0]) + np.float32(lighting.cloud_shift)
+    rise = rays[:, 2] / np.sqrt(rays[:, 0] * rays[:, 0] + rays[:, 1] * rays[:, 1])
+    u = np.mod(azimuth * np.float32(_CLOUD_SIZE / (2 * np.pi)), _CLOUD_SIZE)
+    v = np.clip(rise, 0, 3) * np.float32(_CLOUD_SIZE / 3.2)
+    seamless = np.concatenate([clouds, clouds[:, :1]], axis=1)[..., None]
+    cover = bilinear(seamless, u[None], v[None])[0]
+    base = as_array(lighting.sky_colour)
+    haze = exp(-3 * np.clip(rise, 0, None))[:, None] * base.mean() * np.float32(0.5)
+    return base * (1 - 0.5 * cover) + cover * base.mean() * np.float32(1.1) + haze
+
+
+def develop(
+    light: Float32, lighting: Lighting, supersampling: int, *, bonnet_seed: int | None
+) -> NDArray[np.uint8]:
+    """Image uint8 (H, W, 3) RGB of the samples' light (H * ss, W * ss, 3).
+
+    ``bonnet_seed`` puts a car's bonnet in front; None leaves it out.
+    """
+    height, width = light.shape[0] // supersampling, light.shape[1] // supersampling
+    if supersampling > 1:
+        light = averaged(light, supersampling)
+    if bonnet_seed is not None:
+        cover, paint = bonnet(width, height, bonnet_seed)
+        lit = as_array(lighting.sky) + np.float32(0.4) * as_array(lighting.sun)
+        lit = lit + np.float32(0.04) * as_array(lighting.lamps)
+        light = light * (1 - cover[..., None]) + paint * cover[..., None] * lit
+    signal = light * (as_array(lighting.white_balance) * np.float32(lighting.exposure))
+    signal *= (1 - np.float32(lighting.vignetting) * _corner_distance(width, height))[..., None]
+    if lighting.condition == "night":  # light that strays around lamps
+        haze = resized(blurred(averaged(np.minimum(signal, 4.0), 8), 3.0), width, height)
+        signal = signal + np.float32(0.06) * haze
+    signal = blurred(signal, lighting.blur_px)
+    rng = np.random.default_rng(lighting.noise_seed)
+    deviation = np.sqrt(lighting.shot_noise * signal + lighting.read_noise**2)
+    signal = signal + deviation * rng.standard_normal(signal.shape, dtype=np.float32)
+    # a shoulder instead of a hard limit, then gamma 2
+    signal = np.clip(signal, 0, None)
+    signal = np.where(signal > 0.7, 1 - 0.3 * exp(-(signal - 0.7) / 0.3), signal)
+    return np.clip(np.sqrt(signal) * 255 + 0.5, 0, 255).astype(np.uint8)
+
+
+@lru_cache(maxsize=8)
+def _corner_distance(width: int, height: int) -> Float32:
+    """Squared distance from the image's middle, 1 in the corners, float32 (height, width)."""
+    x = (np.arange(width, dtype=np.float32) + 0.5) / width * 2 - 1
+    y = (np.arange(height, dtype=np.float32) + 0.5) / height * 2 - 1
+    return ((x[None] ** 2 + y[:, None] ** 2) / 2).astype(np.float32)
+
+
+@lru_cache(maxsize=4)
+def bonnet(width: int, height: int, seed: int) -> tuple[Float32, Float32]:
+    """The bonnet as the front camera sees it: cover (H, W) 0..1 and paint (H, W, 3) linear.
+
+    It keeps its place in the image while the world moves, and so do its seams, dirt and emblem.
+    """
+    x = (np.arange(width, dtype=np.float32) + 0.5) / width * 2 - 1
+    y = (np.arange(height, dtype=np.float32) + 0.5) / height
+    edge = 0.86 + 0.11 * x**2
+    below = y[:, None] - edge[None]
+    cover = np.clip(below * height + 0.5, 0, 1).astype(np.float32)
+    rng = stream(seed, "bonnet")
+    colour = rng.uniform(0.05, 0.35, 3).astype(np.float32)
+    gloss = exp(-(((below - 0.035) / 0.02) ** 2)) * 0.5 + 0.6 + 1.5 * np.clip(below, 0, None)
+    canvas = np.clip(colour * gloss[..., None], 0, 1).astype(np.float32)
+    for side in (-0.42, 0.42):
+        start = (int((0.5 + side * 0.6) * width), int(0.86 * height))
+        stop = (int((0.5 + side) * width), height)
+        cv2.line(canvas, start, stop, (0.02, 0.02, 0.02), max(1, height // 200), cv2.LINE_AA)
+    for _ in range(40):
+        spot = (int(rng.uniform(0, width)), int(rng.uniform(0.86, 1.0) * height))
+        tone = float(rng.uniform(0.2, 0.5))
+        cv2.circle(canvas, spot, int(rng.integers(1, 4)), (tone, tone, tone), -1, cv2.LINE_AA)
+    emblem = (width // 2, int(0.9 * height))
+    cv2.circle(canvas, emblem, height // 48, (0.7, 0.7, 0.7), -1, cv2.LINE_AA)
+    cv2.circle(canvas, emblem, height // 80, (0.1, 0.1, 0.3), -1, cv2.LINE_AA)
+    cover.setflags(write=False)
+    canvas.setflags(write=False)
+    return cover, canvas

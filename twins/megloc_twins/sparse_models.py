@@ -1,0 +1,333 @@
+"""Sparse models of a rendered world: exact tracks, or SIFT features that are triangulated.
+
+The twins' official layouts come with a model. Exact points are lifted from the depth of the
+rendered images and projected, so that the model is as exact as float32 pixels allow. Models of SIFT
+are made as real ones are, but that poses, cameras and what matches are known: points and keypoints
+have the errors of real ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.datasets.formats.sparse_points import SparsePoints
+from megloc_kapture.features.colmap_sift import ColmapSift
+from megloc_kapture.io.colmap import (
+    DatabaseFeatures,
+    MapImage,
+    normalized_from_px,
+    px_from_cam,
+    triangulate,
+    write_feature_database,
+)
+from megloc_kapture.io.images import read_image_rgb, write_image
+from megloc_kapture.matching.nearest_neighbours import NearestNeighbourOptions, match_nearest
+from megloc_kapture.stages.work import Work
+from megloc_kapture.values import Camera, LocalFeatures
+from megloc_twins.frames import Frame
+from megloc_twins.options import SyntheticWorldOptions
+from megloc_twins.rasterization import project, sample_grid
+from megloc_twins.render import RenderedFrame, render_frames
+
+_BORDER_PX = 2.0  # no feature nearer to the border
+# between a point's depth and that of the pixel it falls into; surfaces seen at a slant need it
+_DEPTH_TOLERANCE = 0.01
+_DEPTH_TOLERANCE_M = 0.02
+_GREY = 128  # the depth knows no colour
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+_MATCHING = NearestNeighbourOptions(max_ratio=0.8)  # as COLMAP's matcher
+_MAX_ERROR_PX = 2.0
+_MIN_SHARED = 20  # features of one image that have one of the other at the same place
+Features = Mapping[str, LocalFeatures]
+Depths = Mapping[str, NDArray[np.float32]]
+
+
+def exact_tracks(
+    frames: Sequence[Frame],
+    depths_m: Mapping[str, NDArray[np.float32]],
+    *,
+    points_per_frame: int,
+    rng: np.random.Generator,
+) -> SparsePoints:
+    """Sparse points that at least two of the frames see, with exact observations.
+
+    Pixels with depth are drawn at random in every frame, lifted to the frame of the frames' poses
+    and projected into all frames of the same place whose depth agrees.
+
+    Parameters
+    ----------
+    frames : PINHOLE, SIMPLE_PINHOLE or SIMPLE_RADIAL cameras.
+    depths_m : float32 (H, W) along the optical axis by image name, one for each frame, 0 where
+        nothing is seen.
+    points_per_frame : pixels drawn in each frame; those that no other frame sees give no point.
+    rng : draws the pixels.
+
+    Returns
+    -------
+    ``xyz`` in the frame of the frames' poses, all grey; observations sorted by point, then image;
+    ``image_ids`` count in ``frames``, ``feature_ids`` from 0 in each image; ``xy_px`` are the
+    projections rounded to float32.
+    """
+    xyz: list[Floats] = [np.zeros((0, 3))]
+    point_ids: list[NDArray[np.int64]] = [np.zeros(0, np.int64)]
+    image_ids: list[NDArray[np.int64]] = [np.zeros(0, np.int64)]
+    xy_px: list[Floats] = [np.zeros((0, 2))]
+    num_points = 0
+    for frame in frames:
+        # those of other places stand behind walls
+        here = [index for index, other in enumerate(frames) if other.place == frame.place]
+        points = _lifted(frame, depths_m[frame.name], points_per_frame, rng)
+        seen, px = _observations([frames[index] for index in here], depths_m, points)
+        seen, px, points = _kept(seen, px, points)
+        of_point, of_image = np.nonzero(seen)
+        xyz.append(points)
+        point_ids.append(of_point + num_points)
+        image_ids.append(np.array(here, np.int64)[of_image])
+        xy_px.append(px[of_point, of_image])
+        num_points += len(points)
+    images = np.concatenate(image_ids)
+    return SparsePoints(
+        xyz=np.concatenate(xyz),
+        rgb=np.full((num_points, 3), _GREY, np.uint8),
+        point_ids=np.concatenate(point_ids),
+        image_ids=images.astype(np.int32),
+        feature_ids=_ranks(images),
+        xy_px=np.concatenate(xy_px).astype(np.float32),
+    )
+
+
+def _lifted(
+    frame: Frame, depth_m: NDArray[np.float32], count: int, rng: np.random.Generator
+) -> Floats:
+    """World points (P, 3), P <= count, of random pixels that have depth."""
+    rows, columns = np.nonzero(depth_m > 0)
+    drawn = rng.permutation(len(rows))[:count]
+    rows, columns = rows[drawn], columns[drawn]
+    x, y = _rays(frame.camera)
+    z = depth_m[rows, columns].astype(np.float64)
+    in_camera = np.stack([x[rows, columns] * z, y[rows, columns] * z, z], axis=1)
+    return frame.cam_from_world.inverse().apply(in_camera)
+
+
+def _observations(
+    frames: Sequence[Frame], depths_m: Mapping[str, NDArray[np.float32]], points: Floats
+) -> tuple[Bools, Floats]:
+    """Visibility bool (P, S) of points (P, 3) in frames, and their pixels, float64 (P, S, 2)."""
+    seen = np.zeros((len(points), len(frames)), bool)
+    pixels = np.zeros((len(points), len(frames), 2))
+    for column, frame in enumerate(frames):
+        in_camera = frame.cam_from_world.apply(points)
+        ahead = _in_field(frame.camera, in_camera)
+        px = project(frame.camera, np.where(ahead[:, None], in_camera, [0.0, 0.0, 1.0]))
+        size = np.array([frame.camera.width, frame.camera.height])
+        inside = ahead & ((px >= _BORDER_PX) & (px <= size - _BORDER_PX)).all(1)
+        where = np.where(inside[:, None], px, 0.0).astype(np.int64)
+        z = in_camera[:, 2]
+        error = np.abs(depths_m[frame.name][where[:, 1], where[:, 0]] - z)
+        seen[:, column] = inside & (error < _DEPTH_TOLERANCE * z + _DEPTH_TOLERANCE_M)
+        pixels[:, column] = px
+    return seen, pixels
+
+
+def _in_field(camera: Camera, in_camera: Floats) -> Bools:
+    """Points that lie ahead and no farther from the axis than the image's corners.
+
+    Farther out the distortion need not be monotonous and may fold a point back into the image.
+    """
+    x, y = _rays(camera)
+    limit = float((x**2 + y**2).max())
+    z = in_camera[:, 2]
+    return np.asarray((z > 0) & ((in_camera[:, :2] ** 2).sum(1) <= limit * z**2), np.bool_)
+
+
+def _rays(camera: Camera) -> tuple[Floats, Floats]:
+    """Normalised coordinates of the pixels' centres, two of float64 (H, W)."""
+    grid = sample_grid(camera, 1)
+    return np.broadcast_to(grid.x, grid.shape), np.broadcast_to(grid.y, grid.shape)
+
+
+def _kept(seen: Bools, pixels: Floats, points: Floats) -> tuple[Bools, Floats, Floats]:
+    """The points that at least two images see."""
+    enough = seen.sum(1) >= 2
+    return seen[enough], pixels[enough], points[enough]
+
+
+def _ranks(images: NDArray[np.int64]) -> NDArray[np.int32]:
+    """For each observation how many of its image precede it."""
+    order = np.argsort(images, kind="stable")
+    ordered = images[order]
+    first = np.searchsorted(ordered, ordered)
+    ranks = np.empty(len(images), np.int32)
+    ranks[order] = np.arange(len(images)) - first
+    return ranks
+
+
+def sift_points(frames: Sequence[Frame], features: Features, depths_m: Depths) -> SparsePoints:
+    """Points triangulated from features that see the same spot and look alike.
+
+    Parameters
+    ----------
+    frames : of cameras that COLMAP knows; poses in any frame in metres.
+    features, depths_m : of each frame by image name; depth float32 (H, W) along the optical axis, 0
+        where nothing is seen.
+
+    Returns
+    -------
+    ``xyz`` in the frame of the frames' poses, all grey; at least three images see a point;
+    ``image_ids`` count in ``frames``, ``feature_ids`` are rows of the features.
+    """
+    images = [
+        MapImage(frame.name, frame.camera, frame.cam_from_world, features[frame.name].keypoints_px)
+        for frame in frames
+    ]
+    world = [_world_points(frame, features[frame.name], depths_m[frame.name]) for frame in frames]
+    matches = {}
+    for i, j in combinations(range(len(frames)), 2):
+        # other places stand behind walls
+        if frames[i].place == frames[j].place:
+            found = _matches(
+                frames[j], features[frames[i].name], features[frames[j].name], world[i]
+            )
+            agree = _near(frames[i], features[frames[i].name], world[j], found[:, ::-1])
+            matches[i, j] = found[agree]
+    points = triangulate(images, matches)
+    keypoints = [image.keypoints_px for image in images]
+    rows = zip(points.image_ids.tolist(), points.keypoint_ids.tolist(), strict=True)
+    xy_px = [keypoints[image][keypoint] for image, keypoint in rows]
+    return SparsePoints(
+        xyz=points.xyz,
+        rgb=np.full((len(points.xyz), 3), _GREY, np.uint8),
+        point_ids=points.point_ids,
+        image_ids=points.image_ids.astype(np.int32),
+        feature_ids=points.keypoint_ids.astype(np.int32),
+        xy_px=np.array(xy_px, np.float32).reshape(-1, 2),
+    )
+
+
+def write_sift_database(path: Path, frames: Mapping[str, Frame], features: Features) -> None:
+    """Write COLMAP's database of the frames' features, under the names given, in their order.
+
+    Raises
+    ------
+    OutputError : cannot be written.
+    """
+    write_feature_database(
+        path,
+        (
+            DatabaseFeatures(
+                name,
+                frame.camera,
+                features[frame.name].keypoints_px,
+                features[frame.name].descriptors,
+            )
+            for name, frame in frames.items()
+        ),
+    )
+
+
+def _world_points(
+    frame: Frame, features: LocalFeatures, depth_m: NDArray[np.float32]
+) -> NDArray[np.float64]:
+    """World point of each feature, float64 (N, 3); NaN where there is no depth."""
+    xy = features.keypoints_px
+    last = np.array(depth_m.shape[::-1]) - 1
+    column, row = np.clip(xy.astype(np.int64), 0, last).T
+    z = depth_m[row, column].astype(np.float64)
+    z[z <= 0] = np.nan
+    rays = normalized_from_px(frame.camera, xy)
+    return frame.cam_from_world.inverse().apply(
+        np.column_stack([rays, np.ones(len(z))]) * z[:, None]
+    )
+
+
+def _matches(
+    frame: Frame, features: LocalFeatures, others: LocalFeatures, world: NDArray[np.float64]
+) -> NDArray[np.int64]:
+    """Matches (K, 2) of ``features``, which show ``world``, with those of another frame."""
+    px = px_from_cam(frame.camera, frame.cam_from_world.apply(world))
+    inside = ((px > 0) & (px < (frame.camera.width, frame.camera.height))).all(axis=1)
+    if inside.sum() < _MIN_SHARED:
+        return np.zeros((0, 2), np.int64)
+    matches, _ = match_nearest(features.descriptors, others.descriptors, _MATCHING)
+    return matches[_near(frame, others, world, matches)]
+
+
+def _near(
+    frame: Frame, features: LocalFeatures, world: NDArray[np.float64], matches: NDArray[np.int64]
+) -> NDArray[np.bool_]:
+    """Matches whose first feature's point is projected to the second, one of the frame."""
+    px = px_from_cam(frame.camera, frame.cam_from_world.apply(world[matches[:, 0]]))
+    error = np.linalg.norm(px - features.keypoints_px[matches[:, 1]], axis=1)
+    return np.asarray(error <= _MAX_ERROR_PX)  # NaN is not
+
+
+@dataclass(frozen=True, eq=False)
+class MapFrames:
+    """Depth and features of the rendered map images, by image name.
+
+    Parameters
+    ----------
+    depths_m : float32 (H, W) along the optical axis, 0 where nothing is seen.
+    features : COLMAP's SIFT; empty where the models' points are to be exact.
+    """
+
+    depths_m: Mapping[str, NDArray[np.float32]]
+    features: Mapping[str, LocalFeatures]
+
+    def points(
+        self, frames: Sequence[Frame], *, points_per_frame: int, rng: np.random.Generator
+    ) -> SparsePoints:
+        """:func:`sift_points` where there are features, else :func:`exact_tracks`."""
+        if self.features:
+            return sift_points(frames, self.features, self.depths_m)
+        return exact_tracks(frames, self.depths_m, points_per_frame=points_per_frame, rng=rng)
+
+
+def render_map_and_queries(
+    world: SyntheticWorldOptions,
+    mapping: Sequence[Frame],
+    others: Sequence[Frame],
+    images: Path,
+    *,
+    model_features: bool,
+    work: Work,
+) -> MapFrames:
+    """Draw all frames and write them below ``images`` under their names.
+
+    Parameters
+    ----------
+    mapping : frames whose depth is returned, with ``model_features`` their SIFT as well.
+    others : frames that are drawn only.
+    work : its processes have to see the same file system.
+    """
+    names = frozenset(frame.name for frame in mapping)
+    finish = partial(_write, images, world.jpeg_quality, names if model_features else frozenset())
+    drawn = render_frames(world, [*mapping, *others], finish, with_depth=names, work=work)
+    return MapFrames(
+        {name: depth for name, (depth, _) in drawn.items() if depth is not None},
+        {name: features for name, (_, features) in drawn.items() if features is not None},
+    )
+
+
+def _write(
+    images: Path,
+    jpeg_quality: int,
+    with_features: frozenset[str],
+    frame: Frame,
+    view: RenderedFrame,
+) -> tuple[NDArray[np.float32] | None, LocalFeatures | None]:
+    path = images / frame.name
+    write_image(path, view.image, jpeg_quality=jpeg_quality)
+    # of the image as it was written
+    wanted = frame.name in with_features
+    return view.depth_m, ColmapSift().extract(read_image_rgb(path)) if wanted else None

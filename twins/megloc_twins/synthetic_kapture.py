@@ -1,0 +1,274 @@
+"""The synthetic world as plain kapture: mapped by a rig, queried by telephones, day and night."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from megloc_kapture.io.dataset_tables import (
+    ImageGroup,
+    Protocol,
+    World,
+    write_groups,
+    write_protocol,
+    write_world,
+)
+from megloc_kapture.io.images import write_depth_map, write_image
+from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
+from megloc_kapture.stages.work import HERE, Work
+from megloc_kapture.values import Camera, RigidTransform
+from megloc_twins.dataset import SyntheticDataset
+from megloc_twins.frames import Frame, cam_from_rig, kapture_records, looking_at, noise_seed
+from megloc_twins.lighting import day_lighting
+from megloc_twins.moving_objects import place_moving_objects
+from megloc_twins.options import SyntheticWorldOptions, stream
+from megloc_twins.render import RenderedFrame, render_frames
+from megloc_twins.squares import Place, build_place
+from megloc_twins.viewpoints import CoarseView, coarse_view, query_frames
+
+RIG_ID = "rig"
+BONNET_CAMERA = "front"
+RIG_HEIGHT_M = 1.9
+
+
+@dataclass(frozen=True)
+class RigStop:
+    """The rig at one moment: its pose, and what its cameras take."""
+
+    timestamp: int
+    rig_from_world: RigidTransform
+    frames: tuple[Frame, ...]
+
+
+def rig_sensor_id(camera: str) -> str:
+    """Id of one of the rig's cameras."""
+    return f"{RIG_ID}_{camera}"
+
+
+def rig_cameras(options: SyntheticWorldOptions) -> dict[str, Camera]:
+    """Cameras of the mapping rig by name, PINHOLE."""
+    width, height = options.width, options.height
+    focal = {"front": 0.76, "left": 0.73, "right": 0.73}
+    centre = {"front": (0.5, 0.5), "left": (0.506, 0.493), "right": (0.494, 0.507)}
+    return {
+        name: Camera(
+            "PINHOLE",
+            width,
+            height,
+            (
+                focal[name] * width,
+                focal[name] * width * 1.004,
+                centre[name][0] * width,
+                centre[name][1] * height,
+            ),
+        )
+        for name in focal
+    }
+
+
+def rig_geometry() -> dict[str, RigidTransform]:
+    """``sensor_from_rig`` of the rig's cameras; the rig looks along z, y down, metres."""
+    return {
+        "front": cam_from_rig(0.0, -2.0, (0.0, -0.05, 0.45)),
+        "left": cam_from_rig(-62.0, 3.0, (-0.35, 0.0, 0.05)),
+        "right": cam_from_rig(62.0, 3.0, (0.35, 0.0, 0.05)),
+    }
+
+
+def mapping_stops(options: SyntheticWorldOptions, place: Place) -> list[RigStop]:
+    """The rig's stops in a place, in order of time."""
+    rng = stream(options.seed, "mapping", place.index)
+    azimuth = float(rng.uniform(-np.pi, np.pi))
+    elevation = float(np.radians(rng.uniform(40, 60)))
+    cameras, geometry = rig_cameras(options), rig_geometry()
+    stops = []
+    for station, (spot, heading) in enumerate(place.plan.stops(options.stations_per_place)):
+        timestamp = 1000 * (place.index + 1) + station
+        position = np.array([*spot + rng.normal(0, 0.15, 2), RIG_HEIGHT_M + rng.normal(0, 0.03)])
+        yaw = heading + float(rng.normal(0, 0.12))
+        pitch, roll = (float(a) for a in rng.normal(0, 0.015, 2))
+        rig_from_world = looking_at(position, yaw, pitch, roll) @ place.place_from_world
+        moving_objects = place_moving_objects(
+            place.plan, rng, options.moving_objects, position, yaw=None
+        )
+        frames = []
+        for name, camera in cameras.items():
+            image = f"db/{place.name}/{name}/{station:05d}.{options.image_format}"
+            lighting = day_lighting(
+                rng,
+                azimuth=azimuth,
+                elevation=elevation,
+                overcast=0.15,
+                noise_seed=noise_seed(options, image),
+            )
+            frames.append(
+                Frame(
+                    name=image,
+                    role="mapping",
+                    condition="day",
+                    place=place.index,
+                    timestamp=timestamp,
+                    sensor_id=rig_sensor_id(name),
+                    camera=camera,
+                    cam_from_world=geometry[name] @ rig_from_world,
+                    lighting=lighting,
+                    moving_objects=moving_objects,
+                    bonnet=options.bonnet and name == BONNET_CAMERA,
+                )
+            )
+        stops.append(RigStop(timestamp, rig_from_world, tuple(frames)))
+    return stops
+
+
+@dataclass(frozen=True, eq=False)
+class SyntheticWorld:
+    """Everything there is, in one world frame (metres, z up).
+
+    Parameters
+    ----------
+    options : that the world was built from.
+    places : by index.
+    rig_cameras : the mapping rig's cameras by sensor id.
+    sensor_from_rig : their places on the rig.
+    rig_from_world : the rig's poses by timestamp.
+    mapping, queries : all images, sorted by name.
+    """
+
+    options: SyntheticWorldOptions
+    places: tuple[Place, ...]
+    rig_cameras: dict[str, Camera]
+    sensor_from_rig: dict[str, RigidTransform]
+    rig_from_world: dict[int, RigidTransform]
+    mapping: tuple[Frame, ...]
+    queries: tuple[Frame, ...]
+
+    def frames(self) -> tuple[Frame, ...]:
+        """All images, those of the map first."""
+        return self.mapping + self.queries
+
+    def coarse_views(self) -> dict[str, CoarseView]:
+        """Coarse view of every frame, without moving objects, by image name; world frame.
+
+        With :func:`covisibility.overlap` this tells which map images a query really shares
+        anything with.
+        """
+        surfaces = [place.surfaces_in_world() for place in self.places]
+        return {
+            frame.name: coarse_view(surfaces[frame.place], frame.camera, frame.cam_from_world)
+            for frame in self.frames()
+        }
+
+
+def build_world(options: SyntheticWorldOptions | None = None) -> SyntheticWorld:
+    """Lay out the world and choose all its frames; the same options give the same world."""
+    options = options or SyntheticWorldOptions()
+    places = tuple(build_place(options, index) for index in range(options.num_places))
+    rig_from_world: dict[int, RigidTransform] = {}
+    mapping: list[Frame] = []
+    queries: list[Frame] = []
+    for place in places:
+        seen: list[Frame] = []
+        for stop in mapping_stops(options, place):
+            rig_from_world[stop.timestamp] = stop.rig_from_world
+            seen += stop.frames
+        queries += query_frames(options, place, seen, "day", options.day_queries)
+        queries += query_frames(options, place, seen, "night", options.night_queries)
+        mapping += seen
+    return SyntheticWorld(
+        options=options,
+        places=places,
+        rig_cameras={rig_sensor_id(k): camera for k, camera in rig_cameras(options).items()},
+        sensor_from_rig={rig_sensor_id(k): pose for k, pose in rig_geometry().items()},
+        rig_from_world=rig_from_world,
+        mapping=tuple(sorted(mapping, key=lambda frame: frame.name)),
+        queries=tuple(sorted(queries, key=lambda frame: frame.name)),
+    )
+
+
+class SyntheticKapture(SyntheticDataset[SyntheticWorldOptions]):
+    """The synthetic world as plain kapture.
+
+    ``mapping/`` (images, poses through the rig, depth if asked), ``query/`` (images and cameras),
+    ``query_gt/`` (the same cameras with poses, no images) and ``megloc/`` (day and night,
+    thresholds).
+    """
+
+    Options = SyntheticWorldOptions
+    version = 2
+
+    def write(self, root: Path, work: Work = HERE) -> dict[str, int]:
+        root, world = Path(root), build_world(self.options)
+        render_frames(
+            self.options,
+            world.frames(),
+            partial(_write_files, root, self.options),
+            with_depth=[frame.name for frame in world.mapping] if self.options.depth else (),
+            work=work,
+        )
+        write_sensors(root / "mapping", mapping_data(world))
+        write_sensors(root / "query", kapture_records(world.queries, poses=False))
+        write_sensors(root / "query_gt", kapture_records(world.queries))
+        write_side_tables(root / "megloc", world)
+        return {
+            "places": len(world.places),
+            "mapping images": len(world.mapping),
+            "query images": len(world.queries),
+        }
+
+
+def mapping_data(world: SyntheticWorld) -> KaptureData:
+    """The mapping images' records; their poses are those of the rig."""
+    data = KaptureData()
+    members = {}
+    for sensor_id, camera in world.rig_cameras.items():
+        data.sensors[sensor_id] = Sensor.from_camera(camera, name=sensor_id)
+        members[sensor_id] = world.sensor_from_rig[sensor_id]
+        if world.options.depth:
+            depth_id = _depth_sensor(sensor_id)
+            data.sensors[depth_id] = Sensor.from_camera(camera, name=depth_id, sensor_type="depth")
+            members[depth_id] = world.sensor_from_rig[sensor_id]
+    data.rigs[RIG_ID] = members
+    for timestamp, pose in world.rig_from_world.items():
+        data.trajectories[timestamp, RIG_ID] = pose
+    for frame in world.mapping:
+        data.records_camera[frame.timestamp, frame.sensor_id] = frame.name
+        if world.options.depth:
+            record = frame.timestamp, _depth_sensor(frame.sensor_id)
+            data.records_depth[record] = depth_name(frame.name)
+    return data
+
+
+def write_side_tables(folder: Path, world: SyntheticWorld) -> None:
+    """Conditions of the queries, thresholds and frame."""
+    groups = {
+        frame.name: ImageGroup(condition=frame.condition, location=world.places[frame.place].name)
+        for frame in world.queries
+    }
+    write_groups(folder, groups)
+    write_protocol(folder, Protocol(dataset="synthetic", conditions=("day", "night")))
+    write_world(folder, World())
+
+
+def depth_name(image: str) -> str:
+    """Path of an image's depth map below ``records_data``."""
+    return str(PurePosixPath("depth") / PurePosixPath(image).with_suffix(".depth"))
+
+
+def _depth_sensor(sensor_id: str) -> str:
+    return f"{sensor_id}_depth"
+
+
+def _write_files(
+    root: Path, options: SyntheticWorldOptions, frame: Frame, view: RenderedFrame
+) -> None:
+    sensors = root / frame.role / "sensors"
+    records = sensors / "records_data"
+    write_image(records / frame.name, view.image, jpeg_quality=options.jpeg_quality)
+    if view.depth_m is not None:
+        write_depth_map(records / depth_name(frame.name), view.depth_m)
+    if options.masks and not view.mask.all():
+        mask = np.where(view.mask, 255, 0).astype(np.uint8)
+        write_image(sensors / "masks" / f"{frame.name}.png", mask)

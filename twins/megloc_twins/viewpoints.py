@@ -1,0 +1,247 @@
+"""Viewpoints of queries: held elsewhere than the map was taken from, yet supported by it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.values import Camera, RigidTransform
+from megloc_twins.frames import Frame, looking_at, noise_seed, reduced
+from megloc_twins.lighting import Condition, Lighting, day_lighting, night_lighting
+from megloc_twins.moving_objects import place_moving_objects
+from megloc_twins.options import SyntheticWorldOptions, stream
+from megloc_twins.rasterization import depth_map, intrinsics, project, sample_grid, visible_surfaces
+from megloc_twins.squares import Place
+from megloc_twins.surfaces import Surfaces
+
+_REDUCTION = 8
+_STRIDE = 4
+_DEPTH_TOLERANCE = 0.05  # relative; the other view's depth is read at the nearest coarse pixel
+# what SIFT bears between two views of a point: angle between the rays, ratio of sizes and of
+# foreshortenings
+_MAX_ANGLE_DEG = 32.0
+_MAX_SIZE_RATIO = 2.0
+_MIN_BASELINE_DEG = 1.5  # less gives a point without depth
+
+Item = TypeVar("Item")
+Bools = NDArray[np.bool_]
+Floats = NDArray[np.float64]
+
+_MAX_OVERLAP = 0.85  # no query is a copy of a mapping image
+_MIN_SUPPORT = 0.6  # share of a query's view that the map can tell it
+_ATTEMPTS = 300
+
+
+@dataclass(frozen=True, eq=False)
+class CoarseView:
+    """A view's depth at an eighth of its resolution, and points on a sparse grid of it.
+
+    Parameters
+    ----------
+    camera, cam_from_world : of the view; the frame is that of the surfaces.
+    depth : float32 (h, w), metres, 0 where nothing is seen.
+    points, normals : float64 (P, 3), what the view sees, in the surfaces' frame.
+    """
+
+    camera: Camera
+    cam_from_world: RigidTransform
+    depth: NDArray[np.float32]
+    points: Floats
+    normals: Floats
+
+
+def coarse_view(surfaces: Surfaces, camera: Camera, cam_from_world: RigidTransform) -> CoarseView:
+    """Look at surfaces coarsely."""
+    grid = sample_grid(reduced(camera, _REDUCTION), 1)
+    seen = visible_surfaces(surfaces, cam_from_world, grid)
+    depth = depth_map(seen)
+    sparse = np.s_[_STRIDE // 2 :: _STRIDE, _STRIDE // 2 :: _STRIDE]
+    z = depth[sparse].astype(np.float64)
+    x = np.broadcast_to(grid.x, depth.shape)[sparse] * z
+    y = np.broadcast_to(grid.y, depth.shape)[sparse] * z
+    in_camera = np.stack([x, y, z], axis=-1)[z > 0]
+    return CoarseView(
+        camera,
+        cam_from_world,
+        depth,
+        points=cam_from_world.inverse().apply(in_camera),
+        normals=surfaces.normals()[seen.surface[sparse][z > 0]],
+    )
+
+
+def visible(points: Floats, view: CoarseView) -> Bools:
+    """Visibility, bool (P,), of points (P, 3) in a view."""
+    in_camera = view.cam_from_world.apply(points)
+    z = in_camera[:, 2]
+    small = reduced(view.camera, _REDUCTION)
+    ahead = np.where((z > 0.1)[:, None], in_camera, [0.0, 0.0, 1.0])
+    column, row = np.floor(project(small, ahead)).astype(np.int64).T
+    inside = (column >= 0) & (column < small.width) & (row >= 0) & (row < small.height)
+    inside &= z > 0.1
+    seen = view.depth[np.where(inside, row, 0), np.where(inside, column, 0)]
+    return inside & (np.abs(seen - z) < _DEPTH_TOLERANCE * z + 0.05)
+
+
+def overlap(view: CoarseView, other: CoarseView) -> float:
+    """Share (0..1) of what ``view`` sees that ``other`` sees too."""
+    return float(visible(view.points, other).mean()) if len(view.points) else 0.0
+
+
+def support(view: CoarseView, others: Sequence[CoarseView]) -> float:
+    """Share (0..1) of what ``view`` sees that a map of the ``others`` can tell it.
+
+    A point counts when another view sees it similarly enough to match, and a third view is there
+    to triangulate it with.
+    """
+    if not len(view.points) or len(others) < 2:
+        return 0.0
+    sees = np.stack([visible(view.points, other) for other in others])
+    rays, sizes, slants = map(
+        np.stack, zip(*(_aspect(view, other) for other in others), strict=True)
+    )
+    ray, size, slant = _aspect(view, view)
+    matches = sees & _similar((rays * ray).sum(-1), sizes / size, slants / slant)
+    between = np.einsum("apk,bpk->abp", rays, rays)
+    alike = _similar(between, sizes[:, None] / sizes[None], slants[:, None] / slants[None])
+    pairs = alike & (between < np.cos(np.radians(_MIN_BASELINE_DEG))) & sees[:, None] & sees[None]
+    return float((matches & pairs.any(axis=1)).any(axis=0).mean())
+
+
+def _aspect(points_of: CoarseView, view: CoarseView) -> tuple[Floats, Floats, Floats]:
+    """How ``view`` looks at the points of another: unit rays (P, 3), sizes and slants (P,)."""
+    difference = points_of.points - view.cam_from_world.center()
+    distance = np.linalg.norm(difference, axis=1)
+    rays = difference / distance[:, None]
+    slant = np.clip(-(rays * points_of.normals).sum(1), 0.02, None)
+    return rays, intrinsics(view.camera)[0] / distance, slant
+
+
+def _similar(cosine: Floats, size_ratio: Floats, slant_ratio: Floats) -> Bools:
+    limit = np.log(_MAX_SIZE_RATIO)
+    similar: Bools = cosine > np.cos(np.radians(_MAX_ANGLE_DEG))
+    return similar & (np.abs(np.log(size_ratio)) < limit) & (np.abs(np.log(slant_ratio)) < limit)
+
+
+def query_frames(
+    options: SyntheticWorldOptions,
+    place: Place,
+    mapping: Sequence[Frame],
+    condition: Condition,
+    total: int,
+) -> list[Frame]:
+    """This place's share of the ``total`` queries of a condition.
+
+    ``mapping`` are the mapping frames of the place.
+    """
+    world_from_place = place.place_from_world.inverse()
+    map_views = [
+        coarse_view(place.surfaces, frame.camera, frame.cam_from_world @ world_from_place)
+        for frame in mapping
+    ]
+    frames = []
+    for number in range(place.index, total, options.num_places):
+        sensor_id = f"{condition}_{number:05d}"
+        image = f"query/{condition}/{number:05d}.{options.image_format}"
+        rng = stream(options.seed, "query", sensor_id)
+        camera = query_camera(options, rng)
+        position, yaw, cam_from_place = first_fitting(
+            _query_poses(place, camera, map_views, rng), place.name
+        )
+        frames.append(
+            Frame(
+                name=image,
+                role="query",
+                condition=condition,
+                place=place.index,
+                timestamp=(100_000 if condition == "day" else 200_000) + number,
+                sensor_id=sensor_id,
+                camera=camera,
+                cam_from_world=cam_from_place @ place.place_from_world,
+                lighting=_query_lighting(options, condition, rng, image),
+                moving_objects=place_moving_objects(
+                    place.plan, rng, options.moving_objects, position, yaw=yaw
+                ),
+                bonnet=False,
+            )
+        )
+    return frames
+
+
+def query_camera(options: SyntheticWorldOptions, rng: np.random.Generator) -> Camera:
+    """A telephone's camera: its own focal length, principal point and distortion."""
+    width, height = options.width, options.height
+    focal = rng.uniform(0.7, 0.95) * width
+    cx, cy = width / 2 + rng.normal(0, 2), height / 2 + rng.normal(0, 2)
+    if not options.distortion:
+        return Camera("SIMPLE_PINHOLE", width, height, (focal, cx, cy))
+    k = rng.uniform(-0.09, 0.04)
+    return Camera("SIMPLE_RADIAL", width, height, (focal, cx, cy, k))
+
+
+def _query_lighting(
+    options: SyntheticWorldOptions, condition: Condition, rng: np.random.Generator, image: str
+) -> Lighting:
+    seed = noise_seed(options, image)
+    if condition == "night":
+        return night_lighting(rng, exposure=options.night_exposure, noise_seed=seed)
+    return day_lighting(
+        rng,
+        azimuth=float(rng.uniform(-np.pi, np.pi)),
+        elevation=float(np.radians(rng.uniform(35, 60))),
+        overcast=float(rng.choice([0.1, 0.5, 1.0])),
+        noise_seed=seed,
+    )
+
+
+def _query_poses(
+    place: Place, camera: Camera, map_views: list[CoarseView], rng: np.random.Generator
+) -> Iterator[tuple[float, tuple[NDArray[np.float64], float, RigidTransform]]]:
+    """Random viewpoints that keep their distance from things, each behind its :func:`misfit`.
+
+    A viewpoint is its position (3,), yaw and ``cam_from_place``.
+    """
+    low, high = place.plan.outline.min(0), place.plan.outline.max(0)
+    for _ in range(_ATTEMPTS):
+        x, y = (float(v) for v in rng.uniform(low, high))
+        yaw = float(rng.uniform(-np.pi, np.pi))
+        pitch, roll = float(rng.normal(0.04, 0.06)), float(rng.normal(0, 0.06))
+        position = np.array([x, y, rng.uniform(1.45, 1.8)])
+        if not place.plan.is_free(x, y, 0.9):
+            continue
+        pose = looking_at(position, yaw, pitch, roll)
+        view = coarse_view(place.surfaces, camera, pose)
+        depth = view.depth[view.depth > 0]
+        if np.percentile(depth, 10) >= 1.2 and np.median(depth) >= 3.5:
+            yield misfit(view, map_views), (position, yaw, pose)
+
+
+def misfit(view: CoarseView, map_views: Sequence[CoarseView], *, min_overlap: float = 0.0) -> float:
+    """How far a view is from being supported by the map without being a copy of its images.
+
+    0 is well. Map images with an overlap up to ``min_overlap`` support nothing.
+    """
+    shares = [overlap(view, other) for other in map_views]
+    seen = [o for o, share in zip(map_views, shares, strict=True) if share > min_overlap]
+    return max(_MIN_SUPPORT - support(view, seen), max(shares) - _MAX_OVERLAP, 0.0)
+
+
+def first_fitting(candidates: Iterable[tuple[float, Item]], place: str) -> Item:
+    """The first candidate whose misfit is 0; failing that, the first of the least.
+
+    Parameters
+    ----------
+    candidates : misfit and candidate; drawn no further than needed.
+    """
+    best: tuple[float, Item] | None = None
+    for candidate in candidates:
+        if best is None or candidate[0] < best[0]:
+            best = candidate
+        if candidate[0] == 0.0:
+            break
+    if best is None:  # every floor plan has room for a query
+        raise RuntimeError(f"no free view in {place}")
+    return best[1]

@@ -1,0 +1,98 @@
+"""A small one of each rendered dataset, rendered once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+from megloc_twins.aachen import AachenTwin, AachenTwinOptions
+from megloc_twins.dataset import SyntheticDataset
+from megloc_twins.fourseasons import FourSeasonsTwin, FourSeasonsTwinOptions
+from megloc_twins.inloc import InLocTwin, InLocTwinOptions
+from megloc_twins.options import SyntheticWorldOptions
+from megloc_twins.robotcar import RobotCarTwin, RobotCarTwinOptions
+from megloc_twins.synthetic_kapture import SyntheticKapture
+
+SMALL: dict[str, SyntheticDataset[Any]] = {
+    "synthetic": SyntheticKapture(
+        SyntheticWorldOptions(
+            num_places=2,
+            stations_per_place=4,
+            day_queries=2,
+            night_queries=2,
+            width=160,
+            height=120,
+            supersampling=1,
+            depth=True,
+            masks=True,
+        )
+    ),
+    "aachen": AachenTwin(
+        AachenTwinOptions(
+            num_places=2,
+            stations_per_place=7,
+            sequence_images=3,
+            day_queries=4,
+            night_queries=2,
+            additional_night_queries=2,
+            width=160,
+            height=120,
+            supersampling=1,
+            points_per_image=60,
+        )
+    ),
+    "robotcar": RobotCarTwin(
+        RobotCarTwinOptions(
+            num_locations=2,
+            stops_per_location=3,
+            moments_per_condition=2,
+            size_px=96,
+            supersampling=1,
+            points_per_image=40,
+        )
+    ),
+    "4seasons": FourSeasonsTwin(
+        FourSeasonsTwinOptions(
+            num_places=2,
+            map_keyframes=6,
+            winter_keyframes=3,
+            dusk_keyframes=2,
+            width=200,
+            height=100,
+            supersampling=1,
+        )
+    ),
+    "inloc": InLocTwin(
+        InLocTwinOptions(
+            modules=1,
+            queries=5,
+            cutout_width=64,
+            cutout_height=48,
+            query_width=96,
+            query_height=72,
+            supersampling=1,
+        )
+    ),
+}
+
+
+@pytest.fixture(scope="session")
+def small() -> dict[str, SyntheticDataset[Any]]:
+    """What :func:`rendered` renders, by layout."""
+    return SMALL
+
+
+@pytest.fixture(scope="session")
+def rendered(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """Folder of the small dataset in a layout; not to be written into."""
+
+    @cache
+    def render(name: str) -> Path:
+        root = tmp_path_factory.mktemp(name) / "root"
+        SMALL[name].write(root)
+        return root
+
+    return render

@@ -1,0 +1,213 @@
+"""Aachen Day-Night's twin: its layout, truth and import, looked at with kapture and COLMAP."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import kapture
+import numpy as np
+import pytest
+from kapture.io.csv import kapture_from_dir
+from kapture.io.features import get_keypoints_fullpath, image_keypoints_from_file
+from megloc_twins.aachen import (
+    AachenFrames,
+    AachenTwin,
+    AachenTwinOptions,
+    build_aachen_frames,
+)
+
+from megloc_kapture.datasets.aachen.adapter import Aachen, AachenOptions
+from megloc_kapture.datasets.official import write_official
+from megloc_kapture.io.kapture import KaptureFolder
+
+import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
+
+TINY = {"num_places": 1, "day_queries": 1, "night_queries": 1, "additional_night_queries": 1}
+NUM_DATABASE, NUM_SEQUENCE = 42, 6
+
+
+@pytest.fixture(scope="module")
+def root(rendered: Callable[[str], Path]) -> Path:
+    return rendered("aachen")
+
+
+@pytest.fixture(scope="module")
+def options(small: dict[str, AachenTwin]) -> AachenTwinOptions:
+    return small["aachen"].options
+
+
+@pytest.fixture(scope="module", params=["1.0", "1.1"])
+def imported(
+    request: pytest.FixtureRequest, root: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """What the adapter makes of it, with the reference model."""
+    out = tmp_path_factory.mktemp("imported") / request.param
+    options = AachenOptions(version=request.param, reference_model=True)
+    dataset = Aachen(options).read(root)
+    assert dataset.missing is not None
+    assert dataset.missing.files == []
+    write_official(dataset, out)
+    return out
+
+
+def cameras_by_image(folder: Path) -> dict[str, list[str]]:
+    data = kapture_from_dir(str(folder))
+    return {
+        image: data.sensors[sensor].sensor_params
+        for _, sensor, image in kapture.flatten(data.records_camera)
+    }
+
+
+def listed(path: Path) -> list[list[str]]:
+    return [line.split() for line in path.read_text().split("\n")]
+
+
+def test_the_official_frame_is_far_from_the_origin(root: Path) -> None:
+    poses = KaptureFolder(root / "ground_truth/mapping").read().poses().values()
+    assert min(np.linalg.norm(pose.center()) for pose in poses) > 500
+    cameras = cameras_by_image(root / "ground_truth/mapping").values()
+    assert any(int(params[1]) < int(params[2]) for params in cameras)  # portraits
+
+
+def test_versions(imported: Path) -> None:
+    mapping, query = cameras_by_image(imported / "mapping"), cameras_by_image(imported / "query")
+    sensors = kapture_from_dir(str(imported / "mapping")).sensors
+    num_added = sum(name.startswith("query/night/nexus5x_additional_night/") for name in query)
+    if imported.name == "1.0":
+        assert all(name.startswith("db/") for name in mapping)
+        assert len(mapping) == len(sensors) == NUM_DATABASE
+        assert (len(query), num_added) == (6, 0)
+    else:
+        in_sequences = sum(name.startswith("sequences/") for name in mapping)
+        assert in_sequences == NUM_SEQUENCE
+        # each sequence has one camera
+        assert len(sensors) == NUM_DATABASE + 2
+        assert (len(query), num_added) == (8, 2)
+
+
+def test_points_reproject_in_colmaps_cameras(imported: Path) -> None:
+    folder = str(imported / "reference")
+    data = kapture_from_dir(folder)
+    points = data.points3d.as_array()[:, :3]
+    records: dict[str, tuple[int, str]] = {
+        image: (timestamp, sensor)
+        for timestamp, sensor, image in kapture.flatten(data.records_camera)
+    }
+    keypoints = {
+        image: image_keypoints_from_file(
+            get_keypoints_fullpath("sift", folder, image), np.float32, 2
+        )
+        for image in records
+    }
+    counts: dict[str, int] = dict.fromkeys(records, 0)
+    worst = 0.0
+    for point_id in range(len(points)):
+        track = data.observations[point_id, "sift"]
+        assert len(track) >= 2
+        for image, keypoint_id in track:
+            timestamp, sensor = records[image]
+            model, width, height, *params = data.sensors[sensor].sensor_params
+            camera = pycolmap.Camera(
+                model=model, width=int(width), height=int(height), params=[*map(float, params)]
+            )
+            pose = data.trajectories[timestamp, sensor]
+            in_camera = pose.transform_points(points[point_id : point_id + 1])[0]
+            px = camera.img_from_cam(np.asarray(in_camera))
+            worst = max(worst, float(np.abs(px - keypoints[image][keypoint_id]).max()))
+            counts[image] += 1
+    assert 0 < worst < 1e-3
+    assert len(points) > 200
+    assert min(counts.values()) > 5
+
+
+def test_colmap_reads_the_added_model(root: Path) -> None:
+    model = pycolmap.Reconstruction(str(root / "3D-models/aachen_v_1_1"))
+    assert model.num_reg_images() == NUM_DATABASE + NUM_SEQUENCE
+    assert len(model.cameras) == NUM_DATABASE + 2
+    model.update_point_3d_errors()
+    assert 0 < model.compute_mean_reprojection_error() < 1e-3
+    ids = {image.name: image_id for image_id, image in model.images.items()}
+    assert sorted(ids, key=lambda name: ids[name]) != sorted(ids)
+
+
+def test_quirks_of_the_layout(root: Path) -> None:
+    models, queries = root / "3D-models", root / "queries"
+    rows = [line.split() for line in (models / "aachen_cvpr2018_db.nvm").read_text().split("\n")]
+    rows = [row for row in rows if row and row[0].startswith("db/")]
+    names = [row[0] for row in rows]
+    # numbered without order, the model's order is its own, and so is that of the intrinsics
+    numbers = [int(name[3:-4]) for name in names]
+    assert numbers != sorted(numbers)
+    assert max(numbers) > len(numbers)
+    assert (models / "aachen_cvpr2018_db.list.txt").read_text().split() == names
+    intrinsics = listed(models / "database_intrinsics.txt")
+    assert {row[0] for row in intrinsics if row} == set(names)
+    assert [row[0] for row in intrinsics if row] != names
+    # the NVM's distortion has the other sign
+    k = {row[0]: float(row[-1]) for row in intrinsics if row}
+    assert [float(row[-2]) for row in rows] == [-k[name] for name in names]
+    assert any(value != 0 for value in k.values())
+
+    day, night = (
+        listed(queries / f"{when}_time_queries_with_intrinsics.txt") for when in ("day", "night")
+    )
+    assert (len(day), len(night)) == (4, 4)  # no line end, so no empty line, at the end
+    assert {len(row) for row in day + night} == {8}
+    assert {row[1] for row in day} == {"SIMPLE_RADIAL"}
+    assert len({tuple(row[2:]) for row in day + night}) == 8  # a camera each
+    # the list without intrinsics has line ends
+    text = (queries / "day_time_queries_without_intrinsics.txt").read_text()
+    assert text == "".join(f"{row[0]}\n" for row in day)
+    on_disk = {
+        str(path.relative_to(root / "images_upright"))
+        for path in (root / "images_upright/query").rglob("*.jpg")
+    }
+    in_lists = {row[0] for row in day + night}
+    assert in_lists < on_disk
+    assert len(on_disk - in_lists) == 2
+    assert len({name.split("/")[-1] for name in on_disk}) == len(on_disk)
+    assert sum("additional" in row[0] for row in night) == 2
+
+
+def test_version_10_alone(options: AachenTwinOptions, tmp_path: Path) -> None:
+    AachenTwin(options.model_copy(update=TINY | {"version": "1.0"})).write(tmp_path)
+    assert sorted(path.name for path in (tmp_path / "3D-models").iterdir()) == [
+        "aachen_cvpr2018_db.list.txt",
+        "aachen_cvpr2018_db.nvm",
+        "database_intrinsics.txt",
+    ]
+    assert not (tmp_path / "images_upright/sequences").exists()
+    dataset = Aachen().read(tmp_path)
+    assert len(dataset.mapping.records_camera) == 21
+    assert len(dataset.query.records_camera) == 2
+    assert dataset.remarks == []
+
+
+@pytest.fixture(scope="module")
+def frames(options: AachenTwinOptions) -> AachenFrames:
+    return build_aachen_frames(options)
+
+
+def test_every_image_is_there_once(frames: AachenFrames) -> None:
+    everything = [*frames.mapping(), *frames.queries(), *frames.unlisted]
+    assert len({frame.name for frame in everything}) == len(everything)
+    assert not any(frame.bonnet for frame in everything)
+    assert {frame.condition for frame in frames.day} == {"day"}
+    assert {frame.condition for frame in frames.night + frames.additional_night} == {"night"}
+    assert (
+        {frame.place for frame in frames.day} == {frame.place for frame in frames.night} == {0, 1}
+    )
+    # the digits the published lists have
+    assert all(float(f"{p:.6g}") == p for frame in frames.day for p in frame.camera.params)
+
+
+def test_another_seed_is_another_world(options: AachenTwinOptions) -> None:
+    tiny = options.model_copy(update=TINY)
+    one, other = (build_aachen_frames(tiny.model_copy(update={"seed": seed})) for seed in (0, 1))
+    assert [frame.name for frame in other.database] != [frame.name for frame in one.database]
+    assert other.day[0].cam_from_world != one.day[0].cam_from_world
+
+
+def test_a_version_may_be_a_number() -> None:
+    assert AachenTwinOptions(version=1.0).version == "1.0"  # type: ignore[arg-type]

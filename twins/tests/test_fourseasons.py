@@ -1,0 +1,298 @@
+"""4Seasons' twin: its import is its truth, checked by kapture's objects and COLMAP's cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from megloc_twins.fourseasons import (
+    DUSK,
+    REFERENCE,
+    WINTER,
+    FourSeasonsTwinOptions,
+)
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from megloc_kapture.datasets.formats.fourseasons_files import (
+    Keyframe,
+    read_gnss_poses,
+    read_keyframe,
+    read_times,
+    read_transformations,
+)
+from megloc_kapture.datasets.fourseasons.adapter import FourSeasons, FourSeasonsOptions
+from megloc_kapture.datasets.fourseasons.poses import earth_from_enu, geodetic
+from megloc_kapture.datasets.official import OfficialDataset, write_official
+from megloc_kapture.io.images import read_depth_map, read_image_rgb
+from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.values import RigidTransform
+
+
+@pytest.fixture(scope="module")
+def root(rendered: Callable[[str], Path]) -> Path:
+    return rendered("4seasons")
+
+
+@pytest.fixture(scope="module")
+def dataset(root: Path) -> OfficialDataset:
+    return FourSeasons(FourSeasonsOptions(depth=True)).read(root)
+
+
+@pytest.fixture(scope="module")
+def workspace(dataset: OfficialDataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    output = tmp_path_factory.mktemp("4seasons") / "workspace"
+    write_official(dataset, output)
+    return output
+
+
+def true_poses(root: Path, part: str) -> dict[str, RigidTransform]:
+    return KaptureFolder(root / "ground_truth" / part).read().poses()
+
+
+def assert_same(found: RigidTransform, expected: RigidTransform) -> None:
+    """To 1e-6 m and 1e-6 deg, by scipy."""
+    rotations = [Rotation.from_quat(p.quat_wxyz, scalar_first=True) for p in (found, expected)]
+    turn_deg = np.degrees((rotations[0] * rotations[1].inv()).magnitude())
+    assert turn_deg < 1e-6
+    centers = [
+        -rotation.inv().apply(pose.translation)
+        for rotation, pose in zip(rotations, (found, expected), strict=True)
+    ]
+    assert np.linalg.norm(centers[0] - centers[1]) < 1e-6
+
+
+def test_the_map_is_recentred(root: Path, dataset: OfficialDataset) -> None:
+    assert all(np.linalg.norm(pose.center()) < 100 for pose in dataset.mapping.poses().values())
+    for pose in true_poses(root, "mapping").values():
+        assert np.linalg.norm(pose.center()) == pytest.approx(6.37e6, rel=1e-2)
+
+
+def test_without_the_truth_beside_it(root: Path, tmp_path: Path) -> None:
+    """What is published makes no use of it."""
+    for entry in root.iterdir():
+        if entry.name != "ground_truth":
+            (tmp_path / entry.name).symlink_to(entry)
+    dataset = FourSeasons().read(tmp_path)
+    truth = true_poses(root, "query")
+    assert dataset.query_gt is not None
+    poses = dataset.query_gt.poses()
+    assert set(poses) == {image for image in truth if image.startswith(WINTER)}
+    assert len(poses) == 12
+    for image, pose in poses.items():
+        assert_same(dataset.world.pose_in_official(pose), truth[image])
+
+
+def test_what_it_asks_for(dataset: OfficialDataset) -> None:
+    assert dataset.missing is not None
+    assert not dataset.missing.files
+    assert not dataset.remarks
+    assert dataset.protocol.pose_file == "mlad"
+    assert dataset.protocol.conditions == (WINTER, DUSK)
+    assert len(dataset.relocalization) == 10
+    assert {pair.file for pair in dataset.relocalization} == {
+        f"relocalizationFile_{REFERENCE}_to_{query}.txt" for query in (WINTER, DUSK)
+    }
+    scored = [i for i in dataset.query.image_names() if dataset.groups[i].scored]
+    assert scored == sorted(pair.query for pair in dataset.relocalization)
+    assert set(dataset.priors) == set(dataset.query.image_names())
+    assert {dataset.groups[i].condition for i in dataset.query.image_names()} == {WINTER, DUSK}
+
+
+def test_references_are_near(root: Path, dataset: OfficialDataset) -> None:
+    mapping, query = (true_poses(root, part) for part in ("mapping", "query"))
+    for pair in dataset.relocalization:
+        distance = np.linalg.norm(mapping[pair.reference].center() - query[pair.query].center())
+        assert distance < 4
+
+
+def test_the_layouts_quirks(root: Path) -> None:
+    for name in (REFERENCE, WINTER, DUSK):
+        folder = root / name
+        times = read_times(folder / "times.txt")
+        assert times == sorted(times)
+        on_disk = {int(p.stem) for p in (folder / "undistorted_images/cam0").iterdir()}
+        assert on_disk < set(times)  # frames without images
+        if name == DUSK:
+            assert sorted(p.name for p in folder.iterdir()) == ["times.txt", "undistorted_images"]
+            continue
+        keyframes = set(read_gnss_poses(folder / "GNSSPoses.txt"))
+        assert keyframes < on_disk  # and images that are of no keyframe
+        header, row, *_ = (folder / "GNSSPoses.txt").read_text().splitlines()
+        assert (header.count(","), row.count(",")) == (10, 9)
+        blank = "\n\n" in (folder / "Transformations.txt").read_text()
+        assert blank == (name == REFERENCE)
+        assert (folder / "septentrio.nmea").read_text().startswith(",D*1C\n$GPRMC,")
+    image = read_image_rgb(next((root / REFERENCE / "undistorted_images/cam0").iterdir()))
+    assert image.shape == (100, 200, 3)
+    assert (image == image[..., :1]).all()  # grey
+
+
+def test_frames_between_the_recordings(root: Path) -> None:
+    """Each has its own scale, worlds and scene; the odometry moves as the poses do."""
+    moments = [
+        read_transformations(root / name / "Transformations.txt") for name in (REFERENCE, WINTER)
+    ]
+    scales = [found.gnss_scale for found in moments]
+    assert all(scale is not None and 0.96 <= scale <= 0.97 for scale in scales)
+    assert scales[0] != scales[1]
+    assert moments[0].w_from_gpsw != moments[1].w_from_gpsw
+    positions = [np.array(found.e_from_gpsw.translation) for found in moments]
+    assert 10 < np.linalg.norm(positions[0] - positions[1]) < 1000
+    latitude, longitude, _ = geodetic(positions[0])
+    assert (latitude, longitude) == pytest.approx((48.2, 11.6), abs=0.1)
+    for name in (REFERENCE, WINTER):
+        rows = read_gnss_poses(root / name / "GNSSPoses.txt")
+        odometry = {k.timestamp: k.world_from_cam for k in keyframes_of(root, name)}
+        assert set(odometry) == set(rows)
+        times = sorted(rows)
+        for first, second in zip(times[:-1], times[1:], strict=True):
+            a, b = (rows[time].slam_from_cam for time in (first, second))
+            gnss, vio = a.inverse() @ b, odometry[first].inverse() @ odometry[second]
+            np.testing.assert_allclose(gnss.translation, vio.translation, atol=1e-9)
+
+
+def test_result_txt_is_of_the_unrectified_camera_in_the_level_world(root: Path) -> None:
+    folder = root / REFERENCE
+    results = np.loadtxt(folder / "result.txt")
+    times = np.array(read_times(folder / "times.txt"))
+    assert len(results) == len(times)
+    level = read_transformations(folder / "Transformations.txt").s_from_as
+    turns = []
+    for keyframe in keyframes_of(root, REFERENCE):
+        row = results[np.abs(results[:, 0] - keyframe.timestamp / 1e9).argmin()]
+        pose = level @ keyframe.world_from_cam
+        np.testing.assert_allclose(row[1:4], pose.translation, atol=1e-9)
+        turn = Rotation.from_quat(pose.quat_wxyz, scalar_first=True).inv()
+        turns.append((turn * Rotation.from_quat(row[4:])).as_rotvec(degrees=True))
+    np.testing.assert_allclose(turns, np.tile([0, 2.2, 0], (len(turns), 1)), atol=1e-6)
+
+
+def test_fixes_of_the_receiver_are_where_the_car_is(root: Path) -> None:
+    import kapture
+    from kapture.converter.nmea.import_nmea import extract_gnss_from_nmea
+
+    truth = true_poses(root, "mapping")
+    centers = [truth[name].center() for name in sorted(truth) if "/cam0/" in name]
+    _, records = extract_gnss_from_nmea(str(root / REFERENCE / "septentrio.nmea"), "GNSS")
+    fixes = [fix for _, _, fix in kapture.flatten(records, is_sorted=True)]
+    assert len(fixes) == len(centers)
+    for fix, center in zip(fixes, centers, strict=True):
+        there = earth_from_enu(fix.y, fix.x, fix.z).translation
+        assert np.linalg.norm(np.array(there) - center) < 1e-2
+
+
+def test_kaptures_importer_has_the_same_poses(
+    root: Path, dataset: OfficialDataset, tmp_path: Path
+) -> None:
+    import kapture
+    from kapture.io.csv import kapture_from_dir
+    from kapture.io.records import TransferAction
+    from tools.kapture_import_4seasons import import_4seasons_sequence
+
+    import_4seasons_sequence(
+        str(root / "calibration"),
+        str(root / REFERENCE),
+        str(tmp_path / "theirs"),
+        TransferAction.skip,
+        True,
+    )
+    theirs = kapture_from_dir(str(tmp_path / "theirs"))
+    assert len(theirs.trajectories) == len(dataset.mapping.trajectories)
+    rig = theirs.rigs["car", "cam1"]
+    for (timestamp, car), pose in dataset.mapping.trajectories.items():
+        other = theirs.trajectories[timestamp, car]
+        assert_same(
+            dataset.world.pose_in_official(pose),
+            RigidTransform(tuple(other.r_raw / np.linalg.norm(other.r_raw)), tuple(other.t_raw)),
+        )
+        right = kapture.PoseTransform.compose([rig, other])
+        image = dataset.mapping.records_camera[timestamp, "cam1"]
+        ours = dataset.mapping.cam_from_world(image)
+        assert ours is not None
+        center = dataset.world.pose_in_official(ours).center()
+        np.testing.assert_allclose(center, right.inverse().t_raw, atol=1e-6)
+
+
+@pytest.mark.parametrize("place", [(48.2, 11.6, 540.0), (-33.9, 151.2, 12.0), (0.0, -180.0, -30.0)])
+def test_geodesy(place: tuple[float, float, float]) -> None:
+    found = geodetic(np.array(earth_from_enu(*place).translation))
+    np.testing.assert_allclose(np.abs(found), np.abs(place), atol=1e-8)
+    # WGS 84 at the equator and the pole
+    np.testing.assert_allclose(earth_from_enu(0, 0, 0).translation, (6378137, 0, 0), atol=1e-6)
+    np.testing.assert_allclose(earth_from_enu(90, 0, 0).translation[2], 6356752.314245, atol=1e-5)
+    enu = earth_from_enu(*place).rotation_matrix()
+    np.testing.assert_allclose(enu.T @ enu, np.eye(3), atol=1e-12)
+    higher = earth_from_enu(place[0], place[1], place[2] + 1).translation
+    step = np.array(higher) - earth_from_enu(*place).translation
+    np.testing.assert_allclose(enu[:, 2], step, atol=1e-8)
+
+
+def keyframes_of(root: Path, recording: str) -> list[Keyframe]:
+    return [read_keyframe(f) for f in sorted((root / recording / "KeyFrameData").iterdir())]
+
+
+def test_point_clouds_reproject(root: Path, workspace: Path) -> None:
+    """A point of one keyframe's cloud falls on its own pixel in another keyframe's cloud.
+
+    Lifted and moved by kapture's poses as imported, projected by COLMAP's cameras.
+    """
+    import pycolmap
+    from kapture.io.csv import kapture_from_dir
+
+    theirs = kapture_from_dir(str(workspace / "mapping"))
+    model, width, height, *params = theirs.sensors["cam0"].sensor_params
+    camera = pycolmap.Camera(
+        model=model, width=int(width), height=int(height), params=list(map(float, params))
+    )
+    rows = read_gnss_poses(root / REFERENCE / "GNSSPoses.txt")
+    clouds: dict[int, NDArray[np.float64]] = {}
+    for keyframe in keyframes_of(root, REFERENCE):
+        scale = rows[keyframe.timestamp].scale
+        assert scale is not None
+        depth = scale / keyframe.points[:, 2]
+        rays = camera.cam_from_img(keyframe.points[:, :2])
+        rays = np.column_stack([rays[:, :2], np.ones(len(rays))])
+        in_cam = rays * depth[:, None]
+        pose = theirs.trajectories[keyframe.timestamp, "car"]
+        clouds[keyframe.timestamp] = pose.inverse().transform_points(in_cam)
+    found = 0
+    pixels = {k.timestamp: k.points[:, :2] for k in keyframes_of(root, REFERENCE)}
+    for first in clouds:
+        for second in clouds:
+            if first == second or not len(clouds[first]) or not len(clouds[second]):
+                continue
+            apart = np.linalg.norm(clouds[first][:, None] - clouds[second][None], axis=2)
+            a, b = np.nonzero(apart < 1e-4)
+            found += len(a)
+            pose = theirs.trajectories[second, "car"]
+            projected = camera.img_from_cam(pose.transform_points(clouds[first][a]))
+            assert np.abs(projected - pixels[second][b]).max(initial=0) < 1e-3
+    assert found > 100
+
+
+def test_depth_maps_are_metric(root: Path, workspace: Path, dataset: OfficialDataset) -> None:
+    mapping = KaptureFolder(workspace / "mapping").read()
+    assert len(mapping.records_depth) == 12
+    rows = read_gnss_poses(root / REFERENCE / "GNSSPoses.txt")
+    points = 0
+    for keyframe in keyframes_of(root, REFERENCE):
+        name = mapping.records_depth[keyframe.timestamp, "depth"]
+        path = workspace / "mapping/sensors/records_data" / name
+        depth = read_depth_map(path, width=200, height=100)
+        scale = rows[keyframe.timestamp].scale
+        assert scale is not None
+        for u, v, inverse in keyframe.points:
+            assert depth[int(v), int(u)] <= np.float32(scale / inverse)
+            points += depth[int(v), int(u)] == np.float32(scale / inverse)
+        assert (depth > 0).sum() <= len(keyframe.points)
+    assert points > 200
+
+
+def test_the_default_is_large_enough() -> None:
+    options = FourSeasonsTwinOptions()
+    assert 2 * options.num_places * options.map_keyframes >= 80
+    assert options.num_places * (options.winter_keyframes + options.dusk_keyframes) >= 40
+    assert (options.width, options.height) == (800, 400)

@@ -1,0 +1,324 @@
+"""The twin of InLoc: its layout, its import, and floors whose rooms are alike."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from itertools import permutations
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+from megloc_twins.indoor_floors import (
+    PITCHES_DEG,
+    YAWS_DEG,
+    Floor,
+    FloorBuilder,
+    QueryView,
+    cam_from_scan,
+    cutout_camera,
+    lamp_lighting,
+    phone_camera,
+    query_views,
+)
+from megloc_twins.indoor_rooms import ROOM_KINDS, Parts, Recipes, build_module, build_room
+from megloc_twins.inloc import InLocTwinOptions, scanned_points
+from megloc_twins.rasterization import NO_SURFACE, depth_map, sample_grid, visible_surfaces
+
+from megloc_kapture.datasets.inloc.adapter import InLoc, InLocOptions
+from megloc_kapture.datasets.official import write_official
+from megloc_kapture.io.dataset_tables import read_groups
+from megloc_kapture.io.images import read_depth_map, read_image_rgb
+from megloc_kapture.io.kapture import KaptureFolder
+
+
+@pytest.fixture(scope="module")
+def root(rendered: Callable[[str], Path]) -> Path:
+    return rendered("inloc")
+
+
+@pytest.fixture(scope="module")
+def imported(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    output = tmp_path_factory.mktemp("imported")
+    write_official(InLoc().read(root), output)
+    return output
+
+
+def test_the_layout_is_the_official_one(root: Path) -> None:
+    names = {path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file()}
+    for floor in ("DUC1", "DUC2"):
+        for scan in ("000", "001", "002"):
+            assert f"database/alignments/{floor}/transformations/DUC_trans_{scan}.txt" in names
+            for yaw in range(0, 360, 30):
+                for pitch in (-30, 0, 30):
+                    cutout = f"database/cutouts/{floor}/{scan}/DUC_cutout_{scan}_{yaw}_{pitch}.jpg"
+                    assert {cutout, f"{cutout}.mat"} <= names
+    assert Counter(name.split("/")[0] for name in names) == {
+        "database": 6 * (72 + 1),
+        "query": 5,
+        "ground_truth": 7,
+    }
+    assert {f"query/iphone7/IMG_080{n}.JPG" for n in range(1, 6)} <= names
+
+
+def test_matlab_files_as_published(root: Path) -> None:
+    path = root / "database/cutouts/DUC1/001/DUC_cutout_001_60_0.jpg"
+    content = scipy.io.loadmat(f"{path}.mat")
+    assert content["XYZcut"].dtype == np.float64
+    assert content["XYZcut"].shape == content["RGBcut"].shape == (48, 64, 3)
+    assert content["RGBcut"].dtype == np.uint8
+    off = np.abs(content["RGBcut"].astype(int) - read_image_rgb(path))
+    assert off.mean() < 6  # as JPEG has it
+
+
+def test_scanned_points_are_seen_in_their_pixels(root: Path, imported: Path) -> None:
+    """From the file to the pixel by MATLAB's rules, scipy, numpy, kapture and COLMAP alone."""
+    import kapture
+    import pycolmap
+    from kapture.io.csv import kapture_from_dir
+
+    theirs = kapture_from_dir(str(imported / "mapping"))
+    poses = kapture.rigs_remove(theirs.trajectories, theirs.rigs)
+    depths = {t: name for t, _, name in kapture.flatten(theirs.records_depth)}
+    columns, rows = np.meshgrid(np.arange(64) + 0.5, np.arange(48) + 0.5)
+    missing = []
+    for timestamp, sensor, name in list(kapture.flatten(theirs.records_camera))[::5]:
+        points = scipy.io.loadmat(root / f"{name}.mat")["XYZcut"]
+        _, _, floor, scan, _ = name.split("/")
+        lines = (
+            (root / f"database/alignments/{floor}/transformations/DUC_trans_{scan}.txt")
+            .read_text()
+            .splitlines()
+        )
+        matrix = np.array([line.split() for line in lines[7:11]], np.float64)
+        seen = np.isfinite(points).all(axis=2)
+        missing.append(1 - seen.mean())
+        in_floor = points[seen] @ matrix[:3, :3].T + matrix[:3, 3]
+        in_camera = poses[timestamp, sensor].transform_points(in_floor)
+        model, width, height, *params = theirs.sensors[sensor].sensor_params
+        camera = pycolmap.Camera(
+            model=model, width=int(width), height=int(height), params=list(map(float, params))
+        )
+        pixels = camera.img_from_cam(in_camera)
+        np.testing.assert_allclose(pixels, np.column_stack([columns[seen], rows[seen]]), atol=1e-3)
+        path = imported / "mapping" / "sensors" / "records_data" / depths[timestamp]
+        depth = read_depth_map(path, width=64, height=48)
+        np.testing.assert_allclose(depth[seen], in_camera[:, 2], rtol=1e-6)
+        assert (depth[~seen] == 0).all()
+    assert 0.02 < np.mean(missing) < 0.3
+
+
+def test_the_matrix_before_refinement_is_another(root: Path) -> None:
+    for path in root.glob("database/alignments/*/transformations/*.txt"):
+        lines = path.read_text().splitlines()
+        before, after = (
+            np.array([line.split() for line in lines[first : first + 4]], float) for first in (1, 7)
+        )
+        assert 0.005 < np.linalg.norm(before[:3, 3] - after[:3, 3]) < 0.5
+
+
+def test_conditions_come_from_the_truth(root: Path, imported: Path) -> None:
+    groups = read_groups(imported / "megloc")
+    queries = {name: group for name, group in groups.items() if name.startswith("query/")}
+    assert Counter(group.condition for group in queries.values()) == {"DUC1": 2, "DUC2": 3}
+    assert {group.frame for group in queries.values()} == {""}
+    dataset = InLoc(InLocOptions(depth=False)).read(root)
+    assert any("queries taken on DUC1" in str(count) for count in dataset.summary)
+    KaptureFolder(imported / "mapping").validate(deep=True)
+    KaptureFolder(imported / "query").validate(deep=True)
+
+
+def test_the_default_twin_is_real_work() -> None:
+    options = InLocTwinOptions()
+    zones = [zone for floor in options.builder().floors(0, 2) for zone in floor.zones]
+    assert len(zones) * 36 >= 80
+    assert options.queries >= 40
+    kinds = Counter(zone.kind for zone in zones)
+    assert all(count >= 4 for count in kinds.values())  # each kind two times on each floor
+
+
+BUILDER = FloorBuilder(2)
+
+
+@pytest.fixture(scope="module")
+def floors() -> list[Floor]:
+    return BUILDER.floors(0, 2)
+
+
+@pytest.fixture(scope="module")
+def views(floors: list[Floor]) -> list[QueryView]:
+    return query_views(floors, 0, 24, (640, 480))
+
+
+def areas(parts: Parts, recipes: Recipes) -> Counter[tuple[object, ...]]:
+    """Area in square metres of each surface, by what and where it is."""
+    surfaces, _ = parts.surfaces()
+    sizes = np.linalg.norm(np.cross(surfaces.edge_u, surfaces.edge_v), axis=1)
+    found: Counter[tuple[object, ...]] = Counter()
+    for index, size in enumerate(sizes):
+        shape = np.concatenate(
+            [
+                part[index].round(6)
+                for part in (surfaces.origin, surfaces.edge_u, surfaces.edge_v, surfaces.uv)
+            ]
+        )
+        found[recipes.items[surfaces.texture[index]], *shape] += float(size)
+    return found
+
+
+@pytest.mark.parametrize("kind", [*ROOM_KINDS, "corridor"])
+def test_rooms_of_a_kind_differ_in_at_most_a_tenth_of_their_surface(kind: str) -> None:
+    def built(owner: str) -> Counter[tuple[object, ...]]:
+        recipes = Recipes(0)
+        is_room = kind != "corridor"
+        parts = build_room(recipes, kind, owner) if is_room else build_module(recipes, owner)
+        return areas(parts, recipes)
+
+    rooms = [built(f"floor{floor}/{kind}{number}") for floor in (0, 1) for number in (0, 1)]
+    for room, other in permutations(rooms, 2):
+        differs = sum((room - other).values()) / sum(room.values())
+        assert 0.05 < differs <= 0.1
+    assert built("floor0/x") == built("floor0/x")
+
+
+def test_floors_are_alike_and_their_own_surfaces_few(floors: list[Floor]) -> None:
+    first, second = floors
+    for floor in floors:
+        surfaces = floor.place.surfaces
+        sizes = np.linalg.norm(np.cross(surfaces.edge_u, surfaces.edge_v), axis=1)
+        assert 0.05 < sizes[floor.own].sum() / sizes.sum() <= 0.1
+        assert 0 < sizes[floor.glass].sum() / sizes.sum() < 0.1
+        assert not (floor.own & floor.glass).any()
+    np.testing.assert_array_equal(first.own, second.own)
+    np.testing.assert_allclose(first.place.surfaces.origin, second.place.surfaces.origin)
+    recipes = [[floor.place.recipes[t] for t in floor.place.surfaces.texture] for floor in floors]
+    same = np.array([a == b for a, b in zip(*recipes, strict=True)])
+    assert same[~first.own].all()
+    sizes = np.linalg.norm(
+        np.cross(first.place.surfaces.edge_u, first.place.surfaces.edge_v), axis=1
+    )
+    # what is own and yet the same are edges of posters
+    assert sizes[first.own & ~same].sum() > 0.8 * sizes[first.own].sum()
+
+
+def test_floors_have_frames_of_their_own_that_overlap(floors: list[Floor]) -> None:
+    corners = [floor.place.surfaces_in_world().corners().reshape(-1, 3) for floor in floors]
+    low, high = (
+        [getattr(np, name)(points, axis=0) for points in corners] for name in ("min", "max")
+    )
+    assert (np.maximum(*low) < np.minimum(*high)).all()
+    between = floors[0].place.place_from_world.inverse() @ floors[1].place.place_from_world
+    assert np.linalg.norm(between.translation) > 1
+    angle = np.degrees(2 * np.arccos(min(1.0, abs(between.quat_wxyz[0]))))
+    assert angle > 10
+
+
+def test_there_is_something_in_every_direction(floors: list[Floor]) -> None:
+    grid = sample_grid(cutout_camera(40, 30), 1)
+    for floor in floors:
+        assert sorted({zone.kind for zone in floor.zones}) == ["corridor", *ROOM_KINDS]
+        assert len(floor.zones) == 6
+        for zone in floor.zones:
+            for yaw in YAWS_DEG[::3]:
+                for pitch in PITCHES_DEG:
+                    pose = cam_from_scan(yaw, pitch) @ zone.scan_from_place
+                    seen = visible_surfaces(floor.place.surfaces, pose, grid)
+                    assert (seen.surface != NO_SURFACE).mean() > 0.999
+                    assert 0.3 < np.median(depth_map(seen)) < 8
+
+
+def test_scanners_stand_nearly_upright_and_turned_at_random(floors: list[Floor]) -> None:
+    rotations = [z.scan_from_place.rotation_matrix() for floor in floors for z in floor.zones]
+    tilts = [np.degrees(np.arccos(min(1.0, r[2, 2]))) for r in rotations]
+    assert 0.1 < max(tilts) < 5
+    headings = [np.arctan2(r[0, 1], r[0, 0]) for r in rotations]
+    assert np.ptp(headings) > 2
+    centers = np.array([z.scan_from_place.center() for floor in floors for z in floor.zones])
+    assert (np.abs(centers[:, 2] - 1.5) < 0.15).all()
+
+
+def test_what_a_scanner_measures(floors: list[Floor]) -> None:
+    import pycolmap
+
+    floor = floors[0]
+    camera = cutout_camera(100, 75)
+    theirs = pycolmap.Camera(model=camera.model, width=100, height=75, params=list(camera.params))
+    columns, rows = np.meshgrid(np.arange(100) + 0.5, np.arange(75) + 0.5)
+    bright = np.full((75, 100, 3), 128, np.uint8)
+    bright[:10] = 5
+    missing = []
+    for zone in floor.zones:
+        for yaw, pitch in ((0, 0), (120, -30), (240, 30)):
+            own = cam_from_scan(yaw, pitch)
+            pose = own @ zone.scan_from_place
+            rng = np.random.default_rng(0)
+            points = scanned_points(floor, camera, pose, own, bright, rng)
+            seen = visible_surfaces(floor.place.surfaces, pose, sample_grid(camera, 1))
+            known = np.isfinite(points).all(axis=2)
+            assert not known[:10].any()  # too dark
+            assert not known[floor.glass[np.maximum(seen.surface, 0)]].any()
+            in_camera = own.apply(points[known])
+            pixels = np.column_stack([columns[known], rows[known]])
+            np.testing.assert_allclose(theirs.img_from_cam(in_camera), pixels, atol=1e-3)
+            off = in_camera[:, 2] - depth_map(seen)[known]
+            assert np.abs(off).max() < 0.006 and 1e-4 < np.std(off) < 2e-3
+            np.testing.assert_array_equal(points[known], points[known].astype(np.float32))
+            missing.append(1 - known[10:].mean())
+            assert missing[-1] > 0.005  # dropouts
+    assert 0.02 < np.mean(missing) < 0.3
+
+
+def test_cutouts_turn_to_the_right_and_up() -> None:
+    ahead = np.array([[0.0, 0.0, 1.0]])
+    for yaw, pitch, expected in (
+        (0, 0, (-1, 0, 0)),
+        (90, 0, (0, 1, 0)),
+        (0, 30, (-np.cos(np.pi / 6), 0, 0.5)),
+    ):
+        direction = cam_from_scan(yaw, pitch).inverse().apply(ahead)[0]
+        np.testing.assert_allclose(direction, expected, atol=1e-8)  # of a settled pose
+    assert phone_camera(4032, 3024).params[0] == 3136
+    np.testing.assert_allclose(cutout_camera(1600, 1200).params[0], 1385.6406460551, rtol=1e-12)
+
+
+def test_queries_are_held_elsewhere_than_scanners_stand(
+    floors: list[Floor], views: list[QueryView]
+) -> None:
+    assert len(views) == 24
+    assert Counter(view.floor for view in views) == {0: 12, 1: 12}
+    gaps = []
+    for view in views:
+        zones = {zone.name: zone for zone in floors[view.floor].zones}
+        center = view.cam_from_place.center()
+        assert zones[view.zone].plan.is_free(center[0], center[1], 0.5)
+        assert 1.3 < center[2] < 1.8
+        gaps.append(
+            min(np.linalg.norm(z.scan_from_place.center() - center) for z in zones.values())
+        )
+    assert np.median(gaps) > 0.6
+    assert Counter(view.zone for view in views if view.floor == 0) == dict.fromkeys(zones, 2)
+    upright = [view.camera.height > view.camera.width for view in views]
+    assert 0.2 < np.mean(upright) < 0.5
+    assert {view.camera.params[0] for view in views} == {640 * 28 / 36}
+    with_people = [bool(view.people) for view in views]
+    assert 0.2 < np.mean(with_people) < 0.8
+    assert all(person.kind == "person" for view in views for person in view.people)
+
+
+def test_queries_do_not_depend_on_how_many_there_are() -> None:
+    small = FloorBuilder(1)
+    few, more = (query_views(small.floors(0, 2), 0, count, (640, 480)) for count in (2, 4))
+    assert few == [more[0], more[2]]
+    other = query_views(small.floors(1, 2), 1, 2, (640, 480))
+    assert other[0].cam_from_place != few[0].cam_from_place
+
+
+def test_light_varies_between_telephones_not_within_a_scan() -> None:
+    first, second = (lamp_lighting(np.random.default_rng(i), noise=1, noise_seed=0) for i in (0, 1))
+    assert first == second
+    phones = [
+        lamp_lighting(np.random.default_rng(i), noise=1, noise_seed=0, spread=0.2) for i in (0, 1)
+    ]
+    assert phones[0].exposure != phones[1].exposure
+    assert phones[0].white_balance != phones[1].white_balance

@@ -1,0 +1,245 @@
+"""Rendered frames: light, bonnet, moving objects, shadows, depth; and the true masks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from megloc_twins.frames import Frame
+from megloc_twins.options import SyntheticWorldOptions
+from megloc_twins.render import PlaceRenderer, on_bonnet, on_moving_objects, stands_still
+from megloc_twins.robotcar import RobotCarTwinOptions, build_robotcar_moments
+from megloc_twins.shading import add_shadows, cast_shadows
+from megloc_twins.squares import build_place
+from megloc_twins.surfaces import SurfaceBuilder, Surfaces
+from megloc_twins.synthetic_kapture import SyntheticWorld, build_world
+from megloc_twins.viewpoints import overlap
+
+from megloc_kapture.features.rootsift import RootSift
+from megloc_kapture.io.colmap import normalized_from_px, px_from_cam
+from megloc_kapture.preprocessing.masks import with_margin
+
+OPTIONS = SyntheticWorldOptions(num_places=1, stations_per_place=9, day_queries=2, night_queries=2)
+
+
+@pytest.fixture(scope="module")
+def world() -> SyntheticWorld:
+    return build_world(OPTIONS)
+
+
+def new_painter(world: SyntheticWorld) -> PlaceRenderer:
+    return PlaceRenderer(world.places[0], seed=OPTIONS.seed, supersampling=OPTIONS.supersampling)
+
+
+@pytest.fixture(scope="module")
+def painter(world: SyntheticWorld) -> PlaceRenderer:
+    return new_painter(world)
+
+
+def first(world: SyntheticWorld, prefix: str) -> Frame:
+    return next(frame for frame in world.frames() if frame.name.startswith(prefix))
+
+
+def test_drawing_gives_the_same_bytes_whatever_was_drawn_before(
+    world: SyntheticWorld, painter: PlaceRenderer
+) -> None:
+    frames = [first(world, p) for p in ("db/place0/front", "query/day", "query/night")]
+    images = [painter.render(frame).image for frame in frames]
+    fresh = new_painter(world)
+    for frame, image in reversed(list(zip(frames, images, strict=True))):
+        assert image.shape == (480, 640, 3) and image.dtype == np.uint8
+        np.testing.assert_array_equal(fresh.render(frame).image, image)
+
+
+def test_images_are_rich_in_features_by_day_and_poorer_at_night(
+    world: SyntheticWorld, painter: PlaceRenderer
+) -> None:
+    sift = RootSift()
+    strong = {}
+    for prefix in ("db/place0/left", "query/day", "query/night"):
+        image = painter.render(first(world, prefix)).image
+        features = sift.extract(image)
+        assert len(features.scores) > 800
+        strong[prefix] = int((features.scores > 0.02).sum())
+    assert strong["query/night"] < 0.5 * min(strong["db/place0/left"], strong["query/day"])
+
+
+def test_the_same_view_is_darker_and_noisier_at_night(
+    world: SyntheticWorld, painter: PlaceRenderer
+) -> None:
+    night = first(world, "query/night")
+    day = replace(night, lighting=first(world, "query/day").lighting)
+    dark, bright = painter.render(night).image, painter.render(day).image
+    assert dark.mean() < 0.5 * bright.mean()
+    red, _, blue = dark.reshape(-1, 3).mean(0)
+    assert red > 1.15 * blue  # the lamps' colour
+    again = painter.render(replace(night, lighting=replace(night.lighting, noise_seed=1))).image
+    assert np.abs(again.astype(int) - dark).mean() > 2
+
+
+def test_the_bonnet_stays_in_the_image_and_is_masked(
+    world: SyntheticWorld, painter: PlaceRenderer
+) -> None:
+    frames = [s for s in world.mapping if s.sensor_id == "rig_front"][:2]
+    first_view, second_view = (painter.render(frame, depth=True) for frame in frames)
+    hidden = ~first_view.mask
+    assert 0.05 < hidden.mean() < 0.25
+    assert hidden[-1, 320] and not hidden[: 480 // 2].any()
+    np.testing.assert_array_equal(hidden, ~second_view.mask)
+    assert first_view.depth_m is not None and (first_view.depth_m[hidden] == 0).all()
+    open_road = painter.render(replace(frames[0], bonnet=False))
+    assert open_road.mask.all()
+    changed = np.abs(open_road.image.astype(int) - first_view.image).max(2) > 2
+    assert changed[hidden].mean() > 0.8
+    assert changed[~hidden].mean() < 0.05  # what blur carries over the edge
+
+
+def test_moving_objects_hide_what_is_behind_and_nothing_else(
+    world: SyntheticWorld, painter: PlaceRenderer
+) -> None:
+    frame = first(world, "query/day")
+    with_movers = painter.render(frame, depth=True)
+    without = painter.render(replace(frame, moving_objects=()), depth=True)
+    assert with_movers.depth_m is not None and without.depth_m is not None
+    changed = with_movers.depth_m != without.depth_m
+    assert 0.005 < changed.mean() < 0.6
+    in_front = with_movers.depth_m[changed]
+    behind = without.depth_m[changed]
+    assert ((in_front > 0) & ((in_front < behind) | (behind == 0))).all()
+
+
+def test_depth_and_poses_of_two_views_agree(world: SyntheticWorld, painter: PlaceRenderer) -> None:
+    # what one camera sees, carried over by its depth and COLMAP's cameras, is where the other
+    # camera's depth puts it, and has the same colour there
+    query, near = _overlapping(world)
+    a = painter.render(_evenly_lit(query), depth=True)
+    b = painter.render(_evenly_lit(near), depth=True)
+    assert a.depth_m is not None and b.depth_m is not None
+    row, column = (g.ravel() for g in np.mgrid[8:472:4, 8:632:4])
+    z = a.depth_m[row, column].astype(np.float64)
+    row, column, z = row[z > 0], column[z > 0], z[z > 0]
+    pixels = np.stack([column + 0.5, row + 0.5], 1)
+    rays = normalized_from_px(query.camera, pixels)[:, :2]
+    points = np.concatenate([rays * z[:, None], z[:, None]], 1)
+    in_b = near.cam_from_world.apply(query.cam_from_world.inverse().apply(points))
+    ahead = in_b[:, 2] > 0.1
+    there = px_from_cam(near.camera, in_b[ahead])
+    inside = ((there > 1) & (there < (639, 479))).all(1)
+    x, y = np.floor(there[inside]).astype(int).T
+    expected = in_b[ahead][inside, 2]
+    seen = b.depth_m[y, x]
+    same = np.abs(seen - expected) < 0.02 * expected
+    assert same.mean() > 0.5
+    # the nearest pixel's centre is up to 0.7 px off, so that depth differs a little on slopes
+    assert np.median(np.abs(seen - expected)[same] / expected[same]) < 2e-3
+    colour_a = a.image[row, column][ahead][inside][same].astype(float)
+    colour_b = b.image[y, x][same].astype(float)
+    correlation = np.corrcoef(colour_a.ravel(), colour_b.ravel())[0, 1]
+    scrambled = np.corrcoef(colour_a.ravel(), np.roll(colour_b, 977, axis=0).ravel())[0, 1]
+    assert correlation > 0.7 > scrambled + 0.2
+
+
+def _evenly_lit(frame: Frame) -> Frame:
+    lighting = replace(frame.lighting, sun=(0.0, 0.0, 0.0), sky=(0.9, 0.9, 0.9), vignetting=0.0)
+    return replace(frame, lighting=lighting, moving_objects=(), bonnet=False)
+
+
+def _overlapping(world: SyntheticWorld) -> tuple[Frame, Frame]:
+    views = world.coarse_views()
+    query = first(world, "query/day")
+    best = max(world.mapping, key=lambda m: overlap(views[query.name], views[m.name]))
+    return query, best
+
+
+CAR = RobotCarTwinOptions(num_locations=1, moments_per_condition=2, size_px=256)
+SEED = CAR.world().seed
+
+
+@pytest.fixture(scope="module")
+def car_frames() -> list[Frame]:
+    return build_robotcar_moments(CAR).query_frames()
+
+
+@pytest.fixture(scope="module")
+def car_renderer() -> PlaceRenderer:
+    return PlaceRenderer(build_place(CAR.world(), 0), seed=SEED, supersampling=1)
+
+
+def test_only_the_rear_camera_sees_the_car_always_at_the_same_place(
+    car_frames: list[Frame],
+) -> None:
+    rear = [frame for frame in car_frames if frame.sensor_id == "rear"]
+    places = [on_bonnet(frame, SEED) for frame in rear]
+    assert len(rear) == 12 and all((place == places[0]).all() for place in places)
+    assert 0.05 < places[0].mean() < 0.25
+    assert places[0][-1].all() and not places[0][: CAR.size_px // 2].any()
+    assert not any(
+        on_bonnet(frame, SEED).any() for frame in car_frames if frame.sensor_id != "rear"
+    )
+
+
+def test_movers_are_where_the_image_changes_without_them(
+    car_frames: list[Frame], car_renderer: PlaceRenderer
+) -> None:
+    place = build_place(CAR.world(), 0)
+    frame = max(car_frames, key=lambda one: on_moving_objects(one, place).mean())
+    hidden = on_moving_objects(frame, place)
+    assert 0.02 < hidden.mean() < 0.6
+    # without sun: a shadow is no mover
+    frame = replace(frame, lighting=replace(frame.lighting, sun=(0.0, 0.0, 0.0)), bonnet=False)
+    there = car_renderer.render(frame, depth=True).depth_m
+    gone = car_renderer.render(replace(frame, moving_objects=()), depth=True).depth_m
+    assert there is not None and gone is not None
+    assert np.array_equal(there != gone, hidden)
+    assert not on_moving_objects(replace(frame, moving_objects=()), place).any()
+
+
+def test_no_feature_is_left_on_the_bonnet_or_on_a_mover(
+    car_frames: list[Frame], car_renderer: PlaceRenderer
+) -> None:
+    place = build_place(CAR.world(), 0)
+    extractor = RootSift()
+    without = 0
+    for frame in (one for one in car_frames if one.sensor_id == "rear"):
+        image, mask = car_renderer.render(frame).image, stands_still(frame, place, SEED)
+        found = extractor.extract(image, with_margin(mask, 3.0)).keypoints_px
+        column, row = np.floor(found[:, :2]).astype(int).T
+        assert len(found) and mask[row, column].all()
+        column, row = np.floor(extractor.extract(image).keypoints_px[:, :2]).astype(int).T
+        without += int(on_bonnet(frame, SEED)[row, column].sum())
+    assert without > 50  # what there is to be removed
+
+
+SUN = (1 / np.sqrt(2), 0.0, 1 / np.sqrt(2))  # 45 degrees above +x: a metre of height, a metre long
+
+
+def ground_and_box() -> tuple[Surfaces, Surfaces]:
+    ground, box = SurfaceBuilder(), SurfaceBuilder()
+    corner = np.array([-6.0, 6.0, 0.0])
+    ground.add(corner, np.array([12.0, 0, 0]), np.array([0, -12.0, 0]), 0)
+    box.add_box((0.0, 0.0), (1.0, 2.0, 2.0), 0.0, (0, 0, 0, 0), 0)
+    return ground.build(), box.build()
+
+
+def test_a_box_throws_its_shadow_away_from_the_sun() -> None:
+    ground, box = ground_and_box()
+    shadows = cast_shadows(ground.joined(box), SUN)
+    x = np.array([[-4.0, -2.6, -2.4, -1.0, 1.0, 3.0, -1.0, -1.0]], np.float32)
+    y = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.9, 1.1]], np.float32)
+    lit = shadows.lit(x, y, np.zeros_like(x))
+    # the box ends at x = -0.5 and is 2 m high: its shadow ends at x = -2.5
+    np.testing.assert_array_equal(lit[0], [1, 1, 0, 0, 1, 1, 0, 1])
+
+
+def test_a_surface_does_not_shade_itself_and_others_can_be_added() -> None:
+    ground, box = ground_and_box()
+    alone = cast_shadows(ground, SUN)
+    grid = np.meshgrid(np.linspace(-5, 5, 50), np.linspace(-5, 5, 50))
+    x, y = (a.astype(np.float32) for a in grid)
+    assert alone.lit(x, y, np.zeros_like(x)).all()
+    both = add_shadows(alone, box)
+    assert not both.lit(x, y, np.zeros_like(x)).all()
+    assert alone.lit(x, y, np.zeros_like(x)).all()  # unchanged
+    together = cast_shadows(ground.joined(box), SUN).lit(x, y, np.zeros_like(x))
+    assert (both.lit(x, y, np.zeros_like(x)) == together).mean() > 0.99

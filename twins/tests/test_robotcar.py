@@ -1,0 +1,305 @@
+"""RobotCar Seasons' twin: layout, truth and import, by the means of kapture and COLMAP."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import kapture
+import numpy as np
+import pytest
+from kapture.algo.pose_operations import world_pose_transform_distance
+from kapture.io.csv import kapture_from_dir
+from kapture.io.features import (
+    get_keypoints_fullpath,
+    image_keypoints_from_file,
+)
+from megloc_twins.lighting import WEATHERS, road_lighting
+from megloc_twins.robotcar import (
+    OFFICIAL_FROM_WORLD,
+)
+
+from megloc_kapture.datasets.official import write_official
+from megloc_kapture.datasets.robotcar.adapter import RobotCar, RobotCarOptions
+from megloc_kapture.io.dataset_tables import read_groups, read_names
+from megloc_kapture.io.images import image_size, read_image_rgb
+
+import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
+
+MAX_M, MAX_DEG, MAX_PX = 1e-6, 1e-6, 1e-3
+
+
+@pytest.fixture(scope="module")
+def root(rendered: Callable[[str], Path]) -> Path:
+    return rendered("robotcar")
+
+
+@pytest.fixture(scope="module", params=["merged", "individual"])
+def imported(
+    request: pytest.FixtureRequest, root: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    out = tmp_path_factory.mktemp("imported") / "out"
+    options = RobotCarOptions(model=request.param, reference_model=True)
+    write_official(RobotCar(options).read(root), out)
+    return out
+
+
+def poses_by_image(data: kapture.Kapture) -> dict[str, kapture.PoseTransform]:
+    return {
+        name: data.trajectories[timestamp, sensor]
+        for timestamp, sensor, name in kapture.flatten(data.records_camera)
+        if (timestamp, sensor) in data.trajectories
+    }
+
+
+def assert_equal_poses(
+    found: dict[str, kapture.PoseTransform], expected: dict[str, kapture.PoseTransform]
+) -> None:
+    assert found.keys() == expected.keys()
+    for name, pose in found.items():
+        distance_m, angle = world_pose_transform_distance(pose, expected[name])
+        assert distance_m < MAX_M, name
+        # kapture's own angle is an arccos, which cannot resolve a microdegree
+        assert angle < 1e-4
+        relative = (pose.r * expected[name].r.inverse()).components[1:]
+        assert np.degrees(2 * np.linalg.norm(relative)) < MAX_DEG, name
+
+
+def test_import_gives_the_truth(root: Path, imported: Path) -> None:
+    truth = kapture_from_dir(str(root / "ground_truth/mapping"))
+    assert len(poses_by_image(truth)) == 16
+    assert_equal_poses(
+        poses_by_image(kapture_from_dir(str(imported / "mapping"))), poses_by_image(truth)
+    )
+    truth = kapture_from_dir(str(root / "ground_truth/query"))
+    query_gt = kapture_from_dir(str(imported / "query_gt"))
+    assert_equal_poses(poses_by_image(query_gt), poses_by_image(truth))
+    query = kapture_from_dir(str(imported / "query"))
+    assert query.trajectories is None or not query.trajectories
+    names = {name for _, _, name in kapture.flatten(query.records_camera)}
+    assert names == poses_by_image(truth).keys()
+
+
+def test_published_poses_are_the_truth(root: Path, tmp_path: Path) -> None:
+    """Those of version 2's list alone, without what lies beside the data."""
+    (tmp_path / "root").mkdir()
+    for path in root.iterdir():
+        if path.name != "ground_truth":
+            (tmp_path / "root" / path.name).symlink_to(path)
+    write_official(RobotCar().read(tmp_path / "root"), tmp_path / "out")
+    truth = poses_by_image(kapture_from_dir(str(root / "ground_truth/query")))
+    found = poses_by_image(kapture_from_dir(str(tmp_path / "out/query_gt")))
+    assert len(found) == len((root / "robotcar_v2_train.txt").read_text().splitlines())
+    assert_equal_poses(found, {name: truth[name] for name in found})
+
+
+def test_rig_is_consistent(root: Path, imported: Path) -> None:
+    truth = kapture_from_dir(str(root / "ground_truth/query"))
+    rigs = kapture_from_dir(str(imported / "query")).rigs
+    assert rigs is not None and list(rigs) == ["car"]
+    for poses in truth.trajectories.values():
+        cars = [
+            kapture.PoseTransform.compose([rigs["car", camera].inverse(), pose])
+            for camera, pose in poses.items()
+        ]
+        assert len(cars) == 3
+        for car in cars[1:]:
+            assert world_pose_transform_distance(car, cars[0])[0] < MAX_M
+    rear = rigs["car", "rear"].inverse()
+    assert (rear.r * np.quaternion(0, 0, 0, 1) * rear.r.inverse()).z < -0.9  # it looks back
+
+
+def nvm_observations(root: Path) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Image, point, pixel of all.nvm; parsed here, without a reader of ours."""
+    words = (root / "3D-models/all-merged/all.nvm").read_text().split()
+    assert words.pop(0) == "NVM_V3"
+    num_cameras, rest = int(words[0]), words[1:]
+    names = rest[: 11 * num_cameras : 11]
+    rest = rest[11 * num_cameras :]
+    num_points, at = int(rest[0]), 1
+    assert num_points > 100
+    for _ in range(num_points):
+        point = np.array(rest[at : at + 3], float)
+        length = int(rest[at + 6])
+        for k in range(at + 7, at + 7 + 4 * length, 4):
+            yield names[int(rest[k])], point, np.array(rest[k + 2 : k + 4], float)
+        at += 7 + 4 * length
+
+
+def colmap_camera(sensor: kapture.Camera) -> pycolmap.Camera:
+    model, width, height, *params = sensor.sensor_params
+    return pycolmap.Camera(
+        model=model, width=int(width), height=int(height), params=[float(p) for p in params]
+    )
+
+
+def test_points_of_the_model_reproject(root: Path, imported: Path) -> None:
+    mapping = kapture_from_dir(str(imported / "mapping"))
+    records = {n: (t, s) for t, s, n in kapture.flatten(mapping.records_camera)}
+    cameras = {sensor: colmap_camera(mapping.sensors[sensor]) for sensor in mapping.sensors}
+    count = 0
+    for name, point, px in nvm_observations(root):
+        assert name.startswith("./overcast-reference/") and name.endswith(".png")
+        timestamp, sensor = records[name[2:-4] + ".jpg"]
+        in_camera = mapping.trajectories[timestamp, sensor].transform_points(point[None])
+        error = np.linalg.norm(cameras[sensor].img_from_cam(in_camera)[0] - px)
+        assert error < MAX_PX
+        count += 1
+    assert count > 500
+
+
+def test_individual_models_are_colmap_models(root: Path, imported: Path) -> None:
+    mapping = kapture_from_dir(str(imported / "mapping"))
+    poses = poses_by_image(mapping)
+    seen = 0
+    for folder in sorted((root / "3D-models/individual/colmap_reconstructions").iterdir()):
+        model = pycolmap.Reconstruction(str(folder))
+        for image in model.images.values():
+            name = image.name.removesuffix(".png") + ".jpg"
+            camera = colmap_camera(mapping.sensors[name.split("/")[1]])
+            for feature in image.points2D:
+                if feature.has_point3D():
+                    point = model.points3D[feature.point3D_id].xyz
+                    in_camera = poses[name].transform_points(point[None])
+                    error = camera.img_from_cam(in_camera)[0] - feature.xy
+                    assert np.linalg.norm(error) < MAX_PX
+                    seen += 1
+    assert seen > 500
+
+
+def test_reference_model_is_a_kapture_map(imported: Path) -> None:
+    folder = str(imported / "reference")
+    data = kapture_from_dir(folder)
+    poses = poses_by_image(data)
+    sensor_of = {n: s for _, s, n in kapture.flatten(data.records_camera)}
+    cameras = {sensor: colmap_camera(data.sensors[sensor]) for sensor in data.sensors}
+    count = 0
+    keypoints = {
+        name: image_keypoints_from_file(get_keypoints_fullpath("sift", folder, name), np.float32, 2)
+        for name in data.keypoints["sift"]
+    }
+    for point_id in data.observations:
+        point = np.array(data.points3d[point_id, :3])
+        for name, feature in data.observations[point_id, "sift"]:
+            in_camera = poses[name].transform_points(point[None])
+            px = cameras[sensor_of[name]].img_from_cam(in_camera)[0]
+            assert np.linalg.norm(px - keypoints[name][feature]) < MAX_PX
+            count += 1
+    assert count > 500
+
+
+@pytest.fixture(scope="module", params=["v1", "v2"])
+def theirs(
+    request: pytest.FixtureRequest, root: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[str, dict[str, kapture.Kapture]]:
+    """What kapture's own importer makes of the twin: one kapture per location and role."""
+    out = tmp_path_factory.mktemp("kapture") / "out"
+    tool = str(Path(sys.executable).with_name("kapture_import_RobotCar_Seasons"))
+    command = [tool, "-i", str(root), "-o", str(out), "--image_transfer", "skip"]
+    command += ["--skip_reconstruction"] + ["--v1"] * (request.param == "v1")
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    # it writes no folder for a location without queries
+    found = sorted(path for path in out.glob("0*/*") if (path / "sensors").is_dir())
+    parts = {f"{path.parent.name}/{path.name}": kapture_from_dir(str(path)) for path in found}
+    assert len(parts) >= 3
+    return request.param, parts
+
+
+def test_against_kaptures_importer(
+    root: Path, theirs: tuple[str, dict[str, kapture.Kapture]], tmp_path: Path
+) -> None:
+    version, parts = theirs
+    options = RobotCarOptions(version=1 if version == "v1" else 2, train_as_map=version == "v2")
+    write_official(RobotCar(options).read(root), tmp_path / "out")
+    groups = read_groups(tmp_path / "out/megloc")
+    for role in ("mapping", "query"):
+        ours = kapture_from_dir(str(tmp_path / "out" / role))
+        own_poses = poses_by_image(ours) if role == "mapping" else {}
+        records = {}
+        for place, part in ((name[:2], part) for name, part in parts.items() if role in name):
+            posed = poses_by_image(part) if role == "mapping" else {}
+            assert_equal_poses({name: own_poses[name] for name in posed}, posed)
+            for timestamp, sensor, name in kapture.flatten(part.records_camera):
+                # it records left and right training images as map images, without poses
+                if role == "query" or name in posed:
+                    records[name] = (timestamp, sensor)
+                    assert groups[name].location == f"0{place}/{sensor}"
+            for rig, sensor in part.rigs.key_pairs():
+                theirs_to_ours = part.rigs[rig, sensor], ours.rigs[rig, sensor]
+                assert world_pose_transform_distance(*theirs_to_ours)[0] < MAX_M
+            for name, sensor in part.sensors.items():
+                # it takes the size of the official images for granted
+                params = [float(text) for text in sensor.sensor_params[3:]]
+                assert params == [float(text) for text in ours.sensors[name].sensor_params[3:]]
+        assert {n: (t, s) for t, s, n in kapture.flatten(ours.records_camera)} == records
+
+
+def test_layout_has_the_quirks_of_the_original(root: Path) -> None:
+    first, second = sorted((root / "3D-models/individual/queries_per_location").iterdir())
+    assert first.read_bytes().endswith(b".jpg\n\n") and b"\r" not in first.read_bytes()
+    assert second.read_bytes().endswith(b".jpg\r\n")
+    on_disk = len(list(root.glob("images/overcast-reference/*/*.jpg")))
+    assert on_disk == 18  # two more than are in the models
+    test_list = (root / "robotcar_v2_test.txt").read_text().split()
+    train_list = (root / "robotcar_v2_train.txt").read_text().splitlines()
+    assert all(name.startswith("rear/") and name.endswith(".png") for name in test_list)
+    assert all("/rear/" in row.split()[0] and len(row.split()) == 17 for row in train_list)
+    # the last moments of the rain are in neither
+    assert len(test_list) + len(train_list) == 12 - 2
+    for path in root.glob("images/*/*/*.jpg"):
+        assert int(path.stem) > 1 << 32
+        assert image_size(path) == (96, 96)
+    assert (root / "intrinsics/rear_intrinsics.txt").read_text().startswith("fx 57.600000\n")
+
+
+def test_names_are_the_test_list(root: Path, imported: Path) -> None:
+    names = read_names(imported / "megloc")
+    assert list(names.values()) == (root / "robotcar_v2_test.txt").read_text().split()
+    groups = read_groups(imported / "megloc")
+    scored = {name for name, group in groups.items() if group.scored}
+    assert len(scored) == 10 and names.keys() < scored
+    assert all("/rear/" in name for name in scored)
+
+
+def test_cameras_are_synchronous(root: Path) -> None:
+    for role, moments in (("mapping", 6), ("query", 12)):
+        truth = kapture_from_dir(str(root / "ground_truth" / role))
+        cameras = [set(of_time) for of_time in truth.records_camera.values()]
+        assert len(cameras) == moments
+        # two of the map's images are in no model
+        assert sum(len(of_time) for of_time in cameras) == 3 * moments - 2 * (role == "mapping")
+    # the official frame is another than the rendered one, and metric
+    assert abs(np.linalg.norm(OFFICIAL_FROM_WORLD.quat_wxyz) - 1) < 1e-12
+    assert np.linalg.norm(OFFICIAL_FROM_WORLD.translation) > 1000
+
+
+def test_the_car_stands_in_the_rear_cameras_way(root: Path) -> None:
+    spread = {}
+    for camera in ("left", "rear"):
+        paths = sorted(root.glob(f"images/overcast-reference/{camera}/*.jpg"))
+        # what is seen in the last rows, without the light of the moment
+        rows = np.stack([read_image_rgb(path)[-4:, 30:66].mean(axis=(0, 2)) for path in paths])
+        spread[camera] = (rows / rows.mean(axis=1, keepdims=True)).std(axis=0).mean()
+    assert spread["rear"] < 0.5 * spread["left"]
+
+
+def test_looks_differ() -> None:
+    lightings = {
+        condition: road_lighting(condition, np.random.default_rng(0), azimuth=0.3, noise_seed=1)
+        for condition in WEATHERS
+    }
+    kinds = {(one.sun, one.sky, one.exposure, one.blur_px) for one in lightings.values()}
+    assert len(kinds) > 5
+    for condition, weather in WEATHERS.items():
+        lighting = lightings[condition]
+        assert weather.is_night == (lighting.condition == "night") == any(lighting.lamps)
+        np.testing.assert_allclose(np.linalg.norm(lighting.sun_direction), 1.0)
+    assert lightings["dawn"].sun_direction[2] < lightings["sun"].sun_direction[2]
+    assert lightings["dawn"].sun[2] < 0.6 * lightings["dawn"].sun[0]  # warm
+    assert not any(lightings["rain"].sun)
+    assert lightings["night-rain"].exposure < lightings["night"].exposure
+    with pytest.raises(KeyError):
+        road_lighting("fog", np.random.default_rng(0), azimuth=0.0, noise_seed=0)

@@ -1,0 +1,391 @@
+"""Sparse models of the twins: exact tracks, and SIFT as COLMAP makes it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from megloc_twins.aachen import (
+    OFFICIAL_FROM_WORLD,
+    AachenTwin,
+    AachenTwinOptions,
+    build_aachen_frames,
+)
+from megloc_twins.frames import Frame, in_frame, looking_at
+from megloc_twins.lighting import day_lighting
+from megloc_twins.moving_objects import moving_object_surfaces
+from megloc_twins.options import SyntheticWorldOptions
+from megloc_twins.rasterization import depth_map, sample_grid, visible_surfaces
+from megloc_twins.robotcar import RobotCarTwin, RobotCarTwinOptions
+from megloc_twins.sparse_models import exact_tracks
+from megloc_twins.squares import build_place
+from megloc_twins.synthetic_kapture import SyntheticWorld, build_world
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from megloc_kapture.datasets.aachen.adapter import Aachen, AachenOptions
+from megloc_kapture.datasets.formats.colmap_database import ColmapDatabase
+from megloc_kapture.datasets.formats.sparse_points import SparsePoints
+from megloc_kapture.datasets.official import write_official
+from megloc_kapture.datasets.robotcar.adapter import RobotCar, RobotCarOptions
+from megloc_kapture.features.colmap_sift import ColmapSift
+from megloc_kapture.io.kapture import ImagePair, KaptureFolder
+from megloc_kapture.localization.map_index import MapIndex
+from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
+from megloc_kapture.matching.verification import TwoViewOptions
+from megloc_kapture.stages.given_map import given_map, has_descriptors
+from megloc_kapture.stages.local_features import extract_local_features
+from megloc_kapture.stages.matches import match_pairs
+from megloc_kapture.values import Camera, RigidTransform
+
+import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
+
+
+Depths = dict[str, NDArray[np.float32]]
+
+
+def rng() -> np.random.Generator:
+    return np.random.default_rng(7)
+
+
+def colmap_px(frame: Frame, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Where COLMAP projects world points, (N, 2)."""
+    camera = pycolmap.Camera(
+        model=frame.camera.model,
+        width=frame.camera.width,
+        height=frame.camera.height,
+        params=list(frame.camera.params),
+    )
+    w, x, y, z = frame.cam_from_world.quat_wxyz
+    pose = pycolmap.Rigid3d(
+        pycolmap.Rotation3d(np.array([x, y, z, w])), np.array(frame.cam_from_world.translation)
+    )
+    return np.array([camera.img_from_cam(pose * point) for point in points])
+
+
+@pytest.fixture(scope="module")
+def world() -> SyntheticWorld:
+    return build_world(
+        SyntheticWorldOptions(
+            num_places=2,
+            stations_per_place=5,
+            day_queries=2,
+            night_queries=0,
+            width=160,
+            height=120,
+        )
+    )
+
+
+@pytest.fixture(scope="module")
+def frames(world: SyntheticWorld) -> list[Frame]:
+    """Rig and telephone images of two places, PINHOLE and SIMPLE_RADIAL."""
+    return list(world.frames())
+
+
+@pytest.fixture(scope="module")
+def depths(world: SyntheticWorld) -> Depths:
+    surfaces = [place.surfaces_in_world() for place in world.places]
+    found = {}
+    for frame in world.frames():
+        grid = sample_grid(frame.camera, 1)
+        seen = visible_surfaces(surfaces[frame.place], frame.cam_from_world, grid)
+        found[frame.name] = depth_map(seen)
+    return found
+
+
+@pytest.fixture(scope="module")
+def points(frames: list[Frame], depths: Depths) -> SparsePoints:
+    return exact_tracks(frames, depths, points_per_frame=60, rng=rng())
+
+
+def test_colmap_projects_the_points_where_they_are_seen(
+    frames: list[Frame], points: SparsePoints
+) -> None:
+    assert {frame.camera.model for frame in frames} == {"PINHOLE", "SIMPLE_RADIAL"}
+    for index, frame in enumerate(frames):
+        mine = points.image_ids == index
+        assert mine.sum() > 20
+        px = colmap_px(frame, points.xyz[points.point_ids[mine]])
+        np.testing.assert_allclose(points.xy_px[mine], px, atol=1e-4)
+
+
+def test_the_points_lie_on_what_the_images_see(
+    frames: list[Frame], depths: Depths, points: SparsePoints
+) -> None:
+    for index, frame in enumerate(frames):
+        mine = points.image_ids == index
+        column, row = points.xy_px[mine].astype(int).T
+        z = frame.cam_from_world.apply(points.xyz[points.point_ids[mine]])[:, 2]
+        error = np.abs(depths[frame.name][row, column] - z)
+        assert (error < 0.021 + 0.011 * z).all()
+        assert np.median(error) < 0.02
+
+
+def test_tracks_are_in_order_and_within_a_place(frames: list[Frame], points: SparsePoints) -> None:
+    assert len(points) > 200
+    counts = np.bincount(points.point_ids, minlength=len(points))
+    assert counts.min() == 2
+    assert counts.max() > 3
+    keys = list(zip(points.point_ids.tolist(), points.image_ids.tolist(), strict=True))
+    assert keys == sorted(set(keys))
+    place = np.array([frame.place for frame in frames])[points.image_ids]
+    first = np.searchsorted(points.point_ids, points.point_ids)
+    assert (place == place[first]).all()
+    for index in range(len(frames)):
+        features = points.feature_ids[points.image_ids == index]
+        assert features.tolist() == list(range(len(features)))
+
+
+def test_the_same_seed_gives_the_same_points(
+    frames: list[Frame], depths: Depths, points: SparsePoints
+) -> None:
+    again = exact_tracks(frames, depths, points_per_frame=60, rng=rng())
+    assert np.array_equal(again.xyz, points.xyz)
+    assert np.array_equal(again.xy_px, points.xy_px)
+
+
+def frame(name: str, x: float, *, camera: Camera, yaw_deg: float = 90.0) -> Frame:
+    """A camera at (x, 0, 0) that looks along +y unless turned."""
+    lighting = day_lighting(rng(), azimuth=0.0, elevation=1.0, overcast=0.0, noise_seed=0)
+    pose = looking_at(np.array([x, 0.0, 0.0]), np.radians(yaw_deg), 0.0, 0.0)
+    return Frame(name, "mapping", "day", 0, 0, name, camera, pose, lighting, (), False)
+
+
+PINHOLE = Camera("PINHOLE", 40, 30, (40.0, 40.0, 20.0, 15.0))
+WALL_M = 10.0
+
+
+def wall() -> NDArray[np.float32]:
+    return np.full((30, 40), WALL_M, np.float32)
+
+
+def test_what_stands_in_front_hides_the_wall() -> None:
+    pair = [frame("a", 0.0, camera=PINHOLE), frame("b", 0.0, camera=PINHOLE)]
+    hidden = wall()
+    hidden[:, :20] = 5.0  # in b, something covers the left half
+    points = exact_tracks(pair, {"a": wall(), "b": hidden}, points_per_frame=1200, rng=rng())
+    # nothing at 5 m is seen by a, nothing on the left of the wall by b
+    assert (points.xy_px[:, 0] > 20).all()
+    np.testing.assert_allclose(points.xyz[:, 1], WALL_M, atol=1e-9)
+    # all of the visible half from both, but for the border
+    assert len(points) == 2 * 18 * 26
+
+
+def test_nothing_is_seen_without_depth_behind_or_out_of_the_image() -> None:
+    nothing = {"a": np.zeros((30, 40), np.float32), "b": np.zeros((30, 40), np.float32)}
+    pair = [frame("a", 0.0, camera=PINHOLE), frame("b", 0.0, camera=PINHOLE)]
+    assert len(exact_tracks(pair, nothing, points_per_frame=50, rng=rng())) == 0
+    behind = [frame("a", 0.0, camera=PINHOLE), frame("b", 0.0, camera=PINHOLE, yaw_deg=-90.0)]
+    both = {"a": wall(), "b": wall()}
+    assert len(exact_tracks(behind, both, points_per_frame=50, rng=rng())) == 0
+    beside = [frame("a", 0.0, camera=PINHOLE), frame("b", 50.0, camera=PINHOLE)]
+    assert len(exact_tracks(beside, both, points_per_frame=50, rng=rng())) == 0
+    assert len(exact_tracks([], {}, points_per_frame=50, rng=rng())) == 0
+
+
+def test_other_places_are_not_looked_at() -> None:
+    pair = [frame("a", 0.0, camera=PINHOLE), replace(frame("b", 0.0, camera=PINHOLE), place=1)]
+    both = {"a": wall(), "b": wall()}
+    assert len(exact_tracks(pair, both, points_per_frame=50, rng=rng())) == 0
+
+
+def test_strong_distortion_folds_nothing_back_into_the_image() -> None:
+    # r (1 - 0.25 r^2) turns back at r = 1.15: rays from far outside land inside the image again
+    camera = Camera("SIMPLE_RADIAL", 40, 30, (40.0, 20.0, 15.0, -0.25))
+    pair = [frame("a", 0.0, camera=camera), frame("b", 19.5, camera=camera)]
+    both = {"a": wall(), "b": wall()}
+    x_px = 20.0 + 40.0 * -1.95 * (1 - 0.25 * 1.95**2)
+    assert 2 < x_px < 38  # the middle of a's image, as b's formula has it
+    assert len(exact_tracks(pair, both, points_per_frame=1200, rng=rng())) == 0
+
+
+def test_poses_may_stand_in_another_frame(frames: list[Frame], depths: Depths) -> None:
+    other_from_world = RigidTransform.from_matrix(np.diag([1.0, -1.0, -1.0]), np.array([9, 8, 7]))
+    moved = [
+        replace(frame, cam_from_world=frame.cam_from_world @ other_from_world.inverse())
+        for frame in frames
+    ]
+    there = exact_tracks(moved, depths, points_per_frame=20, rng=rng())
+    here = exact_tracks(frames, depths, points_per_frame=20, rng=rng())
+    np.testing.assert_allclose(there.xyz, other_from_world.apply(here.xyz), atol=1e-9)
+
+
+OPTIONS = AachenTwinOptions(
+    num_places=1,
+    stations_per_place=7,
+    sequence_images=3,
+    day_queries=2,
+    night_queries=1,
+    additional_night_queries=1,
+    width=256,
+    height=192,
+    supersampling=1,
+    model_features=True,
+)
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("aachen")
+    AachenTwin(OPTIONS).write(root)
+    return root
+
+
+@pytest.mark.slow
+def test_the_database_is_what_colmap_extracts(root: Path, tmp_path: Path) -> None:
+    options = pycolmap.FeatureExtractionOptions()
+    options.num_threads = 1
+    with ColmapDatabase(root / "aachen.db") as ours:
+        assert len(ours.images) == 21  # without the sequence, which v1.0 does not have
+        names = sorted(ours.images)[:4]
+        pycolmap.extract_features(
+            tmp_path / "theirs.db",
+            root / "images_upright",
+            image_names=names,
+            extraction_options=options,
+            device=pycolmap.Device.cpu,
+        )
+        with ColmapDatabase(tmp_path / "theirs.db") as theirs:
+            assert sorted(theirs.images) == names
+            for name in names:
+                rows = [
+                    np.hstack([found.keypoints(name), found.descriptors(name)])
+                    for found in (ours, theirs)
+                ]
+                assert len(rows[0]) > 300
+                a, b = (some[np.lexsort(some.T)] for some in rows)
+                np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.slow
+def test_points_lie_on_what_the_images_show(root: Path) -> None:
+    model = pycolmap.Reconstruction(str(root / "3D-models/aachen_v_1_1"))
+    assert model.num_points3D() > 500
+    assert model.compute_mean_track_length() >= 3
+    model.update_point_3d_errors()
+    assert 0.05 < model.compute_mean_reprojection_error() < 1.0
+    # the world itself says how far each point is
+    frames = {frame.name: frame for frame in build_aachen_frames(OPTIONS).mapping()}
+    place = build_place(OPTIONS.world(), 0)
+    errors = []
+    for image in model.images.values():
+        frame = frames[image.name]
+        surfaces = place.surfaces.joined(moving_object_surfaces(frame.moving_objects))
+        cam_from_place = frame.cam_from_world @ place.place_from_world.inverse()
+        grid = sample_grid(frame.camera, 1)
+        depth = depth_map(visible_surfaces(surfaces, cam_from_place, grid))
+        pose = in_frame([frame], OFFICIAL_FROM_WORLD)[0].cam_from_world
+        for point2d in image.points2D:
+            if point2d.has_point3D():
+                point = model.points3D[point2d.point3D_id].xyz
+                column, row = point2d.xy.astype(int)
+                z = pose.apply(point[None])[0, 2]
+                errors.append(abs(depth[row, column] - z) / z)
+    assert len(errors) > 2000
+    assert np.median(errors) < 0.01
+    # what is not at an edge of something is where it seems to be
+    assert np.quantile(errors, 0.9) < 0.05
+
+
+def localized(
+    query: KaptureFolder, made: KaptureFolder, output: Path
+) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Rotation and centre of the queries that COLMAP's PnP finds, by matches with all images."""
+    seen = made.observations()["sift"]
+    xyz = made.points3d()[:, :3]
+    index = MapIndex.build(xyz, seen.image_names, seen.image_ids, seen.keypoint_ids, seen.point_ids)
+    options = pycolmap.AbsolutePoseEstimationOptions()
+    options.ransac.random_seed = 0
+    names, images = query.read().image_names(), sorted(made.read().poses())
+    pairs = [ImagePair(name, image, 1.0) for name in names for image in images]
+    match_pairs(query, made, pairs, "sift", NearestNeighbours(), TwoViewOptions(), output)
+    matches = KaptureFolder(made.root, features_dirs=[output]).matches("sift")
+    for name in names:
+        keypoints = query.keypoints("sift").read(name)
+        px, points = [], []
+        for image in images:
+            if (name, image) in matches:
+                rows, _ = matches.read(name, image)
+                found = index.points_of_keypoints(image, rows[:, 1])
+                px.append(keypoints[rows[found >= 0, 0]])
+                points.append(xyz[found[found >= 0]])
+        camera = query.read().camera_of(name)
+        result = pycolmap.estimate_and_refine_absolute_pose(
+            np.concatenate(px).astype(np.float64),
+            np.concatenate(points),
+            pycolmap.Camera(
+                model=camera.model,
+                width=camera.width,
+                height=camera.height,
+                params=list(camera.params),
+            ),
+            options,
+        )
+        if result is None:  # a night's
+            continue
+        rotation = result["cam_from_world"].rotation.matrix()
+        yield name, rotation, -rotation.T @ result["cam_from_world"].translation
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("version", ["1.0", "1.1"])
+def test_queries_localize_in_the_given_map(root: Path, tmp_path: Path, version: str) -> None:
+    dataset = Aachen(AachenOptions(version=version, reference_model=True)).read(root)
+    write_official(dataset, tmp_path)
+    reference = KaptureFolder(tmp_path / "reference")
+    # v1.0's are published, v1.1's have to be extracted again
+    assert has_descriptors(reference) == (version == "1.0")
+    wanted = [KaptureFolder(tmp_path / "query")]
+    if version == "1.1":
+        wanted.append(KaptureFolder(tmp_path / "mapping"))
+    extract_local_features(wanted, ColmapSift(), tmp_path)
+    mapping = KaptureFolder(tmp_path / "mapping", features_dirs=[tmp_path])
+    counts = given_map(reference, mapping, tmp_path / "map")
+    assert counts["found_again"] == 1.0
+    assert counts["points"] == len(reference.points3d())
+    made = KaptureFolder(tmp_path / "map")
+    made.validate()
+    query = KaptureFolder(tmp_path / "query", features_dirs=[tmp_path])
+    truth = KaptureFolder(root / "ground_truth/query").read().poses()
+    results = localized(query, made, tmp_path / "matches")
+    found = {name: pose for name, *pose in results if name.startswith("query/day")}
+    assert len(found) == OPTIONS.day_queries
+    for name, (rotation, centre) in found.items():
+        turned = Rotation.from_matrix(rotation @ truth[name].rotation_matrix().T)
+        assert np.linalg.norm(centre - truth[name].center()) < 0.25
+        assert np.degrees(turned.magnitude()) < 2.0
+
+
+@pytest.mark.slow
+def test_robotcars_models_share_a_database(tmp_path: Path) -> None:
+    options = RobotCarTwinOptions(
+        num_locations=1,
+        stops_per_location=8,
+        moments_per_condition=2,
+        size_px=128,
+        supersampling=1,
+        model_features=True,
+    )
+    RobotCarTwin(options).write(tmp_path / "root")
+    observations = []
+    for model in ("merged", "individual"):
+        out = tmp_path / model
+        dataset = RobotCar(RobotCarOptions(model=model, reference_model=True)).read(
+            tmp_path / "root"
+        )
+        write_official(dataset, out)
+        reference = KaptureFolder(out / "reference")
+        # features and models fit each other, or the import would refuse them
+        reference.validate()
+        assert has_descriptors(reference)
+        seen = reference.observations()["sift"]
+        observations.append((seen.point_ids, seen.image_ids, seen.keypoint_ids))
+        assert len(seen) > 300
+    np.testing.assert_array_equal(observations[0], observations[1])
+    with ColmapDatabase(tmp_path / "root/3D-models/overcast-reference.db") as database:
+        assert len(database.images) == 24
+        assert all(name.endswith(".png") for name in database.images)

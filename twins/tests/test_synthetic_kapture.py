@@ -1,0 +1,199 @@
+"""The synthetic world: what there is to see, and what is written."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from megloc_twins.options import SyntheticWorldOptions
+from megloc_twins.synthetic_kapture import SyntheticKapture, SyntheticWorld, build_world, depth_name
+from megloc_twins.viewpoints import coarse_view, overlap, support
+
+from megloc_kapture.io.dataset_tables import read_groups, read_protocol, read_world
+from megloc_kapture.io.images import read_depth_map, read_image_rgb
+from megloc_kapture.io.kapture import KaptureFolder, to_kapture
+from megloc_kapture.values import RigidTransform
+
+
+@pytest.fixture(scope="module")
+def world() -> SyntheticWorld:
+    return build_world()
+
+
+@pytest.mark.slow
+def test_the_default_world_is_real_work(world: SyntheticWorld) -> None:
+    assert len(world.mapping) >= 80
+    assert len(world.queries) >= 40
+    assert len({frame.place for frame in world.queries}) >= 3
+    assert {frame.condition for frame in world.queries} == {"day", "night"}
+    assert all(s.camera.width >= 640 and s.camera.height >= 480 for s in world.frames())
+    names = [frame.name for frame in world.frames()]
+    assert len(set(names)) == len(names)
+    assert names == sorted(names, key=lambda name: (name.startswith("query"), name))
+    records = {(frame.timestamp, frame.sensor_id) for frame in world.frames()}
+    assert len(records) == len(names)
+
+
+def test_queries_have_their_own_cameras_and_moving_objects(world: SyntheticWorld) -> None:
+    assert len({frame.camera.params for frame in world.queries}) == len(world.queries)
+    assert all(frame.camera.model == "SIMPLE_RADIAL" for frame in world.queries)
+    assert all(frame.moving_objects for frame in world.queries)
+    spots = {m.position for frame in world.queries for m in frame.moving_objects}
+    assert not spots & {m.position for frame in world.mapping for m in frame.moving_objects}
+    assert any(m.kind == "car" for frame in world.frames() for m in frame.moving_objects)
+
+
+def test_every_query_shares_its_view_with_the_map_of_its_place_only(world: SyntheticWorld) -> None:
+    views = world.coarse_views()
+    for query in world.queries:
+        shares = {m.name: overlap(views[query.name], views[m.name]) for m in world.mapping}
+        here = [views[m.name] for m in world.mapping if m.place == query.place]
+        assert max(shares.values()) < 0.9
+        assert support(views[query.name], here) > 0.5
+        assert all(shares[m.name] == 0 for m in world.mapping if m.place != query.place)
+
+
+def test_queries_stand_elsewhere_than_the_map_images(world: SyntheticWorld) -> None:
+    map_centers = np.array([frame.cam_from_world.center() for frame in world.mapping])
+    gaps = [
+        np.linalg.norm(map_centers - frame.cam_from_world.center(), axis=1).min()
+        for frame in world.queries
+    ]
+    assert np.median(gaps) > 0.8
+
+
+def test_poses_of_the_map_are_those_of_the_rig(world: SyntheticWorld) -> None:
+    assert len(world.rig_from_world) * 3 == len(world.mapping)
+    for frame in world.mapping:
+        expected = world.sensor_from_rig[frame.sensor_id] @ world.rig_from_world[frame.timestamp]
+        np.testing.assert_allclose(
+            frame.cam_from_world.rotation_matrix(), expected.rotation_matrix(), atol=1e-12
+        )
+        np.testing.assert_allclose(
+            frame.cam_from_world.translation, expected.translation, atol=1e-9
+        )
+    offsets = [pose.center() for pose in world.sensor_from_rig.values()]
+    assert max(np.linalg.norm(a - b) for a in offsets for b in offsets) > 0.5
+
+
+def test_the_same_options_give_the_same_world() -> None:
+    options = SyntheticWorldOptions(num_places=2, day_queries=2, night_queries=2)
+    first, second = build_world(options), build_world(options)
+    assert first.frames() == second.frames()
+    assert first.frames() != build_world(options.model_copy(update={"seed": 1})).frames()
+
+
+def test_more_queries_leave_the_others_as_they_are() -> None:
+    few = build_world(SyntheticWorldOptions(num_places=1, day_queries=2, night_queries=1))
+    more = build_world(SyntheticWorldOptions(num_places=1, day_queries=3, night_queries=1))
+    assert more.mapping == few.mapping
+    assert set(few.queries) < set(more.queries)
+
+
+def test_without_extras() -> None:
+    options = SyntheticWorldOptions(
+        num_places=1,
+        day_queries=1,
+        night_queries=0,
+        moving_objects=0,
+        bonnet=False,
+        distortion=False,
+    )
+    world = build_world(options)
+    assert not any(frame.moving_objects or frame.bonnet for frame in world.frames())
+    assert world.queries[0].camera.model == "SIMPLE_PINHOLE"
+
+
+def test_overlap_is_whole_with_itself_and_none_behind(world: SyntheticWorld) -> None:
+    frame = world.mapping[0]
+    views = world.coarse_views()
+    assert overlap(views[frame.name], views[frame.name]) > 0.97
+    opposite = RigidTransform((0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0)) @ frame.cam_from_world
+    surfaces = world.places[frame.place].surfaces_in_world()
+    behind = coarse_view(surfaces, frame.camera, opposite)
+    assert overlap(views[frame.name], behind) == 0
+    assert support(views[frame.name], [behind, behind]) == 0
+    assert support(views[frame.name], []) == 0
+
+
+@pytest.fixture(scope="module")
+def small_world(small: dict[str, SyntheticKapture]) -> SyntheticWorld:
+    return build_world(small["synthetic"].options)
+
+
+@pytest.fixture(scope="module")
+def root(rendered: Callable[[str], Path]) -> Path:
+    return rendered("synthetic")
+
+
+def test_what_is_written_is_the_world(root: Path, small_world: SyntheticWorld) -> None:
+    mapping, query, truth = (KaptureFolder(root / f) for f in ("mapping", "query", "query_gt"))
+    mapping.validate(deep=True)
+    query.validate(deep=True)
+    assert mapping.read().image_names() == [frame.name for frame in small_world.mapping]
+    assert list(mapping.read().rigs) == ["rig"]
+    assert {device for _, device in mapping.read().trajectories} == {"rig"}
+    assert query.read().image_names() == truth.read().image_names()
+    assert not query.read().trajectories
+    for folder, frames in ((mapping, small_world.mapping), (truth, small_world.queries)):
+        poses = folder.read().poses()
+        assert len(poses) == len(frames)
+        for frame in frames:
+            assert folder.read().camera_of(frame.name) == frame.camera
+            np.testing.assert_allclose(
+                poses[frame.name].rotation_matrix(),
+                frame.cam_from_world.rotation_matrix(),
+                atol=1e-12,
+            )
+            np.testing.assert_allclose(
+                poses[frame.name].translation, frame.cam_from_world.translation, atol=1e-9
+            )
+    for folder, frames in ((mapping, small_world.mapping), (query, small_world.queries)):
+        for frame in frames:
+            assert read_image_rgb(folder.image_path(frame.name)).shape == (120, 160, 3)
+
+
+def test_depth_and_masks(root: Path, small_world: SyntheticWorld) -> None:
+    data = KaptureFolder(root / "mapping").read()
+    assert len(data.records_depth) == len(small_world.mapping)
+    for frame in small_world.mapping:
+        assert data.records_depth[frame.timestamp, f"{frame.sensor_id}_depth"] == depth_name(
+            frame.name
+        )
+        pose = data.device_from_world(frame.timestamp, f"{frame.sensor_id}_depth")
+        assert pose == data.cam_from_world(frame.name)
+        path = root / "mapping/sensors/records_data" / depth_name(frame.name)
+        depth = read_depth_map(path, width=160, height=120)
+        assert 0.5 < np.median(depth) < 20
+        mask_path = root / "mapping/sensors/masks" / f"{frame.name}.png"
+        assert mask_path.exists() == frame.bonnet
+        if frame.bonnet:
+            mask = read_image_rgb(mask_path)[..., 0]
+            assert set(np.unique(mask)) == {0, 255}
+            assert (depth[mask == 0] == 0).all()
+
+
+def test_side_tables(root: Path, small_world: SyntheticWorld) -> None:
+    groups = read_groups(root / "megloc")
+    assert {name: g.condition for name, g in groups.items()} == {
+        frame.name: frame.condition for frame in small_world.queries
+    }
+    assert {g.location for g in groups.values()} == {"place0", "place1"}
+    protocol = read_protocol(root / "megloc")
+    assert protocol.dataset == "synthetic"
+    assert protocol.conditions == ("day", "night")
+    assert protocol.thresholds == ((0.05, 5), (0.25, 2), (0.5, 5), (5, 10))
+    assert read_world(root / "megloc").unit == "m"
+
+
+def test_kapture_itself_reads_it(root: Path, small_world: SyntheticWorld) -> None:
+    from kapture.io.csv import kapture_from_dir
+
+    theirs = kapture_from_dir(str(root / "mapping"))
+    ours = to_kapture(root / "mapping")
+    assert theirs.records_camera == ours.records_camera
+    assert theirs.sensors.keys() == ours.sensors.keys()
+    assert len(theirs.records_depth) == len(ours.records_depth)
+    assert len(theirs.trajectories) == len(small_world.rig_from_world)
