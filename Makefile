@@ -65,6 +65,9 @@ lint: $(STAMP)
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports --no-cache --no-logo
+	@for folder in megloc_kapture twins/megloc_twins tests twins/tests; do \
+		find $$folder -name '*.py' | xargs cat | wc -l | tr '\n' ' '; \
+		echo "lines in $$(find $$folder -name '*.py' | wc -l) files of $$folder"; done
 
 docs: $(STAMP)
 	@$(BIN)/python scripts/api_reference.py build/docs
