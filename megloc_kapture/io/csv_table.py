@@ -51,7 +51,7 @@ def read_csv_table(
                     continue
                 problem = (
                     f"the header must name the columns {','.join(columns)}; "
-                    f"it reads {','.join(header)}"
+                    f"it reads {' '.join(','.join(header).split())}"
                 )
             elif len(fields) != len(header):
                 problem = f"{len(fields)} fields where the header names {len(header)}"

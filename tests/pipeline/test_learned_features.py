@@ -60,11 +60,11 @@ def test_several_types_are_one_map_and_one_problem(fountain: Path, tmp_path: Pat
     found = json.loads(workspace.path("evaluation/recall.json").read_text())
     assert found["rows"][-1]["recall"][0]["recall"] == 1.0
     manifest = json.loads(workspace.path("stages/local_features.json").read_text())
-    weights = [chosen["weights"] for chosen in manifest["options"]["local_features"]]
-    assert [list(files) for files in weights] == [["aliked-n16.pth"], ["xfeat.pt"]]
-    assert all(len(sha256) == 64 for files in weights for sha256 in files.values())
+    weights = manifest["options"]["weights"]
+    assert list(weights) == ["aliked-n16.pth", "xfeat.pt"]
+    assert all(len(sha256) == 64 for sha256 in weights.values())
     matching = json.loads(workspace.path("stages/query_matches.json").read_text())["options"]
-    assert list(matching["matching"]["xfeat"]["weights"]) == ["xfeat-lighterglue.pt"]
+    assert list(matching["weights"]) == ["xfeat-lighterglue.pt"]
 
 
 def test_modern_maps_smaller_images_and_localizes_whole_ones(
