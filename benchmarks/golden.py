@@ -93,13 +93,12 @@ def execute(case: Case, place: Path, output: Path) -> float:
     else:
         seconds = megloc(case.name, [*case.arguments, "--workspace", str(workspace)])
         localized, recall = workspace / "localized", workspace / "evaluation" / RECALL
-    refined = workspace / "refined"
     kept = output / case.name
     kept.mkdir(parents=True)
-    shutil.copyfile((refined if refined.is_dir() else localized) / "sensors" / POSES, kept / POSES)
-    shutil.copyfile((refined if refined.is_dir() else localized) / STATUS, kept / STATUS)
-    if recall is not None:
-        shutil.copyfile(recall, kept / RECALL)
+    # without a pose there are no trajectories
+    for file in (localized / "sensors" / POSES, localized / STATUS, recall):
+        if file is not None and file.is_file():
+            shutil.copyfile(file, kept / file.name)
     shutil.rmtree(workspace)
     return seconds
 
