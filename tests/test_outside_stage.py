@@ -130,6 +130,21 @@ def test_it_has_a_command_of_its_own(
     assert status == 2 and "count_keypoints" in text and "most" in text
 
 
+def test_a_stage_that_cannot_be_loaded_leaves_the_other_commands_alone(
+    installed: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (installed / "keypoint_counts" / "__init__.py").write_text("raise RuntimeError('broken')")
+    for arguments in (["--help"], ["info", "--help"]):
+        with pytest.raises(SystemExit) as end:
+            main(arguments)
+        assert end.value.code == 0
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as end:
+        main(["count-keypoints", "-w", "workspace"])
+    assert end.value.code == 2
+    assert "cannot be loaded: broken" in capsys.readouterr().err
+
+
 def test_what_cannot_be_planned_is_refused(scene: Path, tmp_path: Path) -> None:
     workspace = Workspace(tmp_path / "workspace")
     with pytest.raises(PluginError, match="no plugin 'count_points' in megloc_kapture.stages"):

@@ -119,13 +119,14 @@ def _parser(given: Sequence[str]) -> Any:
     """What tyro parses: the command that is given, or the names of all of them for help."""
     stages = [name.replace("_", "-") for name in plugin_names(STAGES)]
     annotated: Any = Annotated  # of types that are values here, which mypy does not follow
-    names = [*COMMANDS, *(name for name in stages if name not in COMMANDS)]
+    texts = {name: f"Run the stage {name}, of another package." for name in stages}
+    texts |= {name: text for name, (_, text) in COMMANDS.items()}
     entries = []
-    for name in names:
-        kind: type[Any] = make_dataclass(name.replace("-", "_"), [])
-        if name in given[:1] or name in stages:
-            kind = command_class(name)
-        text = COMMANDS[name][1] if name in COMMANDS else kind.__doc__
+    for name in [*COMMANDS, *(name for name in stages if name not in COMMANDS)]:
+        # a stage that cannot be loaded must not take the other commands with it
+        asked = name in given[:1]
+        kind = command_class(name) if asked else make_dataclass(name.replace("-", "_"), [])
+        text = kind.__doc__ if asked and name not in COMMANDS else texts[name]
         entries.append(annotated[kind, tyro.conf.subcommand(name, description=text)])
     return functools.reduce(operator.or_, entries)
 
