@@ -8,6 +8,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,6 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import OptionError
+from megloc_kapture.evaluation.metrics import Threshold
+from megloc_kapture.evaluation.report.renderers import REPORT_HTML
+from megloc_kapture.evaluation.report.reports import RECALL_JSON
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.localization.absolute_pose import absolute_pose
@@ -25,7 +29,7 @@ from megloc_kapture.localization.estimation import AbsolutePoseOptions
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation, plan_map
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
-from megloc_kapture.pipeline.localizer import Localizer
+from megloc_kapture.pipeline.localizer import LOCALIZING, Localizer
 from megloc_kapture.pipeline.plan import run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.results import Results
@@ -33,6 +37,7 @@ from megloc_kapture.pipeline.run import choose_run
 from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS, load_plugin
 from megloc_kapture.stages.layout import EVALUATION, LOCALIZED, MAP
+from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera, Failure, ImageFeatures, Pose
 
@@ -49,13 +54,11 @@ class Map:
     Attributes
     ----------
     kapture_map : the map itself: its images, points and keypoints types.
+    options : those of localizing; the others change nothing.
     """
 
-    def __init__(
-        self, kapture_map: KaptureMap, preset: str = "classic", set: Changes | None = None
-    ) -> None:
-        self.kapture_map = kapture_map
-        self._preset, self._set = preset, dict(set or {})
+    def __init__(self, kapture_map: KaptureMap, options: PipelineOptions) -> None:
+        self.kapture_map, self.options = kapture_map, options
         self._localizers: dict[tuple[str, ...], Localizer] = {}
 
     def localizer(self, refine: str | Sequence[str] = ()) -> Localizer:
@@ -67,13 +70,10 @@ class Map:
         """
         refiners = (refine,) if isinstance(refine, str) else tuple(refine)
         if refiners not in self._localizers:
-            changes = nested(self._set)
+            options = self.options
             if refiners:
-                changes["pose_refinement"] = {
-                    **changes.get("pose_refinement", {}),
-                    "by": [{"name": name} for name in refiners],
-                }
-            options = options_of_preset(self._preset, changes=[changes])
+                refined = options.pose_refinement.with_refiners(refiners)
+                options = options.model_copy(update={"pose_refinement": refined})
             self._localizers[refiners] = Localizer(self.kapture_map, options=options)
         return self._localizers[refiners]
 
@@ -157,11 +157,13 @@ def open_map(
     Raises
     ------
     DataError : it is no map, or broken; names file and line.
+    OptionError : an option that there is not, or that changes nothing.
     """
+    options = options_of_preset(preset, assignments=set or {}, used=LOCALIZING)
     opened = KaptureMap.open(
         path, features_dirs=[Path(one) for one in features_dirs], pixel_origin=pixel_origin
     )
-    return Map(opened, preset, set)
+    return Map(opened, options)
 
 
 def build_map(
@@ -186,13 +188,13 @@ def build_map(
     MeglocError : images, poses or options cannot be used.
     """
     source = KaptureFolder(mapping)
-    options = options_of_preset(preset, changes=[nested(set or {})])
+    options = options_of_preset(preset, assignments=set or {})
     place = Path(workspace or Path("runs") / f"{source.root.resolve().name}-{preset}")
     stages = plan_map(source, options)
     opened = Workspace(place)
     with opened.lock(), single_threaded(), open_executor("processes", workers) as executor:
         run_plan(stages, opened, Work(executor, num_threads=workers))
-    return open_map(opened.path(MAP), preset, set=set)
+    return Map(KaptureMap.open(opened.path(MAP)), options)
 
 
 @dataclass(frozen=True)
@@ -207,12 +209,12 @@ class FinishedRun:
 
     workspace: Path
     pose_file: Path
-    preset: str
+    options: PipelineOptions
 
     @cached_property
     def map(self) -> Map:
-        """The map."""
-        return open_map(self.workspace / MAP, self.preset)
+        """The map, localized in with the options of the run."""
+        return Map(KaptureMap.open(self.workspace / MAP), self.options)
 
     @property
     def localized(self) -> Path:
@@ -222,21 +224,19 @@ class FinishedRun:
     @property
     def report(self) -> Path:
         """The report as a page."""
-        return self.workspace / EVALUATION / "report.html"
+        return self.workspace / EVALUATION / REPORT_HTML
 
     @cached_property
     def recall(self) -> pd.DataFrame:
         """Recall by condition (rows) and threshold (columns); empty where no truth is known."""
-        import json
-
         import pandas as pd
 
-        path = self.workspace / EVALUATION / "recall.json"
+        path = self.workspace / EVALUATION / RECALL_JSON
         if not path.is_file():
             return pd.DataFrame()
         rows = json.loads(path.read_text(encoding="utf-8"))["rows"]
         table = {
-            row["name"]: {_threshold(at["threshold"]): at["recall"] for at in row["recall"]}
+            row["name"]: {str(Threshold(**at["threshold"])): at["recall"] for at in row["recall"]}
             for row in rows
         }
         return pd.DataFrame.from_dict(table, orient="index")
@@ -266,13 +266,13 @@ def run(
     MeglocError : the dataset or the options cannot be used.
     """
     choice = choose_run(
-        dataset, None if root is None else Path(root), preset=preset, changes=[nested(set or {})]
+        dataset, None if root is None else Path(root), preset=preset, assignments=set or {}
     )
     opened = Workspace(Path(workspace or Path("runs") / f"{dataset}-{choice.preset}"))
     with opened.lock(), single_threaded(), open_executor("processes", workers) as executor:
         chosen = choice.run_in(opened)
         run_plan(plan_evaluation(chosen), opened, Work(executor, num_threads=workers))
-    return FinishedRun(opened.root, chosen.submission_below(opened.root), choice.preset)
+    return FinishedRun(opened.root, chosen.submission_below(opened.root), choice.options)
 
 
 def extract(features: str, image: Image, **options: Any) -> ImageFeatures:
@@ -330,20 +330,3 @@ def solve_pose(
     """
     options = AbsolutePoseOptions(max_error_px=max_error_px, min_inliers=min_inliers, seed=seed)
     return absolute_pose(points_px, np.asarray(points_world, np.float64), camera, options)
-
-
-def nested(changes: Changes) -> dict[str, Any]:
-    """Nested tables of options that are given by dotted names."""
-    tree: dict[str, Any] = {}
-    for key, value in changes.items():
-        *above, last = key.split(".")
-        place = tree
-        for part in above:
-            place = place.setdefault(part, {})
-        place[last] = value
-    return tree
-
-
-def _threshold(threshold: Mapping[str, float | None]) -> str:
-    metres = f"{threshold['position_m']:g} m"
-    return metres if threshold["angle_deg"] is None else f"{metres}, {threshold['angle_deg']:g} deg"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 
 import megloc_kapture as megloc
 from megloc_kapture.cli.main import main
-from megloc_kapture.io.images import read_image_rgb
+from megloc_kapture.io.images import read_image_rgb, write_image
 from megloc_kapture.io.kapture import KaptureFolder
 
 SMALL = {
@@ -105,6 +106,7 @@ def test_a_run_and_the_map_it_made(scene: Path, tmp_path: Path) -> None:
     assert set(KaptureFolder(run.localized).read().poses()) == set(
         run.map.localize(scene / "query")
     )
+    assert run.map.options.local_features[0].options == {"max_keypoints": 800}
     before = {path: path.stat().st_mtime_ns for path in run.workspace.glob("stages/[a-z]*.json")}
     again = megloc.run("kapture", scene, set=SMALL, workspace=tmp_path / "run")
     assert again.recall.equals(run.recall)
@@ -130,6 +132,23 @@ def test_features_matches_and_a_pose_by_arrays(built: megloc.Map, scene: Path) -
     assert not failed and failed.reason
 
 
+def test_a_mask_that_changed_makes_the_map_anew(scene: Path, tmp_path: Path) -> None:
+    mapping = tmp_path / "mapping"
+    shutil.copytree(scene / "mapping", mapping)
+    first = megloc.build_map(mapping, set=SMALL, workspace=tmp_path / "workspace")
+    folder = KaptureFolder(mapping)
+    for name in folder.read().image_names():
+        assert first.kapture_map.folder.keypoints("rootsift").read(name)[:, 0].min() < 100
+        camera = folder.read().camera_of(name)
+        mask = np.full((camera.height, camera.width), 255, np.uint8)
+        mask[:, : camera.width // 2] = 0
+        write_image(mapping / "sensors" / "masks" / f"{name}.png", mask)
+    again = megloc.build_map(mapping, set=SMALL, workspace=tmp_path / "workspace")
+    for name in folder.read().image_names():
+        middle = folder.read().camera_of(name).width / 2
+        assert again.kapture_map.folder.keypoints("rootsift").read(name)[:, 0].min() >= middle
+
+
 def test_refused(built: megloc.Map, scene: Path, tmp_path: Path) -> None:
     image = next((scene / "query").rglob("*.jpg"))
     with pytest.raises(megloc.OptionError, match="an image needs its camera"):
@@ -143,6 +162,11 @@ def test_refused(built: megloc.Map, scene: Path, tmp_path: Path) -> None:
         megloc.open_map(built.kapture_map.folder.root, set={"localization.speed": 1}).localize(
             scene / "query"
         )
+    folder = built.kapture_map.folder.root
+    with pytest.raises(megloc.OptionError, match="nothing here uses it"):
+        megloc.open_map(folder, set={"triangulation.min_angle_deg": 3.0})
+    with pytest.raises(megloc.OptionError, match="reranking.keep changes nothing"):
+        megloc.run("kapture", scene, set={"reranking.keep": 5}, workspace=tmp_path / "idle")
     with pytest.raises(megloc.OptionError, match="come with no model"):
         megloc.build_map(scene / "mapping", set={"map": "given"}, workspace=tmp_path / "given")
     assert not (tmp_path / "given").exists()

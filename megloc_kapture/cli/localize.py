@@ -17,29 +17,12 @@ from megloc_kapture.io.files import staged_output
 from megloc_kapture.io.kapture import KaptureFolder, read_pairs
 from megloc_kapture.pipeline.executors import available_cores
 from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
-from megloc_kapture.pipeline.localizer import Localizer
+from megloc_kapture.pipeline.localizer import LOCALIZING, Localizer
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, assigned, options_of_preset
 from megloc_kapture.pipeline.queries import KaptureQueries
 from megloc_kapture.pipeline.results import Results
 from megloc_kapture.stages.layout import LOCALIZED
 from megloc_kapture.stages.matches import iterate_candidates
-
-# the others are of maps that are made
-_USED = (
-    "preprocessing",
-    "local_features",
-    "mask_margin_px",
-    "global_features",
-    "fusion",
-    "query_pairs",
-    "reranking",
-    "matching",
-    "verification",
-    "query_verification",
-    "guided_pyramid",
-    "localization",
-    "pose_refinement",
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +57,9 @@ class Localize(Reading, Choosing, Common):
             pixel_origin=self.pixel_origin,
             allow_links_below=existing(self.allow_links_below),
         )
-        options = options_of_preset(self.preset or DEFAULT_PRESET, assignments=self.set, used=_USED)
+        options = options_of_preset(
+            self.preset or DEFAULT_PRESET, assignments=self.set, used=LOCALIZING
+        )
         folder = self.kapture(self.query)
         given = None if self.pairs is None else dict(iterate_candidates(read_pairs(self.pairs)))
         # what is wrong is found before the first query, and before anything is written

@@ -45,9 +45,7 @@ class RefinePoses(Linked, StageCommand):
         changes: dict[str, object] = {"pose_refinement": {"by": list(self.by)}} if self.by else {}
         options = self.options(changes).pose_refinement
         if self.by:  # in this order, with the options that --set gives them
-            known = {one.name: one.options for one in options.by}
-            chosen = [{"name": name, "options": known.get(name, {})} for name in self.by]
-            options = options.model_validate({**options.model_dump(), "by": chosen})
+            options = options.with_refiners(self.by)
         if not options.refines():
             names = ", ".join(plugin_names(POSE_REFINERS))
             raise OptionError(f"no pose refiner is chosen; --by takes: {names}")

@@ -8,6 +8,7 @@ centres is reported beside it.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -70,14 +71,14 @@ class QueryResult:
     candidates: tuple[str, ...] = ()
 
 
-class Reported:
+class Reported(ABC):
     """A result, or several, that a report can be made of; prints as its tables."""
 
     __slots__ = ()
 
+    @abstractmethod
     def per_query(self) -> dict[str, list[Any]]:
         """Column -> one value per query, as in ``per_query.csv``."""
-        raise NotImplementedError
 
     def __str__(self) -> str:
         from megloc_kapture.evaluation.report.reports import report_text

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.report.reports import RECALL_JSON
 from megloc_kapture.io.csv_table import write_csv_table
 from megloc_kapture.io.files import hard_link, output_error
@@ -175,7 +176,7 @@ def outcome(name: str, workspace: Workspace, stages: Sequence[Stage]) -> Outcome
     manifests = [read_manifest(workspace.manifest_path(s.name)) for s in stages]
     return Outcome(
         name=name,
-        recall={_threshold(at["threshold"]): float(at["recall"]) for at in row["recall"]},
+        recall={str(Threshold(**at["threshold"])): float(at["recall"]) for at in row["recall"]},
         median_position_m=_number(row["median_position_m"]),
         median_angle_deg=_number(row["median_angle_deg"]),
         seconds=sum(m.seconds for m in manifests if m is not None and m.stage not in _BESIDE),
@@ -185,12 +186,6 @@ def outcome(name: str, workspace: Workspace, stages: Sequence[Stage]) -> Outcome
 def _number(value: float | None) -> float:
     """JSON knows no infinity: a median over queries without a pose is written as null."""
     return float("inf") if value is None else float(value)
-
-
-def _threshold(threshold: dict[str, float | None]) -> str:
-    angle = threshold["angle_deg"]
-    metres = f"{threshold['position_m']:g} m"
-    return metres if angle is None else f"{metres}, {angle:g} deg"
 
 
 def write_outcomes(workspace: Workspace, outcomes: Sequence[Outcome]) -> Path:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
-from megloc_kapture.datasets.kapture_folders import import_mapping
+from megloc_kapture.datasets.kapture_folders import import_mapping, mapping_files
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.evaluation.evaluate import evaluate, results_without_truth
 from megloc_kapture.evaluation.protocols import benchmark_of
@@ -218,9 +218,7 @@ class ImportMapping(Stage):
 
     def external(self, hashes: Hashes) -> Mapping[str, str]:
         root = self._mapping.root.resolve()
-        sensors = sorted((root / "sensors").glob("*.txt"))
-        images = [self._mapping.image_path(name) for name in self._mapping.read().image_names()]
-        return {"images": hashes.of_files(root, [*sensors, *images]), "root": str(root)}
+        return {"images": hashes.of_files(root, mapping_files(self._mapping)), "root": str(root)}
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         return import_mapping(self._mapping, work.out)

@@ -37,6 +37,22 @@ from megloc_kapture.stages.work import FolderSpec, ordered_map
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
 _ALONE = RigidTransform.identity()
+# the options that localizing uses; the others are of maps that are made
+LOCALIZING = (
+    "preprocessing",
+    "local_features",
+    "mask_margin_px",
+    "global_features",
+    "fusion",
+    "query_pairs",
+    "reranking",
+    "matching",
+    "verification",
+    "query_verification",
+    "guided_pyramid",
+    "localization",
+    "pose_refinement",
+)
 
 
 @dataclass(frozen=True, eq=False)

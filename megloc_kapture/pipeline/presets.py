@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 from pydantic import ValidationError
@@ -78,14 +78,15 @@ def options_of_preset(
     preset: str = DEFAULT_PRESET,
     *,
     changes: Sequence[dict[str, Any]] = (),
-    assignments: Sequence[str] = (),
+    assignments: Sequence[str] | Mapping[str, Any] = (),
     used: Collection[str] | None = None,
 ) -> PipelineOptions:
-    """A preset's options with changes: nested tables in order, then ``key.key=value`` texts.
+    """A preset's options with changes: nested tables in order, then what a user typed.
 
     Parameters
     ----------
-    used : the options that texts may change, by their first key; None: all.
+    assignments : ``key.key=value`` texts, or ``key.key`` to values.
+    used : the options that a user may change, by their first key; None: all.
 
     Raises
     ------
@@ -111,21 +112,31 @@ def options_of_preset(
     return options
 
 
-def assigned(assignments: Sequence[str]) -> dict[str, Any]:
-    """Nested tables of ``key.key=value`` texts; raises OptionError for one that is not."""
+def assigned(assignments: Sequence[str] | Mapping[str, Any]) -> dict[str, Any]:
+    """Nested tables of ``key.key=value`` texts, or of ``key.key`` to values.
+
+    Raises
+    ------
+    OptionError : a text that is none.
+    """
     tree: dict[str, Any] = {}
+    for key, value in _typed(assignments):
+        nested: Any = value
+        for part in reversed(key.split(".")):
+            nested = {part: nested}
+        _merge(tree, nested)
+    return tree
+
+
+def _typed(assignments: Sequence[str] | Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    if isinstance(assignments, Mapping):
+        yield from assignments.items()
+        return
     for assignment in assignments:
         key, equals, text = assignment.partition("=")
         if not equals or not key:
             raise OptionError(f"--set takes key=value, got {assignment!r}")
-        nested: dict[str, Any] = {}
-        place = nested
-        *parents, last = key.strip().split(".")
-        for parent in parents:
-            place = place.setdefault(parent, {})
-        place[last] = _value(text.strip())
-        _merge(tree, nested)
-    return tree
+        yield key.strip(), _value(text.strip())
 
 
 def _known(path: str) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -69,8 +69,7 @@ def choose_run(
     root: Path | None = None,
     *,
     preset: str | None = None,
-    assignments: Sequence[str] = (),
-    changes: Sequence[dict[str, Any]] = (),
+    assignments: Sequence[str] | Mapping[str, Any] = (),
     config: Path | None = None,
     query_prefix: str = "",
     allow_missing: bool = False,
@@ -82,7 +81,7 @@ def choose_run(
     ----------
     root : folder of the dataset as it is published; looked for below MEGLOC_DATA unless given.
     preset : that of the benchmark file unless given.
-    assignments : ``key.key=value`` texts; ``changes`` the same as nested tables.
+    assignments : what a user changes: ``key.key=value`` texts, or ``key.key`` to values.
     config : a benchmark file instead of the one that we bring.
     find_root : false: an official dataset may be without a root; it cannot be imported then.
 
@@ -111,7 +110,7 @@ def choose_run(
         preset,
         options_of_preset(preset),
         options_of_preset(preset, changes=of_file),
-        options_of_preset(preset, changes=[*of_file, *changes], assignments=assignments),
+        options_of_preset(preset, changes=of_file, assignments=assignments),
     )
     return RunChoice(source, benchmark, layers, facts)
 

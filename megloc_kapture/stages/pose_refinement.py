@@ -68,6 +68,12 @@ class PoseRefinementOptions(Options):
     def idle(self) -> dict[str, str]:
         return {} if self.refines() else {"max_references": "pose_refinement.by is empty"}
 
+    def with_refiners(self, names: Sequence[str]) -> PoseRefinementOptions:
+        """With these refiners, in this order, each with the options that it has here."""
+        known = {one.name: one.options for one in self.by}
+        chosen = [{"name": name, "options": known.get(name, {})} for name in names]
+        return PoseRefinementOptions.model_validate({**self.model_dump(), "by": chosen})
+
     def refines(self) -> bool:
         """Whether anything is done."""
         return bool(self.by)
