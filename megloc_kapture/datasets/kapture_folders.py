@@ -34,6 +34,7 @@ from megloc_kapture.io.files import link_images, output_error
 from megloc_kapture.io.images import image_size
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
 from megloc_kapture.io.paths import check_relative
+from megloc_kapture.values import RigidTransform
 
 MAPPING, QUERY, QUERY_GT = "mapping", "query", "query_gt"
 
@@ -61,21 +62,9 @@ def check_root(root: Path) -> Path:
 def input_files(root: Path) -> Iterator[Path]:
     """Every file whose content an import depends on: sensors, images, masks, depth, side tables."""
     for part in (MAPPING, QUERY, QUERY_GT):
-        sensors = root / part / "sensors"
-        if not sensors.is_dir():
-            continue
-        yield from sorted(sensors.glob("*.txt"))
         folder = KaptureFolder(root / part)
-        if part == QUERY_GT:
-            continue
-        for name in folder.read().records_depth.values():
-            if folder.depth_path(name).is_file():
-                yield folder.depth_path(name)
-        for image in folder.read().image_names():
-            yield folder.image_path(image)
-            mask = sensors / "masks" / f"{image}.png"
-            if mask.is_file():
-                yield mask
+        if (folder.root / "sensors").is_dir():
+            yield from files_of(folder, images=part != QUERY_GT)
     for name in (
         GROUPS_FILE,
         PRIORS_FILE,
@@ -86,6 +75,27 @@ def input_files(root: Path) -> Iterator[Path]:
     ):
         if (root / SIDE_TABLES / name).is_file():
             yield root / SIDE_TABLES / name
+
+
+def files_of(folder: KaptureFolder, *, images: bool = True) -> Iterator[Path]:
+    """Every file of a kapture folder that an import depends on.
+
+    Parameters
+    ----------
+    images : with the images, their masks and depth maps.
+    """
+    sensors = folder.root / "sensors"
+    yield from sorted(sensors.glob("*.txt"))
+    if not images:
+        return
+    for name in folder.read().records_depth.values():
+        if folder.depth_path(name).is_file():
+            yield folder.depth_path(name)
+    for image in folder.read().image_names():
+        yield folder.image_path(image)
+        mask = sensors / "masks" / f"{image}.png"
+        if mask.is_file():
+            yield mask
 
 
 def import_kapture_folders(
@@ -116,9 +126,7 @@ def import_kapture_folders(
     map_data, query_data = mapping.read(), query.read()
     for folder in (mapping, query):
         check_images(folder)
-    poses = map_data.poses()
-    if not poses:
-        raise DataError("no mapping image has a pose", path=mapping.root)
+    poses = _map_poses(mapping)
     if not query_data.records_camera:
         raise DataError("there are no query images", path=query.root)
     rename = prefixed(query_prefix)
@@ -151,19 +159,35 @@ def import_kapture_folders(
 def import_mapping(mapping: KaptureFolder, output: Path) -> dict[str, float]:
     """Import images with poses, without queries; see :func:`import_kapture_folders`."""
     check_images(mapping)
-    data = mapping.read()
-    poses = data.poses()
-    if not poses:
-        raise DataError("no mapping image has a pose", path=mapping.root)
+    poses, data = _map_poses(mapping), mapping.read()
     write_sensors(output / MAPPING, data)
     link_images(mapping.root, output / MAPPING)
     names = set(data.image_names())
-    found = read_groups(mapping.root.resolve().parent / SIDE_TABLES)
+    found = read_groups(_tables_beside(mapping))
     groups = {name: group for name, group in found.items() if name in names}
     write_protocol(output / SIDE_TABLES, Protocol())
     if groups:
         write_groups(output / SIDE_TABLES, groups)
     return {"map_images": len(names), "map_images_with_pose": len(poses)}
+
+
+def mapping_files(mapping: KaptureFolder) -> Iterator[Path]:
+    """Every file that :func:`import_mapping` depends on."""
+    yield from files_of(mapping)
+    groups = _tables_beside(mapping) / GROUPS_FILE
+    if groups.is_file():
+        yield groups
+
+
+def _tables_beside(mapping: KaptureFolder) -> Path:
+    return mapping.root.resolve().parent / SIDE_TABLES
+
+
+def _map_poses(mapping: KaptureFolder) -> dict[str, RigidTransform]:
+    poses = mapping.read().poses()
+    if not poses:
+        raise DataError("no mapping image has a pose", path=mapping.root)
+    return poses
 
 
 def check_images(folder: KaptureFolder) -> None:
