@@ -27,7 +27,6 @@ from megloc_kapture.stages.image_pairs import PairingMethod, pair_map_images, pa
 from megloc_kapture.stages.matches import match_pairs
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.reranking import RerankingOptions, reranked
-from megloc_kapture.stages.work import Work
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +57,7 @@ class ExtractGlobal(Reading, StageCommand):
         ]
         folders = [self.kapture(folder) for folder in (self.input, *self.query)]
         extractors = {chosen.name: chosen.make() for chosen in choices if not chosen.is_vlad}
-        with self.features_folder(self.output, force=self.force) as (out, executor):
+        with self.features_folder(self.output, force=self.force) as (out, work):
             for chosen in choices:
                 if chosen.is_vlad:
                     options = chosen.vlad_options()
@@ -72,14 +71,12 @@ class ExtractGlobal(Reading, StageCommand):
                         local_type,
                         out,
                         options.of_vlad(),
-                        work=Work(executor, console.track),
+                        work=work,
                     )
                 else:
                     extractor = extractors[chosen.name]
                     type_name = extractor.name
-                    counts = extract_global_features(
-                        folders, extractor, out, work=Work(executor, console.track)
-                    )
+                    counts = extract_global_features(folders, extractor, out, work=work)
                 console.say(f"{type_name}: {counts['images']} images")
         return 0
 
@@ -216,8 +213,7 @@ class PairsQuery(Reading, StageCommand):
                 f"{query.root}: no local features that the map has as well; give their folder "
                 "with --features-dir"
             )
-        track = self.console().track
-        with self.features_folder(matches_dir, force=self.force) as (out, executor):
+        with self.features_folder(matches_dir, force=self.force) as (out, work):
             for local_type in local_types:
                 match_pairs(
                     query,
@@ -227,7 +223,7 @@ class PairsQuery(Reading, StageCommand):
                     options.make_matcher(local_type),
                     options.verify_queries(),
                     out,
-                    work=Work(executor, track),
+                    work=work,
                 )
             matched = query.with_features([*query.features_dirs, out])
             how = RerankingOptions(by=self.rerank_by, keep=keep)

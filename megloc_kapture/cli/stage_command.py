@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from megloc_kapture.pipeline.executors import open_executor, single_threaded
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, options_of_preset
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
+from megloc_kapture.stages.work import Work
 
 FEATURES = "features"
 
@@ -43,16 +43,14 @@ class StageCommand(Choosing, Working, Common):
         )
 
     @contextmanager
-    def features_folder(
-        self, output: Path, *, force: bool
-    ) -> Iterator[tuple[Path, Executor | None]]:
+    def features_folder(self, output: Path, *, force: bool) -> Iterator[tuple[Path, Work]]:
         """Where to write features or matches, and what to work with."""
         with (
             single_threaded(),
             staged_output(output, kind=FEATURES, force=force) as out,
             open_executor(self.executor, self.workers) as executor,
         ):
-            yield out, executor
+            yield out, Work(executor, self.console().track)
 
 
 def only_type(folder: KaptureFolder, kind: str, asked: str | None) -> str:

@@ -19,7 +19,6 @@ from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS, load_plugin
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.matches import match_pairs
 from megloc_kapture.stages.triangulation import triangulate_map
-from megloc_kapture.stages.work import Work
 
 MAP = "map"
 
@@ -51,14 +50,14 @@ class ExtractLocal(Linked, StageCommand):
         chosen = {one.name: one.options for one in options.local_features}
         names = self.features or tuple(chosen)
         extractors = [load_plugin(LOCAL_FEATURES, name, chosen.get(name, {})) for name in names]
-        with self.features_folder(self.output, force=self.force) as (out, executor):
+        with self.features_folder(self.output, force=self.force) as (out, work):
             for extractor in extractors:
                 counts = extract_local_features(
                     folders,
                     extractor,
                     out,
                     mask_margin_px=options.mask_margin_px,
-                    work=Work(executor, console.track),
+                    work=work,
                 )
                 console.say(
                     f"{extractor.name}: {counts['keypoints']} keypoints, {counts['images']} images"
@@ -111,7 +110,7 @@ class Match(Reading, StageCommand):
             verification = options.verify_queries()
         pairs = read_pairs(self.pairs)
         _check_images_of(pairs, first, mapping, self.pairs)
-        with self.features_folder(self.output, force=self.force) as (out, executor):
+        with self.features_folder(self.output, force=self.force) as (out, work):
             counts = match_pairs(
                 first,
                 mapping,
@@ -120,7 +119,7 @@ class Match(Reading, StageCommand):
                 matcher,
                 verification,
                 out,
-                work=Work(executor, console.track),
+                work=work,
             )
         console.say(f"{counts['matches']} matches in {counts['pairs_with_matches']} pairs")
         return 0

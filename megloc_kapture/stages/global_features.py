@@ -15,10 +15,10 @@ from megloc_kapture.errors import DataError, PluginError
 from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
 from megloc_kapture.plugins import GlobalFeatureExtractor
 from megloc_kapture.stages.global_vlad import extract_vlad
-from megloc_kapture.stages.layout import FEATURES, GLOBAL_FEATURES, LOCAL_FEATURES, REFERENCE
+from megloc_kapture.stages.layout import FEATURES, GLOBAL_FEATURES, LOCAL_FEATURES
 from megloc_kapture.stages.local_features import read_image_of
 from megloc_kapture.stages.map_points import described_images
-from megloc_kapture.stages.stage import PipelineStage, StageWork
+from megloc_kapture.stages.stage import LOCAL_TYPES, PipelineStage, StageWork
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera
 
@@ -143,26 +143,16 @@ class ExtractGlobalFeatures(PipelineStage):
 
     name = "global_features"
     version = 2
-    uses = (
-        "global_features.name",
-        "global_features.options",
-        "map",
-        "local_features.name",
-        "local_features.options",
-        "given_features",
-    )
+    uses = ("global_features.name", "global_features.options", *LOCAL_TYPES)
     writes = (GLOBAL_FEATURES,)
 
     @property
     def reads(self) -> Sequence[str]:  # type: ignore[override]
         images = (self.layout.mapping, self.layout.query)
-        return (*images, *self._given(), LOCAL_FEATURES) if self._trains() else images
+        return (*images, *self.layout.reference, LOCAL_FEATURES) if self._trains() else images
 
     def _trains(self) -> bool:
         return any(chosen.is_vlad for chosen in self.options.global_features)
-
-    def _given(self) -> Sequence[str]:
-        return (REFERENCE,) if self.options.uses_given_map() else ()
 
     def settings(self) -> dict[str, Any]:
         found = super().settings()

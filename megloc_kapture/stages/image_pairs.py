@@ -44,7 +44,7 @@ from megloc_kapture.stages.layout import (
 )
 from megloc_kapture.stages.map_points import described_images
 from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
-from megloc_kapture.stages.stage import PipelineStage, StageWork
+from megloc_kapture.stages.stage import LOCAL_TYPES, PipelineStage, StageWork
 from megloc_kapture.values import Options, RigidTransform
 
 if TYPE_CHECKING:
@@ -260,13 +260,7 @@ def pair_queries(
 
 
 # what decides which global features there are, and how they are fused
-RETRIEVAL_OPTIONS = (
-    "global_features",
-    "fusion",
-    "local_features.name",
-    "local_features.options",
-    "given_features",
-)
+RETRIEVAL_OPTIONS = ("global_features", "fusion", *LOCAL_TYPES)
 
 
 class PairMapping(PipelineStage):
@@ -274,7 +268,7 @@ class PairMapping(PipelineStage):
 
     name = "mapping_pairs"
     version = 4
-    uses = ("mapping_pairs", "map", *RETRIEVAL_OPTIONS)
+    uses = ("mapping_pairs", *RETRIEVAL_OPTIONS)
     writes = (MAPPING_PAIRS,)
 
     @property
@@ -302,7 +296,7 @@ class PairQueries(PipelineStage):
     """Choose the map images that each query is matched with."""
 
     version = 3
-    uses = ("query_pairs", "map", *RETRIEVAL_OPTIONS)
+    uses = ("query_pairs", *RETRIEVAL_OPTIONS)
 
     @property
     def name(self) -> str:  # type: ignore[override]
@@ -310,9 +304,8 @@ class PairQueries(PipelineStage):
 
     @property
     def reads(self) -> Sequence[str]:  # type: ignore[override]
-        given = (REFERENCE,) if self.options.uses_given_map() else ()
         images = (self.layout.mapping, self.layout.query)
-        return (*images, SIDE_TABLES, GLOBAL_FEATURES, *given)
+        return (*images, SIDE_TABLES, GLOBAL_FEATURES, *self.layout.reference)
 
     @property
     def writes(self) -> Sequence[str]:  # type: ignore[override]

@@ -40,6 +40,11 @@ class Layout:
         return f"{PREPROCESSED}/{QUERY}" if self.options.preprocesses() else QUERY
 
     @property
+    def reference(self) -> tuple[str, ...]:
+        """The model that the dataset comes with, where the map has points of it."""
+        return (REFERENCE,) if self.options.uses_given_map() else ()
+
+    @property
     def mapping_matches(self) -> tuple[str, ...]:
         """Features folders with the matches of map images."""
         if not self.options.triangulates():

@@ -20,7 +20,7 @@ from megloc_kapture.preprocessing.masks import with_margin
 from megloc_kapture.stages.given_map import has_descriptors
 from megloc_kapture.stages.layout import LOCAL_FEATURES, REFERENCE
 from megloc_kapture.stages.map_points import check_given_type
-from megloc_kapture.stages.stage import PipelineStage, StageWork
+from megloc_kapture.stages.stage import LOCAL_TYPES, PipelineStage, StageWork
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, LocalFeatures
 
@@ -199,19 +199,12 @@ class ExtractLocalFeatures(PipelineStage):
     """Extract local features of all images; of a given map's, where it brings none."""
 
     name = "local_features"
-    uses = (
-        "mask_margin_px",
-        "map",
-        "local_features.name",
-        "local_features.options",
-        "given_features",
-    )
+    uses = ("mask_margin_px", *LOCAL_TYPES)
     writes = (LOCAL_FEATURES,)
 
     @property
     def reads(self) -> Sequence[str]:  # type: ignore[override]
-        given = (REFERENCE,) if self.options.uses_given_map() else ()
-        return (self.layout.mapping, self.layout.query, *given)
+        return (self.layout.mapping, self.layout.query, *self.layout.reference)
 
     def plugins(self) -> Sequence[object]:
         return self.options.query_extractors()

@@ -18,7 +18,7 @@ from megloc_kapture.stages.layout import (
     UNREFINED,
 )
 from megloc_kapture.stages.lifting import lift_map
-from megloc_kapture.stages.stage import PipelineStage, StageWork
+from megloc_kapture.stages.stage import LOCAL_TYPES, PipelineStage, StageWork
 from megloc_kapture.stages.triangulation import triangulate_map
 
 if TYPE_CHECKING:
@@ -115,21 +115,18 @@ class TriangulatePoints(PipelineStage):
     """Triangulate the map's points, beside those of a given map where both are wanted."""
 
     name = "points"
-    uses = (
-        "map",
-        "triangulation",
-        "local_features.name",
-        "local_features.options",
-        "given_features",
-        "guided_pyramid.mode",
-    )
+    uses = ("triangulation", "guided_pyramid.mode", *LOCAL_TYPES)
     writes = (UNREFINED,)
 
     @property
     def reads(self) -> Sequence[str]:  # type: ignore[override]
-        given = (REFERENCE,) if self.options.uses_given_map() else ()
         features = (LOCAL_FEATURES, GLOBAL_FEATURES)
-        return (self.layout.mapping, *features, *self.layout.mapping_matches, *given)
+        return (
+            self.layout.mapping,
+            *features,
+            *self.layout.mapping_matches,
+            *self.layout.reference,
+        )
 
     @classmethod
     def is_wanted(cls, options: PipelineOptions) -> bool:

@@ -52,7 +52,7 @@ from megloc_kapture.stages.query_units import QueryUnit, query_units
 from megloc_kapture.stages.ranking_scene import KaptureScene
 from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.shared_index import index_map, open_index, shared_index
-from megloc_kapture.stages.stage import PipelineStage, StageWork
+from megloc_kapture.stages.stage import LOCAL_TYPES, PipelineStage, StageWork
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
 from megloc_kapture.values import Failure, Options, Pose, RigidTransform
 
@@ -287,14 +287,7 @@ class LocalizeQueries(PipelineStage):
 
     name = "localization"
     version = 4
-    uses = (
-        "localization",
-        "map",
-        "local_features.name",
-        "local_features.options",
-        "given_features",
-        "guided_pyramid.mode",
-    )
+    uses = ("localization", "guided_pyramid.mode", *LOCAL_TYPES)
 
     @property
     def reads(self) -> Sequence[str]:  # type: ignore[override]

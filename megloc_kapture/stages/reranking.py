@@ -26,7 +26,7 @@ from megloc_kapture.stages.layout import (
     QUERY_PAIRS,
 )
 from megloc_kapture.stages.matches import VerifiedMatches, iterate_candidates
-from megloc_kapture.stages.stage import PipelineStage, StageWork
+from megloc_kapture.stages.stage import LOCAL_TYPES, PipelineStage, StageWork
 from megloc_kapture.values import Options
 
 if TYPE_CHECKING:
@@ -203,13 +203,7 @@ class RerankQueries(PipelineStage):
 
     name = "query_pairs"
     version = 3
-    uses = (
-        "reranking",
-        "map",
-        "local_features.name",
-        "local_features.options",
-        "given_features",
-    )
+    uses = ("reranking", *LOCAL_TYPES)
     writes = (QUERY_PAIRS,)
 
     @property

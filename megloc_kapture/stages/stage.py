@@ -7,6 +7,7 @@ stage of another package, its command. ``docs/plugins.md`` has an example.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -71,7 +72,7 @@ def is_below(path: str, folder: str) -> bool:
     return path == folder or path.startswith(f"{folder}/")
 
 
-class Stage:
+class Stage(ABC):
     """One step of a run. A class says what it is in its attributes, or in properties.
 
     Attributes
@@ -98,6 +99,7 @@ class Stage:
         """Fingerprints of what is read from outside the workspace, by what they are of."""
         return {}
 
+    @abstractmethod
     def run(self, work: StageWork) -> Mapping[str, float]:
         """Write the outputs; returns counts for the log.
 
@@ -105,7 +107,10 @@ class Stage:
         ------
         MeglocError : the data or the options cannot be used; the workspace stays as it was.
         """
-        raise NotImplementedError
+
+
+# the options that decide which types of local features there are
+LOCAL_TYPES = ("map", "local_features.name", "local_features.options", "given_features")
 
 
 class PipelineStage(Stage):

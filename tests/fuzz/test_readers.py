@@ -20,6 +20,7 @@ import numpy as np
 import onnx
 import pytest
 import torch
+from hostile import NUMBERS
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from onnx import helper, numpy_helper
@@ -474,28 +475,6 @@ def test_both_readers_of_observations_agree(tmp_path: Path, content: bytes) -> N
     survives(READERS["observations"], tmp_path, content)
 
 
-NUMBERS = st.one_of(
-    st.floats(allow_nan=False, allow_infinity=False).map(repr),
-    st.floats(-1e6, 1e6).map("{:.10f}".format),  # kapture's own writer
-    st.floats(allow_nan=False, allow_infinity=False).map("{:.18e}".format),
-    st.floats(allow_nan=False, allow_infinity=False).map("{:.25e}".format),
-    st.decimals(
-        allow_nan=False, allow_infinity=False, places=30, min_value=-100, max_value=100
-    ).map("{:f}".format),
-    st.builds(
-        "{}{}{}{}".format,
-        st.sampled_from(["", "-", "+", "0", "-00"]),
-        st.from_regex(r"[0-9]{1,25}", fullmatch=True),
-        st.sampled_from(["", "."]) | st.from_regex(r"\.[0-9]{1,25}", fullmatch=True),
-        st.just("") | st.integers(-340, 300).map("e{}".format),
-    ),
-    # half-way cases, where a wrong last digit would show
-    st.integers(2**53, 2**56).map(str),
-    st.integers(2**52, 2**53 - 1).map(lambda m: f"{m}.5"),
-    st.sampled_from(
-        ["4.9e-324", "2.2250738585072011e-308", "1.7976931348623157e308", "9007199254740993"]
-    ),
-).filter(lambda text: np.isfinite(float(text)))
 POINT_FIELDS = NUMBERS | st.sampled_from(
     ["", "x", "nan", "1e999", "1 2", " 5\t", ".", "-", "1e", "\0"]
 )

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import pytest
 
 from megloc_kapture.pipeline.evaluation_plan import PIPELINE
 from megloc_kapture.stages.matches import MatchQueries
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.query_poses import LocalizeQueries
-from megloc_kapture.stages.stage import PipelineStage
+from megloc_kapture.stages.stage import PipelineStage, StageWork
 
 
 class Declares(PipelineStage):
     name = "declares"
     uses = ("local_features.name", "mask_margin_px", "triangulation.min_angle_deg")
+
+    def run(self, work: StageWork) -> Mapping[str, float]:
+        return {}
 
 
 def test_settings_are_the_declared_options_and_no_more() -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hostile import NUMBERS
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -111,30 +112,6 @@ def test_bad_points_name_file_and_line(
 def test_points_have_three_or_six_columns(tmp_path: Path, large_bytes: int) -> None:
     with pytest.raises(DataError, match=r"p\.txt:1: expected 3 or 6 columns, got 4"):
         read_points3d(file(tmp_path / "p.txt", "1,2,3,4\n"), large_bytes=large_bytes)
-
-
-NUMBERS = st.one_of(
-    st.floats(allow_nan=False, allow_infinity=False).map(repr),
-    st.floats(-1e6, 1e6).map("{:.10f}".format),  # kapture's own writer
-    st.floats(allow_nan=False, allow_infinity=False).map("{:.18e}".format),
-    st.floats(allow_nan=False, allow_infinity=False).map("{:.25e}".format),
-    st.decimals(
-        allow_nan=False, allow_infinity=False, places=30, min_value=-100, max_value=100
-    ).map("{:f}".format),
-    st.builds(
-        "{}{}{}{}".format,
-        st.sampled_from(["", "-", "+", "0", "-00"]),
-        st.from_regex(r"[0-9]{1,25}", fullmatch=True),
-        st.sampled_from(["", "."]) | st.from_regex(r"\.[0-9]{1,25}", fullmatch=True),
-        st.just("") | st.integers(-340, 300).map("e{}".format),
-    ),
-    # half-way cases, where a wrong last digit would show
-    st.integers(2**53, 2**56).map(str),
-    st.integers(2**52, 2**53 - 1).map(lambda m: f"{m}.5"),
-    st.sampled_from(
-        ["4.9e-324", "2.2250738585072011e-308", "1.7976931348623157e308", "9007199254740993"]
-    ),
-).filter(lambda text: np.isfinite(float(text)))
 
 
 @given(st.lists(NUMBERS, min_size=3, max_size=30))

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import io
-import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from hostile import Runs
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
@@ -107,16 +107,6 @@ def test_converted_it_is_the_same(kind: type, tmp_path: Path) -> None:
     before, after = (read_weights(describe(p.name, p)) for p in (source, place))
     assert before.keys() == after.keys() and "pca.Landmarks_clean.components" in after
     assert all(torch.equal(before[name], after[name]) for name in before)
-
-
-class Runs:
-    """Pickled as a call; unpickled by pickle itself it makes a folder."""
-
-    def __init__(self, place: Path) -> None:
-        self.place = place
-
-    def __reduce__(self) -> tuple[Callable[..., object], tuple[str]]:
-        return os.mkdir, (str(self.place),)
 
 
 @pytest.mark.parametrize("legacy", [False, True])

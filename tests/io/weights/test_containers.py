@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import io
-import os
 import sys
 import tarfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +13,7 @@ import numpy as np
 import onnx
 import pytest
 import torch
+from hostile import Runs
 from onnx import TensorProto, helper, numpy_helper
 from safetensors.torch import save
 
@@ -130,16 +129,6 @@ def test_a_tar_writes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.chdir(tmp_path)
     read(tar(bundle("../../") | {"/absolute": b""}), "x.tar")
     assert list(tmp_path.iterdir()) == []
-
-
-class Runs:
-    """Pickled as a call; unpickled by pickle itself it makes a folder."""
-
-    def __init__(self, place: Path) -> None:
-        self.place = place
-
-    def __reduce__(self) -> tuple[Callable[..., object], tuple[str]]:
-        return os.mkdir, (str(self.place),)
 
 
 @pytest.mark.parametrize("legacy", [False, True])
