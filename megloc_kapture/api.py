@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import OptionError
+from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.report.renderers import REPORT_HTML
 from megloc_kapture.evaluation.report.reports import RECALL_JSON
@@ -156,13 +156,15 @@ def open_map(
 
     Raises
     ------
-    DataError : it is no map, or broken; names file and line.
+    DataError : it is no map, or broken, or contradicts itself; names file and line.
     OptionError : an option that there is not, or that changes nothing.
     """
     options = options_of_preset(preset, assignments=set or {}, used=LOCALIZING)
     opened = KaptureMap.open(
         path, features_dirs=[Path(one) for one in features_dirs], pixel_origin=pixel_origin
     )
+    if fault := opened.fault():
+        raise DataError(f"{fault}; the poses would be wrong", path=Path(path))
     return Map(opened, options)
 
 

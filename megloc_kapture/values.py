@@ -299,6 +299,9 @@ class Pose:
     cluster : the one this pose comes from, an index into ``clusters``.
     refinements : what each pose refiner made of it, in their order.
     remarks : steps that were left out because the query, or the map, lacks what they need.
+    confidence : the probability that the pose is right, None where it was not asked for; of the
+        pose before refinement by other means.
+    evidence : the terms behind it, see :mod:`megloc_kapture.localization.confidence`.
     seconds : by step.
     """
 
@@ -312,6 +315,8 @@ class Pose:
     cluster: int | None = None
     refinements: tuple[RefinementRow, ...] = ()
     remarks: tuple[str, ...] = ()
+    confidence: float | None = None
+    evidence: Mapping[str, float] = field(default_factory=dict)
     seconds: Mapping[str, float] = field(default_factory=dict)
 
     def __bool__(self) -> Literal[True]:
@@ -325,6 +330,7 @@ class Failure:
     Attributes
     ----------
     num_matches, num_inliers, candidates : of the cluster that came nearest to a pose.
+    confidence : of the pose that was found and not trusted; None where there was none.
     clusters, remarks, seconds : as of :class:`Pose`.
     """
 
@@ -334,6 +340,7 @@ class Failure:
     candidates: tuple[str, ...] = ()
     clusters: tuple[ClusterPose, ...] = ()
     remarks: tuple[str, ...] = ()
+    confidence: float | None = None
     seconds: Mapping[str, float] = field(default_factory=dict, compare=False)
 
     def __bool__(self) -> Literal[False]:

@@ -100,3 +100,18 @@ class Choosing:
     """A set of options by name: classic, modern, modern-large, megloc."""
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
     """Change an option: key.key=value; may be repeated."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Deciding(Choosing):
+    """Flags of commands that localize."""
+
+    min_confidence: float | None = None
+    """A pose that is less likely to be right (0 to 1) is a failure; 0: every pose is kept, for
+    challenges, where a wrong answer costs nothing. 0.5 unless given."""
+
+    def assignments(self) -> tuple[str, ...]:
+        """What is set by --set and by flags of its own."""
+        if self.min_confidence is None:
+            return self.set
+        return (*self.set, f"localization.min_confidence={self.min_confidence:g}")

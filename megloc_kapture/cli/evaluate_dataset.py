@@ -10,7 +10,7 @@ from typing import Annotated
 
 import tyro
 
-from megloc_kapture.cli.common import Choosing, Common, Force, Working
+from megloc_kapture.cli.common import Common, Deciding, Force, Working
 from megloc_kapture.cli.console import Console
 from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.metrics import Threshold
@@ -49,7 +49,7 @@ BELOW_RECALL = 3
 
 
 @dataclass(frozen=True, kw_only=True)
-class Eval(Choosing, Working, Common):
+class Eval(Deciding, Working, Common):
     """Run all stages on a dataset; what is done and still true is kept."""
 
     dataset: tyro.conf.Positional[str] = "synthetic-aachen"
@@ -92,7 +92,7 @@ class Eval(Choosing, Working, Common):
             self.dataset,
             self.root,
             preset=self.preset,
-            assignments=self.set,
+            assignments=self.assignments(),
             config=self.config,
             query_prefix=self.query_prefix,
             allow_missing=self.allow_missing,

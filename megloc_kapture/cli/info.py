@@ -43,7 +43,8 @@ class Info(Reading, Common):
         folder = self.kapture(self.input)
         describe_content(console, folder)
         folder.validate(deep=self.deep)
-        line(console, "checked", "everything, image by image" if self.deep else "no fault found")
+        checked = "everything, image by image" if self.deep else "files: no fault found"
+        line(console, "checked", checked)
         if folder.has_points():
             self._describe_map(console)
         else:
@@ -62,6 +63,8 @@ class Info(Reading, Common):
         except MeglocError as error:
             line(console, "localizing", f"not possible: {error}")
             return
+        if fault := opened.fault():
+            line(console, "FAULT", fault)
         for local_type, keypoints in opened.keypoints.items():
             origin = keypoints.pixel_origin
             errors = ", ".join(f"{name} {value:.3f} px" for name, value in origin.error_px.items())

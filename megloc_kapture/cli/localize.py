@@ -11,8 +11,8 @@ from typing import Annotated, Any
 
 import tyro
 
-from megloc_kapture.cli.common import Choosing, Common, Force, Input, Output, Reading, existing
-from megloc_kapture.errors import OptionError
+from megloc_kapture.cli.common import Common, Deciding, Force, Input, Output, Reading, existing
+from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.files import staged_output
 from megloc_kapture.io.kapture import KaptureFolder, read_pairs
 from megloc_kapture.pipeline.executors import available_cores
@@ -26,7 +26,7 @@ from megloc_kapture.stages.matches import iterate_candidates
 
 
 @dataclass(frozen=True, kw_only=True)
-class Localize(Reading, Choosing, Common):
+class Localize(Reading, Deciding, Common):
     """Localize the images of a kapture folder in a kapture map."""
 
     input: Input
@@ -44,7 +44,8 @@ class Localize(Reading, Choosing, Common):
     workers: int | None = None
     """Number of threads; all cores unless given."""
     force: Force = False
-    """Write into a folder that has other things in it."""
+    """Write into a folder that has other things in it, and localize in a map that contradicts
+    itself."""
 
     def run(self) -> int:
         """Run it."""
@@ -57,8 +58,13 @@ class Localize(Reading, Choosing, Common):
             pixel_origin=self.pixel_origin,
             allow_links_below=existing(self.allow_links_below),
         )
+        if not self.force and (fault := kapture_map.fault()):
+            raise DataError(
+                f"{fault}; the poses would be wrong (--force localizes all the same)",
+                path=self.input,
+            )
         options = options_of_preset(
-            self.preset or DEFAULT_PRESET, assignments=self.set, used=LOCALIZING
+            self.preset or DEFAULT_PRESET, assignments=self.assignments(), used=LOCALIZING
         )
         folder = self.kapture(self.query)
         given = None if self.pairs is None else dict(iterate_candidates(read_pairs(self.pairs)))

@@ -10,6 +10,7 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.io.dataset_tables import (
     GROUPS_FILE,
     NAMES_FILE,
+    NOWHERE_FILE,
     PRIORS_FILE,
     PROTOCOL_FILE,
     RELOCALIZATION_FILE,
@@ -19,12 +20,14 @@ from megloc_kapture.io.dataset_tables import (
     Protocol,
     read_groups,
     read_names,
+    read_nowhere,
     read_priors,
     read_protocol,
     read_relocalization,
     read_world,
     write_groups,
     write_names,
+    write_nowhere,
     write_priors,
     write_protocol,
     write_relocalization,
@@ -65,6 +68,8 @@ def input_files(root: Path) -> Iterator[Path]:
         folder = KaptureFolder(root / part)
         if (folder.root / "sensors").is_dir():
             yield from files_of(folder, images=part != QUERY_GT)
+    if (root / QUERY_GT / NOWHERE_FILE).is_file():
+        yield root / QUERY_GT / NOWHERE_FILE
     for name in (
         GROUPS_FILE,
         PRIORS_FILE,
@@ -147,6 +152,8 @@ def import_kapture_folders(
         truth_data = KaptureFolder(root / QUERY_GT).read()
         truth = len(truth_data.poses())
         write_sensors(output / QUERY_GT, _renamed(truth_data, rename, is_truth=True))
+        if nowhere := [rename(name) for name in read_nowhere(root / QUERY_GT)]:
+            write_nowhere(output / QUERY_GT, nowhere)
     _write_side_tables(root, output, rename, map_data, query_data, protocol_change)
     return {
         "map_images": len(map_data.image_names()),

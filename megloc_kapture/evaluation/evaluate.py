@@ -21,6 +21,7 @@ from megloc_kapture.evaluation.results import (
 )
 from megloc_kapture.evaluation.scoring import Evaluation, evaluate_pairs, evaluate_poses
 from megloc_kapture.evaluation.without_truth import WithoutTruth, evaluate_without_truth
+from megloc_kapture.io.dataset_tables import read_nowhere
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import Failure, Pose, RigidTransform
 
@@ -47,7 +48,8 @@ def evaluate(
     ----------
     estimated : a kapture folder with trajectories (and perhaps ``status.csv``), a pose file, or
         image -> pose; poses in memory are ``cam_from_world`` in the frame of the truth, metres.
-    truth : a kapture folder, or image -> ``cam_from_world``.
+    truth : a kapture folder, or image -> ``cam_from_world``. Queries that show nothing of the map
+        stand in the folder's ``nowhere.txt``, one a line: they are right without a pose.
     dataset : whose thresholds, conditions and pools hold; by default those of the side tables.
     side_tables : the workspace's ``megloc/`` folder: conditions, which images are scored, the
         protocol, and the world a pose file has to be brought back from; found beside truth or
@@ -106,6 +108,7 @@ def evaluate_results(
     DataError : something is missing or broken, or there is nothing to count.
     """
     true_poses = truth if isinstance(truth, Mapping) else KaptureFolder(Path(truth)).read().poses()
+    nowhere = () if isinstance(truth, Mapping) else read_nowhere(truth)
     contexts = [
         ResultContext() if isinstance(source, Mapping) else context_of(source, mapping=mapping)
         for source in results
@@ -132,7 +135,7 @@ def evaluate_results(
                 label=label,
             )
         else:
-            evaluation = _by_centers(found, true_poses, benchmark, limits)
+            evaluation = _by_centers(found, true_poses, benchmark, limits, nowhere)
         known_by = benchmark.protocol.truth
         evaluations.append(replace(evaluation, truth_known_by=known_by, context=context))
     return evaluations
@@ -202,9 +205,13 @@ def _labels(results: Sequence[Localized]) -> list[str]:
 
 
 def _by_centers(
-    result: Result, truth: Poses, benchmark: Benchmark, thresholds: Sequence[Threshold]
+    result: Result,
+    truth: Poses,
+    benchmark: Benchmark,
+    thresholds: Sequence[Threshold],
+    nowhere: Sequence[str],
 ) -> Evaluation:
-    known = {*truth, *result.poses}
+    known = {*truth, *result.poses, *nowhere}
     return evaluate_poses(
         result.poses,
         truth,
@@ -215,6 +222,7 @@ def _by_centers(
         condition_order=benchmark.protocol.conditions,
         pools=benchmark.protocol.pools,
         label=result.label,
+        nowhere=nowhere,
     )
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.evaluation.confidence import Confidence, confidence_of
 from megloc_kapture.evaluation.metrics import (
     DEFAULT_THRESHOLDS,
     PoseErrors,
@@ -57,6 +58,7 @@ class QueryResult:
     num_matches, num_inliers : from the status table; None without one.
     fallback : what kind of guess a fallback pose is.
     candidates : map images the pose comes from, best first; from the status table.
+    confidence : probability that the pose is right, as the result says; None where it does not.
     """
 
     image: str
@@ -69,6 +71,7 @@ class QueryResult:
     num_inliers: int | None = None
     fallback: Fallback = "none"
     candidates: tuple[str, ...] = ()
+    confidence: float | None = None
 
 
 class Reported(ABC):
@@ -132,6 +135,8 @@ class Evaluation(Reported):
     not_scored : images with a true pose that the benchmark does not count; sorted.
     truth_known_by : who knows the true poses that are not published; empty: said nowhere.
     pairs : of MLAD's challenges, what a query is called in ``queries`` -> its pair; else empty.
+    nowhere : queries that show nothing of the map, sorted by name; they are right without a pose,
+        and stand in no row.
     by_center : None where the position error is the distance of the camera centres. Where it is
         another (see :mod:`megloc_kapture.evaluation.scoring`), the same queries' evaluation by
         that distance.
@@ -149,8 +154,14 @@ class Evaluation(Reported):
     not_scored: tuple[str, ...]
     truth_known_by: str = ""
     pairs: Mapping[str, RelocalizationPair] = field(default_factory=dict)
+    nowhere: tuple[QueryResult, ...] = ()
     by_center: Evaluation | None = None
     context: ResultContext = field(default_factory=ResultContext)
+
+    @property
+    def confidence(self) -> Confidence | None:
+        """The confidences of the result against the truth; None where it brings none."""
+        return confidence_of(self.queries, self.thresholds[-1], self.nowhere)
 
     def compare(self, *others: Evaluation) -> Comparison:
         """Test the differences from results on the same queries, which need other labels.
@@ -186,6 +197,7 @@ class Evaluation(Reported):
 
 def query_columns(queries: Sequence[QueryResult]) -> dict[str, list[Any]]:
     """Column -> one value per query, as tables of queries have them."""
+    known = any(query.confidence is not None for query in queries)
     return {
         "image": [query.image for query in queries],
         "condition": [query.condition for query in queries],
@@ -194,6 +206,7 @@ def query_columns(queries: Sequence[QueryResult]) -> dict[str, list[Any]]:
         "angle_error_deg": [query.angle_deg for query in queries],
         "num_matches": [query.num_matches for query in queries],
         "num_inliers": [query.num_inliers for query in queries],
+        **({"confidence": [query.confidence for query in queries]} if known else {}),
         "reason": [query.reason for query in queries],
     }
 
@@ -210,6 +223,7 @@ def evaluate_poses(
     pools: Mapping[str, Sequence[str]] | None = None,
     label: str = "",
     errors: PoseErrors | None = None,
+    nowhere: Collection[str] = (),
 ) -> Evaluation:
     """Errors, recall and outcomes of ``estimated``.
 
@@ -226,15 +240,19 @@ def evaluate_poses(
     label : what to call this result.
     errors : of exactly the counted queries, sorted by name, where they are measured in another
         way than by camera centres and rotation angle.
+    nowhere : images that are known to show nothing of the map.
 
     Raises
     ------
-    DataError : no scored query has a true pose, so that there is nothing to count.
+    DataError : no scored query has a true pose, so that there is nothing to count; or an image
+        that shows nothing of the map has one.
     OptionError : two rows of the table would bear one name, or there is no threshold.
     """
     if not thresholds:
         raise OptionError("at least one recall threshold is needed")
     counted = tuple(sorted(n for n in truth if scored is None or n in scored))
+    if both := set(nowhere).intersection(truth):
+        raise DataError(f"{min(both)!r} is said to show nothing of the map, and has a true pose")
     if not counted:
         raise DataError("no query with a true pose to count: is this the right ground truth?")
     wanted = set(estimated) if scored is None else set(estimated) | set(scored)
@@ -245,6 +263,11 @@ def evaluate_poses(
         for name, position_m, angle_deg in zip(
             counted, errors.position_m.tolist(), errors.angle_deg.tolist(), strict=True
         )
+    )
+    strays = tuple(
+        _query_result(name, error, error, conditions, statuses)
+        for name in sorted(nowhere)
+        for error in (1e9 if name in estimated else np.inf,)
     )
     members = row_members(
         [query.condition for query in queries], order=condition_order, pools=pools
@@ -259,7 +282,8 @@ def evaluate_poses(
         errors=errors,
         truth={name: truth[name] for name in counted},
         estimated={name: estimated[name] for name in counted if name in estimated},
-        without_truth=tuple(sorted(wanted - set(truth))),
+        nowhere=strays,
+        without_truth=tuple(sorted(wanted - set(truth) - set(nowhere))),
         not_scored=tuple(sorted(set(truth) - set(counted))),
     )
 
@@ -294,6 +318,7 @@ def _query_result(
         num_inliers=None if status is None else status.num_inliers,
         fallback=fallback,
         candidates=() if status is None else status.candidates,
+        confidence=None if status is None else status.confidence,
     )
 
 

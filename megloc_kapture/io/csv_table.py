@@ -27,11 +27,12 @@ _MAX_UNIT_ERROR = 1e-6  # of the length of a quaternion that is written with eve
 
 
 def read_csv_table(
-    path: Path | str, columns: Sequence[str]
+    path: Path | str, columns: Sequence[str], *, optional: Sequence[str] = ()
 ) -> Iterator[tuple[int, dict[str, str]]]:
     """Yield ``(line, row)`` for each row of the table; ``row`` maps every column to its text.
 
-    ``line`` is the 1-based line on which the row ends. Empty lines are passed over.
+    ``line`` is the 1-based line on which the row ends. Empty lines are passed over. Those of the
+    columns that are ``optional`` may be absent, and are in no row then.
 
     Raises
     ------
@@ -47,7 +48,9 @@ def read_csv_table(
             problem = None
             if header is None:
                 header = fields
-                if sorted(header) == sorted(columns):
+                needed = set(columns).difference(optional)
+                unique = len(set(header)) == len(header)
+                if unique and needed <= set(header) <= set(columns):
                     continue
                 problem = (
                     f"the header must name the columns {','.join(columns)}; "
@@ -109,6 +112,7 @@ class Table(Generic[RowT]):
     row : makes a record of the values by column: a dataclass, a named tuple or a pydantic model.
     columns : by the name of the column, which is that of the record's attribute.
     keys : groups of columns; no two rows may have the same in all columns of one.
+    later : columns that older files lack; the record's own defaults stand for them.
     """
 
     def __init__(
@@ -117,8 +121,9 @@ class Table(Generic[RowT]):
         columns: Mapping[str, Column],
         *,
         keys: Sequence[tuple[str, ...]] = (),
+        later: Sequence[str] = (),
     ) -> None:
-        self._row, self._columns, self._keys = row, columns, keys
+        self._row, self._columns, self._keys, self._later = row, columns, keys, later
 
     def read(self, path: Path | str) -> Iterator[RowT]:
         """The records of a file, in its order.
@@ -129,9 +134,9 @@ class Table(Generic[RowT]):
             names file, line and column.
         """
         known: set[tuple[tuple[str, ...], ...]] = set()
-        for line, cells in read_csv_table(path, tuple(self._columns)):
+        for line, cells in read_csv_table(path, tuple(self._columns), optional=self._later):
             try:
-                row = self._row(**{name: self._value(name, cells[name]) for name in self._columns})
+                row = self._row(**{name: self._value(name, text) for name, text in cells.items()})
                 self._check_keys(cells, known)
             except ValidationError as error:
                 raise DataError(first_problem(error), path=path, line=line) from error

@@ -31,7 +31,8 @@ from pydantic import Field, field_validator, model_validator
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.csv_table import IMAGE, TEXT, ZERO_ONE, Column, Table
-from megloc_kapture.io.files import read_json_model, write_json_model
+from megloc_kapture.io.files import read_json_model, read_text, write_bytes, write_json_model
+from megloc_kapture.io.paths import check_relative
 from megloc_kapture.values import Options, RigidTransform
 
 SIDE_TABLES = "megloc"
@@ -41,6 +42,8 @@ WORLD_FILE = "world.json"
 PROTOCOL_FILE = "protocol.json"
 NAMES_FILE = "names.csv"
 RELOCALIZATION_FILE = "relocalization.csv"
+# in the folder of the true poses
+NOWHERE_FILE = "nowhere.txt"
 
 # how far a quaternion may be off unit length before it is refused; below, it is normalised
 MAX_QUATERNION_NORM_ERROR = 1e-3
@@ -309,3 +312,35 @@ def read_protocol(folder: Path | str) -> Protocol:
 def write_protocol(folder: Path | str, protocol: Protocol) -> None:
     """Write ``protocol.json`` atomically."""
     write_json_model(Path(folder) / PROTOCOL_FILE, protocol)
+
+
+def read_nowhere(truth: Path | str) -> tuple[str, ...]:
+    """Queries of which the folder of the true poses says that they show nothing of the map.
+
+    They stand in its ``nowhere.txt``, one a line; without it there is none.
+
+    Raises
+    ------
+    DataError : the file cannot be read, or a name stands in it twice; names file and line.
+    """
+    path = Path(truth) / NOWHERE_FILE
+    if not path.is_file():
+        return ()
+    names: dict[str, int] = {}
+    for line, text in enumerate(read_text(path).splitlines(), start=1):
+        name = text.strip()
+        if not name or name.startswith("#"):
+            continue
+        try:
+            check_relative(name)
+        except DataError as error:
+            raise DataError(error.message, path=path, line=line) from error
+        if name in names:
+            raise DataError(f"{name!r} stands on line {names[name]} as well", path=path, line=line)
+        names[name] = line
+    return tuple(sorted(names))
+
+
+def write_nowhere(truth: Path, names: Iterable[str]) -> None:
+    """Write ``nowhere.txt`` of a folder of true poses; raises OutputError."""
+    write_bytes(truth / NOWHERE_FILE, "".join(f"{name}\n" for name in names).encode("utf-8"))

@@ -57,6 +57,8 @@ class QueryStatus(Options):
     reason : why it failed; empty for a localized query.
     num_matches : 2D-3D matches the solver was given.
     num_inliers : those that agree with the pose.
+    confidence : probability that the pose is right; of a failed query that of the pose that was
+        not trusted; None where there was none, or nobody asked.
     cluster : index of the candidate cluster the pose comes from; None without clusters.
     fallback : ``retrieval``: a failed query was given the pose of the best retrieved map image, a
         guess; ``rig``: it was given its pose through the rig, by another camera of its moment.
@@ -72,6 +74,7 @@ class QueryStatus(Options):
     reason: str = ""
     num_matches: int = Field(default=0, ge=0)
     num_inliers: int = Field(default=0, ge=0)
+    confidence: float | None = Field(default=None, ge=0, le=1)
     cluster: int | None = Field(default=None, ge=0)
     fallback: Fallback = "none"
     candidates: tuple[str, ...] = ()
@@ -103,6 +106,7 @@ _STATUS = Table(
         "reason": TEXT,
         "num_matches": COUNT,
         "num_inliers": COUNT,
+        "confidence": or_empty(number(".4f")),
         "cluster": or_empty(COUNT),
         "fallback": TEXT,
         "candidates": IMAGES,
@@ -110,6 +114,7 @@ _STATUS = Table(
         "remarks": TEXT,
     },
     keys=[("image",)],
+    later=("confidence", "remarks"),
 )
 
 

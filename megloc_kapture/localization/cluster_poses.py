@@ -7,7 +7,7 @@ MegLoc, section "Cluster-wise localization". One view or the views of a rig are 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import zip_longest
 
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.geometry.poses import cross_matrix
 from megloc_kapture.localization.absolute_pose import refine_pose
+from megloc_kapture.localization.confidence import MatchSources, with_confidence
 from megloc_kapture.localization.estimation import (
     AbsolutePoseOptions,
     PoseEstimate,
@@ -24,7 +25,12 @@ from megloc_kapture.localization.estimation import (
     estimate_pose,
     split_by_view,
 )
-from megloc_kapture.localization.map_index import MapIndex, ObservedMatches, observed_matches
+from megloc_kapture.localization.map_index import (
+    Correspondences,
+    MapIndex,
+    ObservedMatches,
+    observed_matches,
+)
 from megloc_kapture.localization.ranking import poses_agree
 from megloc_kapture.plugins import HypothesisView, PoseHypothesis
 from megloc_kapture.values import Camera, ClusterPose, Failure, Pose, RigidTransform
@@ -86,6 +92,8 @@ def localize_in_clusters(
     rank: Rank,
     max_clusters: int,
     frames: Sequence[str] | None = None,
+    centers: Mapping[str, NDArray[np.float64]] | None = None,
+    min_confidence: float | None = None,
 ) -> ClusterLocalization:
     """Localize a query in each cluster by itself, rank the poses, and refine the best.
 
@@ -99,6 +107,8 @@ def localize_in_clusters(
     rank : scores of poses, higher is better.
     max_clusters : only those with the most matches are tried.
     frames : the coordinate frame of each cluster; clusters of different ones are never joined.
+    centers : of the map images, (3,) each; needed for ``min_confidence``.
+    min_confidence : a pose of less is a failure; None: poses have no confidence.
 
     Returns
     -------
@@ -116,16 +126,21 @@ def localize_in_clusters(
     clock.lap("correspondences")
 
     def attempt(cluster: Sequence[str], frame: str) -> _Attempt:
-        problem = PoseProblem.of(
-            [_view(view, own, cluster) for view, own in zip(views, gathered, strict=True)]
-        )
+        found = [
+            [
+                observed.resolve(_rows(m, cluster))
+                for m, observed in zip(view.matches, own, strict=True)
+            ]
+            for view, own in zip(views, gathered, strict=True)
+        ]
+        problem = PoseProblem.of(list(map(_view, views, found)))
         clock.lap("correspondences")
         estimate = estimate_pose(problem, options)
         hypothesis = None
         if isinstance(estimate, PoseEstimate):
             hypothesis = _hypothesis(tuple(cluster), views, problem, estimate, options)
         clock.lap("estimation")
-        return _Attempt(tuple(cluster), frame, problem, estimate, hypothesis)
+        return _Attempt(tuple(cluster), frame, found, problem, estimate, hypothesis)
 
     attempts = [attempt(clusters[at], frames[at] if frames else "") for at in tried]
     attempts = _join_agreeing(attempts, attempt, rank_of.__getitem__)
@@ -143,6 +158,10 @@ def localize_in_clusters(
     else:
         result = refine_pose(problem, estimate, options)
         clock.lap("refinement")
+        if min_confidence is not None and isinstance(result, Pose):
+            sources = _sources(views, attempts[best].found, ranked[best].images, centers or {})
+            result = with_confidence(problem, result, sources, options.max_error_px, min_confidence)
+            clock.lap("confidence")
     result = replace(result, candidates=ranked[best].images, clusters=ranked, seconds=clock.seconds)
     if isinstance(result, Pose):
         result = replace(result, cluster=best)
@@ -155,6 +174,7 @@ class _Attempt:
 
     cluster: tuple[str, ...]
     frame: str
+    found: Sequence[Sequence[Correspondences]]  # of each view, by keypoints type
     problem: PoseProblem
     estimate: PoseEstimate | Failure
     hypothesis: PoseHypothesis | None
@@ -240,25 +260,59 @@ def _num_observed(
     return total
 
 
-def _view(view: QueryView, gathered: Sequence[ObservedMatches], cluster: Sequence[str]) -> View:
-    """The 2D-3D matches of one camera with the images of one cluster, types one after another."""
+def _view(view: QueryView, found: Sequence[Correspondences]) -> View:
+    """The 2D-3D matches of one camera, types one after another."""
     pixels, points, covariances = [np.zeros((0, 2))], [np.zeros((0, 3))], [np.zeros((0, 6))]
     known = False
-    for typed, observed in zip(view.matches, gathered, strict=True):
-        found = observed.resolve(_rows(typed, cluster))
-        pixels.append(typed.keypoints_px[found.keypoint_ids, :2].astype(np.float64))
-        points.append(typed.index.xyz[found.point_ids])
+    for typed, own in zip(view.matches, found, strict=True):
+        pixels.append(typed.keypoints_px[own.keypoint_ids, :2].astype(np.float64))
+        points.append(typed.index.xyz[own.point_ids])
         if typed.index.covariances is None:
-            covariances.append(np.full((len(found.point_ids), 6), np.nan))
+            covariances.append(np.full((len(own.point_ids), 6), np.nan))
         else:
             known = True
-            covariances.append(np.asarray(typed.index.covariances[found.point_ids]))
+            covariances.append(np.asarray(typed.index.covariances[own.point_ids]))
     return View(
         camera=view.camera,
         cam_from_rig=view.cam_from_rig,
         points_px=np.concatenate(pixels),
         points_world=np.concatenate(points),
         point_covariances=np.concatenate(covariances) if known else None,
+    )
+
+
+def _sources(
+    views: Sequence[QueryView],
+    found: Sequence[Sequence[Correspondences]],
+    cluster: Sequence[str],
+    centers: Mapping[str, NDArray[np.float64]],
+) -> MatchSources:
+    """Where the matches of a cluster come from, and what its images see."""
+    number = {image: at for at, image in enumerate(cluster)}
+    center_of = np.array([centers[image] for image in cluster]).reshape(-1, 3)
+    similarities, support, images, noise, seen = [], [], [], [], []
+    types: list[NDArray[np.int64]] = []
+    for view, of_types in zip(views, found, strict=True):
+        for typed, own in zip(view.matches, of_types, strict=True):
+            rows = np.array([number.get(image, -1) for image, _, _ in typed.matches], np.int64)
+            similarities.append(own.similarities)
+            support.append(own.support)
+            images.append(rows[own.image_rows])
+            noise.append(np.full(len(own.support), typed.index.noise_rad))
+            types.append(np.full(len(own.support), len(types)))
+        seen.append(
+            np.concatenate([np.zeros((0, 3)), *(m.index.seen_by(cluster) for m in view.matches)])
+        )
+    rows_of_images = np.concatenate(images)
+    return MatchSources(
+        similarities=np.concatenate(similarities),
+        types=np.concatenate(types),
+        support=np.concatenate(support),
+        centers=center_of[rows_of_images],
+        images=rows_of_images,
+        num_keypoints=sum(len(m.keypoints_px) for view in views for m in view.matches),
+        noise_rad=np.concatenate(noise),
+        seen=seen,
     )
 
 

@@ -272,6 +272,14 @@ def _errors_px(
     return errors
 
 
+def reprojection_errors_px(
+    problem: PoseProblem, rig_from_world: RigidTransform
+) -> NDArray[np.float64]:
+    """Errors in pixels (N,) of all matches; infinite behind a camera and where a point is none."""
+    usable = np.asarray(np.isfinite(problem.points).all(axis=1))
+    return _errors_px(problem, undo_recentring(rig_from_world, -problem.offset), usable)
+
+
 def _ransac(
     problem: PoseProblem,
     rays: NDArray[np.float64],

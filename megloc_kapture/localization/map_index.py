@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -23,6 +24,8 @@ class MapIndex:
     point_ids : int32 (O,), rows of ``xyz``.
     covariances : float64 (N, 6) of the points as xx, xy, xz, yy, yz, zz in the map's unit squared,
         for a measurement noise of 1 px, NaN where unknown; None where the map has none.
+    noise_rad : median angle between an observation and its point, seen by the map's image; NaN
+        where it is not known.
     """
 
     xyz: NDArray[np.float64]
@@ -31,6 +34,7 @@ class MapIndex:
     keypoint_ids: NDArray[np.int32]
     point_ids: NDArray[np.int32]
     covariances: NDArray[np.float64] | None = None
+    noise_rad: float = math.nan
 
     @classmethod
     def build(
@@ -81,6 +85,13 @@ class MapIndex:
         found[hit] = points[rows[hit]]
         return found
 
+    def seen_by(self, images: Sequence[str]) -> NDArray[np.float64]:
+        """The points that some of the images observe, each once, (K, 3)."""
+        seen = np.zeros(len(self.xyz), dtype=np.bool_)
+        for image in images:
+            seen[self.observed(image)[1]] = True
+        return self.xyz[np.flatnonzero(seen)]
+
     def rows_of(self, images: Sequence[str]) -> NDArray[np.int64]:
         """Row of each image in ``offsets``, -1 where it is not in the map; int64 (n,)."""
         return np.array([self.row_of_image.get(image, -1) for image in images], dtype=np.int64)
@@ -117,11 +128,15 @@ class Correspondences:
     keypoint_ids : int64 (N,), rows of the query's keypoints, ascending.
     point_ids : int64 (N,), rows of the map's points.
     support : int64 (N,), number of map images that say so.
+    similarities : float64 (N,), of the most similar of them; higher is better.
+    image_rows : int64 (sum of support,), these images, match by match.
     """
 
     keypoint_ids: NDArray[np.int64]
     point_ids: NDArray[np.int64]
     support: NDArray[np.int64]
+    similarities: NDArray[np.float64]
+    image_rows: NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,7 +179,7 @@ class ObservedMatches:
         taken = np.flatnonzero(rows[self.image_rows])
         if len(taken) == 0:
             none = np.zeros(0, dtype=np.int64)
-            return Correspondences(none, none, none)
+            return Correspondences(none, none, none, np.zeros(0), none)
         # both in one number: equals are the same pair, and their order does not matter
         taken = taken[np.argsort((self.keypoint_ids[taken] << 32) | self.point_ids[taken])]
         keypoints, points = self.keypoint_ids[taken], self.point_ids[taken]
@@ -179,7 +194,13 @@ class ObservedMatches:
             np.cumsum(np.diff(keypoints, prepend=keypoints[0]) != 0),
             np.unique(points, return_inverse=True)[1],
         )
-        return Correspondences(keypoints[chosen], points[chosen], support[chosen])
+        return Correspondences(
+            keypoints[chosen],
+            points[chosen],
+            support[chosen],
+            best[chosen],
+            self.image_rows[taken][np.repeat(chosen, support)],
+        )
 
 
 def observed_matches(

@@ -17,6 +17,7 @@ from megloc_kapture.io.dataset_tables import PROTOCOL_FILE, SIDE_TABLES
 from megloc_kapture.io.kapture import FeatureReader, KaptureFolder
 from megloc_kapture.io.weights.registry import registry
 from megloc_kapture.localization.map_index import MapIndex
+from megloc_kapture.mapping.map_check import ObservedKeypoints, map_fault
 from megloc_kapture.mapping.pixel_origin import (
     ObservedImage,
     Origin,
@@ -261,6 +262,33 @@ class KaptureMap:
             vectors = self.folder.global_features(name)
             for image in self.images:
                 vectors.length(image)
+
+    def fault(self) -> str | None:
+        """In words, why the map contradicts itself; None where it does not.
+
+        Of a sample of its images the points are compared with the keypoints that observe them; see
+        :mod:`megloc_kapture.mapping.map_check`.
+        """
+        for name, keypoints in self.keypoints.items():
+            images = [image for image in self.images if image in keypoints]
+            # runs of neighbours: a pose may have gone to the image after its own
+            run, number = 10, _SAMPLED_IMAGES // 10
+            starts = np.linspace(0, max(len(images) - run, 0), number).astype(int).tolist()
+            taken = sorted({at for start in starts for at in range(start, start + run)})
+            sample = [
+                ObservedKeypoints(
+                    image,
+                    self.camera(image),
+                    self.poses[image],
+                    keypoints.keypoints_px(image)[:, :2],
+                    *keypoints.index.observed(image),
+                )
+                for image in (images[at] for at in taken if at < len(images))
+            ]
+            found = map_fault(sample, keypoints.index.xyz)
+            if found is not None:
+                return found if len(self.keypoints) == 1 else f"{name}: {found}"
+        return None
 
     @cached_property
     def _global_types(self) -> tuple[str, ...]:

@@ -108,6 +108,7 @@ def query_status(image: str, result: Pose | Failure, fallback: Fallback = "none"
         reason="" if isinstance(result, Pose) else result.reason,
         num_matches=result.num_matches,
         num_inliers=result.num_inliers,
+        confidence=result.confidence,
         cluster=result.cluster if isinstance(result, Pose) else None,
         refinement=refinement_text(result.refinements) if isinstance(result, Pose) else "",
         fallback=fallback,

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs
@@ -63,6 +64,12 @@ class LocalizationOptions(Options):
     clusters: ClusterOptions = ClusterOptions()
     rank: PluginChoice = PluginChoice(name="distinctive")
     pose: AbsolutePoseOptions = AbsolutePoseOptions()
+    min_confidence: float = Field(
+        default=0.5,
+        ge=0,
+        le=1,
+        description="a pose that is less likely to be right is a failure; 0: none is",
+    )
     rigs: bool = False
     fallback: Fallback = "none"
 
@@ -127,6 +134,8 @@ def localize_views(
         rank=lambda hypotheses: ranker.score(hypotheses, scene),
         max_clusters=options.clusters.max_clusters,
         frames=[frame_of[cluster[0]] for cluster in clusters],
+        centers=centers,
+        min_confidence=options.min_confidence,
     )
     result = replace(found.result, seconds={**seconds, **found.result.seconds})
     return replace(found, result=result)

@@ -7,9 +7,11 @@ the same files share both. The arrays are plain ``.npy`` files, the names JSON: 
 from __future__ import annotations
 
 import json
+import math
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
+from megloc_kapture.geometry.cameras import focal_px, project
 from megloc_kapture.io.files import atomic_write, output_error, write_bytes
 from megloc_kapture.io.kapture import KaptureFolder, Observations
 from megloc_kapture.io.kapture.points import read_point_covariances
@@ -31,6 +34,7 @@ _ARRAYS: dict[str, tuple[int, type[Any]]] = {
     "point_ids": (0, np.int32),
 }
 _COVARIANCES = (6, np.float64)
+_SAMPLED_IMAGES = 32
 
 
 def index_map(folder: KaptureFolder, local_type: str) -> MapIndex:
@@ -50,7 +54,7 @@ def index_map(folder: KaptureFolder, local_type: str) -> MapIndex:
         nothing = np.zeros(0, np.int32)
         observations = Observations(local_type, (), nothing.astype(np.int64), nothing, nothing)
     points = folder.points3d()
-    return MapIndex.build(
+    index = MapIndex.build(
         points[:, :3],
         observations.image_names,
         observations.image_ids,
@@ -58,6 +62,28 @@ def index_map(folder: KaptureFolder, local_type: str) -> MapIndex:
         observations.point_ids,
         read_point_covariances(folder.root, len(points)),
     )
+    return replace(index, noise_rad=_noise_rad(folder, local_type, index))
+
+
+def _noise_rad(folder: KaptureFolder, local_type: str, index: MapIndex) -> float:
+    """Median angle between observations and their points, of a sample of the images."""
+    if local_type not in folder.types("keypoints"):
+        return math.nan
+    data, keypoints = folder.read(), folder.keypoints(local_type)
+    images = [i for i in index.row_of_image if i in keypoints and data.cam_from_world(i)]
+    errors = [np.zeros(0)]
+    for image in images[:: max(1, len(images) // _SAMPLED_IMAGES)]:
+        camera, pose = data.camera_of(image), data.cam_from_world(image)
+        rows, points = index.observed(image)
+        stored = keypoints.read(image)
+        if pose is None or not len(rows) or rows[-1] >= len(stored):
+            continue
+        with np.errstate(invalid="ignore"):
+            offsets = project(camera, pose, index.xyz[points]) - stored[rows, :2]
+        errors.append(np.linalg.norm(offsets, axis=1) / focal_px(camera))
+    found = np.concatenate(errors)
+    found = found[np.isfinite(found)]
+    return float(np.median(found)) if len(found) else math.nan
 
 
 def write_index(index: MapIndex, folder: Path) -> None:
@@ -72,7 +98,9 @@ def write_index(index: MapIndex, folder: Path) -> None:
     if index.covariances is not None:
         _write_array(folder / "covariances.npy", index.covariances)
     names = sorted(index.row_of_image, key=index.row_of_image.__getitem__)
-    write_bytes(folder / _IMAGES, json.dumps(names).encode())
+    noise = None if math.isnan(index.noise_rad) else index.noise_rad
+    content = {"images": names, "noise_rad": noise}
+    write_bytes(folder / _IMAGES, json.dumps(content).encode())
 
 
 def open_index(folder: Path) -> MapIndex:
@@ -88,13 +116,15 @@ def open_index(folder: Path) -> MapIndex:
         covariances = _open_array(folder / "covariances.npy", *_COVARIANCES)
     path = folder / _IMAGES
     try:
-        names = json.loads(path.read_bytes())
-    except (OSError, ValueError) as error:
+        content = json.loads(path.read_bytes())
+        names, noise = content["images"], content["noise_rad"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"cannot read: {error}", path=path) from error
     rows = {name: row for row, name in enumerate(names)}
     if len(arrays["offsets"]) != len(names) + 1:
         raise DataError(f"{len(names)} images for {len(arrays['offsets'])} offsets", path=path)
-    return MapIndex(row_of_image=rows, covariances=covariances, **arrays)
+    noise_rad = math.nan if noise is None else float(noise)
+    return MapIndex(row_of_image=rows, covariances=covariances, noise_rad=noise_rad, **arrays)
 
 
 @contextmanager

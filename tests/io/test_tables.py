@@ -29,13 +29,15 @@ from megloc_kapture.io.tables import (
 from megloc_kapture.values import ClusterPose, RefinementRow, RigidTransform
 
 HEADER = (
-    "image,status,reason,num_matches,num_inliers,cluster,fallback,candidates,refinement,remarks\n"
+    "image,status,reason,num_matches,num_inliers,confidence,cluster,fallback,candidates,"
+    "refinement,remarks\n"
 )
 LOCALIZED = QueryStatus(
     image="q/b.jpg",
     status="localized",
     num_matches=310,
     num_inliers=120,
+    confidence=0.9766,
     cluster=0,
     candidates=("map/2; left.jpg", "map/1.jpg"),
     refinement="icp: accepted",
@@ -82,15 +84,15 @@ def test_rows_are_sorted_whatever_the_order(tmp_path: Path) -> None:
     write_status(second, [FAILED, LOCALIZED])
     assert first.read_bytes() == second.read_bytes()
     assert first.read_text() == (
-        f'{HEADER}q/a.jpg,failed,"7 inliers, 12 needed",0,0,,retrieval,,,\n'
-        'q/b.jpg,localized,,310,120,0,none,"map/2; left.jpg,map/1.jpg",icp: accepted,\n'
+        f'{HEADER}q/a.jpg,failed,"7 inliers, 12 needed",0,0,,,retrieval,,,\n'
+        'q/b.jpg,localized,,310,120,0.9766,0,none,"map/2; left.jpg,map/1.jpg",icp: accepted,\n'
     )
 
 
 def test_two_rows_for_one_query(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="is given twice"):
         write_status(tmp_path / "status.csv", [FAILED, FAILED])
-    (tmp_path / "status.csv").write_text(HEADER + 2 * "a.jpg,localized,,9,9,,none,,,\n")
+    (tmp_path / "status.csv").write_text(HEADER + 2 * "a.jpg,localized,,9,9,,,none,,,\n")
     with pytest.raises(DataError, match="is given twice") as caught:
         read_status(tmp_path / "status.csv")
     assert caught.value.line == 3
@@ -99,17 +101,18 @@ def test_two_rows_for_one_query(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("row", "words"),
     [
-        ("a.jpg,lost,,0,0,,none,", "status"),
-        ("a.jpg,localized,,x,0,,none,", "num_matches"),
-        ("a.jpg,localized,,-1,0,,none,", "num_matches"),
-        ("a.jpg,localized,,3,1.5,,none,", "num_inliers"),
-        ("a.jpg,localized,,3,1,one,none,", "cluster"),
-        ("a.jpg,failed,why,0,0,,identity,", "fallback"),
-        ("a.jpg,failed,,0,0,,none,", "needs a reason"),
-        ("a.jpg,localized,,3,1,,retrieval,", "no fallback"),
-        ("a.jpg,localized,why,3,1,,none,", "no reason"),
-        ('a.jpg,localized,,3,1,,none,"x,,y"', "candidate"),
-        ("../a.jpg,localized,,3,1,,none,", "leads out"),
+        ("a.jpg,lost,,0,0,,,none,", "status"),
+        ("a.jpg,localized,,x,0,,,none,", "num_matches"),
+        ("a.jpg,localized,,-1,0,,,none,", "num_matches"),
+        ("a.jpg,localized,,3,1.5,,,none,", "num_inliers"),
+        ("a.jpg,localized,,3,1,,one,none,", "cluster"),
+        ("a.jpg,failed,why,0,0,,,identity,", "fallback"),
+        ("a.jpg,failed,,0,0,,,none,", "needs a reason"),
+        ("a.jpg,localized,,3,1,,,retrieval,", "no fallback"),
+        ("a.jpg,localized,why,3,1,,,none,", "no reason"),
+        ("a.jpg,localized,,3,1,1.5,,none,", "confidence"),
+        ('a.jpg,localized,,3,1,,,none,"x,,y"', "candidate"),
+        ("../a.jpg,localized,,3,1,,,none,", "leads out"),
     ],
 )
 def test_broken_rows_name_line_and_field(tmp_path: Path, row: str, words: str) -> None:
@@ -259,3 +262,16 @@ def test_a_broken_row_is_named_with_its_line_of_consistency(
     with pytest.raises(DataError, match=expected) as raised:
         read_consistency(path)
     assert f"{path}:2" in str(raised.value)
+
+
+def test_a_table_of_before_confidences_reads(tmp_path: Path) -> None:
+    path = tmp_path / "status.csv"
+    path.write_text(
+        "image,status,reason,num_matches,num_inliers,cluster,fallback,candidates,refinement\n"
+        "q/b.jpg,localized,,310,120,0,none,map/1.jpg,\n"
+    )
+    row = read_status(path)["q/b.jpg"]
+    assert row.confidence is None and row.remarks == "" and row.num_inliers == 120
+    path.write_text("image,status,confidence\nq/b.jpg,localized,0.5\n")
+    with pytest.raises(DataError, match="the header must name the columns"):
+        read_status(path)

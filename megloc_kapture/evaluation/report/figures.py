@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 from numpy.typing import NDArray
 
+from megloc_kapture.evaluation.confidence import Confidence
 from megloc_kapture.evaluation.metrics import ALL, Threshold
 from megloc_kapture.evaluation.report.tables import PALETTE, colors_of
 from megloc_kapture.evaluation.report.wording import display_name
@@ -313,6 +314,32 @@ def errors_against_inliers(evaluation: Evaluation, *, prefix: str = "inliers") -
         plain_ticks(axes.yaxis)
         if len(colors) > 1 or guessed.any():
             legend_below(axes)
+        return to_svg(figure, prefix)
+
+
+def confidence_curves(confidence: Confidence, *, prefix: str = "confidence") -> str:
+    """The reliability diagram, and the risk against the coverage."""
+    with styled_figure(10.5, 4.0) as figure:
+        reliability, curve = figure.subplots(1, 2)
+        reliability.plot([0, 100], [0, 100], color=MUTED, linewidth=0.9, linestyle=":")
+        filled = [one for one in confidence.bins if one.num_poses]
+        mean = 100 * np.array([one.mean_confidence for one in filled])
+        share = 100 * np.array([one.share_right for one in filled])
+        reliability.plot(mean, share, "o-", color=INK, markersize=5)
+        for x, y, one in zip(mean, share, filled, strict=True):
+            reliability.annotate(
+                str(one.num_poses), (x, y), xytext=(0, 6), textcoords="offset points",
+                ha="center", fontsize=7, color=MUTED,
+            )  # fmt: skip
+        reliability.set(
+            xlabel="confidence (%)", ylabel="right poses (%)", xlim=(-2, 104), ylim=(-2, 110)
+        )
+        coverage, risk = 100 * np.array(confidence.coverage), 100 * np.array(confidence.risk)
+        curve.step(coverage, risk, where="post", color=INK)
+        curve.set(
+            xlabel="queries answered (%)", ylabel="wrong among them (%)", xlim=(0, 102),
+            ylim=(0, max(5.0, 1.1 * float(risk.max(initial=0.0)))),
+        )  # fmt: skip
         return to_svg(figure, prefix)
 
 

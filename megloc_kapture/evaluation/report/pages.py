@@ -38,6 +38,7 @@ from megloc_kapture.evaluation.report.wording import (
     INTERVALS,
     agreement_sentence,
     comparison_sentences,
+    confidence_sentences,
     criterion,
     format_degrees,
     format_interval,
@@ -144,6 +145,22 @@ def evaluation_page(
         )
         beside = Section(explained, "How to read it")
         sections.append(Section((Figure(Markup(inliers)),), "Error against inliers", beside=beside))
+    confidence = evaluation.confidence
+    if confidence is not None:
+        worth = (
+            *(
+                Paragraph(f"{sentence[0].upper()}{sentence[1:]}.")
+                for sentence in confidence_sentences(confidence, evaluation.thresholds[-1])
+            ),
+            Paragraph(
+                "Left: poses by their confidence; where it can be trusted, the dots lie on the "
+                "dotted line. Right: poses are accepted from the most confident on."
+            ),
+        )
+        drawn = (
+            (Figure(Markup(figures.confidence_curves(confidence))),) if confidence.num_poses else ()
+        )
+        sections.append(Section((*worth, *drawn), "Does it know when it does not know?"))
     sections += _pictured(
         "The worst queries",
         "Left the query, right the candidate with most matches. ",
@@ -299,6 +316,7 @@ def query_table(evaluation: Evaluation) -> tuple[Table, int]:
         ),
         column("inliers", rows, lambda row: _if_known(row.num_inliers), kind="count"),
         column("matches", rows, lambda row: _if_known(row.num_matches), kind="count"),
+        column("confidence", rows, lambda row: _if_confident(row.confidence), kind="count"),
         column("reason", rows, lambda row: row.reason),
     ]
     empty = set() if any(query.condition for query in queries) else {"condition"}
@@ -306,6 +324,8 @@ def query_table(evaluation: Evaluation) -> tuple[Table, int]:
         empty.add("centre (m)")
     if all(query.num_inliers is None for query in queries):
         empty |= {"inliers", "matches"}
+    if all(query.confidence is None for query in queries):
+        empty.add("confidence")
     shown = tuple(own for own in columns if own.heading not in empty)
     return Table(shown, tall=True), max(len(queries) - _MAX_ROWS, 0)
 
@@ -428,3 +448,7 @@ def _if_finite(value: float, form: Callable[[float], str]) -> str:
 
 def _if_known(count: int | None) -> str:
     return "" if count is None else str(count)
+
+
+def _if_confident(confidence: float | None) -> str:
+    return "" if confidence is None else f"{confidence:.2f}"

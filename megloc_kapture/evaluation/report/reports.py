@@ -22,6 +22,7 @@ from megloc_kapture.evaluation.report.wording import (
     agreement_sentence,
     bounds,
     comparison_sentences,
+    confidence_sentences,
     criterion,
     method_sentence,
     notes,
@@ -149,10 +150,16 @@ def _results(reported: AnyReported) -> Sequence[Evaluation] | Sequence[ResultWit
 def _text_sections(reported: AnyReported) -> tuple[Section, ...]:
     if isinstance(reported, Evaluation):
         label = (_lines(_line(reported.label)),) if reported.label else ()
-        return (*label, *_recall_sections([reported]), *_note_sections([reported]))
+        return (
+            *label,
+            *_recall_sections([reported]),
+            *_confidence_sections([reported]),
+            *_note_sections([reported]),
+        )
     if isinstance(reported, Comparison):
         return (
             *_recall_sections(reported.evaluations),
+            *_confidence_sections(reported.evaluations),
             _lines(Items(tuple(comparison_sentences(reported)))),
             _lines(Paragraph(method_sentence(reported))),
             *_note_sections(reported.evaluations),
@@ -174,6 +181,15 @@ def _recall_sections(evaluations: Sequence[Evaluation]) -> list[Section]:
         sections.append(_lines(tables.recall_table(by_center)))
     intervals = tables.interval_table(evaluations)
     return [*sections, _lines(_line(f"{INTERVALS}, (%)"), intervals)]
+
+
+def _confidence_sections(evaluations: Sequence[Evaluation]) -> list[Section]:
+    return [
+        _lines(Paragraph(f"Confidence{f' of {e.label}' if evaluations[1:] else ''}: {sentence}."))
+        for e in evaluations
+        if (confidence := e.confidence) is not None
+        for sentence in confidence_sentences(confidence, e.thresholds[-1])
+    ]
 
 
 def _note_sections(evaluations: Sequence[Evaluation]) -> list[Section]:
@@ -241,6 +257,11 @@ def _recall_data(evaluation: Evaluation) -> dict[str, Any]:
         "thresholds": evaluation.thresholds,
         "rows": evaluation.rows,
         "notes": notes(evaluation),
+        **(
+            {}
+            if (confidence := evaluation.confidence) is None
+            else {"confidence": asdict(confidence)}
+        ),
         "without_truth": evaluation.without_truth,
         "not_scored": evaluation.not_scored,
         **({} if by_center is None else {"rows_by_center": by_center.rows}),

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from megloc_kapture.evaluation.confidence import Confidence
 from megloc_kapture.evaluation.metrics import ALL, RecallAt, Threshold
 from megloc_kapture.evaluation.scoring import Evaluation
 from megloc_kapture.evaluation.statistics import (
@@ -141,6 +142,32 @@ def notes(evaluation: Evaluation) -> list[str]:
         said.append(
             f"{counted(len(evaluation.not_scored), 'image', 'images')} with a true pose "
             f"{_verb(len(evaluation.not_scored), 'is', 'are')} not scored by this benchmark"
+        )
+    return said
+
+
+def confidence_sentences(confidence: Confidence, coarsest: Threshold) -> list[str]:
+    """What the confidences of a result are worth, without a full stop."""
+    said = []
+    if confidence.num_poses:
+        interval = f"{100 * confidence.wrong_low:.1f}-{100 * confidence.wrong_high:.1f}"
+        said.append(
+            f"of {counted(confidence.num_poses, 'pose', 'poses')} with a confidence "
+            f"{confidence.num_wrong} {_verb(confidence.num_wrong, 'is', 'are')} wrong (beyond "
+            f"{coarsest}): {format_share(confidence.num_wrong, confidence.num_poses)} % "
+            f"({interval})"
+        )
+        by_inliers = confidence.area_by_inliers
+        than = "" if by_inliers is None else f" ({by_inliers:.4f} by number of inliers)"
+        said.append(
+            f"calibration error {confidence.calibration_error:.3f}; area under risk against "
+            f"coverage {confidence.area:.4f}{than}"
+        )
+    if confidence.num_nowhere:
+        said.append(
+            f"{counted(confidence.num_nowhere, 'query shows', 'queries show')} nothing of the map: "
+            f"{confidence.num_nowhere_refused} refused, "
+            f"{confidence.num_nowhere - confidence.num_nowhere_refused} given a pose"
         )
     return said
 

@@ -1,0 +1,303 @@
+"""Confidence of a pose: the probability that it is right, from what is known without the truth.
+
+A number of inliers says little by itself: of a thousand matches some agree with any pose. What is
+looked at (:func:`evidence_of`) is how far the inliers exceed chance, what share of all matches and
+of all that could match they are, how well they fit, whether their descriptors are more alike than
+those of the other matches, how firmly they hold the pose, and from how far away they were seen.
+A logistic model weighs it (:class:`Calibration`). Its weights are fitted by
+``benchmarks/confidence.py`` and stand, with their origin, in ``confidence.toml`` beside this file.
+"""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from importlib import resources
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.geometry.cameras import focal_px, project
+from megloc_kapture.localization.absolute_pose import center_deviation
+from megloc_kapture.localization.estimation import PoseProblem, reprojection_errors_px
+from megloc_kapture.values import Failure, Pose, RigidTransform
+
+# of an a contrario test: matches that a pose is made of
+_SAMPLE = 3
+# inliers so near to each other count once, as a share of the image's diagonal
+_CELL = 0.01
+# as many points tell how many of all could be seen
+_MAX_PROJECTED = 2048
+_MIN_ERROR_PX = 0.5
+# no map is better than that, in pixels of the query
+_MIN_NOISE_PX = 0.3
+# an image of the scene fits worse than the map's own by less than that, and fewer inliers than
+# these say nothing about it
+_USUAL_RATIO, _FEW = 3.3, 20
+# the area under the ROC curve of similarities before any is seen, and how many pairs that is worth
+_USUAL_SIMILARITY, _USUAL_PAIRS = 0.75, 20.0
+
+TERMS: dict[str, str] = {
+    "surprise": "hardly more matches agree than would by chance",
+    "agreement": "most matches contradict the pose",
+    "matched_share": "few of the points that the camera would see were matched",
+    "residual": "the inliers fit badly",
+    "misfit": "many inliers fit, and all of them worse than the map's own images do",
+    "similarity": "the inliers are no more alike than the other matches",
+    "deviation": "the inliers hold the pose loosely",
+    "viewing_angle": "the map's images saw these points from elsewhere",
+    "distance_ratio": "the map's images saw these points from another distance",
+    "support": "few map images agree with the pose",
+}
+"""The terms of the model, and what a low contribution of each says."""
+
+
+@dataclass(frozen=True, eq=False)
+class MatchSources:
+    """Where the 2D-3D matches of a pose problem come from, match by match.
+
+    Attributes
+    ----------
+    similarities : float64 (N,), of the descriptors, higher is better; of one keypoints type they
+        can be compared.
+    types : int64 (N,), the view and keypoints type of each, counted from 0.
+    support : int64 (N,), number of map images that say so.
+    centers : float64 (sum of support, 3), where these images were taken, match by match.
+    images : int64 (sum of support,), these images.
+    num_keypoints : of the query, in all its views and types.
+    noise_rad : (N,) median angle between an observation of the map, of the match's type, and its
+        point; NaN where that is not known.
+    seen : of each view the points (K, 3) that the map images of the cluster observe.
+    """
+
+    similarities: NDArray[np.float64]
+    types: NDArray[np.int64]
+    support: NDArray[np.int64]
+    centers: NDArray[np.float64]
+    images: NDArray[np.int64]
+    num_keypoints: int
+    noise_rad: NDArray[np.float64]
+    seen: Sequence[NDArray[np.float64]]
+
+
+def evidence_of(
+    problem: PoseProblem, pose: Pose, sources: MatchSources, max_error_px: float
+) -> dict[str, float]:
+    """The terms that speak for a pose or against it, by the names of :data:`TERMS`.
+
+    Parameters
+    ----------
+    pose : of the problem, refined, with its covariance and inliers; of a rig ``rig_from_world``.
+
+    Raises
+    ------
+    ValueError : the pose brings no inliers or no covariance.
+    """
+    if pose.inliers is None or pose.covariance is None:
+        raise ValueError("evidence needs the inliers and the covariance of a pose")
+    rig_from_world = pose.cam_from_world
+    inliers = pose.inliers
+    errors_px = reprojection_errors_px(problem, rig_from_world)
+    count, num = int(inliers.sum()), len(inliers)
+    center = rig_from_world.center()
+    points = problem.points[inliers] + problem.offset
+    distances = np.linalg.norm(points - center, axis=1)
+    matchable = min(sources.num_keypoints, _num_visible(problem, rig_from_world, sources.seen))
+    sighted = np.repeat(inliers, sources.support)
+    angles, ratios = _viewpoints(points, center, sources, inliers, sighted)
+    images = np.unique(sources.images[sighted], return_counts=True)[1]
+    return {
+        "surprise": math.log10(1.0 + _surprise(problem, errors_px, max_error_px)),
+        "agreement": math.log(count / (num - count + 1.0)),
+        "matched_share": math.log(count / max(matchable, count)),
+        "residual": math.log(max(float(np.median(errors_px[inliers])), 0.1) / max_error_px),
+        "misfit": _misfit(problem, errors_px, inliers, sources),
+        "similarity": _similarity(sources, inliers),
+        "deviation": math.log(
+            max(center_deviation(pose.covariance) / float(np.median(distances)), 1e-5)
+        ),
+        "viewing_angle": angles,
+        "distance_ratio": ratios,
+        "support": math.log(1.0 + float((images >= 5).sum())),
+    }
+
+
+def with_confidence(
+    problem: PoseProblem,
+    pose: Pose,
+    sources: MatchSources,
+    max_error_px: float,
+    min_confidence: float,
+) -> Pose | Failure:
+    """The pose with its confidence and the evidence for it; a failure where that is too little."""
+    evidence = evidence_of(problem, pose, sources, max_error_px)
+    model = calibration()
+    confidence = model.probability(evidence)
+    if confidence >= min_confidence:
+        return replace(pose, confidence=confidence, evidence=evidence)
+    return Failure(
+        f"confidence {confidence:.2g} of the pose, at least {min_confidence:g} is needed: "
+        f"{pose.num_inliers} of {pose.num_matches} 2D-3D matches agree, and "
+        f"{model.weakest(evidence)}",
+        num_matches=pose.num_matches,
+        num_inliers=pose.num_inliers,
+        confidence=confidence,
+    )
+
+
+def _surprise(problem: PoseProblem, errors_px: NDArray[np.float64], max_error_px: float) -> float:
+    """How unlikely it is that so many matches agree by chance: -log10 of the number of false
+    alarms, at least 0.
+
+    A contrario (Moisan and Stival, "A probabilistic criterion to detect rigid point matches between
+    two images and estimate the fundamental matrix", IJCV 2004; for poses Moulon et al., "Adaptive
+    structure from motion with a contrario model estimation", ACCV 2012): a wrong match falls within
+    r of its point's projection with the probability of that disc in the image, whatever the pose.
+    The radius is the one that surprises most. Matches that stand together count once.
+    """
+    errors, shares = [], []
+    for view, first, last in zip(
+        problem.views, problem.starts[:-1].tolist(), problem.starts[1:].tolist(), strict=True
+    ):
+        width, height = view.camera.width, view.camera.height
+        cells = np.floor(problem.points_px[first:last] / max(_CELL * math.hypot(width, height), 1))
+        order = np.argsort(errors_px[first:last], kind="stable")
+        kept = order[np.unique(cells[order], axis=0, return_index=True)[1]]
+        errors.append(errors_px[first:last][kept])
+        disc = np.pi * np.maximum(errors[-1], _MIN_ERROR_PX) ** 2
+        shares.append(np.minimum(disc / (width * height), 1.0))
+    error, share = np.concatenate(errors), np.concatenate(shares)
+    num = len(error)
+    order = np.argsort(error, kind="stable")[: int((error <= max_error_px).sum())]
+    counts = np.arange(1, len(order) + 1)
+    # of the k best the largest disc
+    shares_of_best = np.maximum.accumulate(share[order])
+    many = counts > _SAMPLE
+    if not many.any():
+        return 0.0
+    counts = counts[many]
+    log_alarms = (
+        math.log(max(num - _SAMPLE, 1))
+        + _log_choose(num, counts)
+        + _log_choose(counts, _SAMPLE)
+        + (counts - _SAMPLE) * np.log(shares_of_best[many])
+    )
+    return max(0.0, -float(log_alarms.min()) / math.log(10))
+
+
+def _log_choose(n: int | NDArray[np.int64], k: int | NDArray[np.int64]) -> NDArray[np.float64]:
+    from scipy.special import gammaln
+
+    return np.asarray(
+        gammaln(np.add(n, 1)) - gammaln(np.add(k, 1)) - gammaln(np.subtract(n, k) + 1)
+    )
+
+
+def _misfit(
+    problem: PoseProblem,
+    errors_px: NDArray[np.float64],
+    inliers: NDArray[np.bool_],
+    sources: MatchSources,
+) -> float:
+    """How much many inliers contradict the pose together.
+
+    The scene in a mirror, or its like elsewhere, has hundreds of inliers that fit nearly; noise of
+    so many is known from the map's own images, and a larger error is of the pose. It is the
+    logarithm of the inliers' median angular error over that of the map's observations, beyond what
+    an image of the scene may have, times that of their number; 0 where the map's is not known.
+    """
+    lengths = np.diff(problem.starts)
+    focals = np.repeat([focal_px(view.camera) for view in problem.views], lengths)[inliers]
+    own = np.maximum(sources.noise_rad[inliers], _MIN_NOISE_PX / focals)
+    ratios = (errors_px[inliers] / focals / own)[np.isfinite(own)]
+    if len(ratios) <= _FEW:
+        return 0.0
+    excess = math.log(max(float(np.median(ratios)) / _USUAL_RATIO, 1.0))
+    return excess * math.log(len(ratios) / _FEW)
+
+
+def _num_visible(
+    problem: PoseProblem, rig_from_world: RigidTransform, seen: Sequence[NDArray[np.float64]]
+) -> int:
+    """Of the points that the map's images observe, those that fall into a view."""
+    total = 0.0
+    for view, points in zip(problem.views, seen, strict=True):
+        every = max(1, len(points) // _MAX_PROJECTED)
+        with np.errstate(invalid="ignore"):
+            px = project(view.camera, view.cam_from_rig @ rig_from_world, points[::every])
+            size = (view.camera.width, view.camera.height)
+            total += every * int(((px >= 0) & (px <= size)).all(axis=1).sum())
+    return int(total)
+
+
+def _similarity(sources: MatchSources, inliers: NDArray[np.bool_]) -> float:
+    """Probability that an inlier's descriptors are more alike than another match's of its type.
+
+    The area under the ROC curve, drawn towards what is usual where there are few pairs to compare.
+    """
+    better, pairs = _USUAL_SIMILARITY * _USUAL_PAIRS, _USUAL_PAIRS
+    for own in range(int(sources.types.max(initial=-1)) + 1):
+        of_type = sources.types == own
+        yes = sources.similarities[of_type & inliers]
+        no = np.sort(sources.similarities[of_type & ~inliers])
+        better += 0.5 * float(
+            np.searchsorted(no, yes, "left").sum() + np.searchsorted(no, yes, "right").sum()
+        )
+        pairs += float(len(yes) * len(no))
+    return better / pairs
+
+
+def _viewpoints(
+    points: NDArray[np.float64],
+    center: NDArray[np.float64],
+    sources: MatchSources,
+    inliers: NDArray[np.bool_],
+    sighted: NDArray[np.bool_],
+) -> tuple[float, float]:
+    """Medians over the inliers' sightings: the angle between the rays of query and map image, in
+    right angles, and how the distances differ, as ``|log2|`` of their ratio."""
+    seen = np.repeat(points, sources.support[inliers], axis=0)
+    ours, theirs = center - seen, sources.centers[sighted] - seen
+    length, other = np.linalg.norm(ours, axis=1), np.linalg.norm(theirs, axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        cosines = np.clip((ours * theirs).sum(axis=1) / (length * other), -1.0, 1.0)
+        ratio = float(np.median(length / other))
+    angle = float(np.median(np.arccos(cosines))) / (np.pi / 2)
+    return angle, abs(math.log2(max(ratio, 1e-6))) if math.isfinite(ratio) else 20.0
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A logistic model of the confidence.
+
+    Attributes
+    ----------
+    origin : the data that it was fitted to.
+    bias, weights : of the terms, by name; a term without a weight counts nothing.
+    """
+
+    origin: str
+    bias: float
+    weights: Mapping[str, float]
+
+    def probability(self, evidence: Mapping[str, float]) -> float:
+        """The probability that a pose of this evidence is right, from 0 to 1."""
+        logit = self.bias + sum(
+            weight * evidence[name] for name, weight in sorted(self.weights.items())
+        )
+        return 1.0 / (1.0 + math.exp(-min(max(logit, -700.0), 700.0)))
+
+    def weakest(self, evidence: Mapping[str, float]) -> str:
+        """In words, the term that speaks most against a pose."""
+        return TERMS[min(self.weights, key=lambda name: self.weights[name] * evidence[name])]
+
+
+@lru_cache(maxsize=1)
+def calibration() -> Calibration:
+    """The calibration that the package brings."""
+    text = resources.files(__package__).joinpath("confidence.toml").read_text(encoding="utf-8")
+    table = tomllib.loads(text)
+    return Calibration(table["origin"], table["bias"], table["weights"])

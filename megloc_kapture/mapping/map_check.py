@@ -1,0 +1,299 @@
+"""Whether a map agrees with itself: points seen through its cameras against its keypoints.
+
+A map whose observations do not fit is named with the mistake that explains it best: what files of
+other tools get wrong is mostly one of a few conventions, and each can be tried.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import permutations, product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.geometry.cameras import focal_px, normalized_from_px, project
+from megloc_kapture.geometry.cameras import principal_point_px as principal_point
+from megloc_kapture.values import ONE_FOCAL_MODELS, Camera, RigidTransform
+
+# of the larger side of an image: no map that serves is worse, none that is made wrongly is better
+_MAX_SHARE = 0.01
+_MIN_LIMIT_PX = 8.0
+# images that may fail: some poses of a good map are wrong
+_MAX_FAILING = 0.2
+_UNITS = {1000.0: "millimetres", 100.0: "centimetres", 1 / 1000: "kilometres", 1 / 0.3048: "feet"}
+
+
+@dataclass(frozen=True, eq=False)
+class ObservedKeypoints:
+    """A map image with its observations.
+
+    Attributes
+    ----------
+    keypoints_px : (K, 2), all of the image, in COLMAP's convention.
+    rows, points : int (M,), rows of the keypoints and of the map's points that they observe.
+    """
+
+    name: str
+    camera: Camera
+    cam_from_world: RigidTransform
+    keypoints_px: NDArray[np.floating]
+    rows: NDArray[np.integer]
+    points: NDArray[np.integer]
+
+
+# of an image: camera, pose, observed pixels (M, 2) and points (M, 3)
+_View = tuple[Camera, RigidTransform, NDArray[np.float64], NDArray[np.float64]]
+_Reading = Callable[[ObservedKeypoints], _View]
+
+
+def map_fault(images: Sequence[ObservedKeypoints], xyz: NDArray[np.float64]) -> str | None:
+    """In words, why a map contradicts itself; None where it does not.
+
+    Parameters
+    ----------
+    images : a sample, by name.
+    xyz : float64 (N, 3), all points.
+    """
+    if not np.isfinite(xyz).all():
+        count = int((~np.isfinite(xyz).all(axis=1)).sum())
+        return f"{count} of {len(xyz)} points are not finite"
+    for image in images:
+        if not np.isfinite(image.keypoints_px).all():
+            return f"keypoints of {image.name} are not finite"
+        if reason := camera_fault(image.camera):
+            return f"the camera of {image.name} cannot be: {reason}"
+    observed = [image for image in images if len(image.rows)]
+    if not observed:
+        return None
+    if len(images) > 2 and len({_rounded(image.cam_from_world) for image in images}) == 1:
+        return f"all of {len(images)} images have one pose"
+    errors = _errors_px(observed, lambda image: _as_it_is(image, xyz))
+    limits = [_limit_px(image.camera) for image in observed]
+    failing = sum(not error <= limit for error, limit in zip(errors, limits, strict=True))
+    if failing <= _MAX_FAILING * len(observed):
+        return None
+    told = (
+        f"the points do not fit the keypoints: of {len(observed)} images {failing} have a median "
+        f"reprojection error above {min(limits):.3g} px, the median of all is "
+        f"{float(np.median(errors)):.3g} px"
+    )
+    best, error = _likely_mistake(observed, xyz)
+    if error > max(np.median(limits) / 2, 4.0) or error > np.median(errors) / 4:
+        return told
+    return f"{told}; with {best} it would be {error:.2g} px"
+
+
+def camera_fault(camera: Camera) -> str | None:
+    """Why no camera has these intrinsics; None where one may have."""
+    size = max(camera.width, camera.height)
+    cx, cy = principal_point(camera)
+    if not (-size <= cx <= 2 * size and -size <= cy <= 2 * size):
+        return f"the principal point is ({cx:g}, {cy:g}) in {camera.width}x{camera.height} pixels"
+    focal = focal_px(camera)
+    if not 0.05 * size <= focal <= 100 * size:
+        return f"the focal length is {focal:g} px in {camera.width}x{camera.height} pixels"
+    # halfway to the borders a lens still does what it is sold for
+    halfway = np.array([[0.25, 0.5], [0.75, 0.5], [0.5, 0.25], [0.5, 0.75]])
+    pixels = halfway * (camera.width, camera.height)
+    rays = normalized_from_px(camera, pixels)
+    if not np.isfinite(rays).all():
+        return "its distortion cannot be undone halfway to the image's border"
+    flat = (pixels - (cx, cy)) / focal
+    lengths, straight = np.linalg.norm(rays, axis=1), np.linalg.norm(flat, axis=1)
+    ratios = lengths[straight > 0.02] / straight[straight > 0.02]
+    if len(ratios) and not (ratios.min() > 0.5 and ratios.max() < 3.0):
+        return f"its distortion moves pixels by a factor of {_farthest(ratios):.2g}"
+    return None
+
+
+def _farthest(ratios: NDArray[np.float64]) -> float:
+    return float(max(ratios, key=lambda ratio: abs(np.log(max(ratio, 1e-6)))))
+
+
+def _limit_px(camera: Camera) -> float:
+    return max(_MIN_LIMIT_PX, _MAX_SHARE * max(camera.width, camera.height))
+
+
+def _rounded(pose: RigidTransform) -> tuple[float, ...]:
+    return tuple(round(value, 9) for value in (*pose.quat_wxyz, *pose.translation))
+
+
+def _as_it_is(image: ObservedKeypoints, xyz: NDArray[np.float64]) -> _View:
+    pixels = image.keypoints_px[image.rows].astype(np.float64)
+    return image.camera, image.cam_from_world, pixels, xyz[image.points]
+
+
+def _errors_px(images: Iterable[ObservedKeypoints], read: _Reading) -> NDArray[np.float64]:
+    """Median reprojection error of each image, infinite where most points are not in front."""
+    medians = []
+    for image in images:
+        camera, pose, pixels, points = read(image)
+        with np.errstate(all="ignore"):
+            errors = np.linalg.norm(project(camera, pose, points) - pixels, axis=1)
+        medians.append(float(np.median(np.where(np.isfinite(errors), errors, np.inf))))
+    return np.array(medians)
+
+
+def _likely_mistake(
+    images: Sequence[ObservedKeypoints], xyz: NDArray[np.float64]
+) -> tuple[str, float]:
+    """The reading of the map that fits best, and the median error of its images."""
+    found = ("", np.inf)
+    for name, read in _readings(images, xyz):
+        error = float(np.median(_errors_px(images, read)))
+        # of equals the first, which is the simplest
+        if error < 0.9 * found[1]:
+            found = (name, error)
+    return found
+
+
+def _readings(
+    images: Sequence[ObservedKeypoints], xyz: NDArray[np.float64]
+) -> Iterator[tuple[str, _Reading]]:
+    """Other readings of a map: what is done to it, in words, and the views that come of it."""
+
+    def changed(
+        pixels: Callable[[ObservedKeypoints], NDArray[np.float64]] | None = None,
+        points: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None,
+        pose: Callable[[RigidTransform], RigidTransform] | None = None,
+        camera: Callable[[Camera], Camera] | None = None,
+        point_shift: int = 0,
+    ) -> _Reading:
+        def read(image: ObservedKeypoints) -> _View:
+            own = image.keypoints_px[image.rows].astype(np.float64)
+            seen = xyz[(image.points + point_shift) % len(xyz)]
+            return (
+                camera(image.camera) if camera else image.camera,
+                pose(image.cam_from_world) if pose else image.cam_from_world,
+                pixels(image) if pixels else own,
+                points(seen) if points else seen,
+            )
+
+        return read
+
+    yield "keypoints read as (y, x)", changed(_swapped)
+    yield "keypoints in reverse order", changed(_reversed)
+    for by in (1, -1):
+        yield f"keypoint ids moved by {by:+d}", changed(partial(_next_to, by))
+        yield f"point ids moved by {by:+d}", changed(point_shift=by)
+    yield "poses read as world_from_cam", changed(pose=RigidTransform.inverse)
+    yield "quaternions read as x, y, z, w", changed(pose=_quaternion_last)
+    yield "translations read as camera centres", changed(pose=_centre_given)
+    yield (
+        "poses read with OpenGL's axes",
+        changed(pose=lambda p: RigidTransform((0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 0.0)) @ p),
+    )
+    yield (
+        "poses read as OpenGL's world_from_cam",
+        changed(pose=lambda p: RigidTransform((0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 0.0)) @ p.inverse()),
+    )
+    for scale, unit in _UNITS.items():
+        yield f"points in {unit}", changed(points=partial(np.multiply, 1 / scale))
+        yield f"poses in {unit}", changed(pose=partial(_scaled, 1 / scale))
+    yield "cx and cy exchanged", changed(camera=_centre_exchanged)
+    for by in (1, -1):
+        yield (
+            f"each pose given to the image {'after' if by > 0 else 'before'} it",
+            _moved(images, xyz, by),
+        )
+    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
+        if order != (0, 1, 2) or min(signs) < 0:
+            axes = ", ".join(
+                f"{'-' if sign < 0 else ''}{'xyz'[axis]}"
+                for axis, sign in zip(order, signs, strict=True)
+            )
+            yield (
+                f"points read as ({axes})",
+                changed(points=partial(_axes_read, order, signs)),
+            )
+    for name, factor in _factors(images, xyz).items():
+        if name == "keypoints":
+            yield (
+                f"keypoints of images {factor:.3g} times as large",
+                changed(partial(_pixels_times, factor)),
+            )
+        else:
+            yield (
+                f"a focal length {factor:.3g} times as long",
+                changed(camera=partial(_focal_scaled, factor)),
+            )
+
+
+def _moved(images: Sequence[ObservedKeypoints], xyz: NDArray[np.float64], by: int) -> _Reading:
+    """Each image with the pose of a neighbour in the sample, which must be of neighbours."""
+    poses = {
+        image.name: images[(at + by) % len(images)].cam_from_world
+        for at, image in enumerate(images)
+    }
+    return lambda image: _as_it_is(replace(image, cam_from_world=poses[image.name]), xyz)
+
+
+def _factors(images: Sequence[ObservedKeypoints], xyz: NDArray[np.float64]) -> dict[str, float]:
+    """By how much keypoints, or the focal length, would have to be scaled to fit."""
+    of_keypoints, of_focal = [], []
+    for image in images:
+        camera, pose, pixels, points = _as_it_is(image, xyz)
+        with np.errstate(all="ignore"):
+            seen = project(camera, pose, points)
+            of_keypoints.append((seen / pixels).ravel())
+            centre = np.array(principal_point(camera))
+            of_focal.append(((pixels - centre) / (seen - centre)).ravel())
+    found = {"keypoints": np.concatenate(of_keypoints), "focal": np.concatenate(of_focal)}
+    finite = {name: ratios[np.isfinite(ratios)] for name, ratios in found.items()}
+    medians = {name: float(np.median(ratios)) for name, ratios in finite.items() if len(ratios)}
+    return {name: value for name, value in medians.items() if 0.02 < value < 50.0}
+
+
+def _swapped(image: ObservedKeypoints) -> NDArray[np.float64]:
+    return image.keypoints_px[image.rows][:, ::-1].astype(np.float64)
+
+
+def _reversed(image: ObservedKeypoints) -> NDArray[np.float64]:
+    return image.keypoints_px[::-1][image.rows].astype(np.float64)
+
+
+def _next_to(by: int, image: ObservedKeypoints) -> NDArray[np.float64]:
+    rows = (image.rows + by) % max(len(image.keypoints_px), 1)
+    return image.keypoints_px[rows].astype(np.float64)
+
+
+def _pixels_times(factor: float, image: ObservedKeypoints) -> NDArray[np.float64]:
+    return image.keypoints_px[image.rows].astype(np.float64) * factor
+
+
+def _axes_read(
+    order: tuple[int, ...], signs: tuple[float, ...], points: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    return points[:, list(order)] * np.array(signs)
+
+
+def _quaternion_last(pose: RigidTransform) -> RigidTransform:
+    x, y, z, w = pose.quat_wxyz
+    return RigidTransform((w, x, y, z), pose.translation)
+
+
+def _centre_given(pose: RigidTransform) -> RigidTransform:
+    t = -pose.rotation_matrix() @ np.array(pose.translation)
+    return RigidTransform(pose.quat_wxyz, (float(t[0]), float(t[1]), float(t[2])))
+
+
+def _scaled(factor: float, pose: RigidTransform) -> RigidTransform:
+    x, y, z = pose.translation
+    return RigidTransform(pose.quat_wxyz, (factor * x, factor * y, factor * z))
+
+
+def _centre_exchanged(camera: Camera) -> Camera:
+    params = list(camera.params)
+    at = 1 if camera.model in ONE_FOCAL_MODELS else 2
+    params[at], params[at + 1] = params[at + 1], params[at]
+    return replace(camera, params=tuple(params))
+
+
+def _focal_scaled(factor: float, camera: Camera) -> Camera:
+    params = list(camera.params)
+    for k in range(1 if camera.model in ONE_FOCAL_MODELS else 2):
+        params[k] *= factor
+    return replace(camera, params=tuple(params))

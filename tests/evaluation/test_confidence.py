@@ -1,0 +1,132 @@
+"""Reliability, risk against coverage, and queries that show nothing of the map."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.evaluation.confidence import calibration_error, reliability, risk_by_score
+from megloc_kapture.evaluation.evaluate import evaluate
+from megloc_kapture.evaluation.report.reports import report_text, write_report
+from megloc_kapture.evaluation.scoring import evaluate_poses
+from megloc_kapture.io.dataset_tables import read_nowhere, write_nowhere
+from megloc_kapture.io.tables import QueryStatus
+from megloc_kapture.values import Failure, Pose, RigidTransform
+
+
+def at(x_m: float) -> RigidTransform:
+    return RigidTransform((1.0, 0.0, 0.0, 0.0), (x_m, 0.0, 0.0))
+
+
+def test_confidences_that_are_true_have_no_calibration_error() -> None:
+    rng = np.random.default_rng(0)
+    said = rng.uniform(0, 1, 200_000)
+    right = rng.uniform(0, 1, 200_000) < said
+    assert calibration_error(reliability(said, right)) < 0.01
+    # and those that say half of it have an error of a quarter
+    assert calibration_error(reliability(said / 2, right)) == pytest.approx(0.25, abs=0.01)
+
+
+def test_bins_hold_their_upper_end() -> None:
+    bins = reliability(np.array([0.0, 0.1, 0.11, 1.0]), np.array([True, False, True, True]))
+    assert [one.num_poses for one in bins] == [2, 1, 0, 0, 0, 0, 0, 0, 0, 1]
+    assert bins[0].num_right == 1 and bins[0].mean_confidence == pytest.approx(0.05)
+
+
+def test_risk_by_hand() -> None:
+    right = np.array([True, False, True, False])
+    assert risk_by_score(np.array([0.9, 0.2, 0.8, 0.1]), right).tolist() == [0, 0, 1 / 3, 1 / 2]
+    assert risk_by_score(np.array([0.1, 0.9, 0.2, 0.8]), right).tolist() == [1, 1, 2 / 3, 1 / 2]
+    # equal scores say nothing: the mean over all orders
+    assert risk_by_score(np.ones(4), right).tolist() == [0.5, 0.5, 0.5, 0.5]
+
+
+@given(st.lists(st.tuples(st.floats(0, 1), st.booleans()), min_size=1, max_size=30))
+def test_risk_ends_at_the_share_of_wrong_poses(poses: list[tuple[float, bool]]) -> None:
+    scores, right = (np.array(column) for column in zip(*poses, strict=True))
+    risk = risk_by_score(scores, right.astype(bool))
+    assert risk[-1] == pytest.approx(1 - right.mean())
+    assert (risk >= 0).all() and (risk <= 1 + 1e-12).all()
+
+
+def status(image: str, confidence: float | None, localized: bool = True) -> QueryStatus:
+    return QueryStatus(
+        image=image,
+        status="localized" if localized else "failed",
+        reason="" if localized else "too little",
+        num_inliers=10,
+        confidence=confidence,
+    )
+
+
+def test_of_a_result() -> None:
+    truth = {name: at(0.0) for name in "abcd"}
+    found = {"a": at(0.1), "b": at(100.0), "c": at(0.2), "stray": at(0.0)}
+    statuses = {
+        "a": status("a", 0.9),
+        "b": status("b", 0.6),
+        "c": status("c", 0.8),
+        "d": status("d", 0.3, localized=False),
+        "stray": status("stray", 0.7),
+        "refused": status("refused", 0.1, localized=False),
+    }
+    evaluation = evaluate_poses(found, truth, statuses=statuses, nowhere=["stray", "refused"])
+    known = evaluation.confidence
+    assert known is not None
+    assert (known.num_queries, known.num_poses, known.num_wrong) == (6, 4, 2)
+    assert (known.num_nowhere, known.num_nowhere_refused) == (2, 1)
+    # a and c first, then the stray, then b
+    assert known.risk == pytest.approx((0, 0, 1 / 3, 1 / 2))
+    assert known.coverage == pytest.approx((1 / 6, 2 / 6, 3 / 6, 4 / 6))
+    assert known.area == pytest.approx(5 / 24) and known.area_by_inliers == pytest.approx(1 / 2)
+    assert known.wrong_low < 0.5 < known.wrong_high
+    # they stand in no row of recall, and are not images without truth
+    assert evaluation.row().num_queries == 4 and evaluation.without_truth == ()
+    text = report_text(evaluation)
+    assert "2 queries show nothing of the map: 1 refused, 1 given a pose" in " ".join(text.split())
+    assert "of 4 poses with a confidence 2 are wrong" in " ".join(text.split())
+    assert evaluation.to_pandas().loc["a", "confidence"] == 0.9
+
+
+def test_a_result_without_confidences_says_nothing_of_them() -> None:
+    evaluation = evaluate_poses({"a": at(0.0)}, {"a": at(0.0)}, statuses={"a": status("a", None)})
+    assert evaluation.confidence is None
+    assert "onfidence:" not in report_text(evaluation)
+    assert "confidence" not in evaluation.to_pandas().columns
+
+
+def test_nowhere_is_no_truth() -> None:
+    with pytest.raises(DataError, match="'a' is said to show nothing of the map, and has"):
+        evaluate_poses({}, {"a": at(0.0)}, nowhere=["a"])
+
+
+def test_files(tmp_path: Path) -> None:
+    assert read_nowhere(tmp_path) == ()
+    write_nowhere(tmp_path, ["q/b.jpg", "q/a.jpg"])
+    assert read_nowhere(tmp_path) == ("q/a.jpg", "q/b.jpg")
+    (tmp_path / "nowhere.txt").write_text("# strangers\nq/a.jpg\n\nq/a.jpg\n")
+    with pytest.raises(DataError, match=r"nowhere\.txt:4: 'q/a.jpg' stands on line 2 as well"):
+        read_nowhere(tmp_path)
+    (tmp_path / "nowhere.txt").write_text("../a.jpg\n")
+    with pytest.raises(DataError, match=r"nowhere\.txt:1:"):
+        read_nowhere(tmp_path)
+
+
+def test_in_memory_and_on_a_page(tmp_path: Path) -> None:
+    results: dict[str, Pose | Failure] = {
+        "a": Pose(at(0.0), 20, 15, confidence=0.97),
+        "b": Failure("confidence 0.2 of the pose", confidence=0.2),
+    }
+    evaluation = evaluate(results, {"a": at(0.0), "b": at(1.0)})
+    known = evaluation.confidence
+    assert known is not None and known.num_poses == 1 and known.num_wrong == 0
+    write_report(tmp_path, evaluation)
+    assert "Does it know when it does not know?" in (tmp_path / "report.html").read_text()
+    data = json.loads((tmp_path / "recall.json").read_text())
+    assert data["confidence"]["num_poses"] == 1

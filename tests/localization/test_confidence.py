@@ -1,0 +1,178 @@
+"""Confidence of poses: its terms against what they mean, and its probabilities."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.stats import binom
+
+from megloc_kapture.geometry.cameras import project
+from megloc_kapture.localization.absolute_pose import rig_pose
+from megloc_kapture.localization.confidence import (
+    TERMS,
+    Calibration,
+    MatchSources,
+    calibration,
+    evidence_of,
+    with_confidence,
+)
+from megloc_kapture.localization.estimation import AbsolutePoseOptions, PoseProblem, View
+from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
+
+CAMERA = Camera.pinhole(640, 480, 500.0)
+POSE = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.1, -0.2, 0.3))
+ERROR_PX = 12.0
+
+
+def scene(
+    right: int, wrong: int, *, noise_px: float = 0.5, seed: int = 0
+) -> tuple[PoseProblem, Pose, MatchSources]:
+    """A pose from so many right and wrong matches, all of one map image at the origin."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform((-2, -1.5, 4), (2, 1.5, 8), (right + wrong, 3))
+    pixels = project(CAMERA, POSE, points) + rng.normal(0, noise_px, (right + wrong, 2))
+    pixels[right:] = rng.uniform((0, 0), (640, 480), (wrong, 2))
+    view = View(CAMERA, RigidTransform.identity(), pixels, points)
+    pose = rig_pose([view], AbsolutePoseOptions(max_error_px=ERROR_PX, min_inliers=4))
+    assert isinstance(pose, Pose)
+    count = right + wrong
+    similarities = np.r_[rng.normal(0.9, 0.03, right), rng.normal(0.8, 0.03, wrong)]
+    sources = MatchSources(
+        similarities=similarities,
+        types=np.zeros(count, np.int64),
+        support=np.ones(count, np.int64),
+        centers=np.zeros((count, 3)),
+        images=np.zeros(count, np.int64),
+        num_keypoints=2 * count,
+        noise_rad=np.full(count, noise_px / 500),
+        seen=[points],
+    )
+    return PoseProblem.of([view]), pose, sources
+
+
+def terms(right: int, wrong: int, **settings: float) -> dict[str, float]:
+    problem, pose, sources = scene(right, wrong, **settings)  # type: ignore[arg-type]
+    return evidence_of(problem, pose, sources, ERROR_PX)
+
+
+def test_every_term_is_there_and_finite() -> None:
+    found = terms(80, 40)
+    assert set(found) == set(TERMS)
+    assert all(math.isfinite(value) for value in found.values())
+
+
+def test_terms_of_known_worth() -> None:
+    found = terms(200, 0, noise_px=1.0)
+    # the median length of a normal vector of deviation 1 in two dimensions
+    assert found["residual"] == pytest.approx(math.log(1.177 / ERROR_PX), abs=0.15)
+    assert found["misfit"] == 0.0
+    assert found["agreement"] == pytest.approx(math.log(200.0))
+    # every point of the map is seen, and every one of them matched
+    assert found["matched_share"] == pytest.approx(0.0, abs=0.02)
+    # the map image stood 0.37 away, the points 6
+    assert 0.03 < found["viewing_angle"] * 90 < 6
+    assert found["distance_ratio"] < 0.2
+    assert found["support"] == pytest.approx(math.log(2.0))
+
+
+def test_similarity_is_the_area_under_the_curve() -> None:
+    problem, pose, sources = scene(100, 100)
+    assert pose.inliers is not None
+    same = replace(sources, similarities=np.ones(200))
+    assert evidence_of(problem, pose, same, ERROR_PX)["similarity"] == pytest.approx(0.5, abs=0.01)
+    best = replace(sources, similarities=pose.inliers.astype(float))
+    assert evidence_of(problem, pose, best, ERROR_PX)["similarity"] == pytest.approx(1.0, abs=0.01)
+
+
+def test_surprise_against_the_binomial_distribution() -> None:
+    """The number of false alarms bounds what chance does, and grows with what agrees."""
+    found = [terms(count, 200 - count)["surprise"] for count in (10, 20, 40, 80)]
+    assert found == sorted(found) and found[0] < found[-1]
+    problem, pose, sources = scene(40, 160, noise_px=2.0)
+    surprise = 10 ** evidence_of(problem, pose, sources, ERROR_PX)["surprise"] - 1
+    share = np.pi * ERROR_PX**2 / (640 * 480)
+    # at least as surprising as 37 of 197 at the largest radius, less the number of tests
+    alone = -binom.logsf(36, 197, share) / math.log(10)
+    tests = math.log10(197) + math.log10(math.comb(40, 3)) + 3
+    assert surprise > alone - tests
+
+
+def test_the_number_of_views_does_not_matter() -> None:
+    """Two cameras of a rig with the same matches are worth what one camera with all of them is."""
+    problem, pose, sources = scene(60, 30)
+    (view,) = problem.views
+    halves = [
+        View(CAMERA, RigidTransform.identity(), view.points_px[at], view.points_world[at])
+        for at in (slice(0, 45), slice(45, 90))
+    ]
+    split = PoseProblem.of(halves)
+    two = replace(sources, seen=[one.points_world for one in halves])
+    one, other = (evidence_of(p, pose, s, ERROR_PX) for p, s in ((problem, sources), (split, two)))
+    assert other == pytest.approx(one, rel=0.02)
+
+
+def test_more_wrong_matches_never_speak_for_a_pose() -> None:
+    model = calibration()
+    found = [model.probability(terms(40, wrong)) for wrong in (0, 40, 160, 640)]
+    assert found == sorted(found, reverse=True)
+
+
+def test_right_and_chance() -> None:
+    """A pose that half of the matches hold is trusted; the best pose of chance matches is not."""
+    problem, pose, sources = scene(100, 60)
+    found = with_confidence(problem, pose, sources, ERROR_PX, 0.5)
+    assert isinstance(found, Pose) and found.confidence is not None and found.confidence > 0.9
+    assert found.evidence == evidence_of(problem, pose, sources, ERROR_PX)
+    problem, pose, sources = scene(4, 600, noise_px=0.1)
+    sources = replace(sources, similarities=np.linspace(0, 1, 604))
+    refused = with_confidence(problem, pose, sources, ERROR_PX, 0.5)
+    assert isinstance(refused, Failure) and refused.num_inliers == pose.num_inliers
+    assert (
+        refused.reason.startswith("confidence 0") and "2D-3D matches agree, and " in refused.reason
+    )
+    assert refused.confidence is not None and refused.confidence < 0.5
+    assert isinstance(with_confidence(problem, pose, sources, ERROR_PX, 0.0), Pose)
+
+
+def test_a_map_without_noise_or_points_in_sight() -> None:
+    problem, pose, sources = scene(50, 10)
+    unknown = replace(sources, noise_rad=np.full(60, np.nan), seen=[np.zeros((0, 3))])
+    found = evidence_of(problem, pose, unknown, ERROR_PX)
+    assert found["misfit"] == 0.0 and found["matched_share"] == 0.0
+
+
+def test_misfit_of_a_map_that_is_better_than_the_query() -> None:
+    problem, pose, sources = scene(200, 0, noise_px=3.0)
+    exact = replace(sources, noise_rad=np.full(200, 0.3 / 500))
+    expected = math.log(1.177 * 10 / 3.3) * math.log(10)
+    assert evidence_of(problem, pose, sources, ERROR_PX)["misfit"] == 0.0
+    found = evidence_of(problem, pose, exact, ERROR_PX)["misfit"]
+    assert found == pytest.approx(expected, rel=0.1)
+
+
+@given(st.dictionaries(st.sampled_from(sorted(TERMS)), st.floats(-1e6, 1e6)), st.floats(-50, 50))
+def test_probabilities(weights: dict[str, float], bias: float) -> None:
+    model = Calibration("", bias, weights)
+    evidence = dict.fromkeys(TERMS, 1.0)
+    probability = model.probability(evidence)
+    assert 0.0 <= probability <= 1.0
+    logit = bias + sum(weights.values())
+    assert (probability > 0.5) == (logit > 0) or abs(logit) < 1e-6 * (1 + abs(bias))
+
+
+def test_the_calibration_of_the_package() -> None:
+    model = calibration()
+    assert model.origin and set(model.weights) <= set(TERMS)
+
+
+def test_evidence_needs_inliers_and_covariance() -> None:
+    problem, pose, sources = scene(50, 10)
+    none: NDArray[np.bool_] | None = None
+    with pytest.raises(ValueError, match="needs the inliers"):
+        evidence_of(problem, replace(pose, inliers=none), sources, ERROR_PX)

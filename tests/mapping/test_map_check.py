@@ -1,0 +1,198 @@
+"""Maps that contradict themselves are named as such, with the mistake; others are not."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from megloc_kapture.geometry.cameras import project
+from megloc_kapture.mapping.map_check import ObservedKeypoints, camera_fault, map_fault
+from megloc_kapture.values import Camera, RigidTransform
+
+CAMERA = Camera("PINHOLE", 640, 480, (500.0, 510.0, 330.0, 235.0))
+Changed = Callable[[NDArray[Any]], NDArray[Any]]
+Map = tuple[list[ObservedKeypoints], NDArray[np.float64]]
+
+
+def pose_at(number: int) -> RigidTransform:
+    """Looking at the points from a bow, turned a little differently each time."""
+    angle, roll = 0.25 * (number - 4), 0.1 * number
+    around = RigidTransform((np.cos(angle / 2), 0.0, np.sin(angle / 2), 0.0), (0.0, 0.0, 6.0))
+    rolled = RigidTransform((np.cos(roll / 2), 0.0, 0.0, np.sin(roll / 2)), (0.0, 0.0, 0.0))
+    return rolled @ around @ RigidTransform((1.0, 0.0, 0.0, 0.0), (0.3 * number, 0.1, -0.2))
+
+
+def good_map(seed: int = 0, noise_px: float = 1.0) -> Map:
+    rng = np.random.default_rng(seed)
+    xyz = rng.uniform((-2.0, -1.5, -0.7), (2.0, 1.0, 1.2), (300, 3))
+    images = []
+    for number in range(9):
+        pose = pose_at(number)
+        seen = project(CAMERA, pose, xyz)
+        inside = np.flatnonzero(((seen > 0) & (seen < (640, 480))).all(axis=1))
+        points = np.sort(rng.choice(inside, 80, replace=False))
+        # some keypoints observe nothing
+        keypoints = rng.uniform((0, 0), (640, 480), (140, 2))
+        rows = 1 + np.sort(rng.choice(138, 80, replace=False))
+        keypoints[rows] = seen[points] + rng.normal(0, noise_px, (80, 2))
+        images.append(
+            ObservedKeypoints(
+                f"{number:02d}.jpg", CAMERA, pose, keypoints.astype(np.float32), rows, points
+            )
+        )
+    return images, xyz
+
+
+def each(found: Map, change: Callable[[ObservedKeypoints], ObservedKeypoints]) -> Map:
+    images, xyz = found
+    return [change(image) for image in images], xyz
+
+
+def with_pose(change: Callable[[RigidTransform], RigidTransform]) -> Callable[[Map], Map]:
+    return lambda m: each(m, lambda i: replace(i, cam_from_world=change(i.cam_from_world)))
+
+
+def with_pixels(change: Changed) -> Callable[[Map], Map]:
+    return lambda m: each(m, lambda i: replace(i, keypoints_px=change(i.keypoints_px)))
+
+
+def with_points(change: Changed) -> Callable[[Map], Map]:
+    return lambda m: (m[0], change(m[1]))
+
+
+def with_params(*params: float, model: str = "PINHOLE") -> Callable[[Map], Map]:
+    return lambda m: each(m, lambda i: replace(i, camera=Camera(model, 640, 480, params)))
+
+
+def centre(pose: RigidTransform) -> RigidTransform:
+    x, y, z = pose.center().tolist()
+    return RigidTransform(pose.quat_wxyz, (x, y, z))
+
+
+def one_with_nan(array: NDArray[np.floating]) -> NDArray[np.floating]:
+    changed = array.copy()
+    changed[3, 1] = np.nan
+    return changed
+
+
+def poses_moved(found: Map) -> Map:
+    images, xyz = found
+    others = [*images[1:], images[0]]
+    return [
+        replace(i, cam_from_world=o.cam_from_world) for i, o in zip(images, others, strict=True)
+    ], xyz
+
+
+OPENGL = RigidTransform((0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+MISTAKES: dict[str, tuple[Callable[[Map], Map], str]] = {
+    "keypoints as y, x": (with_pixels(lambda k: k[:, ::-1]), r"read as \(y, x\)"),
+    "keypoints reversed": (with_pixels(lambda k: k[::-1]), "reverse order"),
+    "keypoint ids from one": (
+        lambda m: each(m, lambda i: replace(i, rows=i.rows + 1)),
+        "keypoint ids moved by -1",
+    ),
+    "keypoint ids one less": (
+        lambda m: each(m, lambda i: replace(i, rows=i.rows - 1)),
+        r"keypoint ids moved by \+1",
+    ),
+    "point ids from one": (
+        lambda m: each(m, lambda i: replace(i, points=(i.points + 1) % 300)),
+        "point ids moved by -1",
+    ),
+    "point ids one less": (
+        lambda m: each(m, lambda i: replace(i, points=(i.points - 1) % 300)),
+        r"point ids moved by \+1",
+    ),
+    "half the resolution": (with_pixels(lambda k: k / 2), "images 2 times as large"),
+    "larger images": (with_pixels(lambda k: k * 1.6), "images 0.625 times as large"),
+    "world_from_cam": (with_pose(RigidTransform.inverse), "world_from_cam"),
+    "xyzw": (
+        with_pose(lambda p: RigidTransform((*p.quat_wxyz[1:], p.quat_wxyz[0]), p.translation)),
+        "quaternions read as x, y, z, w",
+    ),
+    "centres": (with_pose(centre), "camera centres"),
+    "OpenGL": (with_pose(lambda p: OPENGL @ p), "OpenGL's axes"),
+    "OpenGL, inverse": (with_pose(lambda p: (OPENGL @ p).inverse()), "OpenGL's world_from_cam"),
+    "points in mm": (with_points(lambda p: 1000 * p), "points in millimetres"),
+    "points in feet": (with_points(lambda p: p / 0.3048), "points in feet"),
+    "poses in mm": (
+        with_pose(
+            lambda p: RigidTransform(
+                p.quat_wxyz,
+                (1e3 * p.translation[0], 1e3 * p.translation[1], 1e3 * p.translation[2]),
+            )
+        ),
+        "poses in millimetres",
+    ),
+    "points as x, z, y": (with_points(lambda p: p[:, [0, 2, 1]]), r"points read as \(x, z, y\)"),
+    "points as y, z, x": (with_points(lambda p: p[:, [1, 2, 0]]), r"points read as \(z, x, y\)"),
+    "points mirrored": (with_points(lambda p: p * (1, -1, 1)), r"points read as \(x, -y, z\)"),
+    "poses of neighbours": (poses_moved, "given to the image before it"),
+    "focal length": (
+        with_params(1000.0, 1020.0, 330.0, 235.0),
+        "focal length 0.5 times as long",
+    ),
+    "cx, cy": (with_params(500.0, 510.0, 235.0, 330.0), "cx and cy exchanged"),
+    "points not finite": (with_points(lambda p: one_with_nan(p)), "1 of 300 points are not finite"),
+    "keypoints not finite": (with_pixels(one_with_nan), "keypoints of 00.jpg are not finite"),
+    "one pose": (with_pose(lambda p: pose_at(3)), "all of 9 images have one pose"),
+    "principal point": (with_params(500.0, 510.0, 1e6, 235.0), "cannot be: the principal point"),
+    "no focal length": (with_params(1.0, 1.0, 330.0, 235.0), "cannot be: the focal length is 1"),
+    "distortion": (
+        with_params(500.0, 330.0, 235.0, 50.0, model="SIMPLE_RADIAL"),
+        "cannot be: its distortion",
+    ),
+    "random points": (
+        with_points(lambda p: np.random.default_rng(1).uniform(-2, 2, p.shape)),
+        "do not fit the keypoints: of 9 images 9 have",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_mistakes_are_named(name: str) -> None:
+    change, expected = MISTAKES[name]
+    fault = map_fault(*change(good_map()))
+    assert fault is not None
+    assert re.search(expected, fault), fault
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("noise_px", [0.0, 1.0, 4.0])
+def test_good_maps_have_no_fault(seed: int, noise_px: float) -> None:
+    assert map_fault(*good_map(seed, noise_px)) is None
+
+
+def test_one_bad_image_of_nine_is_no_fault_of_the_map() -> None:
+    images, xyz = good_map()
+    images[4] = replace(images[4], cam_from_world=pose_at(0))
+    assert map_fault(images, xyz) is None
+
+
+def test_without_observations_there_is_nothing_to_say() -> None:
+    images, xyz = good_map()
+    none = np.zeros(0, np.int64)
+    assert map_fault([replace(i, rows=none, points=none) for i in images], xyz) is None
+    assert map_fault([], xyz) is None
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        Camera("SIMPLE_RADIAL", 4032, 3024, (3100.0, 2016.0, 1512.0, -0.3)),
+        Camera("OPENCV_FISHEYE", 1024, 1024, (300.0, 300.0, 512.0, 512.0, 0.1, 0.0, 0.0, 0.0)),
+        Camera("FULL_OPENCV", 640, 480, (360.0, 360.0, 320, 240, 10, 4, 0, 0, 0.2, 10, 7, 1)),
+        Camera("FOV", 752, 480, (400.0, 400.0, 376.0, 240.0, 0.9)),
+        # a part that was cut from a large image
+        Camera.pinhole(200, 200, 3000.0),
+        Camera("PINHOLE", 200, 200, (800.0, 800.0, -150.0, 380.0)),
+    ],
+)
+def test_cameras_that_may_be(camera: Camera) -> None:
+    assert camera_fault(camera) is None
