@@ -14,12 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from megloc_kapture.geometry.robust import deviation_by_median
 from megloc_kapture.values import Camera, Options, RigidTransform
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-
-_SIGMA_OF_MAD = 1.4826  # of normally distributed values: 1 / (quantile of 3/4)
 
 
 class ConsistencyOptions(Options):
@@ -195,13 +194,9 @@ def too_uncertain(deviations: Floats, depths: Floats, options: UncertaintyOption
 
 
 def robust_limit(values: Floats, num_sigmas: float) -> float:
-    """The median of ``values`` (N,), N > 0, and so many of their standard deviations more.
-
-    The deviation is 1.4826 times the median absolute deviation: that of a normal distribution,
-    which up to half of the values cannot spoil (Rousseeuw and Croux, JASA 1993).
-    """
+    """The median of ``values`` (N,), N > 0, and so many of their standard deviations more."""
     median = float(np.median(values))
-    return median + num_sigmas * _SIGMA_OF_MAD * float(np.median(np.abs(values - median)))
+    return median + num_sigmas * float(deviation_by_median(values - median))
 
 
 def left_with_too_few(

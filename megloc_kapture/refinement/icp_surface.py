@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from megloc_kapture.geometry.cameras import focal_px, px_from_cam
 from megloc_kapture.geometry.poses import rotation_angles_deg
+from megloc_kapture.geometry.robust import deviation_by_median
 from megloc_kapture.plugins import DepthView, RankingScene
 from megloc_kapture.refinement.depth_points import DepthCloudOptions, depth_cloud
 from megloc_kapture.values import Camera, RigidTransform
@@ -27,8 +28,6 @@ _MAX_ITERATIONS = 20
 # a tenth of what a refined pose has to be good to
 _ROTATION_EPSILON_RAD = 1e-4
 _TRANSLATION_EPSILON_M = 1e-4
-# the standard deviation of Gaussian values over the median of their lengths
-_DEVIATION_FROM_MEDIAN = 1.482602218505602
 _CONVERGED = 5e-5  # radians and metres, a hundredth of what a refined pose has to be good to
 # the scale at which the Cauchy loss has 95 % of least squares' efficiency under Gaussian noise
 _CAUCHY_EFFICIENT = 2.385
@@ -197,7 +196,7 @@ def fit_covariance(fit: SurfaceFit) -> Floats:
     pixels alike is not in it.
     """
     jacobian = np.column_stack([np.cross(fit.points, fit.normals), fit.normals])
-    deviation = _DEVIATION_FROM_MEDIAN * np.median(np.abs(fit.residuals_m))
+    deviation = deviation_by_median(fit.residuals_m)
     return np.linalg.inv(jacobian.T @ jacobian) * deviation**2
 
 
@@ -234,7 +233,7 @@ def fit_weighted(
         normals, moved = surface.normals[rows[near]], moved[near]
         residuals = np.einsum("ni,ni->n", moved - surface.points[rows[near]], normals)
         relative = residuals / noise[near]
-        scale = _DEVIATION_FROM_MEDIAN * np.median(np.abs(relative))
+        scale = deviation_by_median(relative)
         if scale == 0:
             return transform
         weights = 1.0 / (1.0 + (relative / (_CAUCHY_EFFICIENT * scale)) ** 2) / noise[near] ** 2

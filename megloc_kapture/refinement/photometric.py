@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.geometry.cameras import focal_px, project
+from megloc_kapture.geometry.robust import deviation_by_median
 from megloc_kapture.refinement.pyramid import ChosenPoints, Level
 from megloc_kapture.values import Camera, RigidTransform
 
@@ -30,8 +31,6 @@ LOSS_SCALE = 2.0  # of the loss, in standard deviations
 _NUISANCE_STEPS = 3
 _NUISANCE_POINTS = 6000  # for two numbers of each reference
 _MIN_GAIN = 0.05
-# the deviation of a normal variable over the median of its magnitude
-_MEDIAN_TO_DEVIATION = 1.4826
 # cells of the query, along its longer side, in which residuals may depend on each other
 _CELLS = 10
 _MAX_STEPS = 12
@@ -212,7 +211,7 @@ def perturbed(cam_from_world: RigidTransform, step: Float64) -> RigidTransform:
 def _deviation(rows: Float64) -> float:
     magnitudes = np.sqrt(np.square(rows[..., 0]).mean(1))
     seen = magnitudes[~np.isnan(magnitudes)]
-    return _MEDIAN_TO_DEVIATION * float(np.median(seen)) if len(seen) else 0.0
+    return float(deviation_by_median(seen)) if len(seen) else 0.0
 
 
 @dataclass(frozen=True, eq=False)
