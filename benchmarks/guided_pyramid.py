@@ -47,10 +47,10 @@ from megloc_kapture.plugins import (
     Matcher,
     load_plugin,
 )
-from megloc_kapture.stages.guided_pyramid import pyramid_mapping, pyramid_queries
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.matches import match_pairs
-from megloc_kapture.stages.pyramid_pairs import COLUMNS, table_path
+from megloc_kapture.stages.pyramid_mapping import pyramid_mapping
+from megloc_kapture.stages.pyramid_queries import COLUMNS, pyramid_queries, table_path
 from megloc_kapture.stages.query_poses import LocalizationOptions, localize_from_matches
 from megloc_kapture.stages.triangulation import triangulate_map
 from megloc_kapture.stages.work import Work

@@ -21,7 +21,6 @@ from megloc_kapture.pipeline.run import Run
 from megloc_kapture.pipeline.submission import write_submission
 from megloc_kapture.plugins import STAGES, load_plugin
 from megloc_kapture.stages.global_features import ExtractGlobalFeatures
-from megloc_kapture.stages.guided_pyramid import PyramidMapping, PyramidQueries
 from megloc_kapture.stages.image_pairs import PairMapping, PairQueries
 from megloc_kapture.stages.layout import (
     EVALUATION,
@@ -39,6 +38,8 @@ from megloc_kapture.stages.matches import MatchMapping, MatchQueries
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.pose_refinement import RefinePoses
 from megloc_kapture.stages.preprocessing import Preprocess
+from megloc_kapture.stages.pyramid_mapping import PyramidMapping
+from megloc_kapture.stages.pyramid_queries import PyramidQueries
 from megloc_kapture.stages.query_poses import LocalizeQueries
 from megloc_kapture.stages.reranking import RerankQueries
 from megloc_kapture.stages.stage import Hashes, PipelineStage, Stage, StageWork, is_below

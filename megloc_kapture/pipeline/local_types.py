@@ -24,19 +24,16 @@ from megloc_kapture.plugins import (
     load_plugin,
 )
 from megloc_kapture.stages.found_again import rows_found_again
-from megloc_kapture.stages.local_features import checked_features, read_image_of, read_mask
+from megloc_kapture.stages.guided_pyramid import PyramidMethod, retry_query
+from megloc_kapture.stages.local_features import extract_checked, read_frame
 from megloc_kapture.stages.matches import (
-    BATCH,
     FeatureCache,
     Features,
     VerifiedMatches,
-    batched,
-    match_and_verify,
-    two_view_verification,
+    match_images,
+    verification_of,
 )
 from megloc_kapture.stages.options import LocalFeaturesChoice, PipelineOptions
-from megloc_kapture.stages.pyramid_query import retry_query
-from megloc_kapture.values import LocalFeatures
 
 _MIN_FOUND_AGAIN = 0.5
 _NO_MATCHES = VerifiedMatches(np.zeros((0, 2), np.int64), np.zeros(0, np.float32), 0)
@@ -130,18 +127,15 @@ class LocalType:
 
     def match(self, query: Features, images: Sequence[str]) -> list[VerifiedMatches]:
         """Verified matches of a query with each of several map images."""
-        verification = two_view_verification(self._options.query_verification)
-        if self._options.verification == "none":
-            verification = _keep_all
-        found = dict.fromkeys(images, _NO_MATCHES)
-        for batch in batched((image for image in images if image in self.first), BATCH):
-            pairs = match_and_verify(
-                query,
-                [self._map_features(self.first, image) for image in batch],
-                self.matcher,
-                [verification] * len(batch),
-            )
-            found.update(zip(batch, pairs, strict=True))
+        known = [image for image in images if image in self.first]
+        pairs = match_images(
+            query,
+            known,
+            lambda image: self._map_features(self.first, image),
+            self.matcher,
+            lambda _: verification_of(self._options.verify_queries()),
+        )
+        found = dict.fromkeys(images, _NO_MATCHES) | dict(zip(known, pairs, strict=True))
         return [found[image] for image in images]
 
     def match_again(
@@ -158,27 +152,25 @@ class LocalType:
         The query's keypoints, added ones last, the matches in their order, and why it was left
         out although it is on; empty where it was not.
         """
-        options = self._options.guided_pyramid
-        few = any(len(found) < options.min_matches for _, found, _ in matches)
-        if not self._options.matches_again() or not few:
+        options = self._options
+        few = any(len(found) < options.guided_pyramid.min_matches for _, found, _ in matches)
+        if not options.matches_again() or not few:
             return query.keypoints_px, list(matches), ""
         reason = self.pyramid_obstacle or ("" if image.query.has_image() else "no image")
         if reason:
             return query.keypoints_px, list(matches), f"guided pyramid matching: {reason}"
-        known = [each for each in matches if each[0] in self.first]
-        keypoints, richer = retry_query(
+        method = PyramidMethod(
+            self.extractor, self.matcher, options.query_verification, options.guided_pyramid
+        )
+        found = retry_query(
             query,
-            known,
+            [each for each in matches if each[0] in self.first],
             lambda name: self._map_features(self.points, name),
-            self.extractor,
-            self.matcher,
-            image=lambda: image.pixels,
-            mask=lambda: image.feature_mask,
-            verification=self._options.query_verification,
-            options=options,
+            method,
+            lambda: (image.pixels, image.feature_mask),
             name=image.query.name,
         )
-        return keypoints, richer, ""
+        return np.concatenate([query.keypoints_px, found.added_px]), found.matches, ""
 
     @cached_property
     def pyramid_obstacle(self) -> str:
@@ -285,7 +277,8 @@ def extract_again(
     for image in kapture_map.images:
         if image not in keypoints:
             continue
-        features = _features_of_map_image(kapture_map, extractor, image)
+        frame = read_frame(kapture_map.folder, image)
+        features = extract_checked(extractor, *frame, image)
         stored = keypoints.keypoints_px(image)
         rows = rows_found_again(stored[:, :2], features.keypoints_px[:, :2])
         descriptors = np.zeros((len(stored), features.descriptors.shape[1]), np.float32)
@@ -302,16 +295,3 @@ def extract_again(
             path=kapture_map.folder.root,
         )
     return found
-
-
-def _features_of_map_image(
-    kapture_map: KaptureMap, extractor: LocalFeatureExtractor, image: str
-) -> LocalFeatures:
-    folder = kapture_map.folder
-    pixels = read_image_of(folder.image_path(image), folder.read().camera_of(image))
-    mask = read_mask(folder.root / "sensors" / "masks" / f"{image}.png", pixels.shape[:2])
-    return checked_features(extractor, extractor.extract(pixels, mask), image)
-
-
-def _keep_all(a: Features, b: Features, matches: NDArray[np.int64]) -> NDArray[np.bool_]:
-    return np.ones(len(matches), dtype=bool)

@@ -32,7 +32,7 @@ from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.pose_refinement import PoseReferences, refine_pose
 from megloc_kapture.stages.query_poses import localize_unit, localize_views
 from megloc_kapture.stages.ranking_scene import KaptureScene
-from megloc_kapture.stages.reranking import kept_candidates
+from megloc_kapture.stages.reranking import counted, rerank
 from megloc_kapture.stages.work import FolderSpec, ordered_map
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
@@ -302,7 +302,8 @@ class Localizer:
             of_types = [
                 local.match(own, ranked) for local, own in zip(self.types, features, strict=True)
             ]
-            kept = kept_candidates(of_types, self.options.reranking)
+            how = self.options.reranking
+            kept, _ = rerank([[counted(one, how.by) for one in own] for own in of_types], how)
             typed, left_out = [], []
             for local, own, found in zip(self.types, features, of_types, strict=True):
                 named: list[ImageMatches] = [

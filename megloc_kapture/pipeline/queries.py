@@ -17,7 +17,7 @@ from megloc_kapture.io.kapture import FeatureReader, KaptureFolder
 from megloc_kapture.matching.guided_pyramid import base_type, pyramid_type
 from megloc_kapture.pipeline.kapture_map import KaptureMap, check_lengths
 from megloc_kapture.plugins import DepthView
-from megloc_kapture.stages.local_features import read_image_of, read_mask
+from megloc_kapture.stages.local_features import mask_path, read_image_of, read_mask
 from megloc_kapture.stages.query_units import query_units
 from megloc_kapture.stages.ranking_scene import depth_of
 from megloc_kapture.values import Camera, LocalFeatures, RigidTransform
@@ -217,7 +217,7 @@ class KaptureQueries:
             features=self._features(name),
             global_features=vectors,
             prior=self._prior(name),
-            mask=self._folder.root / "sensors" / "masks" / f"{name}.png",
+            mask=mask_path(self._folder, name),
             depth=partial(depth_of, self._folder, name) if self._data.records_depth else None,
         )
 

@@ -29,7 +29,7 @@ from megloc_kapture.preprocessing.masks import with_margin
 from megloc_kapture.stages.class_masks import ClassMasks
 from megloc_kapture.stages.global_features import describe_images
 from megloc_kapture.stages.image_masks import MaskOptions
-from megloc_kapture.stages.local_features import checked_features
+from megloc_kapture.stages.local_features import extract_checked
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.processed_frames import frame_as_stored
 from megloc_kapture.values import Camera, LocalFeatures
@@ -132,8 +132,7 @@ class QueryImage:
         DataError : the image or its mask cannot be read, or is not of its camera's size.
         PluginError : the extractor returns something else.
         """
-        found = extractor.extract(self.pixels, self.feature_mask)
-        return checked_features(extractor, found, self.query.name)
+        return extract_checked(extractor, self.pixels, self.feature_mask, self.query.name)
 
     def describe(self, extractor: GlobalFeatureExtractor) -> NDArray[np.float32]:
         """Its global feature, float32 (D,); raises as :meth:`extract`."""

@@ -1,232 +1,267 @@
-"""Stage: guided pyramid matching of pairs with few matches, as a keypoints type of its own.
+"""Guided pyramid matching of one image with others, from arrays.
 
 MegLoc, section "Guided pyramid matching": when mapping, both images of a pair are extracted again
-at other scales and turns, when localizing the query alone. ``T-pyramid`` has of every image the
-keypoints of T first, unchanged, then those that were added, and the matches of all pairs: so every
-index into T is one into T-pyramid, and what reads kapture reads it.
-
-An image is extracted again once, however many pairs it is in: the work goes by images, not by
-pairs. Map images whose poses leave them no view in common are not tried.
+at other scales and turns, when localizing the query alone. An image is extracted again once,
+however many pairs it is in.
 """
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
 
-from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs
-from megloc_kapture.mapping.pairs import views_can_overlap
-from megloc_kapture.matching.guided_pyramid import GuidedPyramidOptions, pyramid_type
-from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
-from megloc_kapture.plugins import LocalFeatureExtractor, Matcher
-from megloc_kapture.stages.layout import (
-    FEATURES,
-    LOCAL_FEATURES,
-    MAP,
-    MAPPING_MATCHES,
-    MAPPING_PAIRS,
-    MAPPING_PYRAMID,
-    QUERY_MATCHES,
-    QUERY_PAIRS,
-    QUERY_PYRAMID,
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.geometry.image_variants import ImageVariant
+from megloc_kapture.localization.cluster_poses import ImageMatches
+from megloc_kapture.matching.guided_pyramid import (
+    GuidedPyramidOptions,
+    PairVerifier,
+    SkippedVariant,
+    VariantFeatures,
+    VariantMatches,
+    extract_variants,
+    match_probed,
+    match_variants,
 )
-from megloc_kapture.stages.map_points import matched_images
-from megloc_kapture.stages.matches import MATCHING_OPTIONS
-from megloc_kapture.stages.pyramid_jobs import HowToRetry, Retry
-from megloc_kapture.stages.pyramid_pairs import PyramidPairs
-from megloc_kapture.stages.stage import PipelineStage, StageWork
-from megloc_kapture.stages.work import HERE, FolderSpec, Work
+from megloc_kapture.matching.pyramid_combination import (
+    Combined,
+    KeypointUnion,
+    TriedVariant,
+    combine,
+)
+from megloc_kapture.matching.verification import (
+    KnownPoseOptions,
+    TwoViewOptions,
+    two_view_of_variants,
+)
+from megloc_kapture.plugins import LocalFeatureExtractor, Matcher
+from megloc_kapture.stages.local_features import extract_checked
+from megloc_kapture.stages.matches import BATCH, Features, batched, match_all
 
-if TYPE_CHECKING:
-    from megloc_kapture.stages.options import PipelineOptions
+
+@dataclass(frozen=True)
+class PyramidMethod:
+    """How pairs with few matches are tried again."""
+
+    extractor: LocalFeatureExtractor
+    matcher: Matcher
+    verification: KnownPoseOptions | TwoViewOptions
+    options: GuidedPyramidOptions
+
+    def is_hard(self, num_matches: int) -> bool:
+        """Whether a pair with so many verified matches is tried again."""
+        return self.options.mode != "off" and num_matches < self.options.min_matches
 
 
-def pyramid_mapping(
-    mapping: KaptureFolder,
-    pairs: Sequence[ImagePair],
-    local_type: str,
-    extractor: LocalFeatureExtractor,
-    matcher: Matcher,
-    verification: KnownPoseOptions,
-    options: GuidedPyramidOptions,
-    output: Path,
+@dataclass(frozen=True, eq=False)
+class MatchedVariants:
+    """What the variants of an image came to.
+
+    Attributes
+    ----------
+    found : for each of the other images the variants that match it.
+    num_variants : that were tried with each of these, the skipped ones among them.
+    """
+
+    found: list[list[VariantMatches]]
+    num_variants: list[int]
+    skipped: list[SkippedVariant]
+    seconds: float
+
+
+def match_image_again(
+    itself: Features,
+    pixels: NDArray[np.uint8],
+    mask: NDArray[np.bool_] | None,
+    others: Sequence[str],
+    load: Callable[[str], Features],
+    judge: Callable[[str, Features], PairVerifier],
+    method: PyramidMethod,
     *,
-    mask_margin_px: float = 0.0,
-    work: Work = HERE,
-) -> dict[str, float]:
-    """Try mapping pairs with few matches again, each image's variants with the other as it is.
+    only_scaled: Sequence[str] = (),
+    name: str,
+) -> MatchedVariants:
+    """Extract the variants of an image, and match them with other images as they are.
 
     Parameters
     ----------
-    mapping : images with poses, with the features and verified matches of ``local_type``.
-    pairs : those that were matched.
-    output : gets ``local_features/T-pyramid``: keypoints, descriptors, matches of all pairs, and
-        ``guided_pyramid.csv``, a row per pair that was tried.
+    itself : features of the image as it is.
+    pixels, mask : RGB (H, W, 3), and True = use (H, W) or None.
+    others : matched with all variants; those with most matches first, as they are probed first.
+    load : features of another image; not all are in memory at once.
+    judge : of the matches with another image, by its name and features.
+    only_scaled : matched with the variants of another scale only; in the same order.
+    name : of the image, for messages.
 
     Returns
     -------
-    Counts for the log, and ``seconds_per_tried_pair``, of one worker.
+    What was found with ``others``, then with ``only_scaled``.
 
     Raises
     ------
-    DataError : features or matches are missing, or an image; or the extractor's features are not
-        like those of ``local_type``.
+    DataError : its features are of another size than the extractor's.
     """
-    spec = FolderSpec(mapping)
-    how = HowToRetry(
-        spec, spec, local_type, local_type, extractor, matcher, verification, options,
-        mask_margin_px,
-    )  # fmt: skip
-    data, poses = mapping.read(), mapping.read().poses()
-
-    def can_gain(first: str, second: str) -> bool:
-        if not (first in poses and second in poses):
-            return False  # poses are what verifies
-        return views_can_overlap(
-            data.camera_of(first), poses[first], data.camera_of(second), poses[second]
-        )
-
-    # kept in one file, so (a, b) and (b, a) are one pair
-    named = sorted({(min(p.query, p.map), max(p.query, p.map)) for p in pairs})
-    run = PyramidPairs(mapping, mapping, how, mapping.matches(local_type), named)
-    run.find_hard(can_gain)
-    jobs = []
-    others: dict[str, tuple[list[str], list[str]]] = defaultdict(lambda: ([], []))
-    for a, b in run.hard:
-        others[a][0].append(b)
-        # turning one image is turning the other: b is turned only where it is scaled
-        others[b][1].append(a)
-    for image in sorted(others):
-        jobs.append(Retry(how, image, *map(tuple, others[image])))
-    return run.write(jobs, output, work)
-
-
-def pyramid_queries(
-    query: KaptureFolder,
-    mapping: KaptureFolder,
-    pairs: Sequence[ImagePair],
-    local_type: str,
-    extractor: LocalFeatureExtractor,
-    matcher: Matcher,
-    verification: TwoViewOptions,
-    options: GuidedPyramidOptions,
-    output: Path,
-    *,
-    mask_margin_px: float = 0.0,
-    work: Work = HERE,
-) -> dict[str, float]:
-    """Try query pairs with few matches again: the query's variants with the map's keypoints.
-
-    The map is neither extracted again nor changed. Where it has keypoints of ``T-pyramid`` the
-    variants are matched with those, which begin with those of T.
-
-    Parameters
-    ----------
-    query : images, with the features and the matches of ``local_type``.
-    mapping : images of the map with features of ``local_type``.
-    pairs : those that were matched, and ``output``: see :func:`pyramid_mapping`.
-
-    Returns
-    -------
-    Counts, see :func:`pyramid_mapping`.
-
-    Raises
-    ------
-    DataError : see :func:`pyramid_mapping`.
-    """
-    larger = pyramid_type(local_type)
-    there = all(larger in mapping.types(kind) for kind in ("keypoints", "descriptors"))
-    how = HowToRetry(
-        FolderSpec(query),
-        FolderSpec(mapping),
-        local_type,
-        larger if there else local_type,
-        extractor,
-        matcher,
-        verification,
-        options,
-        mask_margin_px,
+    started = time.perf_counter()
+    every = method.options.variants(itself.camera.width, itself.camera.height)
+    scaled = [variant for variant in every if variant.scale != 1.0]
+    variants, skipped = extract_variants(
+        pixels,
+        mask,
+        every if others else scaled,
+        lambda image, mask: extract_checked(method.extractor, image, mask, name),
+        like=itself,
     )
-    named = list(dict.fromkeys((pair.query, pair.map) for pair in pairs))
-    run = PyramidPairs(query, mapping, how, query.matches(local_type), named)
-    run.find_hard()
-    others: dict[str, list[str]] = defaultdict(list)
-    for image, other in run.hard:
-        others[image].append(other)
-    jobs = [Retry(how, image, tuple(others[image])) for image in sorted(others)]
-    return run.write(jobs, output, work)
+
+    def match(
+        names: Sequence[str], some: Sequence[VariantFeatures], which: range
+    ) -> list[list[VariantMatches]]:
+        found = []
+        for batch in batched(names[which.start : which.stop], BATCH):
+            loaded = [load(other) for other in batch]
+            judgements = [
+                judge(other, features) for other, features in zip(batch, loaded, strict=True)
+            ]
+            found += match_variants(some, loaded, partial(match_all, method.matcher), judgements)
+        return found
+
+    found: list[list[VariantMatches]] = []
+    counts: list[int] = []
+    of_scale = [one for one in variants if one.variant.scale != 1.0]
+    for names, used, num in ((others, variants, every), (only_scaled, of_scale, scaled)):
+        matches, num_left = match_probed(used, len(names), partial(match, names), method.options)
+        probed = min(len(names), method.options.probed_pairs)
+        found += matches
+        counts += [len(num)] * probed + [num_left] * (len(names) - probed)
+    return MatchedVariants(found, counts, skipped, time.perf_counter() - started)
 
 
-class PyramidMapping(PipelineStage):
-    """Match map images with few matches again, at other scales and turns."""
+@dataclass(eq=False)
+class RetriedPairs:
+    """Sums over the pairs that were tried, and a row of ``guided_pyramid.csv`` for each."""
 
-    name = "mapping_pyramid"
-    uses = (*MATCHING_OPTIONS, "mapping_verification", "guided_pyramid", "mask_margin_px")
-    writes = (MAPPING_PYRAMID,)
+    rows: list[list[str]] = field(default_factory=list)
+    gained: int = 0
+    before: int = 0
+    after: int = 0
+    added: int = 0
+    seconds: float = 0.0
 
-    @property
-    def reads(self) -> Sequence[str]:  # type: ignore[override]
-        return (self.layout.mapping, LOCAL_FEATURES, MAPPING_PAIRS, MAPPING_MATCHES)
+    def count(
+        self, pair: tuple[str, str], before: int, combined: Combined, tried: int, *told: str
+    ) -> None:
+        """Add a pair: matches that it had, what it has, variants tried, best one, skipped ones."""
+        after, added = len(combined.matches), [len(new) for new in combined.added]
+        self.gained += after > before
+        self.before += before
+        self.after += after
+        self.added += sum(added)
+        self.rows.append([*pair, *map(str, (before, after, *added, tried)), *told])
 
-    @classmethod
-    def is_wanted(cls, options: PipelineOptions) -> bool:
-        return options.matches_again() and options.triangulates()
+    def add(self, other: RetriedPairs) -> None:
+        """Add the pairs of another image."""
+        for name, value in vars(other).items():
+            setattr(self, name, getattr(self, name) + value)
 
-    def run(self, work: StageWork) -> Mapping[str, float]:
-        counts: dict[str, float] = {}
-        for extractor in self.options.make_extractors():
-            found = pyramid_mapping(
-                work.folder(self.layout.mapping, FEATURES, MAPPING_MATCHES),
-                read_pairs(work.path(MAPPING_PAIRS)),
-                extractor.name,
-                extractor,
-                self.options.make_matcher(extractor.name),
-                self.options.mapping_verification,
-                self.options.guided_pyramid,
-                work.out / MAPPING_PYRAMID,
-                mask_margin_px=self.options.mask_margin_px,
-                work=work,
-            )
-            counts |= {f"{extractor.name} {name}": count for name, count in found.items()}
-        return counts
+    def counts(self) -> dict[str, float]:
+        """For the log; seconds are of one worker."""
+        return {
+            "pairs_tried": len(self.rows),
+            "pairs_gained": self.gained,
+            "matches_before": self.before,
+            "matches_after": self.after,
+            "keypoints_added": self.added,
+            "seconds_per_tried_pair": round(self.seconds / max(len(self.rows), 1), 3),
+        }
 
 
-class PyramidQueries(PipelineStage):
-    """Match queries with few matches again; see :class:`PyramidMapping`."""
+@dataclass(frozen=True, eq=False)
+class RetriedQuery:
+    """A query after guided pyramid matching.
 
-    name = "query_pyramid"
-    uses = (*MATCHING_OPTIONS, "query_verification", "guided_pyramid", "mask_margin_px")
-    writes = (QUERY_PYRAMID,)
+    Attributes
+    ----------
+    added_px, added_descriptors : (A, C) and (A, D), keypoints behind the query's own.
+    matches : of all candidates, in their order.
+    """
 
-    @property
-    def reads(self) -> Sequence[str]:  # type: ignore[override]
-        images = (self.layout.mapping, self.layout.query)
-        return (*images, LOCAL_FEATURES, MAP, QUERY_PAIRS, QUERY_MATCHES)
+    added_px: NDArray[np.float32]
+    added_descriptors: NDArray[Any]
+    matches: list[ImageMatches]
+    tried: RetriedPairs
 
-    @classmethod
-    def is_wanted(cls, options: PipelineOptions) -> bool:
-        return options.matches_again()
 
-    def run(self, work: StageWork) -> Mapping[str, float]:
-        counts: dict[str, float] = {}
-        pairs = read_pairs(work.path(QUERY_PAIRS))
-        for extractor in self.options.query_extractors():
-            mapping = matched_images(work, self, extractor.name)
-            described = mapping.descriptors(extractor.name)
-            found = pyramid_queries(
-                work.folder(self.layout.query, FEATURES, QUERY_MATCHES),
-                mapping,
-                [pair for pair in pairs if pair.map in described],
-                extractor.name,
-                extractor,
-                self.options.make_matcher(extractor.name),
-                self.options.query_verification,
-                self.options.guided_pyramid,
-                work.out / QUERY_PYRAMID,
-                mask_margin_px=self.options.mask_margin_px,
-                work=work,
-            )
-            counts |= {f"{extractor.name} {name}": count for name, count in found.items()}
-        return counts
+def retry_query(
+    query: Features,
+    matches: Sequence[ImageMatches],
+    load: Callable[[str], Features],
+    method: PyramidMethod,
+    frame: Callable[[], tuple[NDArray[np.uint8], NDArray[np.bool_] | None]],
+    *,
+    name: str = "query",
+) -> RetriedQuery:
+    """Try a query's candidates with few matches again: its variants with the map's keypoints.
+
+    Parameters
+    ----------
+    matches : of each candidate, best first: its name, verified matches (K, 2), scores (K,).
+    load : features of a candidate.
+    frame : pixels and mask of the query; called only where a candidate has few matches.
+    name : of the query, for messages.
+
+    Raises
+    ------
+    DataError : the image cannot be read, or its features are of another size than the query's.
+    """
+    tried = RetriedPairs()
+    base = {other: pairs for other, pairs, _ in matches}
+    hard = [other for other, pairs in base.items() if method.is_hard(len(pairs))]
+    hard.sort(key=lambda other: -len(base[other]))
+    mode = method.options.mode
+    if mode == "off" or not hard:
+        nothing = query.keypoints_px[:0], query.descriptors[:0]
+        return RetriedQuery(*nothing, list(matches), tried)
+    verification = method.verification
+    if not isinstance(verification, TwoViewOptions):
+        raise ValueError("a query has no pose to verify with")
+
+    def judge(other: str, features: Features) -> PairVerifier:
+        return two_view_of_variants(
+            query.camera, query.keypoints_px, features.camera, features.keypoints_px, base[other],
+            verification,
+        )  # fmt: skip
+
+    matched = match_image_again(query, *frame(), hard, load, judge, method, name=name)
+    tried.seconds = matched.seconds
+    of_other = dict(zip(hard, zip(matched.found, matched.num_variants, strict=True), strict=True))
+    skipped = described(matched.skipped)
+    keypoints = KeypointUnion(query.keypoints_px)
+    descriptors: list[NDArray[Any]] = []
+    richer: list[ImageMatches] = []
+    for other, pairs, scores in matches:
+        if other in of_other:
+            found, num_variants = of_other[other]
+            variants = [TriedVariant(0, each) for each in found]
+            combined = combine((pairs, scores), variants, mode, (keypoints, None))
+            best = "" if combined.best is None else f"image {found[combined.best].variant}"
+            why = f"image {skipped}" if skipped else ""
+            tried.count((name, other), len(pairs), combined, num_variants, best, why)
+            descriptors += [found[at].descriptors[k] for at, k in combined.added[0].tolist()]
+            pairs, scores = combined.matches, combined.scores
+        richer.append((other, pairs, scores))
+    added = np.array(descriptors, query.descriptors.dtype).reshape(-1, query.descriptors.shape[1])
+    return RetriedQuery(keypoints.added(), added, richer, tried)
+
+
+def described(skipped: Sequence[SkippedVariant]) -> str:
+    """The variants that gave nothing, and why, as one line; those of one reason together."""
+    by_reason: dict[str, list[ImageVariant]] = {}
+    for each in skipped:
+        by_reason.setdefault(each.reason, []).append(each.variant)
+    return "; ".join(
+        f"{' '.join(map(str, variants))}: {reason}" for reason, variants in by_reason.items()
+    )

@@ -17,7 +17,7 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.plugins import PluginChoice
 from megloc_kapture.preprocessing.masks import FixedMask, UnchangingRegion
-from megloc_kapture.stages.local_features import read_mask
+from megloc_kapture.stages.local_features import mask_path, read_mask
 from megloc_kapture.values import Camera, Options
 
 Mask = NDArray[np.bool_]
@@ -83,7 +83,7 @@ def mask_files(
     found = {}
     some = False
     for image in images:
-        own = folder.root / "sensors" / "masks" / f"{image}.png"
+        own = mask_path(folder, image)
         user = None if user_masks is None else user_masks / f"{image}.png"
         own_file = own if own.is_file() else None
         user_file = user if user is not None and user.is_file() else None

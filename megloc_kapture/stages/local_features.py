@@ -21,18 +21,17 @@ from megloc_kapture.stages.given_map import has_descriptors
 from megloc_kapture.stages.layout import LOCAL_FEATURES, REFERENCE
 from megloc_kapture.stages.map_points import check_given_type
 from megloc_kapture.stages.stage import LOCAL_TYPES, PipelineStage, StageWork
-from megloc_kapture.stages.work import HERE, Work
+from megloc_kapture.stages.work import HERE, FolderSpec, Work
 from megloc_kapture.values import Camera, LocalFeatures
 
 
 @dataclass(frozen=True)
 class _Job:
     extractor: LocalFeatureExtractor
+    folder: FolderSpec
     image: str
-    image_path: Path
-    mask_path: Path
+    has_mask: bool
     mask_margin_px: float
-    camera: Camera
 
 
 def extract_local_features(
@@ -80,7 +79,7 @@ def extract_local_features(
         keypoint_writer.write(job.image, features.keypoints_px)
         descriptor_writer.write(job.image, features.descriptors)
         total += len(features.keypoints_px)
-        if job.mask_path.is_file():
+        if job.has_mask:
             masked[job.image] = features.num_masked
     counts = {"images": len(jobs), "keypoints": total}
     if masked:
@@ -95,16 +94,10 @@ def _jobs(
     named = sorted(
         ((image, k) for k, folder in enumerate(folders) for image in folder.read().image_names())
     )
+    specs = [FolderSpec(folder) for folder in folders]
     for image, k in named:
-        folder = folders[k]
-        yield _Job(
-            extractor=extractor,
-            image=image,
-            image_path=folder.image_path(image),
-            mask_path=folder.root / "sensors" / "masks" / f"{image}.png",
-            mask_margin_px=mask_margin_px,
-            camera=folder.read().camera_of(image),
-        )
+        has_mask = mask_path(folders[k], image).is_file()
+        yield _Job(extractor, specs[k], image, has_mask, mask_margin_px)
 
 
 def _writers(
@@ -128,9 +121,21 @@ def _writers(
 
 
 def _extract(job: _Job) -> LocalFeatures:
-    image = read_image_of(job.image_path, job.camera)
-    mask = read_mask(job.mask_path, image.shape[:2], margin_px=job.mask_margin_px)
-    return checked_features(job.extractor, job.extractor.extract(image, mask), job.image)
+    frame = read_frame(job.folder.open(), job.image, margin_px=job.mask_margin_px)
+    return extract_checked(job.extractor, *frame, job.image)
+
+
+def mask_path(folder: KaptureFolder, image: str) -> Path:
+    """Where the mask of an image lies, if it has one."""
+    return folder.root / "sensors" / "masks" / f"{image}.png"
+
+
+def read_frame(
+    folder: KaptureFolder, image: str, *, margin_px: float = 0.0
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+    """An image of a folder, uint8 (H, W, 3) RGB, and its mask, see :func:`read_mask`."""
+    pixels = read_image_of(folder.image_path(image), folder.read().camera_of(image))
+    return pixels, read_mask(mask_path(folder, image), pixels.shape[:2], margin_px=margin_px)
 
 
 def read_image_of(path: Path, camera: Camera) -> NDArray[np.uint8]:
@@ -175,11 +180,23 @@ def read_mask(
     return with_margin(np.asarray(mask), margin_px)
 
 
-def checked_features(extractor: LocalFeatureExtractor, features: Any, image: str) -> LocalFeatures:
-    """What a plugin returned, refused with its name where it breaks the protocol."""
+def extract_checked(
+    extractor: LocalFeatureExtractor,
+    pixels: NDArray[np.uint8],
+    mask: NDArray[np.bool_] | None,
+    image: str,
+) -> LocalFeatures:
+    """What a plugin makes of an image; ``image`` is its name, for messages.
+
+    Raises
+    ------
+    PluginError : it breaks the protocol.
+    """
 
     def refuse(what: str) -> PluginError:
         return PluginError(f"plugin {extractor.name!r} on image {image}: {what}")
+
+    features: Any = extractor.extract(pixels, mask)
 
     if not isinstance(features, LocalFeatures):
         raise refuse(f"extract returned {type(features).__name__}, not LocalFeatures")

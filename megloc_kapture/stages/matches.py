@@ -18,13 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.geometry.cameras import bearing_rays
-from megloc_kapture.io.kapture import (
-    FeatureReader,
-    ImagePair,
-    KaptureFolder,
-    MatchesWriter,
-    read_pairs,
-)
+from megloc_kapture.io.kapture import ImagePair, KaptureFolder, MatchesWriter, read_pairs
 from megloc_kapture.io.tables import PairCount, write_match_counts
 from megloc_kapture.matching.verification import (
     KnownPoseOptions,
@@ -45,7 +39,7 @@ from megloc_kapture.stages.layout import (
 from megloc_kapture.stages.map_points import matched_images
 from megloc_kapture.stages.stage import PipelineStage, StageWork
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
-from megloc_kapture.values import Camera, ImageFeatures, Options
+from megloc_kapture.values import Camera, ImageFeatures, Options, RigidTransform
 
 if TYPE_CHECKING:
     from megloc_kapture.stages.options import PipelineOptions
@@ -67,31 +61,34 @@ Verification = KnownPoseOptions | TwoViewOptions | NoVerification
 
 
 @dataclass(frozen=True, eq=False)
-class Features:
-    """What matching needs of one image: keypoints (N, 2 or more), rays (N, 3), descriptors."""
+class Features(ImageFeatures):
+    """Local features of one image, as a matcher gets them, and what verifying matches needs.
+
+    Make one with :meth:`of`. Rays and slopes are worked out when first asked for.
+    """
 
     camera: Camera
-    keypoints_px: NDArray[np.float32]
-    rays: NDArray[np.float64]
-    descriptors: NDArray[Any]
 
     @classmethod
     def of(
         cls, camera: Camera, keypoints_px: NDArray[np.float32], descriptors: NDArray[Any]
     ) -> Features:
-        """With the rays of the keypoints."""
-        return cls(camera, keypoints_px, bearing_rays(camera, keypoints_px[:, :2]), descriptors)
+        """Keypoints (N, 2 or more) and descriptors (N, D) of an image of this camera."""
+        return cls(keypoints_px, descriptors, camera.width, camera.height, camera)
 
-    def for_matcher(self) -> ImageFeatures:
-        """What a matcher gets of them."""
-        return ImageFeatures(
-            self.keypoints_px, self.descriptors, self.camera.width, self.camera.height
-        )
+    @cached_property
+    def rays(self) -> NDArray[np.float64]:
+        """Unit rays of the keypoints (N, 3)."""
+        return bearing_rays(self.camera, self.keypoints_px[:, :2])
 
     @cached_property
     def slopes(self) -> NDArray[np.float64]:
-        """``ray_slopes`` of the keypoints (N, 2, 2), worked out when first asked for."""
+        """``ray_slopes`` of the keypoints (N, 2, 2)."""
         return ray_slopes(self.camera, self.keypoints_px[:, :2], self.rays)
+
+
+Verify = Callable[[Features, Features, NDArray[np.int64]], NDArray[np.bool_]]
+"""Which of the matches (K, 2) of two images are right, bool (K,)."""
 
 
 @dataclass(frozen=True)
@@ -167,36 +164,47 @@ def match_pairs(
 
 def _match(job: _Job) -> list[VerifiedMatches]:
     first, second = job.first.open(), job.second.open()
-    features = cached_features(job.first, first, job.local_type, job.image)
-    found: list[VerifiedMatches] = []
-    for others in batched(job.others, BATCH):  # not all at once: their features are in memory
-        found += match_and_verify(
-            features,
-            [cached_features(job.second, second, job.local_type, other) for other in others],
-            job.matcher,
-            [
-                _relative_verification(job.verification, first, second, job.image, other)
-                for other in others
-            ],
-        )
-    return found
+
+    def verifier(other: str) -> Verify:
+        def relative() -> RigidTransform | None:
+            a_from_world = first.read().cam_from_world(job.image)
+            b_from_world = second.read().cam_from_world(other)
+            if a_from_world is None or b_from_world is None:
+                return None
+            return b_from_world @ a_from_world.inverse()
+
+        return verification_of(job.verification, relative)
+
+    return match_images(
+        cached_features(job.first, first, job.local_type, job.image),
+        job.others,
+        lambda other: cached_features(job.second, second, job.local_type, other),
+        job.matcher,
+        verifier,
+    )
 
 
-def match_and_verify(
-    a: Features, others: Sequence[Features], matcher: Matcher, verifications: Sequence[Any]
+def match_images(
+    a: Features,
+    others: Sequence[str],
+    load: Callable[[str], Features],
+    matcher: Matcher,
+    verifier: Callable[[str], Verify],
 ) -> list[VerifiedMatches]:
     """Match one image with several, and keep the matches that are verified.
 
     Parameters
     ----------
-    verifications : for each pair a function of (a, other, matches) that is the mask of those to
-        keep.
+    load : features of another image, by its name; not all are in memory at once.
+    verifier : what verifies the matches with another image.
     """
-    matched = match_all(matcher, a.for_matcher(), [other.for_matcher() for other in others])
     found = []
-    for other, verify, (matches, scores) in zip(others, verifications, matched, strict=True):
-        good = verify(a, other, matches) if len(matches) else np.zeros(0, bool)
-        found.append(VerifiedMatches(matches[good], scores[good], len(matches)))
+    for names in batched(others, BATCH):
+        loaded = [load(name) for name in names]
+        matched = match_all(matcher, a, loaded)
+        for name, b, (matches, scores) in zip(names, loaded, matched, strict=True):
+            good = verifier(name)(a, b, matches) if len(matches) else np.zeros(0, bool)
+            found.append(VerifiedMatches(matches[good], scores[good], len(matches)))
     return found
 
 
@@ -220,52 +228,31 @@ def batched(items: Iterable[Item], size: int) -> Iterator[list[Item]]:
         yield batch
 
 
-def two_view_verification(options: TwoViewOptions) -> Any:
-    """Verification by a two-view model, for :func:`match_and_verify`."""
+def verification_of(
+    options: Verification, b_from_a: Callable[[], RigidTransform | None] = lambda: None
+) -> Verify:
+    """How the matches of two images are verified.
+
+    Parameters
+    ----------
+    b_from_a : for known poses, the second camera's; without, no match is right.
+    """
 
     def verify(a: Features, b: Features, matches: NDArray[np.int64]) -> NDArray[np.bool_]:
-        return verify_two_view(
-            a.keypoints_px[matches[:, 0], :2],
-            a.camera,
-            b.keypoints_px[matches[:, 1], :2],
-            b.camera,
-            options,
-        )
-
-    return verify
-
-
-def _relative_verification(
-    options: Verification, first: KaptureFolder, second: KaptureFolder, image: str, other: str
-) -> Any:
-    if isinstance(options, TwoViewOptions):
-        return two_view_verification(options)
-    if isinstance(options, NoVerification):
-        return lambda a, b, matches: np.ones(len(matches), dtype=bool)
-    a_from_world = first.read().cam_from_world(image)
-    b_from_world = second.read().cam_from_world(other)
-
-    def verify(a: Features, b: Features, matches: NDArray[np.int64]) -> NDArray[np.bool_]:
-        if a_from_world is None or b_from_world is None:
-            return np.zeros(len(matches), dtype=bool)
         rows_a, rows_b = matches.T
+        if isinstance(options, NoVerification):
+            return np.ones(len(matches), dtype=bool)
+        if isinstance(options, TwoViewOptions):
+            points_px = a.keypoints_px[rows_a, :2], b.keypoints_px[rows_b, :2]
+            return verify_two_view(points_px[0], a.camera, points_px[1], b.camera, options)
+        pose = b_from_a()
+        if pose is None:
+            return np.zeros(len(matches), dtype=bool)
         return verify_with_poses(
-            a.rays[rows_a],
-            a.slopes[rows_a],
-            b.rays[rows_b],
-            b.slopes[rows_b],
-            b_from_world @ a_from_world.inverse(),
-            options,
+            a.rays[rows_a], a.slopes[rows_a], b.rays[rows_b], b.slopes[rows_b], pose, options
         )
 
     return verify
-
-
-def read_features(
-    keypoints: FeatureReader, descriptors: FeatureReader, camera: Camera, image: str
-) -> Features:
-    """Read what matching needs of one image."""
-    return Features.of(camera, keypoints.read(image), descriptors.read(image))
 
 
 class FeatureCache:
@@ -295,9 +282,8 @@ class FeatureCache:
 
 
 def _size(features: Features) -> int:
-    slopes = 4 * features.rays.itemsize * len(features.rays)  # there or not
-    arrays = (features.descriptors, features.keypoints_px, features.rays)
-    return sum(array.nbytes for array in arrays) + slopes
+    rays_and_slopes = (3 + 4) * 8 * len(features.keypoints_px)  # there or not
+    return features.descriptors.nbytes + features.keypoints_px.nbytes + rays_and_slopes
 
 
 _cache = FeatureCache()
@@ -309,11 +295,10 @@ def cached_features(
     """The features of an image of a folder that a work item opened; kept in this process."""
     return _cache.get(
         (*spec.key, local_type, image),
-        lambda: read_features(
-            folder.keypoints(local_type),
-            folder.descriptors(local_type),
+        lambda: Features.of(
             folder.read().camera_of(image),
-            image,
+            folder.keypoints(local_type).read(image),
+            folder.descriptors(local_type).read(image),
         ),
     )
 

@@ -14,7 +14,7 @@ from megloc_kapture.io.images import read_depth_map
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.plugins import DepthView
 from megloc_kapture.stages.depth_records import DepthRecord, depth_records
-from megloc_kapture.stages.local_features import read_image_of, read_mask
+from megloc_kapture.stages.local_features import mask_path, read_image_of, read_mask
 from megloc_kapture.values import Camera, RigidTransform
 
 
@@ -32,8 +32,7 @@ class _Images:
 
     def mask(self, name: str) -> NDArray[np.bool_] | None:
         camera = self.camera(name)
-        path = self.folder.root / "sensors" / "masks" / f"{name}.png"
-        return read_mask(path, (camera.height, camera.width))
+        return read_mask(mask_path(self.folder, name), (camera.height, camera.width))
 
     def depth(self, name: str) -> DepthView | None:
         record = self._depth_records.get(name)

@@ -6,8 +6,7 @@ with each, and the N with the most valid correspondences are kept.
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -33,8 +32,7 @@ if TYPE_CHECKING:
     from megloc_kapture.stages.options import PipelineOptions
 
 
-Pair = tuple[str, str]
-Counted = Literal["matches", "verified"]
+Matched = int | NDArray[np.int64]
 
 
 class RerankingOptions(Options):
@@ -56,29 +54,41 @@ class RerankingOptions(Options):
         return self.by != "none"
 
 
-def rerank_pairs(
-    pairs: Sequence[ImagePair], counts: Mapping[Pair, int], keep: int
-) -> list[ImagePair]:
-    """The ``keep`` candidates of each query with the most correspondences, best first.
+def rerank(
+    of_types: Sequence[Sequence[Matched]], options: RerankingOptions
+) -> tuple[list[int], list[int]]:
+    """Positions of the candidates of one query that stay, best first, and what each has.
 
-    Of equal counts, and so where nothing matches, retrieval's order stays. Sorted by query. The
-    score is the count, and below one a part that keeps that order in the file.
+    Of equal counts, and so where nothing matches, retrieval's order stays.
 
     Parameters
     ----------
-    counts : (query, map image) to correspondences; 0 for pairs that are not in it.
+    of_types : of each type of local features and each candidate, in retrieval's order, the number
+        of its matches; for coverage the rows (K,) of the query's keypoints that they are of.
     """
-    found = []
-    for query, images in iterate_candidates(pairs):
-        own = [counts.get((query, image), 0) for image in images]
-        for place, rank in enumerate(_greatest(own, keep)):
-            found.append(ImagePair(query, images[rank], own[rank] + 1.0 / (2.0 + place)))
-    return found
+    num = len(of_types[0]) if of_types else 0
+    if options.by == "coverage":
+        rows = [[np.unique(np.asarray(matched)) for matched in own] for own in of_types]
+        # keypoints are numbered through the types
+        sizes = [max((int(ids[-1]) + 1 for ids in own if len(ids)), default=0) for own in rows]
+        starts = np.cumsum([0, *sizes[:-1]])
+        keypoints = [
+            np.concatenate([start + own[at] for start, own in zip(starts, rows, strict=True)])
+            for at in range(num)
+        ]
+        return greedy_coverage(keypoints, options.keep)
+    counts = [sum(int(own[at]) for own in of_types) for at in range(num)]
+    order = list(range(num))
+    if options.reranks():
+        order = sorted(order, key=lambda at: (-counts[at], at))[: options.keep]
+    return order, [counts[at] for at in order]
 
 
-def _greatest(counts: Sequence[int], keep: int) -> list[int]:
-    """Positions of the greatest counts, greatest first; of equal ones the first stays first."""
-    return sorted(range(len(counts)), key=lambda at: (-counts[at], at))[:keep]
+def counted(pair: VerifiedMatches, by: str) -> Matched:
+    """What reranking looks at in the matches of a candidate, see :func:`rerank`."""
+    if by == "coverage":
+        return pair.matches[:, 0]
+    return pair.num_found if by == "matches" else len(pair.matches)
 
 
 def reranked(
@@ -88,114 +98,46 @@ def reranked(
     local_types: Sequence[str],
     options: RerankingOptions,
 ) -> list[ImagePair]:
-    """Candidates as the options want them, from matches that are stored.
+    """Candidates as the options want them, from matches that are stored; sorted by query.
+
+    The score is what a candidate has, and below one a part that keeps their order in the file.
 
     Parameters
     ----------
-    query : with keypoints and matches of the types.
+    query : with matches of the types.
     matches : the features folder that the matches are in.
 
     Raises
     ------
-    DataError : matches are missing or broken.
+    DataError : matches, or the tables of their numbers, are missing or broken.
     """
-    if options.by == "none":
+    if not options.reranks():
         return list(pairs)
-    if options.by == "coverage":
-        return cover_pairs(pairs, matched_keypoints(query, local_types), options.keep)
-    return rerank_pairs(pairs, correspondences(matches, local_types, options.by), options.keep)
-
-
-def kept_candidates(
-    of_types: Sequence[Sequence[VerifiedMatches]], options: RerankingOptions
-) -> list[int]:
-    """Positions of the candidates of one query that stay, best first, as :func:`reranked` has it.
-
-    Parameters
-    ----------
-    of_types : of each type of local features the matches with each candidate, best first.
-    """
-    count = len(of_types[0]) if of_types else 0
-    if options.by == "none":
-        return list(range(count))
-    if options.by == "coverage":
-        rows = [[np.unique(pair.matches[:, 0]) for pair in own] for own in of_types]
-        # keypoints are numbered through the types
-        sizes = [max((int(ids[-1]) + 1 for ids in own if len(ids)), default=0) for own in rows]
-        starts = np.cumsum([0, *sizes[:-1]])
-        keypoints = [
-            np.concatenate([start + own[at] for start, own in zip(starts, rows, strict=True)])
-            for at in range(count)
-        ]
-        return greedy_coverage(keypoints, options.keep)[0]
-    by_matches = options.by == "matches"
-    counts = [
-        sum(own[at].num_found if by_matches else len(own[at].matches) for own in of_types)
-        for at in range(count)
-    ]
-    return _greatest(counts, options.keep)
-
-
-def cover_pairs(
-    pairs: Sequence[ImagePair],
-    matched: Callable[[str, str], NDArray[np.int64]],
-    keep: int,
-) -> list[ImagePair]:
-    """The ``keep`` candidates of each query that together match most of its keypoints.
-
-    As :func:`rerank_pairs`; the score counts the keypoints that an image adds.
-
-    Parameters
-    ----------
-    matched : of (query, map image) the query's keypoints that are matched, numbered through its
-        types; see :func:`matched_keypoints`.
-    """
+    stored = [_stored(query, matches, name, options.by) for name in local_types]
     found = []
-    for query, images in iterate_candidates(pairs):
-        order, added = greedy_coverage([matched(query, image) for image in images], keep)
-        for place, (at, count) in enumerate(zip(order, added, strict=True)):
-            found.append(ImagePair(query, images[at], count + 1.0 / (2.0 + place)))
+    for image, candidates in iterate_candidates(pairs):
+        of_types = [[matched(image, other) for other in candidates] for matched in stored]
+        for place, (at, count) in enumerate(zip(*rerank(of_types, options), strict=True)):
+            found.append(ImagePair(image, candidates[at], count + 1.0 / (2.0 + place)))
     return found
 
 
-def matched_keypoints(
-    query: KaptureFolder, local_types: Sequence[str]
-) -> Callable[[str, str], NDArray[np.int64]]:
-    """Reads the keypoints of a query that a map image matches; see :func:`cover_pairs`.
+def _stored(
+    query: KaptureFolder, matches_dir: Path, local_type: str, by: str
+) -> Callable[[str, str], Matched]:
+    """Reads what :func:`counted` says of a query and a candidate; of unmatched pairs nothing."""
+    if by != "coverage":
+        rows = read_match_counts(matches_dir, local_type)
+        counts = {
+            (row.image, row.other): row.matches if by == "matches" else row.verified for row in rows
+        }
+        return lambda image, other: counts.get((image, other), 0)
+    matches, none = query.matches(local_type), np.zeros(0, np.int64)
 
-    Parameters
-    ----------
-    query : with keypoints and matches of the types.
-    """
-    readers = [(query.keypoints(name), query.matches(name)) for name in local_types]
-
-    def matched(image: str, other: str) -> NDArray[np.int64]:
-        ids, first = [np.zeros(0, np.int64)], 0
-        for keypoints, matches in readers:
-            if (image, other) in matches:
-                ids.append(first + np.unique(matches.read(image, other)[0][:, 0]))
-            first += keypoints.length(image)
-        return np.concatenate(ids)
+    def matched(image: str, other: str) -> Matched:
+        return matches.read(image, other)[0][:, 0] if (image, other) in matches else none
 
     return matched
-
-
-def correspondences(features_dir: Path, local_types: Iterable[str], by: Counted) -> Counter[Pair]:
-    """(query, map image) to correspondences, the sum over types of local features.
-
-    Parameters
-    ----------
-    features_dir : where :func:`~megloc_kapture.stages.matches.match_pairs` wrote them.
-
-    Raises
-    ------
-    DataError : there is no table of counts, or a broken one.
-    """
-    total: Counter[Pair] = Counter()
-    for local_type in local_types:
-        for row in read_match_counts(features_dir, local_type):
-            total[row.image, row.other] += row.matches if by == "matches" else row.verified
-    return total
 
 
 class RerankQueries(PipelineStage):

@@ -20,7 +20,7 @@ from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.queries import KaptureQueries
 from megloc_kapture.plugins import PluginChoice
-from megloc_kapture.stages.matches import Features, match_and_verify, two_view_verification
+from megloc_kapture.stages.matches import Features, match_images, verification_of
 from megloc_kapture.values import Pose
 
 
@@ -93,8 +93,11 @@ def residuals_px(opened: KaptureMap, queries: KaptureFolder, truth: Path) -> lis
     stored = opened.keypoints[local_type]
     matcher, verify = (
         options.make_matcher(local_type),
-        two_view_verification(options.query_verification),
+        verification_of(options.query_verification),
     )
+
+    def match_one(a: Features, b: Features) -> tuple[np.ndarray, np.ndarray]:
+        return match_images(a, ["b"], lambda _: b, matcher, lambda _: verify)[0][:2]
 
     for query in KaptureQueries(queries, opened):
         features = query.features[local_type]
@@ -105,7 +108,7 @@ def residuals_px(opened: KaptureMap, queries: KaptureFolder, truth: Path) -> lis
             theirs = Features.of(
                 opened.camera(image), stored.keypoints_px(image), stored.descriptors(image)
             )
-            matches.append((image, *match_and_verify(ours, [theirs], matcher, [verify])[0][:2]))
+            matches.append((image, *match_one(ours, theirs)))
         pairs = observed_matches(stored.index, matches).resolve()
         seen = project(query.camera, poses[query.name], stored.index.xyz[pairs.point_ids])
         distances = np.linalg.norm(seen - keypoints[pairs.keypoint_ids], axis=1)

@@ -31,11 +31,11 @@ from megloc_kapture.matching.guided_pyramid import GuidedPyramidOptions
 from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
 from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
 from megloc_kapture.pipeline.executors import single_threaded
-from megloc_kapture.stages.guided_pyramid import pyramid_mapping, pyramid_queries
+from megloc_kapture.stages.guided_pyramid import PyramidMethod, retry_query
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.matches import Features, match_pairs
-from megloc_kapture.stages.pyramid_pairs import COLUMNS, table_path
-from megloc_kapture.stages.pyramid_query import retry_query
+from megloc_kapture.stages.pyramid_mapping import pyramid_mapping
+from megloc_kapture.stages.pyramid_queries import COLUMNS, pyramid_queries, table_path
 from megloc_kapture.stages.query_poses import LocalizationOptions, localize_from_matches
 from megloc_kapture.stages.triangulation import triangulate_map
 from megloc_kapture.stages.work import Work
@@ -487,15 +487,18 @@ def test_one_query_alone_gives_what_the_stage_gives(scene: Scene) -> None:
 
     base = [(other, *query.matches("upright").read(image, other)) for other in MAP_IMAGES]
     with single_threaded():
-        keypoints, found = retry_query(
-            features(query, image), base, lambda name: features(mapping, name), Upright(),
-            NearestNeighbours(), image=lambda: read_image_rgb(query.image_path(image)),
-            mask=lambda: None, verification=TwoViewOptions(), options=ALL,
+        found = retry_query(
+            features(query, image), base, lambda name: features(mapping, name),
+            PyramidMethod(Upright(), NearestNeighbours(), TwoViewOptions(), ALL),
+            lambda: (read_image_rgb(query.image_path(image)), None),
         )  # fmt: skip
     stored = KaptureFolder(query.root, features_dirs=[scene.root / "turned_all"])
-    np.testing.assert_array_equal(keypoints, stored.keypoints("upright-pyramid").read(image))
-    assert [other for other, _, _ in found] == list(MAP_IMAGES)
-    for other, matches, scores in found:
+    for kind, added in (("keypoints", found.added_px), ("descriptors", found.added_descriptors)):
+        before = getattr(query, kind)("upright").read(image)
+        after = getattr(stored, kind)("upright-pyramid").read(image)
+        np.testing.assert_array_equal(np.concatenate([before, added]), after)
+    assert [other for other, _, _ in found.matches] == list(MAP_IMAGES)
+    for other, matches, scores in found.matches:
         expected, expected_scores = stored.matches("upright-pyramid").read(image, other)
         np.testing.assert_array_equal(matches, expected)
         np.testing.assert_allclose(scores, expected_scores)
@@ -514,12 +517,12 @@ def test_one_query_whose_pairs_are_easy_is_never_read(scene: Scene) -> None:
     )
     rows = np.stack([np.arange(100)] * 2, axis=1)
     for options in (ALL, GuidedPyramidOptions(min_matches=1000)):
-        keypoints, found = retry_query(
-            own, [("left/1.png", rows, np.ones(100))], never, Forbidden(), NearestNeighbours(),
-            image=never, mask=never, verification=TwoViewOptions(), options=options,
-        )  # fmt: skip
-        np.testing.assert_array_equal(keypoints, own.keypoints_px)
-        assert [(other, len(matches)) for other, matches, _ in found] == [("left/1.png", 100)]
+        method = PyramidMethod(Forbidden(), NearestNeighbours(), TwoViewOptions(), options)
+        found = retry_query(own, [("left/1.png", rows, np.ones(100))], never, method, never)
+        assert len(found.added_px) == len(found.added_descriptors) == len(found.tried.rows) == 0
+        assert [(other, len(matches)) for other, matches, _ in found.matches] == [
+            ("left/1.png", 100)
+        ]
 
 
 @pytest.mark.parametrize("kind", ["mapping", "queries"])

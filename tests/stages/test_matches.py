@@ -27,7 +27,7 @@ from megloc_kapture.stages.matches import (
     Features,
     NoVerification,
     iterate_candidates,
-    match_and_verify,
+    match_images,
     match_pairs,
 )
 from megloc_kapture.stages.work import Work
@@ -195,12 +195,7 @@ def test_what_has_no_features_is_named(world: Any, tmp_path: Path) -> None:
 
 
 def features(count: int) -> Features:
-    return Features(
-        CAMERA,
-        np.zeros((count, 2), np.float32),
-        np.zeros((count, 3)),
-        np.zeros((count, 4), np.float32),
-    )
+    return Features.of(CAMERA, np.zeros((count, 2), np.float32), np.zeros((count, 4), np.float32))
 
 
 def test_the_matchers_rows_are_those_that_verification_judges() -> None:
@@ -214,7 +209,9 @@ def test_the_matchers_rows_are_those_that_verification_judges() -> None:
         seen.append(matches.tolist())
         return np.array([True, False, True])
 
-    matches, scores, found = match_and_verify(features(4), [features(3)], Fixed(), [verify])[0]
+    matches, scores, found = match_images(
+        features(4), ["b"], lambda _: features(3), Fixed(), lambda _: verify
+    )[0]
     assert seen == [[[0, 2], [1, 1], [3, 0]]]
     assert matches.tolist() == [[0, 2], [3, 0]]
     np.testing.assert_allclose(scores, [0.9, 0.7])
@@ -223,7 +220,7 @@ def test_the_matchers_rows_are_those_that_verification_judges() -> None:
 
 def test_the_cache_is_bounded_and_forgets_what_was_used_longest_ago() -> None:
     one = features(100)
-    # the slopes of the rays are made when they are needed, and counted from the start
+    # rays and their slopes are made when they are needed, and counted from the start
     slopes = 100 * 2 * 2 * 8
     size = one.descriptors.nbytes + one.keypoints_px.nbytes + one.rays.nbytes + slopes
     cache = FeatureCache(max_bytes=3 * size)

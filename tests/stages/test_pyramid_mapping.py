@@ -7,18 +7,31 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from megloc_kapture.errors import OutputError
+from megloc_kapture.errors import DataError, OutputError
 from megloc_kapture.geometry.image_variants import ImageVariant
-from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter
+from megloc_kapture.io.kapture import (
+    FeatureConfig,
+    FeatureWriter,
+    KaptureData,
+    KaptureFolder,
+    Sensor,
+    write_sensors,
+)
 from megloc_kapture.io.kapture.features import FeatureReader, feature_folder
 from megloc_kapture.matching.guided_pyramid import VariantMatches
-from megloc_kapture.stages.pyramid_files import MatchSpool, PyramidFeatures
+from megloc_kapture.stages.pyramid_mapping import MatchSpool
+from megloc_kapture.stages.pyramid_queries import PyramidFeatures
+from megloc_kapture.values import Camera
 
 KEYPOINTS = FeatureConfig("toy", np.dtype("float32"), 3)
 DESCRIPTORS = FeatureConfig("toy", np.dtype("uint8"), 5, "toy", "L2")
 
 
-def readers(root: Path, *, tar: bool = False) -> tuple[FeatureReader, FeatureReader]:
+def toy(root: Path, *, tar: bool = False) -> KaptureFolder:
+    """An image with four features of a toy type."""
+    data = KaptureData(sensors={"cam": Sensor.from_camera(Camera.pinhole(40, 30, 50.0))})
+    data.records_camera[0, "cam"] = "a/1.png"
+    write_sensors(root, data)
     rng = np.random.default_rng(0)
     keypoints = rng.random((4, 3)).astype(np.float32)
     descriptors = rng.integers(0, 255, (4, 5)).astype(np.uint8)
@@ -28,7 +41,11 @@ def readers(root: Path, *, tar: bool = False) -> tuple[FeatureReader, FeatureRea
     ):
         with FeatureWriter(root, kind, "toy", config, orphan=True, tar=tar) as writer:
             writer.write("a/1.png", array)
-    return _opened(root, "toy")
+    return KaptureFolder(root, features_dirs=[root])
+
+
+def readers(folder: KaptureFolder) -> tuple[FeatureReader, FeatureReader]:
+    return folder.keypoints("toy"), folder.descriptors("toy")
 
 
 def _opened(root: Path, name: str) -> tuple[FeatureReader, FeatureReader]:
@@ -54,7 +71,7 @@ def test_what_is_spooled_comes_back(tmp_path: Path) -> None:
         )
         for count in (3, 0, 5)
     ]
-    with MatchSpool(tmp_path / "new", *readers(tmp_path / "toy")) as spool:
+    with MatchSpool(tmp_path / "new", *readers(toy(tmp_path / "toy"))) as spool:
         places = [spool.put(matches) for matches in many]
         for matches, place in reversed(list(zip(many, places, strict=True))):
             found = spool.get(place)
@@ -73,9 +90,9 @@ def test_what_is_spooled_comes_back(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("tar", [False, True])
 def test_an_image_that_nothing_was_added_to_has_what_it_had(tmp_path: Path, tar: bool) -> None:
-    sources = readers(tmp_path / "toy", tar=tar)
-    features = PyramidFeatures(tmp_path / "out", *sources)
-    features.write("a/1.png", np.zeros((0, 3), np.float32), np.zeros((0, 5), np.uint8))
+    folder = toy(tmp_path / "toy", tar=tar)
+    PyramidFeatures(tmp_path / "out", folder, "toy").write_rest()
+    sources = readers(folder)
     for source, written in zip(sources, _opened(tmp_path / "out", "toy-pyramid"), strict=True):
         np.testing.assert_array_equal(written.read("a/1.png"), source.read("a/1.png"))
         if not tar:  # no space twice
@@ -83,10 +100,13 @@ def test_an_image_that_nothing_was_added_to_has_what_it_had(tmp_path: Path, tar:
 
 
 def test_what_was_added_comes_behind_and_the_source_stays_as_it_is(tmp_path: Path) -> None:
-    sources = readers(tmp_path / "toy")
+    folder = toy(tmp_path / "toy")
+    sources = readers(folder)
     before = [source.read("a/1.png") for source in sources]
     more = np.full((2, 3), 7.5, np.float32), np.full((2, 5), 9, np.uint8)
-    PyramidFeatures(tmp_path / "out", *sources).write("a/1.png", *more)
+    features = PyramidFeatures(tmp_path / "out", folder, "toy")
+    features.write("a/1.png", *more)
+    features.write_rest()  # it is no image that nothing was added to
     opened = _opened(tmp_path / "out", "toy-pyramid")
     for source, written, own, added in zip(sources, opened, before, more, strict=True):
         np.testing.assert_array_equal(written.read("a/1.png"), np.concatenate([own, added]))
@@ -97,4 +117,14 @@ def test_what_was_added_comes_behind_and_the_source_stays_as_it_is(tmp_path: Pat
 def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="file"):
-        MatchSpool(tmp_path / "file", *readers(tmp_path / "toy"))
+        MatchSpool(tmp_path / "file", *readers(toy(tmp_path / "toy")))
+
+
+def test_an_image_with_fewer_descriptors_than_keypoints_is_named(tmp_path: Path) -> None:
+    folder = toy(tmp_path / "toy")
+    with FeatureWriter(folder.root, "descriptors", "toy", DESCRIPTORS, orphan=True) as writer:
+        writer.write("a/1.png", np.zeros((3, 5), np.uint8))
+    with pytest.raises(DataError, match=r"1\.png.*: 3 descriptors for 4 keypoints"):
+        PyramidFeatures(
+            tmp_path / "out", KaptureFolder(folder.root, features_dirs=[folder.root]), "toy"
+        )
