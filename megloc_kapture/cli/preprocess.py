@@ -15,10 +15,11 @@ from megloc_kapture.errors import OptionError
 from megloc_kapture.io.files import first_problem, replace_directory, staged_output
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
 from megloc_kapture.pipeline.presets import assigned
-from megloc_kapture.stages.preprocessing import PreprocessingOptions, preprocess_images
-from megloc_kapture.stages.preprocessing_report import (
+from megloc_kapture.stages.preprocessing import (
     REPORT_FILE,
+    PreprocessingOptions,
     PreprocessingReport,
+    preprocess_images,
     read_report,
 )
 from megloc_kapture.stages.work import Work

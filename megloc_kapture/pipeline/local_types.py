@@ -23,7 +23,7 @@ from megloc_kapture.plugins import (
     PluginChoice,
     load_plugin,
 )
-from megloc_kapture.stages.found_again import rows_found_again
+from megloc_kapture.stages.given_map import rows_found_again
 from megloc_kapture.stages.guided_pyramid import PyramidMethod, retry_query
 from megloc_kapture.stages.local_features import extract_checked, read_frame
 from megloc_kapture.stages.matches import (

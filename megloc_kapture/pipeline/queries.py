@@ -18,8 +18,8 @@ from megloc_kapture.matching.guided_pyramid import base_type, pyramid_type
 from megloc_kapture.pipeline.kapture_map import KaptureMap, check_lengths
 from megloc_kapture.plugins import DepthView
 from megloc_kapture.stages.local_features import mask_path, read_image_of, read_mask
-from megloc_kapture.stages.query_units import query_units
 from megloc_kapture.stages.ranking_scene import depth_of
+from megloc_kapture.stages.rigs import query_units
 from megloc_kapture.values import Camera, LocalFeatures, RigidTransform
 
 
@@ -196,13 +196,12 @@ class KaptureQueries:
         ----------
         rigs : whether cameras of one rig and one moment are; else every image by itself.
         """
-        return [unit.images for unit in query_units(self._data, rigs=rigs)]
+        return [tuple(image for image, _ in unit) for unit in query_units(self._data, rigs=rigs)]
 
     def read_units(self, *, rigs: bool) -> Iterator[Unit]:
         """The queries of :meth:`units`, read one after another."""
         for unit in query_units(self._data, rigs=rigs):
-            queries = map(self.query, unit.images)
-            yield tuple(zip(queries, unit.cams_from_rig, strict=True))
+            yield tuple((self.query(image), cam_from_rig) for image, cam_from_rig in unit)
 
     def __iter__(self) -> Iterator[Query]:
         return map(self.query, self.names)

@@ -21,17 +21,12 @@ from megloc_kapture.preprocessing.frames import (
     FrameOptions,
     FramePlan,
     plan_frame,
-    processed_image,
-    processed_mask,
-    reached_region,
 )
 from megloc_kapture.preprocessing.masks import with_margin
-from megloc_kapture.stages.class_masks import ClassMasks
 from megloc_kapture.stages.global_features import describe_images
-from megloc_kapture.stages.image_masks import MaskOptions
+from megloc_kapture.stages.image_masks import ClassMasks, MaskOptions, ProcessedFrame
 from megloc_kapture.stages.local_features import extract_checked
 from megloc_kapture.stages.options import PipelineOptions
-from megloc_kapture.stages.processed_frames import frame_as_stored
 from megloc_kapture.values import Camera, LocalFeatures
 
 
@@ -88,13 +83,20 @@ class QueryImage:
     """
 
     def __init__(self, query: Query, plan: FramePlan, preprocessor: Preprocessor) -> None:
-        self.query, self._plan, self._preprocessor = query, plan, preprocessor
+        self.query, self._preprocessor = query, preprocessor
         self.camera: Camera = plan.processed
+        self._frame = ProcessedFrame(
+            query.name, plan, query.read_image, self._own_mask, lambda: preprocessor.classes
+        )
 
-    @cached_property
+    def _own_mask(self) -> dict[str, NDArray[np.bool_]]:
+        own = self.query.read_mask()
+        return {} if own is None else {"own": own}
+
+    @property
     def pixels(self) -> NDArray[np.uint8]:
         """The image, uint8 (H, W, 3) RGB; raises DataError."""
-        return frame_as_stored(self._unstored, self._plan, self.query.name)
+        return self._frame.stored
 
     @cached_property
     def mask(self) -> NDArray[np.bool_] | None:
@@ -106,17 +108,7 @@ class QueryImage:
         ------
         DataError : the mask cannot be read, or is not of the camera's size.
         """
-        masks = []
-        own = self.query.read_mask()
-        if own is not None:
-            masks.append(processed_mask(own, self._plan))
-        classes = self._preprocessor.classes
-        if classes is not None:
-            masks.append(classes.mask(classes.labels(self._unstored, self.query.name)))
-        reached = reached_region(self._plan)
-        if reached is not None:
-            masks.append(reached)
-        return np.logical_and.reduce(masks) if masks else None
+        return self._frame.mask
 
     @property
     def feature_mask(self) -> NDArray[np.bool_] | None:
@@ -137,11 +129,6 @@ class QueryImage:
     def describe(self, extractor: GlobalFeatureExtractor) -> NDArray[np.float32]:
         """Its global feature, float32 (D,); raises as :meth:`extract`."""
         return describe_images(extractor, [self.pixels], self.query.name)[0]
-
-    @cached_property
-    def _unstored(self) -> NDArray[np.uint8]:
-        image = self.query.read_image()
-        return processed_image(image, self._plan) if self._plan.changes_pixels else image
 
 
 class QueryImages:

@@ -35,7 +35,7 @@ from megloc_kapture.io.paths import safe_join
 from megloc_kapture.io.tables import STATUS_FILE, QueryStatus, read_status
 from megloc_kapture.pipeline.datasets import KAPTURE, SYNTHETIC, TWIN_PREFIX, dataset_names
 from megloc_kapture.pipeline.manifests import read_manifest
-from megloc_kapture.stages import rig_siblings
+from megloc_kapture.stages import rigs
 from megloc_kapture.values import Pose, RigidTransform
 
 _IMPORT_MANIFEST = "stages/import.json"
@@ -193,7 +193,7 @@ def poses_through_rig(
             localized[image] = Pose(pose, 0, 0)
         elif status.status == "localized":
             localized[image] = Pose(pose, status.num_matches, status.num_inliers)
-    found = rig_siblings.poses_through_rig(data, localized)
+    found = rigs.poses_through_rig(data, localized)
     return {image: pose for image, (_, pose) in found.items()}
 
 

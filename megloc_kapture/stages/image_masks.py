@@ -1,24 +1,44 @@
-"""The masks of a kapture's images, from wherever they come, and how they are combined.
+"""An image after pre-processing, and masks, from wherever they come, and how they are combined.
 
 Everything that is ignored by one source is ignored: masks are combined by AND.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, OptionError, PluginError
+from megloc_kapture.io.images import image_as_read_back
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.plugins import PluginChoice
-from megloc_kapture.preprocessing.masks import FixedMask, UnchangingRegion
-from megloc_kapture.stages.local_features import mask_path, read_mask
+from megloc_kapture.plugins import PluginChoice, Segmenter
+from megloc_kapture.preprocessing.frames import (
+    FramePlan,
+    processed_image,
+    processed_mask,
+    reached_region,
+)
+from megloc_kapture.preprocessing.masks import (
+    MAX_IMAGES,
+    MIN_IMAGES,
+    FixedMask,
+    UnchangingRegion,
+    edge_directions,
+    find_unchanging_region,
+)
+from megloc_kapture.stages.local_features import mask_path, read_image_of, read_mask
+from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, Options
+
+# a JPEG stays one: at this quality half of the keypoints move by less than 0.03 px, at a third of
+# the size that it would have as PNG
+JPEG_QUALITY = 98
 
 Mask = NDArray[np.bool_]
 
@@ -160,3 +180,188 @@ class StandingMasks:
                     raise DataError("no such mask", path=path)
                 self._drawn[key] = mask
         return self._drawn[key]
+
+
+@dataclass(frozen=True)
+class ClassMasks:
+    """A segmenter and the classes whose pixels are ignored, in the order of their labels."""
+
+    segmenter: Segmenter
+    dynamic: tuple[str, ...]
+
+    @classmethod
+    def of(cls, segmenter: Segmenter, dynamic: Sequence[str] | None = None) -> ClassMasks:
+        """Of the classes asked for; without, of those the segmenter names itself.
+
+        Raises
+        ------
+        OptionError : a class it does not have; lists those it has.
+        """
+        wanted = segmenter.dynamic if dynamic is None else dynamic
+        unknown = sorted(set(wanted) - set(segmenter.classes))
+        if unknown:
+            raise OptionError(
+                f"segmenter {segmenter.name!r} has no class {unknown[0]!r}; "
+                f"it has: {', '.join(segmenter.classes)}"
+            )
+        return cls(segmenter, tuple(name for name in segmenter.classes if name in wanted))
+
+    def labels(self, image: NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
+        """The label of each pixel, uint8 (H, W), of an image (H, W, 3) called ``name``.
+
+        Raises
+        ------
+        PluginError : the segmenter returns something else.
+        """
+        found = self.segmenter.segment(image)
+        shape, dtype = getattr(found, "shape", None), getattr(found, "dtype", None)
+        told = ""
+        if shape != image.shape[:2] or dtype != np.uint8:
+            told = f"segment returned {dtype} {shape}, not uint8 {image.shape[:2]}"
+        elif found.max() >= len(self.segmenter.classes):
+            told = f"label {found.max()}, but there are {len(self.segmenter.classes)} classes"
+        if told:
+            raise PluginError(f"plugin {self.segmenter.name!r} on image {name}: {told}")
+        return found
+
+    def mask(self, labels: NDArray[np.uint8]) -> NDArray[np.bool_]:
+        """True where a pixel is used, bool (H, W)."""
+        used = np.array([name not in self.dynamic for name in self.segmenter.classes])
+        return np.asarray(used[labels])
+
+
+@dataclass(frozen=True)
+class _Job:
+    path: Path
+    camera: Camera
+
+
+def find_unchanging_regions(
+    folder: KaptureFolder,
+    sequences: Sequence[KaptureFolder] = (),
+    *,
+    work: Work = HERE,
+) -> dict[str, UnchangingRegion]:
+    """The region of every camera of a folder, by sensor id; falsy with a reason where none is.
+
+    Parameters
+    ----------
+    sequences : folders whose images tell of its cameras as well, where they have a sensor of the
+        same id and image size: the map's, for queries.
+
+    Raises
+    ------
+    DataError : an image is absent, unreadable, or not of its camera's size.
+    """
+    data = folder.read()
+    sensors = sorted({sensor for _, sensor in data.records_camera})
+    chosen: dict[str, list[_Job]] = {}
+    regions: dict[str, UnchangingRegion] = {}
+    for sensor in sensors:
+        jobs = _images_of(sensor, [folder, *sequences])
+        if len(jobs) < MIN_IMAGES:
+            regions[sensor] = UnchangingRegion(
+                (), f"it has {len(jobs)} images, and at least {MIN_IMAGES} of a sequence are needed"
+            )
+        else:
+            picked = np.linspace(0, len(jobs) - 1, min(len(jobs), MAX_IMAGES)).round().astype(int)
+            chosen[sensor] = [jobs[k] for k in picked]
+    everything = [job for jobs in chosen.values() for job in jobs]
+    results = iter(work.map(_edges, everything, "unchanging regions"))
+    for sensor, jobs in chosen.items():
+        regions[sensor] = find_unchanging_region(next(results) for _ in jobs)
+    # lets a progress bar see its end
+    for _ in results:
+        pass
+    return regions
+
+
+def _images_of(sensor: str, folders: Sequence[KaptureFolder]) -> list[_Job]:
+    """Images of a sensor in the order they were taken, folder by folder."""
+    jobs: list[_Job] = []
+    for folder in folders:
+        data = folder.read()
+        if sensor not in data.sensors or data.sensors[sensor].sensor_type != "camera":
+            continue
+        taken = sorted((t, image) for (t, s), image in data.records_camera.items() if s == sensor)
+        for _, image in taken:
+            camera = data.camera_of(image)
+            if not jobs or _size(camera) == _size(jobs[0].camera):
+                jobs.append(_Job(folder.image_path(image), camera))
+    return jobs
+
+
+def _size(camera: Camera) -> tuple[int, int]:
+    return camera.width, camera.height
+
+
+def _edges(job: _Job) -> NDArray[np.float32]:
+    return edge_directions(read_image_of(job.path, job.camera))
+
+
+class ProcessedFrame:
+    """An image after pre-processing: its pixels and masks, made when first asked for.
+
+    Parameters
+    ----------
+    name : of the image; its suffix says how it is stored.
+    read : gives the original pixels, uint8 (H, W, 3) RGB.
+    masks : gives the masks of the original by their sources, bool (H, W), True = use.
+    classes : gives what tells classes of pixels apart, None without.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        plan: FramePlan,
+        read: Callable[[], NDArray[np.uint8]],
+        masks: Callable[[], Mapping[str, Mask]],
+        classes: Callable[[], ClassMasks | None],
+    ) -> None:
+        self.name, self.plan = name, plan
+        self._read, self._original_masks, self._classes = read, masks, classes
+
+    @cached_property
+    def pixels(self) -> NDArray[np.uint8]:
+        """The new image, uint8 (H, W, 3) RGB."""
+        image = self._read()
+        return processed_image(image, self.plan) if self.plan.changes_pixels else image
+
+    @property
+    def written(self) -> NDArray[np.uint8]:
+        """The new image as it is written: a grey one has one channel, a third of the size."""
+        red = self.pixels[..., 0]
+        grey = all(np.array_equal(red, self.pixels[..., channel]) for channel in (1, 2))
+        return np.ascontiguousarray(red) if grey else self.pixels
+
+    @cached_property
+    def stored(self) -> NDArray[np.uint8]:
+        """The new image as it is read from the new kapture: a JPEG has lost a little."""
+        if not self.plan.changes_pixels:
+            return self.pixels
+        read = image_as_read_back(self.written, self.name, jpeg_quality=JPEG_QUALITY)
+        return read if read.ndim == 3 else self.pixels
+
+    @cached_property
+    def labels(self) -> NDArray[np.uint8] | None:
+        """The class of each pixel, uint8 (H, W); None where nothing tells them apart."""
+        classes = self._classes()
+        return None if classes is None else classes.labels(self.pixels, self.name)
+
+    @cached_property
+    def masks(self) -> dict[str, Mask]:
+        """The masks of the new image by source, bool (H, W), True = use."""
+        original = self._original_masks()
+        masks = {source: processed_mask(mask, self.plan) for source, mask in original.items()}
+        classes = self._classes()
+        if classes is not None and self.labels is not None:
+            masks["classes"] = classes.mask(self.labels)
+        reached = reached_region(self.plan)
+        if reached is not None:
+            masks["unseen"] = reached
+        return masks
+
+    @property
+    def mask(self) -> Mask | None:
+        """All masks together; None where all of the image is used."""
+        return np.logical_and.reduce(list(self.masks.values())) if self.masks else None

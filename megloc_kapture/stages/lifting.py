@@ -25,7 +25,7 @@ from megloc_kapture.io.kapture import (
     write_sensors,
 )
 from megloc_kapture.mapping.depth import LiftingOptions, lift_keypoints
-from megloc_kapture.stages.depth_records import DepthRecord, depth_records
+from megloc_kapture.stages.rigs import DepthRecord, depth_records
 from megloc_kapture.stages.triangulation import copy_features
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
 

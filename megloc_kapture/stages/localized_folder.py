@@ -19,7 +19,7 @@ from megloc_kapture.io.tables import (
     write_refinement,
     write_status,
 )
-from megloc_kapture.stages.rig_siblings import poses_through_rig
+from megloc_kapture.stages.rigs import poses_through_rig
 from megloc_kapture.values import Failure, Pose, RigidTransform
 
 

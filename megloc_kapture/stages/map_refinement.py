@@ -48,8 +48,8 @@ from megloc_kapture.mapping.rejection import (
     track_lengths,
 )
 from megloc_kapture.mapping.uncertainty import point_covariances, point_deviations
-from megloc_kapture.stages.depth_records import DepthRecord, depth_records
 from megloc_kapture.stages.layout import MAP, UNREFINED
+from megloc_kapture.stages.rigs import DepthRecord, depth_records
 from megloc_kapture.stages.stage import PipelineStage, StageWork
 from megloc_kapture.stages.triangulation import copy_features
 from megloc_kapture.stages.work import HERE, FolderSpec, Work

@@ -9,47 +9,176 @@ belong to the old pixels.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict
 
 from megloc_kapture.errors import DataError, OptionError, OutputError
 from megloc_kapture.io.files import (
     link_file,
     link_records,
     output_error,
+    read_json_model,
     write_json,
     write_json_model,
 )
-from megloc_kapture.io.images import WRITABLE_SUFFIXES
+from megloc_kapture.io.images import (
+    WRITABLE_SUFFIXES,
+    image_size,
+    write_image,
+)
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.plugins import SEGMENTERS, Segmenter, load_plugin
-from megloc_kapture.preprocessing.frames import FrameOptions, FramePlan, plan_frame
-from megloc_kapture.preprocessing.masks import UnchangingRegion
-from megloc_kapture.stages.class_masks import ClassMasks
-from megloc_kapture.stages.image_masks import MaskOptions, StandingMasks, mask_files
-from megloc_kapture.stages.layout import MAPPING, PREPROCESSED, QUERY
-from megloc_kapture.stages.preprocessing_report import (
-    REPORT_FILE,
-    PreprocessingReport,
-    camera_reports,
+from megloc_kapture.preprocessing.frames import (
+    FrameOptions,
+    FramePlan,
+    plan_frame,
 )
-from megloc_kapture.stages.processed_frames import CLASSES, FrameJob, process_frame
+from megloc_kapture.preprocessing.masks import UnchangingRegion
+from megloc_kapture.preprocessing.resampling import PixelMap
+from megloc_kapture.stages.image_masks import (
+    JPEG_QUALITY,
+    ClassMasks,
+    Mask,
+    MaskFiles,
+    MaskOptions,
+    ProcessedFrame,
+    StandingMasks,
+    find_unchanging_regions,
+    mask_files,
+)
+from megloc_kapture.stages.layout import MAPPING, PREPROCESSED, QUERY
+from megloc_kapture.stages.local_features import read_image_of
 from megloc_kapture.stages.stage import Hashes, PipelineStage, StageWork
-from megloc_kapture.stages.unchanging_regions import find_unchanging_regions
 from megloc_kapture.stages.work import HERE, Work
 
 if TYPE_CHECKING:
     from megloc_kapture.stages.options import PipelineOptions
 
-
-CLASSES_FILE = "classes.json"
+CLASSES, CLASSES_FILE = "classes", "classes.json"
+REPORT_FILE = "preprocessing.json"
 
 
 class PreprocessingOptions(FrameOptions):
     """What is done to images before anything looks at them; by default nothing."""
 
     masks: MaskOptions = MaskOptions()
+
+
+@dataclass(frozen=True)
+class _Job:
+    image: str
+    source: Path
+    output: Path
+    plan: FramePlan
+    link: bool  # it does not change and has no place in the new kapture yet
+    files: MaskFiles
+    standing: Mapping[str, Mask]  # of its camera, in original pixels
+    classes: ClassMasks | None
+
+
+def _process(job: _Job) -> dict[str, float]:
+    """Write what becomes of one image and its mask.
+
+    Returns
+    -------
+    The share of its pixels masked by each source of masks, and by ``all`` of them; empty where
+    there is none.
+    """
+    sensors, camera = job.output / "sensors", job.plan.original
+    frame = ProcessedFrame(
+        job.image,
+        job.plan,
+        lambda: read_image_of(job.source, camera),
+        lambda: {**job.files.read((camera.height, camera.width)), **job.standing},
+        lambda: job.classes,
+    )
+    place = sensors / "records_data" / job.image
+    if job.plan.changes_pixels:
+        write_image(place, frame.written, jpeg_quality=JPEG_QUALITY)
+    else:
+        size = image_size(job.source)
+        if size != (camera.width, camera.height):
+            raise DataError(
+                f"the image is {size[0]}x{size[1]}, its camera says {camera.width}x{camera.height}",
+                path=job.source,
+            )
+        if job.link:
+            link_file(job.source, place)
+    if frame.labels is not None:
+        write_image(sensors / CLASSES / f"{job.image}.png", frame.labels)
+    if frame.mask is None:
+        return {}
+    together = frame.mask
+    write_image(sensors / "masks" / f"{job.image}.png", together.astype(np.uint8) * 255)
+    masks = {**frame.masks, "all": together}
+    return {source: float((~mask).mean()) for source, mask in masks.items()}
+
+
+class CameraReport(BaseModel):
+    """One camera before and after: model, width, height and its parameters, as in sensors.txt."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    images: int
+    original: tuple[str, ...]
+    processed: tuple[str, ...]
+
+
+class PreprocessingReport(BaseModel):
+    """``sensors/preprocessing.json``: what was done to a kapture.
+
+    ``masked`` is the share of the pixels of all images that each source of masks ignores, ``all``
+    that they ignore together; ``remarks`` say what was asked for and could not be done.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    images: int
+    images_changed: int
+    images_masked: int
+    cameras: dict[str, CameraReport]
+    masked: dict[str, float]
+    remarks: tuple[str, ...]
+
+
+def camera_reports(data: KaptureData, plans: Mapping[str, FramePlan]) -> dict[str, CameraReport]:
+    """Every camera that took an image, by sensor id."""
+    numbers: dict[str, int] = {}
+    for _, sensor_id in data.records_camera:
+        numbers[sensor_id] = numbers.get(sensor_id, 0) + 1
+    return {
+        sensor_id: CameraReport(
+            images=numbers[sensor_id],
+            original=Sensor.from_camera(plan.original).params,
+            processed=Sensor.from_camera(plan.processed).params,
+        )
+        for sensor_id, plan in plans.items()
+    }
+
+
+def read_report(root: Path) -> PreprocessingReport | None:
+    """What was done to a kapture; None where nothing was.
+
+    Raises
+    ------
+    DataError : the report is broken.
+    """
+    path = root / "sensors" / REPORT_FILE
+    return read_json_model(path, PreprocessingReport) if path.is_file() else None
+
+
+def pixel_maps(report: PreprocessingReport) -> dict[str, PixelMap]:
+    """By sensor id: what carries keypoints between the original images and the processed ones."""
+    return {
+        sensor_id: PixelMap(
+            *(Sensor("", "camera", params).camera() for params in (row.original, row.processed))
+        )
+        for sensor_id, row in report.cameras.items()
+    }
 
 
 def preprocess_images(
@@ -111,11 +240,11 @@ def preprocess_images(
         what = {"classes": list(classes.segmenter.classes), "dynamic": list(classes.dynamic)}
         write_json(output / "sensors" / CLASSES / CLASSES_FILE, what)
 
-    def jobs() -> Iterator[FrameJob]:
+    def jobs() -> Iterator[_Job]:
         for image in data.image_names():
             sensor_id = data.record_of(image)[1]
             plan = plans[sensor_id]
-            yield FrameJob(
+            yield _Job(
                 image=image,
                 source=folder.image_path(image),
                 output=output,
@@ -129,7 +258,7 @@ def preprocess_images(
     shares: dict[str, float] = {}
     num_images = len(data.records_camera)
     num_masked = 0
-    for found in work.map(process_frame, jobs(), "pre-processing", num_images):
+    for found in work.map(_process, jobs(), "pre-processing", num_images):
         num_masked += bool(found)
         for source, share in found.items():
             shares[source] = shares.get(source, 0.0) + share

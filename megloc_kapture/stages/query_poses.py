@@ -49,9 +49,9 @@ from megloc_kapture.stages.layout import (
 )
 from megloc_kapture.stages.localized_folder import write_localized
 from megloc_kapture.stages.matches import iterate_candidates
-from megloc_kapture.stages.query_units import QueryUnit, query_units
 from megloc_kapture.stages.ranking_scene import KaptureScene
 from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
+from megloc_kapture.stages.rigs import Unit, query_units
 from megloc_kapture.stages.shared_index import index_map, open_index, shared_index
 from megloc_kapture.stages.stage import LOCAL_TYPES, PipelineStage, StageWork
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
@@ -85,7 +85,7 @@ class _Job:
     query: FolderSpec
     matches: FolderSpec
     indices: tuple[tuple[str, Path], ...]  # by keypoints type
-    unit: QueryUnit
+    unit: Unit
     candidates: tuple[str, ...]  # of all images of the unit
     own_candidates: tuple[tuple[str, ...], ...]  # of each
     frames: tuple[str, ...]  # of the candidates
@@ -175,7 +175,7 @@ def _indices_of(views: Sequence[QueryView]) -> list[MapIndex]:
 
 def _localize(job: _Job) -> list[tuple[str, Pose | Failure]]:
     started = time.perf_counter()
-    views = [_read_view(job, number) for number in range(len(job.unit.images))]
+    views = [_read_view(job, number) for number in range(len(job.unit))]
     reading = (time.perf_counter() - started) / len(views)
     mapping, query = job.map.open(), job.query.open()
     centers = {
@@ -196,7 +196,7 @@ def _localize(job: _Job) -> list[tuple[str, Pose | Failure]]:
     )
     return [
         (image, _for_writing(result, reading))
-        for image, result in zip(job.unit.images, results, strict=True)
+        for (image, _), result in zip(job.unit, results, strict=True)
     ]
 
 
@@ -207,7 +207,8 @@ def _for_writing(result: Pose | Failure, reading_s: float) -> Pose | Failure:
 
 
 def _read_view(job: _Job, number: int) -> QueryView:
-    image, query, matches = job.unit.images[number], job.query.open(), job.matches.open()
+    image, cam_from_rig = job.unit[number]
+    query, matches = job.query.open(), job.matches.open()
     typed = []
     for local_type, folder in job.indices:
         reader = matches.matches(local_type)
@@ -223,7 +224,7 @@ def _read_view(job: _Job, number: int) -> QueryView:
             )
         )
     camera = query.read().camera_of(image)
-    return QueryView(image, camera, tuple(typed), job.unit.cams_from_rig[number])
+    return QueryView(image, camera, tuple(typed), cam_from_rig)
 
 
 @lru_cache(maxsize=8)
@@ -264,7 +265,7 @@ def localize_from_matches(
     ) as indices:
         jobs = []
         for unit in units:
-            own = tuple(candidates.get(image, ()) for image in unit.images)
+            own = tuple(candidates.get(image, ()) for image, _ in unit)
             together = tuple(interleave(own))
             jobs.append(
                 _Job(

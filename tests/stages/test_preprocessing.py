@@ -25,11 +25,16 @@ from megloc_kapture.io.images import image_size, read_depth_map, read_image_rgb,
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.mapping.depth import lift_keypoints
 from megloc_kapture.preprocessing.masks import FixedMask
-from megloc_kapture.stages.depth_records import depth_records
 from megloc_kapture.stages.image_masks import MaskOptions
 from megloc_kapture.stages.local_features import extract_local_features, read_mask
-from megloc_kapture.stages.preprocessing import PreprocessingOptions, preprocess_images
-from megloc_kapture.stages.preprocessing_report import PreprocessingReport, pixel_maps, read_report
+from megloc_kapture.stages.preprocessing import (
+    PreprocessingOptions,
+    PreprocessingReport,
+    pixel_maps,
+    preprocess_images,
+    read_report,
+)
+from megloc_kapture.stages.rigs import depth_records
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera, RigidTransform
 

@@ -1,0 +1,131 @@
+"""Images of one moment on one rig: units of queries, poses of siblings, depth maps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from megloc_kapture.io.kapture import KaptureData
+from megloc_kapture.values import Camera, Pose, RigidTransform
+
+Unit = tuple[tuple[str, RigidTransform], ...]
+"""Images that get one pose, sorted by name, with the ``cam_from_rig`` of each."""
+
+
+def query_units(data: KaptureData, *, rigs: bool) -> list[Unit]:
+    """The units of a query folder, sorted by their images; every image is in one.
+
+    Parameters
+    ----------
+    rigs : whether cameras of one rig and one timestamp are localized together. A camera on several
+        rigs goes with the first by name. Without, every image is by itself.
+    """
+    rigs_of = _rigs_of(data) if rigs else {}
+    together: dict[tuple[int, str, str], list[str]] = {}
+    for image in data.image_names():
+        timestamp, sensor = data.record_of(image)
+        owner = ("rig", rigs_of[sensor][0]) if sensor in rigs_of else ("sensor", sensor)
+        together.setdefault((timestamp, *owner), []).append(image)
+    units: list[Unit] = []
+    for (_, kind, rig), images in together.items():
+        if kind == "sensor" or len(images) == 1:
+            units += [((image, RigidTransform.identity()),) for image in images]
+        else:
+            members = data.rigs[rig]
+            units.append(tuple((image, members[data.record_of(image)[1]]) for image in images))
+    return sorted(units, key=lambda unit: [image for image, _ in unit])
+
+
+def poses_through_rig(
+    data: KaptureData, localized: Mapping[str, Pose]
+) -> dict[str, tuple[str, RigidTransform]]:
+    """For images that are not localized: the sibling that is, and the pose it gives them.
+
+    Siblings share the timestamp and a rig; of several, the one with the most inliers counts, then
+    the first by name.
+
+    Parameters
+    ----------
+    data : sensors, rigs (``sensor_from_rig``) and records of the images.
+    localized : the images that were localized.
+    """
+    rigs_of = _rigs_of(data)
+    at_time: dict[int, list[tuple[str, str]]] = {}
+    for (timestamp, sensor), image in data.records_camera.items():
+        at_time.setdefault(timestamp, []).append((sensor, image))
+    found = {}
+    for image in sorted(set(data.records_camera.values()) - set(localized)):
+        timestamp, sensor = data.record_of(image)
+        best: tuple[int, str, RigidTransform] | None = None
+        for other_sensor, other in at_time[timestamp]:
+            result = localized.get(other)
+            sensor_from_other = _between(data, rigs_of, sensor, other_sensor)
+            if result is None or sensor_from_other is None:
+                continue
+            key = (-result.num_inliers, other)
+            if best is None or key < best[:2]:
+                best = (*key, sensor_from_other @ result.cam_from_world)
+        if best is not None:
+            found[image] = (best[1], best[2])
+    return found
+
+
+@dataclass(frozen=True)
+class DepthRecord:
+    """A depth map that was taken with an image.
+
+    Parameters
+    ----------
+    path : below ``records_data``.
+    camera : of the depth sensor.
+    image_from_depth : from the depth camera's frame to the image's.
+    """
+
+    path: str
+    camera: Camera
+    image_from_depth: RigidTransform
+
+
+def depth_records(data: KaptureData) -> dict[str, DepthRecord]:
+    """Image -> the depth map of its moment, of a depth sensor on one rig with its camera.
+
+    Where several depth sensors share the rig, the one nearest to the camera counts.
+    """
+    rigs_of = _rigs_of(data)
+    at_time: dict[int, list[tuple[str, str]]] = {}
+    for (timestamp, sensor), path in sorted(data.records_depth.items()):
+        at_time.setdefault(timestamp, []).append((sensor, path))
+    found = {}
+    for (timestamp, camera), image in data.records_camera.items():
+        options = [
+            (image_from_depth, sensor, path)
+            for sensor, path in at_time.get(timestamp, ())
+            if (image_from_depth := _between(data, rigs_of, camera, sensor)) is not None
+        ]
+        if options:
+            image_from_depth, sensor, path = min(
+                options, key=lambda option: (np.linalg.norm(option[0].translation), option[1])
+            )
+            found[image] = DepthRecord(path, data.sensors[sensor].camera(), image_from_depth)
+    return found
+
+
+def _rigs_of(data: KaptureData) -> dict[str, list[str]]:
+    """The rigs that a sensor is on, sorted by name."""
+    rigs_of: dict[str, list[str]] = {}
+    for rig, members in sorted(data.rigs.items()):
+        for sensor in members:
+            rigs_of.setdefault(sensor, []).append(rig)
+    return rigs_of
+
+
+def _between(
+    data: KaptureData, rigs_of: Mapping[str, list[str]], sensor: str, other: str
+) -> RigidTransform | None:
+    """``sensor_from_other`` where one rig carries both."""
+    for rig in rigs_of.get(sensor, ()):
+        if other in data.rigs[rig]:
+            return data.rigs[rig][sensor] @ data.rigs[rig][other].inverse()
+    return None
