@@ -18,7 +18,12 @@ from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.kapture.points import read_point_covariances
 from megloc_kapture.mapping.uncertainty import point_deviations
 from megloc_kapture.pipeline.kapture_map import KaptureMap, MapKeypoints, PixelOriginChoice
+from megloc_kapture.pipeline.local_types import local_types_of
+from megloc_kapture.pipeline.map_retrieval import MapRetrieval
+from megloc_kapture.pipeline.presets import DEFAULT_PRESET, options_of_preset
+from megloc_kapture.pipeline.query_images import Preprocessor
 from megloc_kapture.plugins import LOCAL_FEATURES, PluginChoice, load_plugin
+from megloc_kapture.stages.matches import FeatureCache
 
 _COLUMN = 18
 _QUANTILES = (0.1, 0.5, 0.9)
@@ -78,13 +83,7 @@ class Info(Reading, Common):
                 describe_descriptors(opened, keypoints, None if found is None else found.name),
             )
             line(console, "query features", describe_extraction(local_type, found))
-        own = "VLAD over the map's descriptors"
-        types = opened.global_types()
-        line(
-            console,
-            "retrieval",
-            f"{', '.join(types)} where queries bring it, else {own}" if types else own,
-        )
+        describe_retrieval(console, opened)
 
 
 def describe_content(console: Console, folder: KaptureFolder) -> None:
@@ -153,6 +152,23 @@ def describe_descriptors(opened: KaptureMap, keypoints: MapKeypoints, extractor:
     if not opened.has_images():
         return "missing, and no images to extract them from: localizing is not possible"
     return f"missing; will be extracted again by plugin {extractor}"
+
+
+def describe_retrieval(console: Console, opened: KaptureMap) -> None:
+    """Print which map images queries are matched with, and by what they are ranked."""
+    for keypoints in opened.keypoints.values():
+        missing = not keypoints.has_descriptors(opened.images)
+        if missing and not (keypoints.extractor() and opened.has_images()):
+            line(console, "retrieval", "not possible without the map's descriptors")
+            return
+    options = options_of_preset(DEFAULT_PRESET)
+    types = local_types_of(opened, options, FeatureCache())
+    retrieval = MapRetrieval(opened, options, types, Preprocessor(options))
+    line(console, "retrieval", retrieval.describe_candidates(()))
+    brought = opened.global_types()
+    if brought:
+        text = retrieval.describe_candidates(brought)
+        line(console, "", f"where queries bring {', '.join(brought)}: {text}")
 
 
 def line(console: Console, name: str, text: str) -> None:

@@ -110,6 +110,15 @@ def base_type(local_type: str) -> str:
     return local_type.removesuffix(_SUFFIX)
 
 
+def equivalent_types(local_type: str) -> tuple[str, ...]:
+    """The types whose features of a query serve matches of a type, the fitting first.
+
+    A pyramid begins with the features of its base: a query that brings either lacks nothing.
+    """
+    base = base_type(local_type)
+    return tuple(dict.fromkeys((local_type, base, pyramid_type(base))))
+
+
 @dataclass(frozen=True, eq=False)
 class VariantFeatures:
     """Features of an image's variant.

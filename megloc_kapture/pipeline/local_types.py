@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.weights import MissingWeightsError
 from megloc_kapture.localization.cluster_poses import ImageMatches
-from megloc_kapture.matching.guided_pyramid import base_type
+from megloc_kapture.matching.guided_pyramid import base_type, equivalent_types
 from megloc_kapture.pipeline.kapture_map import KaptureMap, MapKeypoints
 from megloc_kapture.pipeline.query_images import QueryImage
 from megloc_kapture.plugins import (
@@ -66,8 +66,16 @@ class LocalType:
         self.choice = choice
         self._map, self._options, self._cache = kapture_map, options, cache
         self._again: dict[str, NDArray[Any]] | None = None
-        if not first.has_descriptors(kapture_map.images):
-            self._again = extract_again(kapture_map, first, self.extractor)
+
+    def prepare(self) -> None:
+        """Extract the map's descriptors again where it has none.
+
+        Raises
+        ------
+        DataError, PluginError, MissingWeightsError : they cannot be.
+        """
+        if not self.first.has_descriptors(self._map.images):
+            self._again = extract_again(self._map, self.first, self.extractor)
 
     @property
     def name(self) -> str:
@@ -116,7 +124,7 @@ class LocalType:
         DataError : it has neither features nor an image, or they cannot be extracted.
         """
         brought = image.query.features
-        local = next((brought[n] for n in (self.name, base_type(self.name)) if n in brought), None)
+        local = next((brought[n] for n in equivalent_types(self.name) if n in brought), None)
         if local is None:
             local = image.extract(self.extractor)
         return Features.of(image.camera, local.keypoints_px, local.descriptors)
@@ -210,9 +218,7 @@ def local_types_of(
     These are the types of the map that have points, and those without any that the options name:
     their matches have a say in which images are candidates, as in ``megloc eval``.
 
-    Raises
-    ------
-    DataError : a type has no descriptors, and they cannot be made again.
+    Each is to be prepared before it is matched with.
     """
     choices = _choices(options)
     by_base = {base_type(name): keypoints for name, keypoints in kapture_map.keypoints.items()}

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,13 +29,14 @@ from megloc_kapture.pipeline.queries import KaptureQueries, Query, Unit
 from megloc_kapture.pipeline.query_images import Preprocessor, QueryImage, QueryImages
 from megloc_kapture.stages.matches import FeatureCache, Features
 from megloc_kapture.stages.options import PipelineOptions
-from megloc_kapture.stages.pose_refinement import PoseReferences, refine_pose
+from megloc_kapture.stages.pose_refinement import MapRefiners
 from megloc_kapture.stages.query_poses import localize_unit, localize_views
 from megloc_kapture.stages.ranking_scene import KaptureScene
 from megloc_kapture.stages.reranking import counted, rerank
-from megloc_kapture.stages.work import FolderSpec, ordered_map
+from megloc_kapture.stages.work import ordered_map
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
+Solved = TypeVar("Solved")
 _ALONE = RigidTransform.identity()
 # the options that localizing uses; the others are of maps that are made
 LOCALIZING = (
@@ -53,17 +54,6 @@ LOCALIZING = (
     "localization",
     "pose_refinement",
 )
-
-
-@dataclass(frozen=True, eq=False)
-class _Matched:
-    """The cameras of a query with their matches, and what localizing needs beside them."""
-
-    images: tuple[QueryImage, ...]
-    views: tuple[QueryView, ...]
-    candidates: list[str]
-    frames: list[str]
-    remarks: tuple[tuple[str, ...], ...]  # of each camera
 
 
 class Localizer:
@@ -101,11 +91,13 @@ class Localizer:
         self.map = kapture_map
         self.options = options or options_of_preset(preset)
         self._ranker = self.options.localization.make_ranker()
-        self._refiners = self.options.pose_refinement.make_refiners()
         self._preprocessor = Preprocessor(self.options)
+        self.refiners = MapRefiners(
+            kapture_map.folder, kapture_map.restrictions, self.options.pose_refinement
+        )
         self.types = local_types_of(kapture_map, self.options, FeatureCache())
-        self._verdicts: dict[str, tuple[str, ...]] = {}
-        self._verdicts_lock = threading.Lock()
+        for local in self.types:
+            local.prepare()
         self._retrieval = MapRetrieval(kapture_map, self.options, self.types, self._preprocessor)
 
     # ------------------------------------------------------------------ the public calls
@@ -209,115 +201,81 @@ class Localizer:
         OptionError : the options have pose refiners, which refine cameras one by one:
             :meth:`localize_units` gives the poses of the cameras.
         """
-        if self._refiners:
+        if self.refiners.refiners:
             raise OptionError(
                 "pose_refinement refines the poses of cameras, not of rigs: use localize_units"
             )
         with single_threaded():
-            matched = self._match(tuple(views))
-            return localize_views(
-                matched.views,
-                matched.candidates,
-                matched.frames,
-                self.options.localization,
-                centers=self._centers,
-                ranker=self._ranker,
-                scene=self._scene(matched.images),
-            ).result
+            images = [self._preprocessor.of(query) for query, _ in views]
+            return self._solve(localize_views, views, images, self._scene(images))[0].result
 
     # ------------------------------------------------------------------ the steps
 
     def _localize_unit(self, unit: Unit) -> list[Pose | Failure]:
         with single_threaded():
-            matched = self._match(unit)
-            scene = self._scene(matched.images)
-            results = localize_unit(
-                matched.views,
-                matched.candidates,
-                matched.frames,
-                self.options.localization,
-                centers=self._centers,
-                ranker=self._ranker,
-                scene=scene,
-            )
-            remarked = [
-                replace(result, remarks=remarks)
-                for result, remarks in zip(results, matched.remarks, strict=True)
-            ]
-            return [
-                self._refined(image, result, scene) if isinstance(result, Pose) else result
-                for image, result in zip(matched.images, remarked, strict=True)
-            ]
+            images = [self._preprocessor.of(query) for query, _ in unit]
+            scene = self._scene(images)
+            found = []
+            for image, result, told in zip(
+                images, *self._solve(localize_unit, unit, images, scene), strict=True
+            ):
+                if isinstance(result, Pose):
+                    result = self.refiners.refine(image.query.name, image.camera, result, scene)
+                found.append(replace(result, remarks=told))
+            return found
 
-    def _refined(self, image: QueryImage, pose: Pose, scene: KaptureScene) -> Pose:
-        if not self._refiners:
-            return pose
-        near = self._references.near(pose.cam_from_world, pose.candidates)
-        found = refine_pose(
-            image.query.name,
-            image.camera,
-            pose.cam_from_world,
-            near,
-            self._refiners,
-            self._distrusted(self._references.frame(pose.candidates)),
-            scene,
+    def _solve(
+        self,
+        solve: Callable[..., Solved],
+        unit: Sequence[tuple[Query, RigidTransform]],
+        images: Sequence[QueryImage],
+        scene: KaptureScene,
+    ) -> tuple[Solved, list[tuple[str, ...]]]:
+        """What ``solve`` makes of the matches of all cameras, and each camera's remarks."""
+        matched = [
+            self._match(image, cam_from_rig)
+            for image, (_, cam_from_rig) in zip(images, unit, strict=True)
+        ]
+        candidates = interleave([ranked for _, ranked, _ in matched])
+        solved = solve(
+            [view for view, _, _ in matched],
+            candidates,
+            [self.map.restrictions.frame(name) for name in candidates],
+            self.options.localization,
+            centers=self._centers,
+            ranker=self._ranker,
+            scene=scene,
         )
-        moved = any(row.accepted for row in found.rows)
-        return replace(
-            pose,
-            cam_from_world=found.cam_from_world,
-            covariance=found.covariance if moved else pose.covariance,
-            refinements=found.rows,
-            seconds={**pose.seconds, **found.seconds},
-        )
+        return solved, [remarks for _, _, remarks in matched]
 
     def _scene(self, images: Iterable[QueryImage]) -> KaptureScene:
         return KaptureScene(self.map.folder, QueryImages(images), map_camera=self.map.camera)
-
-    def _distrusted(self, frame: str) -> tuple[str, ...]:
-        """Of each refiner, why it must not be used in a coordinate frame; tested once."""
-        with self._verdicts_lock:
-            if frame not in self._verdicts:
-                spec = FolderSpec(self.map.folder)
-                found = self._references.verdicts(spec, [frame], self._refiners)
-                self._verdicts[frame] = tuple(one[frame].reason if one else "" for one in found)
-            return self._verdicts[frame]
-
-    @cached_property
-    def _references(self) -> PoseReferences:
-        poses = self.map.folder.read().poses()
-        return PoseReferences(poses, self.map.restrictions, self.options.pose_refinement)
 
     @cached_property
     def _centers(self) -> dict[str, NDArray[np.float64]]:
         return {image: pose.center() for image, pose in self.map.poses.items()}
 
-    def _match(self, unit: Unit) -> _Matched:
-        """Match each camera's features with its candidates."""
-        images = tuple(self._preprocessor.of(query) for query, _ in unit)
-        views, rankings, remarks = [], [], []
-        for image, (query, cam_from_rig) in zip(images, unit, strict=True):
-            features = [local.of_query(image) for local in self.types]
-            ranked = self._candidates(image, features)
-            of_types = [
-                local.match(own, ranked) for local, own in zip(self.types, features, strict=True)
+    def _match(
+        self, image: QueryImage, cam_from_rig: RigidTransform
+    ) -> tuple[QueryView, list[str], tuple[str, ...]]:
+        """The matches of one camera, its candidates, best first, and what was left out."""
+        features = [local.of_query(image) for local in self.types]
+        ranked = self._candidates(image, features)
+        of_types = [
+            local.match(own, ranked) for local, own in zip(self.types, features, strict=True)
+        ]
+        how = self.options.reranking
+        kept, _ = rerank([[counted(one, how.by) for one in own] for own in of_types], how)
+        typed, left_out = [], []
+        for local, own, found in zip(self.types, features, of_types, strict=True):
+            named: list[ImageMatches] = [
+                (ranked[at], found[at].matches, found[at].scores) for at in kept
             ]
-            how = self.options.reranking
-            kept, _ = rerank([[counted(one, how.by) for one in own] for own in of_types], how)
-            typed, left_out = [], []
-            for local, own, found in zip(self.types, features, of_types, strict=True):
-                named: list[ImageMatches] = [
-                    (ranked[at], found[at].matches, found[at].scores) for at in kept
-                ]
-                keypoints_px, named, remark = local.match_again(own, named, image)
-                left_out += [remark] if remark else []
-                typed.append(TypedMatches(local.points.index, keypoints_px, named))
-            views.append(QueryView(query.name, image.camera, tuple(typed), cam_from_rig))
-            rankings.append([ranked[at] for at in kept])
-            remarks.append(tuple(left_out))
-        candidates = interleave(rankings)
-        frames = [self.map.restrictions.frame(name) for name in candidates]
-        return _Matched(images, tuple(views), candidates, frames, tuple(remarks))
+            keypoints_px, named, remark = local.match_again(own, named, image)
+            left_out += [remark] if remark else []
+            typed.append(TypedMatches(local.points.index, keypoints_px, named))
+        view = QueryView(image.query.name, image.camera, tuple(typed), cam_from_rig)
+        return view, [ranked[at] for at in kept], tuple(left_out)
 
     def _candidates(self, image: QueryImage, features: Sequence[Features]) -> list[str]:
         """The map images to match a query with, best first where they can be ranked."""
@@ -328,7 +286,9 @@ class Localizer:
         options = self.options.query_pairs
         if options.by == "exhaustive" or not permitted:
             return permitted
-        if len(permitted) <= options.top_k and not self._retrieval.is_at_hand(query):
+        if len(permitted) <= options.top_k and not self._retrieval.is_at_hand(
+            query.global_features
+        ):
             return permitted
         return self._retrieval.rank(image, features, permitted)
 

@@ -116,9 +116,12 @@ class MapRetrieval:
         index, _ = candidates.of(rows, members, self._options.query_pairs)
         return [self._map.images[i] for i in index[0] if i >= 0]
 
-    def is_at_hand(self, query: Query) -> bool:
-        """Whether a query can be ranked without describing the map first, or lacking weights."""
-        compared = self._compared(query.global_features)
+    def is_at_hand(self, brought: Collection[str]) -> bool:
+        """Whether queries that bring these global features are ranked by what is there.
+
+        Else the map would have to be described first, or weights are lacking.
+        """
+        compared = self._compared(brought)
         return all(one.stored and not one.lacks_weights for one in compared)
 
     def names_one_of(self, brought: Collection[str]) -> bool:
@@ -135,6 +138,18 @@ class MapRetrieval:
             else:
                 words.append(f"global features {one.name}")
         return ", ".join(words)
+
+    def describe_candidates(self, brought: Collection[str]) -> str:
+        """The map images that queries which bring these features are matched with, for people."""
+        how, count = self.describe(brought), len(self._map.images)
+        top_k = self._options.query_pairs.top_k
+        if count <= top_k:
+            ranked = f"ranked by {how}" if self.is_at_hand(brought) else "not ranked"
+            return f"all {count} map images, {ranked}"
+        lacking = [one.name for one in self._compared(brought) if one.lacks_weights]
+        if lacking:
+            return f"not possible: the weights that make {lacking[0]} are missing"
+        return f"the {top_k} of {count} map images that are most similar by {how}"
 
     def _compared(self, brought: Collection[str]) -> Sequence[_Compared]:
         shared = [name for name in self._map.global_types() if name in brought]

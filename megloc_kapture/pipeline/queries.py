@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from megloc_kapture.datasets.kapture_folders import check_image
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.kapture import FeatureReader, KaptureFolder
-from megloc_kapture.matching.guided_pyramid import base_type, pyramid_type
+from megloc_kapture.matching.guided_pyramid import equivalent_types
 from megloc_kapture.pipeline.kapture_map import KaptureMap, check_lengths
 from megloc_kapture.plugins import DepthView
 from megloc_kapture.stages.local_features import mask_path, read_image_of, read_mask
@@ -119,15 +119,18 @@ class KaptureQueries:
         self._data = folder.read()
         self.names = self._data.image_names()
         stored = kapture_map.stored_types()
+        self._stored = stored
+        wanted = {other for name in stored for other in equivalent_types(name)}
         brought = set(folder.types("keypoints")).intersection(folder.types("descriptors"))
         self._local: dict[str, tuple[FeatureReader, FeatureReader]] = {
             name: (folder.keypoints(name), folder.descriptors(name))
-            for name in _types_and_bases(stored)
-            if name in brought
+            for name in sorted(wanted & brought)
         }
         # what the map says of keypoints of each type; looked up here, not for every query
         self._like = {
-            name: kapture_map.keypoints_of(name if name in stored else pyramid_type(name))
+            name: kapture_map.keypoints_of(
+                next(other for other in equivalent_types(name) if other in stored)
+            )
             for name in self._local
         }
         self._globals = {
@@ -137,11 +140,11 @@ class KaptureQueries:
         }
 
     def lacking(self, local_type: str) -> str | None:
-        """The first image without features of a type; None where all bring them."""
-        if local_type not in self._local:
-            return self.names[0] if self.names else None
-        keypoints, _ = self._local[local_type]
-        return next((name for name in self.names if name not in keypoints), None)
+        """The first image without features that serve a type; None where all bring them."""
+        types = [name for name in equivalent_types(local_type) if name in self._local]
+        return next(
+            (name for name in self.names if not any(name in self._local[t][0] for t in types)), None
+        )
 
     def check(self) -> None:
         """Check all that can be checked without reading features or pixels.
@@ -171,13 +174,15 @@ class KaptureQueries:
             for name, vectors in self._globals.items()
         ]
         for name, (_, descriptors) in self._local.items():
-            if name in self._map.folder.types("descriptors"):
-                pairs.append((descriptors, self._map.folder.descriptors(name)))
-        for ours, theirs in pairs:
-            if ours.config.dsize != theirs.config.dsize:
+            described = self._map.folder.types("descriptors")
+            theirs = next((other for other in equivalent_types(name) if other in described), None)
+            if theirs is not None:
+                pairs.append((descriptors, self._map.folder.descriptors(theirs)))
+        for own, other in pairs:
+            if own.config.dsize != other.config.dsize:
                 raise DataError(
-                    f"{ours.kind} of type {ours.type_name!r} have {ours.config.dsize} values, "
-                    f"the map's {theirs.config.dsize}",
+                    f"{own.kind} of type {own.type_name!r} have {own.config.dsize} values, "
+                    f"the map's {other.config.dsize}",
                     path=self._folder.root,
                 )
 
@@ -237,9 +242,12 @@ class KaptureQueries:
 
     def _features(self, name: str) -> dict[str, LocalFeatures]:
         found = {}
-        for local_type, (keypoints, descriptors) in self._local.items():
-            if name not in keypoints:
+        for needed in self._stored:
+            serving = (one for one in equivalent_types(needed) if one in self._local)
+            local_type = next((one for one in serving if name in self._local[one][0]), None)
+            if local_type is None or local_type in found:
                 continue
+            keypoints, descriptors = self._local[local_type]
             check_lengths(keypoints, descriptors, name)
             stored = keypoints.read(name)
             found[local_type] = LocalFeatures(
@@ -248,8 +256,3 @@ class KaptureQueries:
                 descriptors.read(name),
             )
         return found
-
-
-def _types_and_bases(types: Sequence[str]) -> list[str]:
-    """With a guided pyramid's type the one it is made of: of this a query may have features."""
-    return sorted({*types, *map(base_type, types)})

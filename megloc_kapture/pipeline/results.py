@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.files import staged_output
 from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.tables import CONSISTENCY_FILE, write_consistency
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.queries import KaptureQueries
 from megloc_kapture.stages.layout import LOCALIZED
@@ -102,9 +103,13 @@ class Results(Mapping[str, Pose | Failure]):
         """As :meth:`save`, into a folder that is ours already."""
         fallback = self.localizer.options.localization.fallback
         best = self._best_candidates() if fallback == "retrieval" else {}
-        return write_localized(
+        counts = write_localized(
             output, self.folder, self.items(), fallback=fallback, first_candidates=best
         )
+        tested = self.localizer.refiners.tested()
+        if tested:
+            write_consistency(output / CONSISTENCY_FILE, tested)
+        return counts
 
     def to_pandas(self) -> pd.DataFrame:
         """One row per image: the columns of ``status.csv``, and the pose, NaN where there is none.

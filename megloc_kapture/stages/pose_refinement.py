@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import shutil
+import threading
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.errors import PluginError
@@ -24,6 +24,7 @@ from megloc_kapture.io.tables import (
     CONSISTENCY_FILE,
     REFINEMENT_FILE,
     STATUS_FILE,
+    ConsistencyRow,
     QueryStatus,
     read_status,
     refinement_text,
@@ -39,18 +40,26 @@ from megloc_kapture.plugins import (
     RankingScene,
     load_plugin,
 )
-from megloc_kapture.refinement.consistency import Consistency, HoldsOut
+from megloc_kapture.refinement.consistency import (
+    Consistency,
+    Displacement,
+    HoldsOut,
+    judge_consistency,
+    spread_names,
+)
 from megloc_kapture.refinement.references import ReferenceImages
 from megloc_kapture.stages.layout import LOCALIZED, MAP, REFINEMENT_TIMING, UNREFINED_POSES
-from megloc_kapture.stages.map_consistency import consistency_row, map_consistency
 from megloc_kapture.stages.ranking_scene import KaptureScene
 from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.stage import PipelineStage, StageWork
-from megloc_kapture.stages.work import HERE, FolderSpec, Work
-from megloc_kapture.values import Camera, Options, RefinementRow, RigidTransform
+from megloc_kapture.stages.work import HERE, FolderSpec, Work, ordered_map
+from megloc_kapture.values import Camera, Options, Pose, RefinementRow, RigidTransform
 
 if TYPE_CHECKING:
     from megloc_kapture.stages.options import PipelineOptions
+
+# map images held out at once: of those, what comes behind the last that is needed is thrown away
+_WINDOW = 4
 
 
 class PoseRefinementOptions(Options):
@@ -83,92 +92,121 @@ class PoseRefinementOptions(Options):
         return [load_plugin(POSE_REFINERS, one.name, one.options) for one in self.by]
 
 
-@dataclass(frozen=True)
-class _Job:
-    map: FolderSpec
-    query: FolderSpec
-    refiners: tuple[PoseRefiner, ...]
-    distrusted: tuple[str, ...]  # of each refiner, why it must not be used; empty where it may
-    image: str
-    cam_from_world: RigidTransform
-    references: tuple[str, ...]
+class MapRefiners:
+    """The pose refiners of a map: the images they use, and the frames they are trusted in.
 
-
-@dataclass(frozen=True, eq=False)
-class RefinedPose:
-    """A query's pose after all refiners.
-
-    Attributes
-    ----------
-    covariance : float64 (6, 6) that the last refiner whose pose counts gave; None without.
-    rows : what each refiner made of it, in their order.
-    """
-
-    cam_from_world: RigidTransform
-    covariance: NDArray[np.float64] | None
-    rows: tuple[RefinementRow, ...]
-    seconds: dict[str, float]
-
-
-class PoseReferences:
-    """Which map images a pose is refined against, by coordinate frame.
+    A refiner whose poses are as good as the map is consistent is used in those coordinate frames
+    only that prove to be: a sample of their images is held out. Threads may share it.
 
     Parameters
     ----------
-    poses : ``cam_from_world`` of the map's images.
+    mapping : kapture with poses, and whatever the refiners need: images, depth maps, points.
+    restrictions : the coordinate frames of the map's images, which are never mixed.
+
+    Raises
+    ------
+    PluginError, MissingWeightsError : there is no such refiner, or it cannot be made.
     """
 
     def __init__(
-        self,
-        poses: Mapping[str, RigidTransform],
-        restrictions: Restrictions,
-        options: PoseRefinementOptions,
+        self, mapping: KaptureFolder, restrictions: Restrictions, options: PoseRefinementOptions
     ) -> None:
+        self.refiners = tuple(options.make_refiners())
+        self._mapping, self._restrictions, self._options = mapping, restrictions, options
+        self._verdicts: dict[str, list[Consistency | None]] = {}
+        self._lock = threading.Lock()
+
+    @cached_property
+    def _by_frame(self) -> dict[str, ReferenceImages]:
+        poses = self._mapping.read().poses()
         images = sorted(poses)
-        self._restrictions, self._options = restrictions, options
-        self._by_frame = {
-            restrictions.frame(images[members[0]]): ReferenceImages(
+        return {
+            self._restrictions.frame(images[members[0]]): ReferenceImages(
                 {images[member]: poses[images[member]] for member in members}
             )
-            for members in restrictions.frames(images)
+            for members in self._restrictions.frames(images)
         }
 
-    def frame(self, candidates: Sequence[str]) -> str:
+    def _frame(self, pose: Pose) -> str:
         """The coordinate frame of a pose, by the map images that it comes from."""
-        return self._restrictions.frame(candidates[0]) if candidates else ""
+        return self._restrictions.frame(pose.candidates[0]) if pose.candidates else ""
 
-    def near(self, cam_from_world: RigidTransform, candidates: Sequence[str]) -> list[str]:
-        """Map images that may show what a query sees, best first.
-
-        Parameters
-        ----------
-        candidates : map images that its pose comes from.
-        """
-        return self._by_frame[self.frame(candidates)].near(
-            cam_from_world, candidates, max_references=self._options.max_references
-        )
-
-    def verdicts(
-        self,
-        mapping: FolderSpec,
-        frames: Sequence[str],
-        refiners: Sequence[PoseRefiner],
-        *,
-        work: Work = HERE,
-    ) -> list[dict[str, Consistency]]:
-        """Of each refiner whose poses are as good as the map is consistent, that of each frame.
+    def test(self, poses: Iterable[Pose], *, work: Work = HERE) -> None:
+        """Test the frames of these poses that have not been tested.
 
         Raises
         ------
         DataError : an image or a depth map cannot be read.
         """
-        asked = {frame: self._by_frame[frame] for frame in frames}
+        with self._lock:
+            for frame in sorted({self._frame(pose) for pose in poses} - set(self._verdicts)):
+                self._verdicts[frame] = [
+                    self._judge(refiner, self._by_frame[frame], work)
+                    if isinstance(refiner, HoldsOut) and refiner.require_consistent_map
+                    else None
+                    for refiner in self.refiners
+                ]
+
+    def _judge(self, refiner: HoldsOut, images: ReferenceImages, work: Work) -> Consistency:
+        spec = FolderSpec(self._mapping)
+        jobs = (_HeldOut(spec, refiner, image, images) for image in spread_names(images.names))
+        return judge_consistency(ordered_map(_hold_out, jobs, work.executor, window=_WINDOW))
+
+    def tested(self) -> list[ConsistencyRow]:
+        """The rows of ``map_consistency.csv``: by refiner, then by frame."""
         return [
-            map_consistency(mapping, asked, refiner, work=work)
-            if isinstance(refiner, HoldsOut) and refiner.require_consistent_map
-            else {}
-            for refiner in refiners
+            _consistency_row(frame, refiner.name, verdict)
+            for number, refiner in enumerate(self.refiners)
+            for frame, verdicts in sorted(self._verdicts.items())
+            if (verdict := verdicts[number]) is not None
         ]
+
+    def uses(self, pose: Pose) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """References of a pose, and of each refiner why it is distrusted: see :func:`refine_pose`.
+
+        Its frame has been tested.
+        """
+        frame = self._frame(pose)
+        near = self._by_frame[frame].near(
+            pose.cam_from_world, pose.candidates, max_references=self._options.max_references
+        )
+        return tuple(near), tuple(one.reason if one else "" for one in self._verdicts[frame])
+
+    def refine(self, image: str, camera: Camera, pose: Pose, scene: RankingScene) -> Pose:
+        """Refine the pose of one query; raises DataError, PluginError."""
+        if not self.refiners:
+            return pose
+        self.test([pose])
+        return refine_pose(image, camera, pose, *self.uses(pose), self.refiners, scene)
+
+
+@dataclass(frozen=True)
+class _HeldOut:
+    map: FolderSpec
+    refiner: HoldsOut
+    image: str
+    images: ReferenceImages
+
+
+def _hold_out(job: _HeldOut) -> Displacement | None:
+    return job.refiner.hold_out(job.image, job.images, KaptureScene(job.map.open()))
+
+
+def _consistency_row(frame: str, method: str, found: Consistency) -> ConsistencyRow:
+    median = found.median or Displacement(*[float("nan")] * len(fields(Displacement)))
+    counts = (found.images, found.contradicting)
+    return ConsistencyRow(frame, method, *counts, **vars(median), reason=found.reason)
+
+
+@dataclass(frozen=True)
+class _Job:
+    map: FolderSpec
+    query: FolderSpec
+    image: str
+    pose: Pose
+    references: tuple[str, ...]
+    distrusted: tuple[str, ...]
+    refiners: tuple[PoseRefiner, ...]
 
 
 def refine_poses(
@@ -206,31 +244,24 @@ def refine_poses(
     DataError : ``status.csv`` is absent or broken; images or depth maps cannot be read.
     PluginError : there is no such refiner, or it breaks its protocol.
     """
-    refiners = tuple(options.make_refiners())
+    refiners = MapRefiners(map_folder, restrictions, options)
     statuses = read_status(localized.root / STATUS_FILE)
     data = localized.read()
     map_spec, query_spec = (FolderSpec(f) for f in (map_folder, query))
-    references = PoseReferences(map_folder.read().poses(), restrictions, options)
-    refined = {
-        image: (pose, references.frame(status.candidates))
-        for image, status in statuses.items()
-        if status.status == "localized" and (pose := data.cam_from_world(image)) is not None
+    poses = {
+        image: Pose(pose, row.num_matches, row.num_inliers, candidates=row.candidates)
+        for image, row in statuses.items()
+        if row.status == "localized" and (pose := data.cam_from_world(image)) is not None
     }
-    frames = sorted({frame for _, frame in refined.values()})
-    verdicts = references.verdicts(map_spec, frames, refiners, work=work)
-    jobs = []
-    for image, (pose, frame) in refined.items():
-        near = references.near(pose, statuses[image].candidates)
-        why = tuple(found[frame].reason if found else "" for found in verdicts)
-        jobs.append(_Job(map_spec, query_spec, refiners, why, image, pose, tuple(near)))
+    refiners.test(poses.values(), work=work)
+    jobs = [
+        _Job(map_spec, query_spec, image, pose, *refiners.uses(pose), refiners.refiners)
+        for image, pose in poses.items()
+    ]
     results = work.map(_refine, jobs, "refining")
     found = {job.image: refined for job, refined in zip(jobs, results, strict=True)}
     _write(output, data, localized, statuses, found)
-    tested = [
-        consistency_row(frame, refiner.name, verdict)
-        for refiner, verdict_of in zip(refiners, verdicts, strict=True)
-        for frame, verdict in verdict_of.items()
-    ]
+    tested = refiners.tested()
     if tested:
         write_consistency(output / CONSISTENCY_FILE, tested)
     if timing is not None:
@@ -241,11 +272,11 @@ def refine_poses(
         )
         write_csv_table(timing, ("image", "step", "seconds"), rows)
     counts: dict[str, float] = {"queries": len(jobs)}
-    for refiner in refiners:
+    for refiner in refiners.refiners:
         counts[f"accepted_by_{refiner.name}"] = sum(
             row.accepted
             for refined in found.values()
-            for row in refined.rows
+            for row in refined.refinements
             if row.method == refiner.name
         )
     for row in tested:
@@ -258,7 +289,7 @@ def _write(
     data: KaptureData,
     localized: KaptureFolder,
     statuses: dict[str, QueryStatus],
-    found: dict[str, RefinedPose],
+    found: dict[str, Pose],
 ) -> None:
     poses = dict(data.trajectories)
     for image, refined in found.items():
@@ -268,7 +299,7 @@ def _write(
     write_status(
         output / STATUS_FILE,
         (
-            status.model_copy(update={"refinement": refinement_text(found[image].rows)})
+            status.model_copy(update={"refinement": refinement_text(found[image].refinements)})
             if image in found
             else status
             for image, status in statuses.items()
@@ -278,19 +309,19 @@ def _write(
     if clusters.is_file():
         shutil.copyfile(clusters, output / CLUSTERS_FILE)
     write_refinement(
-        output / REFINEMENT_FILE, (row for refined in found.values() for row in refined.rows)
+        output / REFINEMENT_FILE, (row for refined in found.values() for row in refined.refinements)
     )
 
 
-def _refine(job: _Job) -> RefinedPose:
+def _refine(job: _Job) -> Pose:
     mapping, query = job.map.open(), job.query.open()
     return refine_pose(
         job.image,
         query.read().camera_of(job.image),
-        job.cam_from_world,
+        job.pose,
         job.references,
-        job.refiners,
         job.distrusted,
+        job.refiners,
         KaptureScene(mapping, query),
     )
 
@@ -298,35 +329,43 @@ def _refine(job: _Job) -> RefinedPose:
 def refine_pose(
     image: str,
     camera: Camera,
-    cam_from_world: RigidTransform,
+    pose: Pose,
     references: Sequence[str],
-    refiners: Sequence[PoseRefiner],
     distrusted: Sequence[str],
+    refiners: Sequence[PoseRefiner],
     scene: RankingScene,
-) -> RefinedPose:
+) -> Pose:
     """Refine the pose of one query by one refiner after another.
 
     Parameters
     ----------
-    references : map images, see :class:`PoseReferences`.
+    references : map images that may show what the query sees, best first.
     distrusted : of each refiner, why it must not be used in this map; empty where it may.
+
+    Returns
+    -------
+    The pose that the last accepted refiner gave, with its covariance; what each made of it stands
+    in its ``refinements``.
 
     Raises
     ------
     PluginError : a refiner breaks its protocol.
     """
-    pose, covariance, rows, seconds = cam_from_world, None, [], {}
+    rows, seconds = [], dict(pose.seconds)
     for refiner, reason in zip(refiners, distrusted, strict=True):
         started = time.perf_counter()
+        before = pose.cam_from_world
         if reason:
-            refined = PoseRefinement(pose, reason)
+            refined = PoseRefinement(before, reason)
         else:
-            refined = refiner.refine(image, camera, pose, references, scene)
-        rows.append(_row(refiner, image, pose, refined))
+            refined = refiner.refine(image, camera, before, references, scene)
+        rows.append(_row(refiner, image, before, refined))
         if refined.accepted:
-            pose, covariance = refined.cam_from_world, refined.covariance
+            pose = replace(
+                pose, cam_from_world=refined.cam_from_world, covariance=refined.covariance
+            )
         seconds[refiner.name] = time.perf_counter() - started
-    return RefinedPose(pose, covariance, tuple(rows), seconds)
+    return replace(pose, refinements=tuple(rows), seconds=seconds)
 
 
 def _row(

@@ -17,7 +17,7 @@ from megloc_kapture.io.kapture import (
     KaptureFolder,
     write_sensors,
 )
-from megloc_kapture.io.tables import read_refinement, read_status
+from megloc_kapture.io.tables import CONSISTENCY_FILE, read_refinement, read_status
 from megloc_kapture.pipeline.datasets import choose_dataset
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
 from megloc_kapture.pipeline.executors import single_threaded
@@ -155,8 +155,9 @@ def test_the_same_refined_poses(with_depth: Path, tmp_path: Path, by: str) -> No
         assert [one.reason for one in pose.refinements] == [row.reason]
 
 
-def test_the_command_writes_what_eval_writes(with_depth: Path, tmp_path: Path) -> None:
-    sets = [*FEW, 'pose_refinement.by=["icp"]', "preprocessing.max_size_px=240"]
+@pytest.mark.parametrize("by", ["icp", pytest.param("rendering", marks=pytest.mark.slow)])
+def test_the_command_writes_what_eval_writes(with_depth: Path, tmp_path: Path, by: str) -> None:
+    sets = [*FEW, f'pose_refinement.by=["{by}"]', "preprocessing.max_size_px=240"]
     workspace = evaluated(with_depth, tmp_path / "w", options_of_preset(assignments=sets))
     flags = [flag for one in sets for flag in ("--set", one)]
     out = tmp_path / "localized"
@@ -166,5 +167,8 @@ def test_the_command_writes_what_eval_writes(with_depth: Path, tmp_path: Path) -
              "-o", str(out), *flags]
         )  # fmt: skip
     assert end.value.code == 0
-    for name in ("status.csv", "refinement.csv", "clusters.csv", "sensors/trajectories.txt"):
+    names = ["status.csv", "refinement.csv", "clusters.csv", "sensors/trajectories.txt"]
+    tested = [place / CONSISTENCY_FILE for place in (out, workspace.path("localized"))]
+    assert [path.is_file() for path in tested] == [by == "rendering"] * 2
+    for name in [*names, CONSISTENCY_FILE] if by == "rendering" else names:
         assert (out / name).read_bytes() == workspace.path(f"localized/{name}").read_bytes(), name

@@ -1,0 +1,83 @@
+"""Queries that bring a type's features serve maps of its guided pyramid, and the reverse."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from megloc_kapture import KaptureMap, Localizer
+from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.pipeline.datasets import choose_dataset
+from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
+from megloc_kapture.pipeline.executors import single_threaded
+from megloc_kapture.pipeline.plan import run_plan
+from megloc_kapture.pipeline.presets import options_of_preset
+from megloc_kapture.pipeline.queries import KaptureQueries
+from megloc_kapture.pipeline.results import Results
+from megloc_kapture.pipeline.run import Run
+from megloc_kapture.pipeline.workspace import Workspace
+
+FEW = "local_features.rootsift.options.max_keypoints=300"
+PYRAMID = ("guided_pyramid.mode=all", "guided_pyramid.scales=[0.5,1.0]")
+TYPES = ("rootsift", "rootsift-pyramid")
+
+
+@pytest.fixture(scope="module")
+def workspaces(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Workspace]:
+    """A run without and one with guided pyramids, by the type that their maps are of."""
+    found = {}
+    for name, more in zip(TYPES, ((), PYRAMID), strict=True):
+        place = Workspace(tmp_path_factory.mktemp(name) / "workspace")
+        options = options_of_preset(assignments=[FEW, *more])
+        run = Run(choose_dataset("kapture", scene), "classic", options, place)
+        with place.lock(), single_threaded():
+            run_plan(plan_evaluation(run), place)
+        found[name] = place
+    return found
+
+
+@pytest.mark.parametrize("of_map", TYPES)
+@pytest.mark.parametrize("brought", TYPES)
+def test_either_type_serves_the_other(
+    workspaces: dict[str, Workspace], tmp_path: Path, of_map: str, brought: str
+) -> None:
+    place = workspaces["rootsift-pyramid"]
+    query = tmp_path / "query"
+    shutil.copytree(place.path("query") / "sensors", query / "sensors", symlinks=True)
+    (query / "sensors" / "records_data").unlink()  # nothing can be extracted
+    features = place.root if brought == "rootsift" else place.path("pyramid/query")
+    folder = KaptureFolder(query, features_dirs=[features])
+    opened = KaptureMap.open(workspaces[of_map].path("map"))
+    assert list(opened.keypoints) == opened.stored_types() == [of_map]
+    queries = KaptureQueries(folder, opened)
+    assert queries.lacking(of_map) is None
+    assert queries.lacking("superpoint") == queries.names[0]
+    queries.check()
+    assert all(list(one.features) == [brought] for one in queries)
+    results = Results(Localizer(opened, options=options_of_preset(assignments=[FEW])), folder)
+    assert all(results.values())
+
+
+def test_of_both_the_fitting_type_is_read(workspaces: dict[str, Workspace]) -> None:
+    place = workspaces["rootsift-pyramid"]
+    both = [place.root, place.path("pyramid/query")]
+    folder = KaptureFolder(place.path("query"), features_dirs=both)
+    for of_map in TYPES:
+        queries = KaptureQueries(folder, KaptureMap.open(workspaces[of_map].path("map")))
+        assert all(list(one.features) == [of_map] for one in queries)
+
+
+def test_an_image_without_any_of_them_is_named(
+    workspaces: dict[str, Workspace], tmp_path: Path
+) -> None:
+    place = workspaces["rootsift-pyramid"]
+    features = Path(shutil.copytree(place.path("pyramid/query"), tmp_path / "features"))
+    names = place.folder("query").read().image_names()
+    for suffix in ("kpt", "desc"):
+        (found,) = features.rglob(f"{names[2]}.{suffix}")
+        found.unlink()
+    folder = KaptureFolder(place.path("query"), features_dirs=[features])
+    opened = KaptureMap.open(workspaces["rootsift"].path("map"))
+    assert KaptureQueries(folder, opened).lacking("rootsift") == names[2]
