@@ -64,7 +64,7 @@ def cases(place: Path) -> Iterator[Case]:
                 )
     gallery = DATA / "foreign_maps" / "virtual_gallery"
     if gallery.is_dir():
-        maps = ("-i", str(gallery / "mapping"), "--query", str(gallery / "query"))
+        maps = ("-i", str(gallery / "map"), "--query", str(gallery / "query"))
         yield Case("virtual_gallery-classic", "free", ("localize", *maps))
     for preset in ("classic", "modern", "megloc"):
         sizes = [part for change in SMALL[preset] for part in ("--set", change)]

@@ -14,7 +14,7 @@ from megloc_kapture.io.weights import MissingWeightsError
 from megloc_kapture.localization.cluster_poses import ImageMatches
 from megloc_kapture.matching.guided_pyramid import base_type, equivalent_types
 from megloc_kapture.pipeline.kapture_map import KaptureMap, MapKeypoints
-from megloc_kapture.pipeline.query_images import QueryImage
+from megloc_kapture.pipeline.queries import QueryImage
 from megloc_kapture.plugins import (
     LOCAL_FEATURES,
     MATCHERS,

@@ -25,8 +25,14 @@ from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.local_types import local_types_of
 from megloc_kapture.pipeline.map_retrieval import MapRetrieval
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.queries import KaptureQueries, Query, Unit
-from megloc_kapture.pipeline.query_images import Preprocessor, QueryImage, QueryImages
+from megloc_kapture.pipeline.queries import (
+    KaptureQueries,
+    Preprocessor,
+    Query,
+    QueryImage,
+    QueryImages,
+    Unit,
+)
 from megloc_kapture.stages.matches import FeatureCache, Features
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.pose_refinement import MapRefiners

@@ -17,11 +17,10 @@ from megloc_kapture.io.weights.registry import registry
 from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.local_types import LocalType
-from megloc_kapture.pipeline.queries import Query
-from megloc_kapture.pipeline.query_images import Preprocessor, QueryImage
+from megloc_kapture.pipeline.queries import Preprocessor, Query, QueryImage
 from megloc_kapture.plugins import GLOBAL_FEATURES, GlobalFeatureExtractor, plugin_names
 from megloc_kapture.stages.candidates import Candidates, Retrieval, vectors_of
-from megloc_kapture.stages.global_choice import GlobalFeaturesChoice
+from megloc_kapture.stages.global_features import GlobalFeaturesChoice
 from megloc_kapture.stages.global_vlad import VladSettings, read_vocabulary, vlad_type
 from megloc_kapture.stages.local_features import read_image_of
 from megloc_kapture.stages.matches import Features

@@ -14,7 +14,7 @@ from megloc_kapture.matching.guided_pyramid import GuidedPyramidOptions
 from megloc_kapture.pipeline.assignments import check_assigned
 from megloc_kapture.plugins import PluginChoice
 from megloc_kapture.stages.candidates import QueryPairsOptions
-from megloc_kapture.stages.global_choice import GlobalFeaturesChoice
+from megloc_kapture.stages.global_features import GlobalFeaturesChoice
 from megloc_kapture.stages.image_pairs import MappingPairsOptions
 from megloc_kapture.stages.map_refinement import MapRefinementOptions
 from megloc_kapture.stages.options import LocalFeaturesChoice, PipelineOptions

@@ -21,7 +21,7 @@ from megloc_kapture.plugins import (
 )
 from megloc_kapture.retrieval.fusion import FusionOptions
 from megloc_kapture.stages.candidates import QueryPairsOptions, Retrieval
-from megloc_kapture.stages.global_choice import GlobalFeaturesChoice
+from megloc_kapture.stages.global_features import GlobalFeaturesChoice
 from megloc_kapture.stages.image_pairs import MappingPairsOptions
 from megloc_kapture.stages.map_refinement import MapRefinementOptions
 from megloc_kapture.stages.matches import NoVerification, Verification
