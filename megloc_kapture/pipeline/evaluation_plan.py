@@ -85,10 +85,7 @@ def plan_evaluation(run: Run) -> list[Stage]:
             f"map = {options.map}: the given map's keypoints are in the original images; "
             "pre-processing may mask them, but not resize or undistort"
         )
-    if options.matches_again() and options.verification == "none":
-        raise OptionError(
-            "guided pyramid matching counts verified matches; verification = none has none"
-        )
+    options.check()
     if given or options.pairs_by_points():
         run = replace(run, source=_with_model(run, given))
     run.source.check()

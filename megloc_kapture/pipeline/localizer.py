@@ -96,6 +96,7 @@ class Localizer:
     ) -> None:
         self.map = kapture_map
         self.options = options or options_of_preset(preset)
+        self.options.check()
         self._ranker = self.options.localization.make_ranker()
         self._preprocessor = Preprocessor(self.options)
         self.refiners = MapRefiners(

@@ -115,6 +115,18 @@ class PipelineOptions(Options):
             idle |= dict.fromkeys(verifications, "verification is none")
         return idle
 
+    def check(self) -> None:
+        """Refuse steps that contradict each other.
+
+        Raises
+        ------
+        OptionError : names them.
+        """
+        if self.matches_again() and self.verification == "none":
+            raise OptionError(
+                "guided pyramid matching counts verified matches; verification = none has none"
+            )
+
     def make_extractors(self) -> list[LocalFeatureExtractor]:
         """The extractors of local features, in order; raises PluginError, MissingWeightsError."""
         return [

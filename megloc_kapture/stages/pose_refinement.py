@@ -112,6 +112,7 @@ class MapRefiners:
         self, mapping: KaptureFolder, restrictions: Restrictions, options: PoseRefinementOptions
     ) -> None:
         self.refiners = tuple(options.make_refiners())
+        self.map = FolderSpec(mapping)
         self._mapping, self._restrictions, self._options = mapping, restrictions, options
         self._verdicts: dict[str, list[Consistency | None]] = {}
         self._lock = threading.Lock()
@@ -148,8 +149,7 @@ class MapRefiners:
                 ]
 
     def _judge(self, refiner: HoldsOut, images: ReferenceImages, work: Work) -> Consistency:
-        spec = FolderSpec(self._mapping)
-        jobs = (_HeldOut(spec, refiner, image, images) for image in spread_names(images.names))
+        jobs = (_HeldOut(self.map, refiner, image, images) for image in spread_names(images.names))
         return judge_consistency(ordered_map(_hold_out, jobs, work.executor, window=_WINDOW))
 
     def tested(self) -> list[ConsistencyRow]:
@@ -247,7 +247,7 @@ def refine_poses(
     refiners = MapRefiners(map_folder, restrictions, options)
     statuses = read_status(localized.root / STATUS_FILE)
     data = localized.read()
-    map_spec, query_spec = (FolderSpec(f) for f in (map_folder, query))
+    query_spec = FolderSpec(query)
     poses = {
         image: Pose(pose, row.num_matches, row.num_inliers, candidates=row.candidates)
         for image, row in statuses.items()
@@ -255,7 +255,7 @@ def refine_poses(
     }
     refiners.test(poses.values(), work=work)
     jobs = [
-        _Job(map_spec, query_spec, image, pose, *refiners.uses(pose), refiners.refiners)
+        _Job(refiners.map, query_spec, image, pose, *refiners.uses(pose), refiners.refiners)
         for image, pose in poses.items()
     ]
     results = work.map(_refine, jobs, "refining")

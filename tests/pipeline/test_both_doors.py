@@ -12,6 +12,7 @@ from corner import write_scene
 
 from megloc_kapture import KaptureMap, Localizer, Pose
 from megloc_kapture.cli.main import main
+from megloc_kapture.errors import OptionError
 from megloc_kapture.io.kapture import (
     KaptureData,
     KaptureFolder,
@@ -122,6 +123,17 @@ def test_the_same_poses(scene: Path, tmp_path: Path, assignments: tuple[str, ...
     opened = KaptureMap.open(workspace.path("map"))
     localizer = Localizer(opened, options=options)
     assert len(assert_same(workspace, localizer.localize_kapture(workspace.path("query")))) == 4
+
+
+def test_options_that_contradict_each_other_are_refused(scene: Path, tmp_path: Path) -> None:
+    options = options_of_preset(assignments=["verification=none", "guided_pyramid.mode=all"])
+    message = "guided pyramid matching counts verified matches"
+    with pytest.raises(OptionError, match=message):
+        evaluated(scene, tmp_path / "workspace", options)
+    map_options = options_of_preset(assignments=FEW)
+    workspace = evaluated(scene, tmp_path / "map", map_options)
+    with pytest.raises(OptionError, match=message):
+        Localizer(KaptureMap.open(workspace.path("map")), options=options)
 
 
 @pytest.mark.slow
