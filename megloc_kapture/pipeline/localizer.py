@@ -33,7 +33,7 @@ from megloc_kapture.pipeline.queries import (
     QueryImages,
     Unit,
 )
-from megloc_kapture.stages.matches import FeatureCache, Features
+from megloc_kapture.stages.matches import FeatureCache, Features, VerifiedMatches
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.pose_refinement import MapRefiners
 from megloc_kapture.stages.query_poses import localize_unit, localize_views
@@ -268,11 +268,7 @@ class Localizer:
         """The matches of one camera, its candidates, best first, and what was left out."""
         features = [local.of_query(image) for local in self.types]
         ranked = self._candidates(image, features)
-        of_types = [
-            local.match(own, ranked) for local, own in zip(self.types, features, strict=True)
-        ]
-        how = self.options.reranking
-        kept, _ = rerank([[counted(one, how.by) for one in own] for own in of_types], how)
+        of_types, kept = self._matched(features, ranked)
         typed, left_out = [], []
         for local, own, found in zip(self.types, features, of_types, strict=True):
             named: list[ImageMatches] = [
@@ -283,6 +279,17 @@ class Localizer:
             typed.append(TypedMatches(local.points.index, keypoints_px, named))
         view = QueryView(image.query.name, image.camera, tuple(typed), cam_from_rig)
         return view, [ranked[at] for at in kept], tuple(left_out)
+
+    def _matched(
+        self, features: Sequence[Features], ranked: Sequence[str]
+    ) -> tuple[list[list[VerifiedMatches]], list[int]]:
+        """Matches of each type with each map image, and the positions of those that stay."""
+        of_types = [
+            local.match(own, ranked) for local, own in zip(self.types, features, strict=True)
+        ]
+        how = self.options.reranking
+        kept, _ = rerank([[counted(one, how.by) for one in own] for own in of_types], how)
+        return of_types, kept
 
     def _candidates(self, image: QueryImage, features: Sequence[Features]) -> list[str]:
         """The map images to match a query with, best first where they can be ranked."""
@@ -300,10 +307,13 @@ class Localizer:
         return self._retrieval.rank(image, features, permitted)
 
     def ranked(self, query: Query) -> list[str]:
-        """The most similar map images of a query, best first, however few there are."""
+        """The most similar map images of a query, best first, however few, reranked if at all."""
         image = self._preprocessor.of(query)
         features = [local.of_query(image) for local in self.types]
-        return self._retrieval.rank(image, features, self._permitted(query))
+        found = self._retrieval.rank(image, features, self._permitted(query))
+        if not self.options.reranking.reranks():
+            return found
+        return [found[at] for at in self._matched(features, found)[1]]
 
     def _permitted(self, query: Query) -> list[str]:
         if query.prior is None:

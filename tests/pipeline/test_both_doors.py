@@ -16,6 +16,7 @@ from megloc_kapture.errors import OptionError
 from megloc_kapture.io.kapture import (
     KaptureData,
     KaptureFolder,
+    read_pairs,
     write_sensors,
 )
 from megloc_kapture.io.tables import CONSISTENCY_FILE, read_refinement, read_status
@@ -24,8 +25,10 @@ from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.plan import run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
+from megloc_kapture.pipeline.results import Results
 from megloc_kapture.pipeline.run import Run
 from megloc_kapture.pipeline.workspace import Workspace
+from megloc_kapture.stages.matches import iterate_candidates
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.values import Failure, RigidTransform
 
@@ -134,6 +137,28 @@ def test_options_that_contradict_each_other_are_refused(scene: Path, tmp_path: P
     workspace = evaluated(scene, tmp_path / "map", map_options)
     with pytest.raises(OptionError, match=message):
         Localizer(KaptureMap.open(workspace.path("map")), options=options)
+
+
+def test_a_fallback_is_the_pose_of_the_first_candidate_after_reranking(
+    scene: Path, tmp_path: Path
+) -> None:
+    sets = [
+        *FEW, "localization.pose.min_inliers=5000", "localization.fallback=retrieval",
+        "reranking.by=verified", "reranking.keep=3", "global_features.vlad.options.num_clusters=1",
+    ]  # fmt: skip
+    options = options_of_preset(assignments=sets)
+    workspace = evaluated(scene, tmp_path / "workspace", options)
+    first = [
+        {name: images[0] for name, images in iterate_candidates(read_pairs(workspace.path(pairs)))}
+        for pairs in ("pairs/query_candidates.txt", "pairs/query.txt")
+    ]
+    assert first[0] != first[1]
+    localizer = Localizer(KaptureMap.open(workspace.path("map")), options=options)
+    Results(localizer, workspace.path("query")).save(tmp_path / "localized")
+    found = KaptureFolder(tmp_path / "localized").read().poses()
+    map_poses = workspace.folder("map").read().poses()
+    assert found == {name: map_poses[image] for name, image in first[1].items()}
+    assert found == workspace.folder("localized").read().poses()
 
 
 @pytest.mark.slow
