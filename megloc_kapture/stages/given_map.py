@@ -24,6 +24,7 @@ from megloc_kapture.io.kapture import (
     write_points3d,
     write_sensors,
 )
+from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.stages.triangulation import copy_features
 
 # other implementations of a detector differ by some tenths of a pixel; by chance few are so near
@@ -162,7 +163,7 @@ def join_maps(first: KaptureFolder, second: KaptureFolder, output: Path) -> dict
     write_sensors(output, first.read())
     link_images(first.root, output)
     for folder, types in zip((first, second), types_of, strict=True):
-        for local_type in types:
+        for local_type in {*types, *map(base_type, types)}.intersection(folder.types("keypoints")):
             copy_features(folder, output, local_type)
     write_points3d(output, np.concatenate([first.points3d(), second.points3d()]))
     write_observations(output, observations)

@@ -115,6 +115,7 @@ class TriangulatePoints(PipelineStage):
     """Triangulate the map's points, beside those of a given map where both are wanted."""
 
     name = "points"
+    version = 2
     uses = ("triangulation", "guided_pyramid.mode", *LOCAL_TYPES)
     writes = (UNREFINED,)
 

@@ -23,6 +23,7 @@ from megloc_kapture.io.kapture import (
     write_sensors,
 )
 from megloc_kapture.io.kapture.features import SUFFIX, ArrayKind
+from megloc_kapture.matching.guided_pyramid import base_type
 
 
 def triangulate_map(
@@ -89,7 +90,8 @@ def triangulate_map(
         by_type[f"observations_{type_name}"] = len(found.point_ids)
     write_sensors(output, data)
     link_images(mapping.root, output)
-    for type_name in types:
+    # with a pyramid's type the one it begins with: queries are matched with that at first
+    for type_name in {*types, *map(base_type, types)}.intersection(mapping.types("keypoints")):
         copy_features(mapping, output, type_name)
     xyz, errors = np.concatenate(points), np.concatenate(errors_px)
     # kapture keeps a colour per point; black says that nobody looked it up

@@ -114,7 +114,11 @@ def with_rig(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
                 "retrieval": ["query_pairs.top_k=4"],
                 "resized": ["preprocessing.max_size_px=240", "query_pairs.top_k=4"],
                 "matches": [*TWO_TYPES, "reranking.by=matches", "reranking.keep=3"],
-                "pyramid": ["guided_pyramid.mode=all", "guided_pyramid.scales=[0.5,1.0]"],
+                "pyramid": [
+                    "guided_pyramid.mode=all",
+                    "guided_pyramid.scales=[0.5,1.0]",
+                    "guided_pyramid.min_matches=400",
+                ],
                 "unverified": ["verification=none", "localization.clusters.by=none"],
             }.items()
         ),
