@@ -241,7 +241,9 @@ def test_every_cluster_gives_a_pose_whichever_retrieval_ranks_first(first: str) 
         sorted(names, key=lambda name: not name.startswith(first)),
         [""] * 4,
         LocalizationOptions(),
-        centers={},
+        centers={
+            name: np.array([0.0 if name.startswith("right") else 50.0, 0.0, 0.0]) for name in names
+        },
         ranker=load_plugin(POSE_RANKERS, "inliers"),
         scene=cast(RankingScene, None),  # that ranker asks for no picture
     ).result
