@@ -13,7 +13,6 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from megloc_kapture.errors import DataError, MeglocError, OptionError, OutputError, PluginError
-from megloc_kapture.values import Camera, Failure, LocalFeatures, Pose, RigidTransform
 
 if TYPE_CHECKING:
     from megloc_kapture.api import Map, build_map, extract, match, open_map, run, solve_pose
@@ -22,6 +21,7 @@ if TYPE_CHECKING:
     from megloc_kapture.pipeline.localizer import Localizer
     from megloc_kapture.pipeline.queries import Query
     from megloc_kapture.pipeline.results import Results
+    from megloc_kapture.values import Camera, Failure, LocalFeatures, Pose, RigidTransform
 
 __all__ = [
     "Camera",
@@ -48,8 +48,11 @@ __all__ = [
     "solve_pose",
 ]
 
-# loaded when asked for: the small types above must not cost the import of the solvers
+# loaded when asked for: an error must not cost the import of numpy, a value that of the solvers
 _LAZY = {
+    **dict.fromkeys(
+        ("Camera", "Failure", "LocalFeatures", "Pose", "RigidTransform"), "megloc_kapture.values"
+    ),
     "KaptureMap": "megloc_kapture.pipeline.kapture_map",
     "Localizer": "megloc_kapture.pipeline.localizer",
     "Query": "megloc_kapture.pipeline.queries",

@@ -1,24 +1,27 @@
-"""``megloc``: parse, run, and turn errors into one line and an exit status."""
+"""``megloc``: parse, run, and turn errors into one line and an exit status.
+
+Heavy modules are imported within :func:`main`, where Ctrl-C is met by one line as well.
+"""
 
 from __future__ import annotations
 
 import functools
 import operator
 import os
+import signal
 import sys
 import traceback
 from collections.abc import Sequence
-from dataclasses import make_dataclass
 from importlib import import_module
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any, NoReturn, Protocol
 
-import tyro
-
-from megloc_kapture.cli.arguments import one_line_errors
 from megloc_kapture.errors import MeglocError
-from megloc_kapture.plugins import STAGES, plugin_names
 
-DONE, DEFECT, USER_ERROR, INTERRUPTED = 0, 1, 2, 130
+DONE, DEFECT, USER_ERROR, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
+
+
+class Terminated(BaseException):
+    """The system, or somebody, asks the process to end."""
 
 
 class Command(Protocol):
@@ -117,6 +120,12 @@ def command_class(name: str) -> type[Any]:
 
 def _parser(given: Sequence[str]) -> Any:
     """What tyro parses: the command that is given, or the names of all of them for help."""
+    from dataclasses import make_dataclass
+
+    import tyro
+
+    from megloc_kapture.plugins import STAGES, plugin_names
+
     stages = [name.replace("_", "-") for name in plugin_names(STAGES)]
     annotated: Any = Annotated  # of types that are values here, which mypy does not follow
     texts = {name: f"Run the stage {name}, of another package." for name in stages}
@@ -131,11 +140,38 @@ def _parser(given: Sequence[str]) -> Any:
     return functools.reduce(operator.or_, entries)
 
 
+def _obey_signals() -> None:
+    """End in an orderly way on Ctrl-C and SIGTERM; a second one meanwhile changes nothing."""
+
+    def end(number: int, _frame: object) -> NoReturn:
+        _ignore_signals()
+        raise KeyboardInterrupt if number == signal.SIGINT else Terminated
+
+    for one in (signal.SIGINT, signal.SIGTERM):
+        if signal.getsignal(one) != signal.SIG_IGN:  # as of what a shell runs in the background
+            signal.signal(one, end)
+
+
+def _ignore_signals() -> None:
+    for one in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(one, signal.SIG_IGN)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point of the console script; exits with 0, 1 (defect), 2 (user's error) or 3."""
+    """Run a command; exits with 0, 1 (defect), 2 (user's error), 3, 130 (Ctrl-C) or 143.
+
+    Without arguments it is the console script: those of the process, which signals end in an
+    orderly way.
+    """
     given = sys.argv[1:] if arguments is None else arguments
     debug = False
     try:
+        if arguments is None:
+            _obey_signals()
+        import tyro
+
+        from megloc_kapture.cli.arguments import one_line_errors
+
         with one_line_errors(given):
             command: Command = tyro.cli(
                 _parser(given), args=given, prog="megloc", config=(tyro.conf.OmitArgPrefixes,)
@@ -151,8 +187,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except KeyboardInterrupt:
         print("megloc: interrupted; run the same command again to go on", file=sys.stderr)
         status = INTERRUPTED
+    except Terminated:
+        print("megloc: terminated; run the same command again to go on", file=sys.stderr)
+        status = TERMINATED
     except BrokenPipeError:
         # who reads our output has gone; the flush at exit must not complain about it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         status = DONE
+    finally:
+        if arguments is None:
+            _ignore_signals()  # or Python would print tracebacks of its own ending
     sys.exit(status)

@@ -7,13 +7,16 @@ keeping it behind this one module keeps both away from the rest of the package.
 from __future__ import annotations
 
 import os
+import signal
 import tempfile
+import threading
 import zlib  # noqa: F401  pycolmap 4.1.1 to 4.2.1 corrupt the heap when imported before zlib
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from shutil import disk_usage
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,15 +24,21 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.errors import DataError, OutputError
+from megloc_kapture.io.files import output_error, owned_name
 from megloc_kapture.values import Camera, Options, RigidTransform
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
 
+@lru_cache(maxsize=1)
 def _pycolmap() -> Any:
+    before = signal.getsignal(signal.SIGTERM)
     import pycolmap
 
+    # its import takes SIGTERM over, and would end a run that is asked to end with a stack trace
+    if before is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, before)
     pycolmap.logging.minloglevel = 2  # its INFO lines are no concern of our users
     return pycolmap
 
@@ -150,6 +159,7 @@ def triangulate(
     options: TriangulationOptions | None = None,
     *,
     num_threads: int = 1,
+    scratch: Path | None = None,
 ) -> TriangulatedPoints:
     """Triangulate verified matches between images of known pose; poses and cameras stay fixed.
 
@@ -160,10 +170,12 @@ def triangulate(
     ----------
     images : the mapping images.
     matches : (M, 2) keypoint rows for pairs (i, j) of indices into ``images``.
+    scratch : folder for COLMAP's database meanwhile, the system's unless given.
 
     Raises
     ------
     DataError : a match refers past the keypoints of its image.
+    OutputError : no room for the database.
     """
     options = options or TriangulationOptions()
     empty = np.zeros(0, dtype=np.int64)
@@ -182,10 +194,7 @@ def triangulate(
             )
     pycolmap = _pycolmap()
     offset = np.mean([image.cam_from_world.center() for image in images], axis=0)
-    with (
-        tempfile.TemporaryDirectory(prefix="megloc-colmap-") as folder,
-        _quiet_stderr(),
-    ):
+    with _database_folder(scratch, images, matches) as folder, _quiet_stderr():
         database_path = Path(folder) / "database.db"
         reconstruction = _write_database(pycolmap, database_path, images, matches, offset)
         pipeline = pycolmap.IncrementalPipelineOptions()
@@ -206,6 +215,39 @@ def triangulate(
             reconstruction, str(database_path), folder, str(result_path), True, pipeline
         )
     return _collect(result, offset)
+
+
+@contextmanager
+def _database_folder(
+    scratch: Path | None,
+    images: Sequence[MapImage],
+    matches: Mapping[tuple[int, int], NDArray[np.integer[Any]]],
+) -> Iterator[str]:
+    """A folder for a database; with too little room COLMAP would end the process, so it is asked.
+
+    Raises
+    ------
+    OutputError : too little room, or COLMAP could not write.
+    """
+    place = tempfile.gettempdir() if scratch is None else scratch
+    # matches are written twice, keypoints as float32; the rest is what SQLite and its journal take
+    needed = 16 * sum(map(len, matches.values())) + 8 * sum(len(i.keypoints_px) for i in images)
+    needed = 2 * needed + 2048 * (len(images) + len(matches)) + (1 << 20)
+    try:
+        Path(place).mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(
+            prefix=f".{owned_name()}", dir=place, ignore_cleanup_errors=True
+        ) as folder:
+            free = disk_usage(folder).free
+            if free < needed:
+                raise OutputError(
+                    f"{place}: {free >> 20} MB are free, COLMAP's database takes {needed >> 20} MB"
+                )
+            yield folder
+    except OSError as error:
+        raise output_error(place, error) from error
+    except RuntimeError as error:
+        raise OutputError(f"{place}: COLMAP cannot work here: {error}") from error
 
 
 def _write_database(

@@ -1,9 +1,10 @@
 """Files: read whole, written atomically, linked, kept as JSON; output folders and their claims.
 
-A file is written beside its final path under a name that no reader lists (``.<token>.tmp``) and
-then renamed over it: a killed run or a full disk leaves the old state or the new one. There is no
-fsync: after a power cut the file system decides, and a thousand small feature files would pay for
-it. Images are linked, never copied or changed.
+A file is written beside its final path under a name that no reader lists and then renamed over it:
+a killed run or a full disk leaves the old state or the new one. There is no fsync: after a power
+cut the file system decides, and a thousand small feature files would pay for it. Temporary names
+say which process they belong to, so that the next run can clear what a killed one has left. Images
+are linked, never copied or changed.
 """
 
 from __future__ import annotations
@@ -11,13 +12,17 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import errno
+import hashlib
 import json
 import os
+import re
 import secrets
 import shutil
+import socket
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, BinaryIO, NoReturn, TypeVar
 
@@ -25,7 +30,6 @@ from pydantic import BaseModel, ValidationError
 
 from megloc_kapture.errors import DataError, OutputError
 
-TEMPORARY_SUFFIX = ".tmp"
 MARKER = ".megloc"
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
@@ -74,6 +78,59 @@ def read_text(path: Path | str) -> str:
     return text
 
 
+# -------------------------------------------------------------------------------- temporary names
+
+
+def owned_name() -> str:
+    """The beginning of a temporary name, which says that it belongs to this process."""
+    return f"megloc-{_machine()}.{os.getpid()}-"
+
+
+@lru_cache(maxsize=1)
+def _machine() -> str:
+    """Short for the machine, or container: names of sockets may have 100 characters in all."""
+    return hashlib.sha256(socket.gethostname().encode()).hexdigest()[:6]
+
+
+def temporary_name() -> str:
+    """A temporary name that nothing has yet, hidden from all readers."""
+    return f".{owned_name()}{secrets.token_hex(8)}.tmp"
+
+
+def clear_leftovers(folder: Path) -> None:
+    """Remove what processes of this machine that live no more have left in a folder.
+
+    Known by :func:`owned_name` behind a dot or ``sem.``; what cannot be removed stays.
+    """
+    pattern = re.compile(rf"(\.|sem\.)?megloc-{_machine()}\.([0-9]+)-.*")
+    try:
+        names = os.listdir(folder)
+    except OSError:
+        return
+    for name in names:
+        if (found := pattern.fullmatch(name)) and not _lives(int(found[2])):
+            with contextlib.suppress(OSError):
+                remove(Path(folder) / name)
+
+
+def remove(path: Path) -> None:
+    """Remove a file, a link or a whole folder, where there is one; raises OSError."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def _lives(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:
+        pass  # somebody else's
+    return True
+
+
 # ------------------------------------------------------------------------------------ writing
 
 
@@ -95,7 +152,7 @@ def atomic_write(path: Path | str) -> Iterator[BinaryIO]:
     OutputError : the file cannot be written (disk full, permission, ...); names ``path``.
     """
     path = Path(path)
-    temporary = path.parent / f".{secrets.token_hex(8)}{TEMPORARY_SUFFIX}"
+    temporary = path.parent / temporary_name()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
@@ -148,7 +205,7 @@ def replace_directory(new: Path, path: Path) -> None:
         if _exchange(new, path):
             shutil.rmtree(new)
             return
-        old = path.with_name(f".{path.name}.{secrets.token_hex(8)}{TEMPORARY_SUFFIX}")
+        old = path.with_name(temporary_name())
         os.rename(path, old)
         os.rename(new, path)
         shutil.rmtree(old)
@@ -254,7 +311,8 @@ def staged_output(folder: Path, *, kind: str, force: bool = False) -> Iterator[P
     """A folder to write a command's output to; it gets to ``folder`` only when the block ends well.
 
     Files that are written anew replace old ones, one by one; others stay. When the
-    block raises, ``folder`` is as it was, and gone if it was not there.
+    block raises, ``folder`` is as it was, and gone if it was not there. What killed runs have left
+    in it is cleared.
 
     Raises
     ------
@@ -262,7 +320,8 @@ def staged_output(folder: Path, *, kind: str, force: bool = False) -> Iterator[P
     """
     folder = Path(folder)
     claim = claim_folder(folder, kind=kind, force=force)
-    staging = folder / f".partial-{secrets.token_hex(4)}"
+    clear_leftovers(folder)
+    staging = folder / temporary_name()
     try:
         try:
             staging.mkdir()

@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+import itertools
+import logging
 import multiprocessing
 import os
+import shutil
 import signal
 import sys
+import tempfile
 import threading
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, suppress
 from multiprocessing import forkserver
 from multiprocessing.connection import wait
+from multiprocessing.util import Finalize, get_temp_dir
+from pathlib import Path
 from typing import Any, Literal
 
 from megloc_kapture.errors import MeglocError, OptionError
+from megloc_kapture.io.files import clear_leftovers, output_error, owned_name
 
 ExecutorKind = Literal["inline", "processes"]
 
@@ -153,6 +161,14 @@ def single_threaded() -> Iterator[None]:
         _single_threads.leave()
 
 
+# ------------------------------------------------------------------------------------ processes
+
+_SEMAPHORES = Path("/dev/shm")  # where Linux keeps those that have a name
+_PATIENCE_S = 600.0  # of silence before a line says so
+
+_log = logging.getLogger(__name__)
+
+
 def _start_worker() -> None:
     import cv2
     import numpy  # noqa: F401  its thread pool must be there to be limited
@@ -163,19 +179,38 @@ def _start_worker() -> None:
 
 
 @contextmanager
-def _deaf_to_interrupts() -> Iterator[None]:
-    """Processes started in the block ignore Ctrl-C, and so do those that they start.
+def _deaf_to(*signals: signal.Signals) -> Iterator[None]:
+    """This process ignores signals in the block, and so do for good those that are started in it.
 
-    A terminal sends it to every process; the run itself ends its workers.
+    A terminal sends Ctrl-C to every process; the run itself ends its workers.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    before = {one: signal.signal(one, signal.SIG_IGN) for one in signals}
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for one, handler in before.items():
+            signal.signal(one, handler)
+
+
+@contextmanager
+def _signals_held() -> Iterator[None]:
+    """Ctrl-C and SIGTERM have their effect at the end of the block."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    met: list[int] = []
+    held = (signal.SIGINT, signal.SIGTERM)
+    before = {one: signal.signal(one, lambda number, _: met.append(number)) for one in held}
+    try:
+        yield
+    finally:
+        for one, handler in before.items():
+            signal.signal(one, handler)
+        for number in met[:1]:
+            signal.raise_signal(number)
 
 
 def _end_with_parent() -> None:
@@ -186,13 +221,32 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
+def _name_as_ours() -> None:
+    """Let what multiprocessing leaves behind in a killed run say whose it is; clear others'.
+
+    That is a folder with a socket, and on Linux semaphores, which have names.
+    """
+    clear_leftovers(Path(tempfile.gettempdir()))
+    clear_leftovers(_SEMAPHORES)
+    settings: dict[str, Any] = multiprocessing.current_process()._config  # type: ignore[attr-defined]
+    if _SEMAPHORES.is_dir():
+        settings["semprefix"] = f"/{owned_name()}"
+    if settings.get("tempdir") is None:
+        place = settings["tempdir"] = tempfile.mkdtemp(prefix=owned_name())
+        # as multiprocessing does with a folder of its own: behind all else that ends
+        Finalize(None, shutil.rmtree, (place,), {"ignore_errors": True}, exitpriority=-100)
+
+
 @contextmanager
 def open_executor(kind: ExecutorKind, workers: int | None = None) -> Iterator[Executor | None]:
     """The executor for a run; None stands for inline.
 
+    A block that ends in an exception does not wait for what its workers are doing: they are killed.
+
     Raises
     ------
     OptionError : no worker at all.
+    OutputError : no room in the temporary folder, where processes talk to each other.
     MeglocError : a worker process was killed while the block ran.
     """
     count = available_cores() if workers is None else workers
@@ -204,14 +258,117 @@ def open_executor(kind: ExecutorKind, workers: int | None = None) -> Iterator[Ex
     # never fork: BLAS and OpenCV have threads by now
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["megloc_kapture.stages.query_poses"])
-    with _deaf_to_interrupts():
-        forkserver.ensure_running()
-    pool = ProcessPoolExecutor(count, mp_context=context, initializer=_start_worker)
+    try:
+        _name_as_ours()
+        with _deaf_to(signal.SIGINT):
+            forkserver.ensure_running()
+        pool = _WatchedPool(count, mp_context=context, initializer=_start_worker)
+    except OSError as error:
+        raise output_error(tempfile.gettempdir(), error) from error
     try:
         yield pool
-    except BrokenProcessPool as error:
-        raise MeglocError(
-            "a worker process died, perhaps for want of memory; try fewer with --workers"
-        ) from error
+    except BaseException as error:
+        with _deaf_to(signal.SIGINT, signal.SIGTERM):
+            pool.kill()
+            pool.shutdown()
+        if isinstance(error, BrokenProcessPool):
+            raise MeglocError(
+                "a worker process died, perhaps for want of memory; try fewer with --workers"
+            ) from error
+        raise
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+class _WatchedPool(ProcessPoolExecutor):
+    """Worker processes, with a line in the log when none of them gives a result for long.
+
+    A worker that was stopped, or does not end, is not killed: who stopped it may let it go on.
+    """
+
+    def __init__(self, count: int, **settings: Any) -> None:
+        super().__init__(count, **settings)
+        self._notes = Path(tempfile.mkdtemp(prefix="notes-", dir=get_temp_dir()))
+        self._tasks: dict[int, Any] = {}  # items under way or waiting, by number
+        self._numbers = itertools.count()
+        self._finished = 0
+        self._over = threading.Event()
+        threading.Thread(target=self._watch, daemon=True).start()
+
+    def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        number = next(self._numbers)
+        # the first starts the workers: one that is half started could not be killed
+        with nullcontext() if number else _signals_held():
+            future = super().submit(_noted, self._notes, number, function, *args, **kwargs)
+        self._tasks[number] = args[0] if args else function
+        future.add_done_callback(lambda _: self._end(number))
+        return future
+
+    def kill(self) -> None:
+        """End all workers at once, whatever they are doing."""
+        for pid in list(self._processes or ()):
+            with suppress(OSError):  # Process.kill does nothing where the fork server has gone
+                os.kill(pid, signal.SIGKILL)
+        # or the thread that reads results would wait for the rest of one for ever
+        if self._result_queue is not None:
+            self._result_queue._writer.close()  # type: ignore[attr-defined]
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        self._over.set()
+        super().shutdown(wait=wait, cancel_futures=cancel_futures)
+        shutil.rmtree(self._notes, ignore_errors=True)
+
+    def _end(self, number: int) -> None:
+        self._tasks.pop(number, None)
+        self._finished += 1
+
+    def _watch(self) -> None:
+        patience_s, before = _PATIENCE_S, -1
+        silent_since = time.monotonic()
+        while not self._over.wait(min(_PATIENCE_S / 10, 1.0)):
+            if self._finished != before or not self._tasks:
+                patience_s, before = _PATIENCE_S, self._finished
+                silent_since = time.monotonic()
+            elif time.monotonic() - silent_since > patience_s:
+                patience_s *= 2
+                minutes = (time.monotonic() - silent_since) / 60
+                _log.warning("no result for %.3g minutes: %s", minutes, self._silent())
+
+    def _silent(self) -> str:
+        """What workers are at, and which of them; one that was stopped may keep the others idle."""
+        told = []
+        for pid in sorted(self._processes or ()):
+            item = None
+            with suppress(OSError, ValueError):
+                item = self._tasks.get(int((self._notes / str(pid)).read_text()))
+            at = "" if item is None else f" is at {described(item)}"
+            if at or _is_stopped(pid):
+                stopped = " was stopped (kill -CONT lets it go on)" if _is_stopped(pid) else ""
+                told.append(f"process {pid}{stopped}{' and' if at and stopped else ''}{at}")
+        return "; ".join(told) or f"{len(self._tasks)} items wait for a process"
+
+
+def _noted(
+    notes: Path, number: int, function: Callable[..., Any], /, *args: Any, **kwargs: Any
+) -> Any:
+    """Call a function in a worker, and note which task it is at."""
+    with suppress(OSError):  # a full disk: only the watchdog would read it
+        (notes / str(os.getpid())).write_text(str(number))
+    return function(*args, **kwargs)
+
+
+def _is_stopped(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] in "Tt"
+    except (OSError, IndexError):
+        return False
+
+
+def described(item: Any) -> str:
+    """An item of work in a few words: the image or images it is of, where it says so."""
+    for name in ("image", "images", "unit", "depth", "name", "path"):
+        found = None if isinstance(item, Path) else getattr(item, name, None)
+        if found is not None and not callable(found):
+            return described(found)
+    text = item if isinstance(item, str) else repr(item)
+    return text if len(text) <= 80 else f"{text[:77]}..."

@@ -11,7 +11,13 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from megloc_kapture.errors import OutputError
-from megloc_kapture.io.files import claim_folder, output_error, replace_directory
+from megloc_kapture.io.files import (
+    claim_folder,
+    clear_leftovers,
+    output_error,
+    remove,
+    replace_directory,
+)
 from megloc_kapture.io.kapture import KaptureFolder
 
 PARTIAL = ".partial"
@@ -31,6 +37,9 @@ class Workspace:
         self.root = Path(root).absolute()
         self._claim = claim_folder(self.root, kind="workspace", force=force)
         self._published = False
+        # open files, so that no other file gets their numbers
+        self._lock: int | None = None
+        self._staged: int | None = None
 
     def path(self, relative: str) -> Path:
         """A path below the workspace."""
@@ -53,8 +62,8 @@ class Workspace:
     def lock(self) -> Iterator[None]:
         """Hold the workspace against a second run; the system lets go when the process dies.
 
-        A workspace that no stage has been run in by the end of the block is taken away again: a
-        run that is refused, or a dry run, leaves nothing behind.
+        What killed runs have left is cleared. A workspace that no stage has been run in by the end
+        of the block is taken away again: a refused run, or a dry run, leaves nothing behind.
         """
         path = self.root / LOCK
         try:
@@ -64,18 +73,24 @@ class Workspace:
         try:
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                # a run that has just taken its unused workspace away holds nothing any more
-                held = os.path.samestat(os.fstat(handle), os.stat(path))
             except OSError:
                 held = False
+            else:
+                # a run that has just taken its unused workspace away holds nothing any more
+                held = _is_still(handle, path)
             if not held:
                 raise OutputError(
                     f"{self.root}: another run is using this workspace; wait for it or give "
                     "another --workspace"
                 )
+            self._lock = handle
+            shutil.rmtree(self.root / PARTIAL, ignore_errors=True)
+            for folder in (self.root, self.root / "stages"):
+                clear_leftovers(folder)
             try:
                 yield
             finally:
+                self._lock = None
                 self._release_if_unused()
         finally:
             os.close(handle)
@@ -83,7 +98,8 @@ class Workspace:
     def _release_if_unused(self) -> None:
         stages = self.root / "stages"
         with contextlib.suppress(OSError):
-            if self._published or self.manifest_paths():
+            gone = not (self.root / LOCK).exists()  # what is there has come after the deletion
+            if not gone and (self._published or self.manifest_paths()):
                 return
             for path in (self.path(HASHES), self.root / LOCK):
                 path.unlink(missing_ok=True)
@@ -94,21 +110,40 @@ class Workspace:
 
     @contextmanager
     def staging(self, stage: str) -> Iterator[Path]:
-        """A fresh folder to write a stage's output into; removed when the block ends."""
+        """A fresh folder to write a stage's output into; removed when the block ends.
+
+        Raises
+        ------
+        OutputError : it cannot be made.
+        """
         place = self.root / PARTIAL / stage
         try:
             if place.exists():
                 shutil.rmtree(place)
             place.mkdir(parents=True)
+            self._staged = os.open(place, os.O_RDONLY)
         except OSError as error:
             raise output_error(place, error) from error
         try:
             yield place
         finally:
+            os.close(self._staged)
+            self._staged = None
             shutil.rmtree(place, ignore_errors=True)
 
     def publish(self, staging: Path, outputs: tuple[str, ...]) -> None:
-        """Move what a stage wrote to its places; outputs it did not write are taken away."""
+        """Move what a stage wrote to its places; outputs it did not write are taken away.
+
+        Raises
+        ------
+        OutputError : cannot be written; or somebody has taken the workspace away meanwhile.
+        """
+        for opened, path in ((self._staged, staging), (self._lock, self.root / LOCK)):
+            if opened is not None and not _is_still(opened, path):
+                raise OutputError(
+                    f"{self.root}: was deleted or moved while a run was working in it; what the "
+                    "last stage made is lost"
+                )
         self._published = True
         for output in outputs:
             new, place = staging / output, self.root / output
@@ -119,7 +154,7 @@ class Workspace:
                 elif new.exists():
                     os.replace(new, place)
                 else:
-                    _remove(place)
+                    remove(place)
             except OSError as error:
                 raise output_error(place, error) from error
 
@@ -128,13 +163,14 @@ class Workspace:
         for output in outputs:
             place = self.root / output
             try:
-                _remove(place)
+                remove(place)
             except OSError as error:
                 raise output_error(place, error) from error
 
 
-def _remove(place: Path) -> None:
-    if place.is_dir() and not place.is_symlink():
-        shutil.rmtree(place)
-    else:
-        place.unlink(missing_ok=True)
+def _is_still(opened: int, path: Path) -> bool:
+    """Whether a path leads to the file or folder that is open."""
+    try:
+        return os.path.samestat(os.fstat(opened), os.stat(path))
+    except OSError:
+        return False

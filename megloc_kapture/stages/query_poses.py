@@ -242,6 +242,7 @@ def localize_from_matches(
     *,
     restrictions: Restrictions = UNRESTRICTED,
     work: Work = HERE,
+    scratch: Path | None = None,
 ) -> Iterator[tuple[str, Pose | Failure]]:
     """Localize every query from stored matches: image and result; in order of units' names.
 
@@ -250,6 +251,7 @@ def localize_from_matches(
     local_types : keypoints types whose matches are used, together. The map may know a guided
         pyramid's type by the type it was made of, whose keypoints come first in it.
     restrictions : the coordinate frames of the map's images, which are never mixed.
+    scratch : folder for the map's index meanwhile, the system's unless given.
 
     Raises
     ------
@@ -261,7 +263,8 @@ def localize_from_matches(
     candidates = {name: tuple(images) for name, images in iterate_candidates(pairs)}
     units = query_units(query.read(), rigs=options.rigs)
     with shared_index(
-        {name: index_map(map_folder, _type_in_map(map_folder, name)) for name in local_types}
+        {name: index_map(map_folder, _type_in_map(map_folder, name)) for name in local_types},
+        scratch,
     ) as indices:
         jobs = []
         for unit in units:
@@ -324,6 +327,7 @@ class LocalizeQueries(PipelineStage):
             options,
             restrictions=work.restrictions(),
             work=work,
+            scratch=work.out,
         )
         return write_localized(
             work.out / self.layout.poses,

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import focal_px, project
-from megloc_kapture.io.files import atomic_write, output_error, write_bytes
+from megloc_kapture.io.files import atomic_write, output_error, owned_name, write_bytes
 from megloc_kapture.io.kapture import KaptureFolder, Observations
 from megloc_kapture.io.kapture.points import read_point_covariances
 from megloc_kapture.localization.map_index import MapIndex
@@ -128,19 +128,28 @@ def open_index(folder: Path) -> MapIndex:
 
 
 @contextmanager
-def shared_index(indices: Mapping[str, MapIndex]) -> Iterator[dict[str, Path]]:
+def shared_index(
+    indices: Mapping[str, MapIndex], scratch: Path | None = None
+) -> Iterator[dict[str, Path]]:
     """Indices by keypoints type as folders for :func:`open_index`; gone after the block.
 
     Who has one open by then may go on using it.
 
+    Parameters
+    ----------
+    scratch : folder for them meanwhile, the system's unless given.
+
     Raises
     ------
-    OutputError : the temporary folder cannot be written to.
+    OutputError : the folder cannot be written to.
     """
+    where = tempfile.gettempdir() if scratch is None else scratch
     try:
-        place = tempfile.TemporaryDirectory(prefix="megloc-index-", ignore_cleanup_errors=True)
+        place = tempfile.TemporaryDirectory(
+            prefix=f".{owned_name()}", dir=where, ignore_cleanup_errors=True
+        )
     except OSError as error:
-        raise output_error(tempfile.gettempdir(), error) from error
+        raise output_error(where, error) from error
     with place as name:
         folders = {}
         for number, (keypoints_type, index) in enumerate(indices.items()):

@@ -23,6 +23,7 @@ from megloc_kapture.io.kapture import (
     write_sensors,
 )
 from megloc_kapture.io.kapture.features import SUFFIX, ArrayKind
+from megloc_kapture.io.kapture.matches import MatchesReader
 from megloc_kapture.matching.guided_pyramid import base_type
 
 
@@ -68,14 +69,14 @@ def triangulate_map(
     errors_px = [np.zeros(0)]
     observations = {}
     by_type: dict[str, float] = {}
-    for type_name in types:
-        verified = _verified(matches, type_name, images, asked)
-        keypoints = mapping.keypoints(type_name)
+    of_type = {name: (matches.matches(name), mapping.keypoints(name)) for name in types}
+    for type_name, (reader, keypoints) in of_type.items():
+        verified = _verified(reader, images, asked)
         map_images = [
             MapImage(image, data.camera_of(image), poses[image], keypoints.read(image)[:, :2])
             for image in images
         ]
-        found = triangulate(map_images, verified, options, num_threads=num_threads)
+        found = triangulate(map_images, verified, options, num_threads=num_threads, scratch=output)
         observations[type_name] = Observations(
             keypoints_type=type_name,
             image_names=tuple(images),
@@ -110,14 +111,12 @@ def triangulate_map(
 
 
 def _verified(
-    matches: KaptureFolder,
-    type_name: str,
+    reader: MatchesReader,
     images: Sequence[str],
     asked: set[tuple[str, ...]] | None,
 ) -> dict[tuple[int, int], NDArray[np.int64]]:
     """Matches by pairs of rows of ``images``, those of the pairs asked for (first name first)."""
     row_of = {image: row for row, image in enumerate(images)}
-    reader = matches.matches(type_name)
     verified = {}
     for a, b in reader.pairs:
         if a in row_of and b in row_of and (asked is None or (a, b) in asked):

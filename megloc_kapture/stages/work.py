@@ -49,9 +49,11 @@ def ordered_map(
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()
-    finally:
+    except GeneratorExit:
+        # not on errors: a pool that breaks stumbles over futures that are cancelled meanwhile
         for future in waiting:
             future.cancel()
+        raise
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,8 @@ def small_disk(tmp_path: Path) -> Iterator[Callable[..., Path]]:
         return place
 
     yield make
-    subprocess.run(["umount", str(place)], check=False, capture_output=True)
+    # lazily: this process may still have a map's index mapped
+    subprocess.run(["umount", "-l", str(place)], check=False, capture_output=True)
 
 
 def test_eval_stops_cleanly_and_goes_on(

@@ -7,8 +7,9 @@ import random
 import signal
 import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -19,8 +20,40 @@ Contents = Callable[[Path], dict[str, bytes]]
 DATED = ("stages/", "timing.csv")
 
 
+ON = "run the same command again to go on"
+
+
 def _obey_interrupts() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def left_behind(workspace: Path, *pids: int) -> list[Path]:
+    """What runs have left: temporary files in the workspace and elsewhere, semaphores."""
+    temporary = list(Path(os.environ["TMPDIR"]).iterdir())
+    hidden = [path for path in workspace.rglob(".*") if path.name.startswith(".megloc-")]
+    staged = list((workspace / ".partial").glob("*"))
+    named = [Path("/dev/shm").glob(f"sem.megloc-*.{pid}-*") for pid in pids]
+    return [*temporary, *hidden, *staged, *(path for found in named for path in found)]
+
+
+def wait_until_it_hears(run: subprocess.Popen[str]) -> None:
+    """Wait for its handler of SIGTERM: what the interpreter does before is not ours."""
+    while not int(_status(run.pid, "SigCgt"), 16) & 1 << (signal.SIGTERM - 1):
+        assert run.poll() is None
+        time.sleep(0.001)
+
+
+def _status(pid: int, key: str) -> str:
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    return next(line.partition(":")[2] for line in lines if line.startswith(key)).strip()
+
+
+@pytest.fixture(autouse=True)
+def temporary(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The temporary folder of all runs of a test; sockets' paths may have 100 characters."""
+    with tempfile.TemporaryDirectory() as folder:
+        monkeypatch.setenv("TMPDIR", folder)
+        yield Path(folder)
 
 
 def start(scene: Path, workspace: Path) -> subprocess.Popen[str]:
@@ -92,10 +125,43 @@ def test_a_run_ended_at_the_keyboard_says_how_to_go_on(scene: Path, tmp_path: Pa
     assert "megloc: interrupted; run the same command again to go on" in told
     assert run.wait() == 130
     assert not (tmp_path / "run" / "local_features").exists()
-    assert list((tmp_path / "run" / ".partial").iterdir()) == []
+    assert left_behind(tmp_path / "run", run.pid) == []
 
 
-@pytest.mark.parametrize("kills", [1, pytest.param(5, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("stage", ["local_features", "mapping_matches", "localization"])
+@pytest.mark.parametrize("group", [True, False], ids=["of all processes", "of the run alone"])
+def test_a_run_that_is_asked_to_end_does(
+    scene: Path, tmp_path: Path, stage: str, group: bool
+) -> None:
+    run = start(scene, tmp_path / "run")
+    wait_for(run, f"{stage}: ")
+    (os.killpg if group else os.kill)(run.pid, signal.SIGTERM)
+    assert run.stderr is not None
+    assert run.stderr.read().splitlines()[-1] == f"megloc: terminated; {ON}"
+    assert run.wait() == 143
+    assert left_behind(tmp_path / "run", run.pid) == []
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
+@pytest.mark.parametrize("after_s", [0.0, 0.1, 0.3, 0.6, 1.0, 1.5])
+def test_ctrl_c_twice_ends_a_run_in_one_line_from_its_first_moment_on(
+    scene: Path, tmp_path: Path, after_s: float
+) -> None:
+    run = start(scene, tmp_path / "run")
+    wait_until_it_hears(run)
+    time.sleep(after_s)
+    os.killpg(run.pid, signal.SIGINT)
+    time.sleep(0.02)
+    os.killpg(run.pid, signal.SIGINT)
+    _, told = run.communicate(timeout=60)  # it hung for ever
+    assert run.returncode == 130
+    assert told.splitlines()[-1] == f"megloc: interrupted; {ON}"
+    assert "Traceback" not in told
+    assert "resource_tracker" not in told
+    assert left_behind(tmp_path / "run", run.pid) == []
+
+
+@pytest.mark.parametrize("kills", [1, pytest.param(6, marks=pytest.mark.slow)])
 def test_runs_killed_at_random_moments_end_in_the_same_bytes(
     scene: Path, finished: Path, tmp_path: Path, contents: Contents, kills: int
 ) -> None:
@@ -105,18 +171,20 @@ def test_runs_killed_at_random_moments_end_in_the_same_bytes(
     order = {stage: (finished / "stages" / f"{stage}.json").stat().st_mtime_ns for stage in stages}
     unlucky = sorted(draw.sample(sorted(stages), kills), key=order.__getitem__)
     workspace = tmp_path / "run"
-    ends = []
+    ends, pids = [], []
     for stage in unlucky:
         run = start(scene, workspace)
         wait_for(run, f"{stage}: ")
         time.sleep(draw.uniform(0.0, 0.05))
         os.killpg(run.pid, signal.SIGKILL)
         ends.append(run.wait())
+        pids.append(run.pid)
     # the last stage may have been faster
     assert ends.count(-signal.SIGKILL) >= kills - 1
     last = start(scene, workspace)
     _, told = last.communicate()
     assert last.returncode == 0, told
+    assert left_behind(workspace, last.pid, *pids) == []
     expected, found = contents(finished), contents(workspace)
     for dated in DATED:
         expected = {n: c for n, c in expected.items() if not n.startswith(dated)}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from itertools import combinations
@@ -352,3 +353,20 @@ def test_nothing_is_written_over(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("no folder")
     with pytest.raises(OutputError, match="cannot be written"):
         write_feature_database(tmp_path / "file" / "b.db", IMAGES)
+
+
+def test_a_disk_without_room_for_the_database_is_said_before_colmap_meets_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, images, _ = scene(CAMERAS["PINHOLE"])
+    asked = []
+
+    def usage(path: str) -> Any:
+        asked.append(Path(path).parent)
+        return shutil.disk_usage(path)._replace(free=1 << 19)
+
+    monkeypatch.setattr("megloc_kapture.io.colmap.disk_usage", usage)
+    with pytest.raises(OutputError, match="0 MB are free, COLMAP's database takes 1 MB"):
+        triangulate(images, {}, scratch=tmp_path / "map")
+    assert asked == [tmp_path / "map"]
+    assert list((tmp_path / "map").iterdir()) == []

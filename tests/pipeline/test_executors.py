@@ -3,24 +3,44 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from megloc_kapture.errors import MeglocError, OptionError
+from megloc_kapture.io.files import owned_name
+from megloc_kapture.pipeline import executors
 from megloc_kapture.pipeline.executors import available_cores, open_executor, single_threaded
 
 
 def threads() -> set[int]:
     """Numbers of threads of the loaded libraries that have a pool."""
     return {pool["num_threads"] for pool in threadpool_info()}
+
+
+@dataclass(frozen=True)
+class Item:
+    """As stages have them."""
+
+    image: str
+
+
+def _until(item: Item, go: Path) -> str:
+    while not go.exists():
+        time.sleep(0.05)
+    return item.image
 
 
 def test_inline_and_one_worker_are_no_executor() -> None:
@@ -119,6 +139,69 @@ def test_an_error_in_a_worker_keeps_its_kind() -> None:
         assert executor is not None
         with pytest.raises(ValueError, match="invalid literal"):
             executor.submit(int, "x").result()
+
+
+def test_an_error_does_not_wait_for_what_workers_are_at(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="of the block"):  # noqa: SIM117
+        with open_executor("processes", 2) as executor:
+            assert executor is not None
+            pids = {executor.submit(os.getpid).result()}
+            executor.submit(time.sleep, 600)
+            raise ValueError("of the block")
+    assert not any(Path(f"/proc/{pid}").exists() for pid in pids)
+
+
+def wait_for(log: pytest.LogCaptureFixture, pattern: str) -> None:
+    patience = time.monotonic() + 60
+    while not re.search(pattern, log.text):
+        assert time.monotonic() < patience, log.text
+        time.sleep(0.05)
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
+def test_a_silent_worker_is_named_and_so_is_a_stopped_one(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(executors, "_PATIENCE_S", 0.3)
+    with open_executor("processes", 2) as executor:
+        assert executor is not None
+        # it may be holding the lock of the queue: then the other gets nothing to do either
+        pid = executor.submit(os.getpid).result()
+        os.kill(pid, signal.SIGSTOP)
+        slow = [executor.submit(_until, Item(f"{k}.jpg"), tmp_path / "go") for k in range(2)]
+        wait_for(caplog, rf"no result for .* minutes: .*process {pid} was stopped \(kill -CONT")
+        os.kill(pid, signal.SIGCONT)
+        wait_for(caplog, r"minutes: process \d+ is at [01].jpg; process \d+ is at [01].jpg\n")
+        assert len(caplog.records) < 12  # the longer it lasts, the less often
+        (tmp_path / "go").touch()
+        assert [future.result() for future in slow] == ["0.jpg", "1.jpg"]
+
+
+@pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="semaphores are no files")
+def test_what_the_dead_have_left_is_cleared_and_nothing_else() -> None:
+    dead = subprocess.Popen(["true"])
+    dead.wait()
+    host = owned_name().removeprefix("megloc-").partition(".")[0]
+    shared, temporary = Path("/dev/shm"), Path(tempfile.gettempdir())
+    gone = [
+        shared / f"sem.megloc-{host}.{dead.pid}-x",
+        temporary / f"megloc-{host}.{dead.pid}-x",
+        temporary / f".megloc-{host}.{dead.pid}-x",
+    ]
+    stay = [
+        shared / f"sem.megloc-{host}.{os.getppid()}-x",
+        temporary / f"megloc-00000x.{dead.pid}-x",
+        temporary / f"megloc-{host}.notes",
+    ]
+    try:
+        for path in (*gone, *stay):
+            path.touch()
+        with open_executor("processes", 2):
+            assert not any(path.exists() for path in gone)
+            assert all(path.exists() for path in stay)
+    finally:
+        for path in (*gone, *stay):
+            path.unlink(missing_ok=True)
 
 
 # ------------------------------------------------------------------ one thread in every thread

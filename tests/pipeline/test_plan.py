@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import DataError, OptionError, OutputError
 from megloc_kapture.pipeline.plan import StageReport, all_kept, run_plan
 from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.stages.stage import Hashes, Stage, StageWork
@@ -218,6 +219,26 @@ def test_rests_of_a_killed_run_do_not_get_into_the_output(kitchen: Kitchen) -> N
     (rest / "rest.txt").write_text("half")
     kitchen.cook()
     assert [p.name for p in kitchen.workspace.path("b").iterdir()] == ["b.txt"]
+
+
+@pytest.mark.parametrize("writes_on", [True, False])
+def test_a_workspace_that_is_deleted_while_a_stage_runs_is_an_error(
+    kitchen: Kitchen, writes_on: bool
+) -> None:
+    def leave(out: Path) -> Mapping[str, float]:
+        shutil.rmtree(kitchen.workspace.root)
+        if writes_on:  # as every writer makes the folders of its files
+            out.mkdir(parents=True)
+            (out / "d.txt").write_text("d")
+        return {}
+
+    stages = [*kitchen.stages(), Step("d", 1, {}, ("c.txt",), ("d.txt",), leave, {})]
+    with (
+        pytest.raises(OutputError, match="was deleted or moved while a run was working in it"),
+        kitchen.workspace.lock(),
+    ):
+        run_plan(stages, kitchen.workspace)
+    assert not kitchen.workspace.root.exists()
 
 
 def test_first_and_last(kitchen: Kitchen) -> None:
