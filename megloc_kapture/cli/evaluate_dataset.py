@@ -76,6 +76,9 @@ class Eval(Deciding, Working, Common):
     """Stop behind this stage."""
     dry_run: bool = False
     """Say which stages would run, and why."""
+    verify: bool = False
+    """Compare the content of all files in the workspace with what stages wrote, not only their
+    sizes and times; a stage whose files have changed runs again."""
     explain: bool = False
     """List the steps of the paper, which of them this run does and why; nothing is run."""
     ablate: bool = False
@@ -126,6 +129,7 @@ class Eval(Deciding, Working, Common):
                 first=self.from_stage,
                 last=self.until,
                 dry_run=self.dry_run,
+                verify=self.verify,
                 on_start=lambda name, why: console.say(f"{name}: {why}"),
                 on_report=lambda report: console.say(describe(report)),
             )

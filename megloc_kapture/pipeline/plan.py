@@ -14,6 +14,7 @@ from megloc_kapture.evaluation.provenance import package_versions
 from megloc_kapture.io.files import write_bytes, write_json_model
 from megloc_kapture.pipeline.manifests import FileHashes, Manifest, fingerprint, read_manifest
 from megloc_kapture.pipeline.workspace import HASHES, Workspace
+from megloc_kapture.pipeline.written_files import changed_file, remember_files
 from megloc_kapture.stages.stage import Stage, StageWork, is_below
 from megloc_kapture.stages.work import HERE, Work
 
@@ -39,6 +40,7 @@ def run_plan(
     first: str | None = None,
     last: str | None = None,
     dry_run: bool = False,
+    verify: bool = False,
     on_start: Callable[[str, str], None] = lambda name, why: None,
     on_report: Callable[[StageReport], None] = lambda report: None,
 ) -> list[StageReport]:
@@ -52,6 +54,8 @@ def run_plan(
         not, is run again in any case.
     last : stages behind it are left out.
     dry_run : say what would run, run nothing.
+    verify : compare the content of all files that stages wrote with what it was then; otherwise
+        their sizes and times alone.
 
     Raises
     ------
@@ -81,13 +85,16 @@ def run_plan(
         mark = fingerprint(stage.name, stage.version, settings, inputs)
         manifest = read_manifest(workspace.manifest_path(stage.name))
         if number < start and manifest is not None:
-            fingerprints[stage.name] = manifest.fingerprint
-            report = StageReport(stage.name, "skipped", manifest.seconds, manifest.counts, "--from")
+            why = changed_file(workspace.files_path(stage.name), workspace.root, verify=verify)
+            # what follows is made of something else than the stage wrote, and has to know that
+            fingerprints[stage.name] = f"{manifest.fingerprint}{', changed' if why else ''}"
+            report = StageReport(stage.name, "skipped", manifest.seconds, manifest.counts, why)
             reports.append(report)
             on_report(report)
             continue
         fingerprints[stage.name] = mark
         why = asked.get(stage.name) or _why(stage, manifest, mark, settings, inputs, workspace)
+        why = why or changed_file(workspace.files_path(stage.name), workspace.root, verify=verify)
         if not why and manifest is not None:
             report = StageReport(stage.name, "kept", manifest.seconds, manifest.counts, "")
         elif dry_run:
@@ -230,6 +237,7 @@ def _run(
         written = tuple(o for o in stage.writes if (folder / o).exists())
         workspace.publish(folder, tuple(stage.writes))
         workspace.remove(former_outputs)
+    remember_files(workspace.files_path(stage.name), workspace.root, written)
     seconds = time.perf_counter() - clock
     manifest = Manifest(
         stage=stage.name,
@@ -257,7 +265,7 @@ def describe(report: StageReport) -> str:
     if report.state == "kept":
         return f"{report.name}: up to date"
     if report.state == "skipped":
-        return f"{report.name}: taken as it is"
+        return f"{report.name}: taken as it is{f'; {report.why}' if report.why else ''}"
     if report.state == "pending":
         return f"{report.name}: would run ({report.why})"
     counts = ", ".join(

@@ -49,6 +49,10 @@ class Workspace:
         """Where the manifest of a stage stands."""
         return self.root / "stages" / f"{stage}.json"
 
+    def files_path(self, stage: str) -> Path:
+        """Where the files that a stage wrote are listed."""
+        return self.root / "stages" / f"{stage}.files"
+
     def manifest_paths(self) -> list[Path]:
         """The manifests that there are."""
         folder = self.root / "stages"
@@ -84,7 +88,9 @@ class Workspace:
                     "another --workspace"
                 )
             self._lock = handle
-            shutil.rmtree(self.root / PARTIAL, ignore_errors=True)
+            for left in (self.root / PARTIAL).glob("*"):
+                with contextlib.suppress(OSError):
+                    remove(left)
             for folder in (self.root, self.root / "stages"):
                 clear_leftovers(folder)
             try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -491,3 +492,22 @@ def test_equal_names_in_map_and_query(
         np.testing.assert_allclose(pose, np.array(expected[old].split(), float), atol=2e-2)
     rows = json.loads((run / "evaluation" / "recall.json").read_text())["rows"]
     assert [at["recall"] for at in rows[-1]["recall"]] == [1.0] * 4
+
+
+def test_verify_finds_what_size_and_time_do_not_show(
+    evaluate: Any, scene: Path, workspace: Path, contents: Any
+) -> None:
+    before = contents(workspace)
+    spoilt = next((workspace / "local_features").rglob("*.desc"))
+    time = spoilt.stat()
+    spoilt.unlink()  # a map may have it by another name
+    name = str(spoilt.relative_to(workspace))
+    spoilt.write_bytes(before[name][::-1])
+    os.utime(spoilt, ns=(time.st_atime_ns, time.st_mtime_ns))
+    assert "nothing to do" in evaluate(scene, workspace).err
+    done = evaluate(scene, workspace, "--verify")
+    assert f"local_features: {name} was changed since it was written" in done.err
+    assert [stage for stage, state in states(done.err).items() if state != "up to date"] == [
+        "local_features"
+    ]
+    assert (workspace / name).read_bytes() == before[name]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import os
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -11,7 +13,7 @@ from typing import Any
 import pytest
 
 from megloc_kapture.errors import DataError, OptionError, OutputError
-from megloc_kapture.pipeline.plan import StageReport, all_kept, run_plan
+from megloc_kapture.pipeline.plan import StageReport, all_kept, describe, run_plan
 from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.stages.stage import Hashes, Stage, StageWork
 from megloc_kapture.values import Options
@@ -221,6 +223,64 @@ def test_rests_of_a_killed_run_do_not_get_into_the_output(kitchen: Kitchen) -> N
     assert [p.name for p in kitchen.workspace.path("b").iterdir()] == ["b.txt"]
 
 
+def spoil(path: Path, content: str, *, same_time: bool) -> None:
+    before = path.stat()
+    path.write_text(content)
+    if same_time:
+        os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+
+
+@pytest.mark.parametrize(
+    ("content", "same_time", "verify"),
+    [("a", True, False), ("AB", False, False), ("AB", True, True)],
+    ids=["cut", "changed", "changed and dated back"],
+)
+def test_a_stage_whose_file_was_changed_runs_again(
+    kitchen: Kitchen, content: str, same_time: bool, verify: bool
+) -> None:
+    kitchen.cook()
+    spoil(kitchen.workspace.path("b/b.txt"), content, same_time=same_time)
+    if verify:
+        assert all_kept(kitchen.cook())
+    reports = kitchen.cook(verify=verify)
+    assert reports[1].why == "b/b.txt was changed since it was written"
+    assert [report.state for report in reports] == ["kept", "run", "kept"]
+    assert kitchen.workspace.path("b/b.txt").read_text() == "ab"
+    assert all_kept(kitchen.cook(verify=True))
+
+
+def test_a_stage_whose_file_is_gone_runs_again(kitchen: Kitchen) -> None:
+    kitchen.cook()
+    kitchen.workspace.path("b/b.txt").unlink()
+    assert [report.why for report in kitchen.cook()] == ["", "b/b.txt is gone", ""]
+    assert all_kept(kitchen.cook())
+
+
+def test_a_copied_workspace_and_one_without_records_are_kept(kitchen: Kitchen) -> None:
+    kitchen.cook()
+    os.utime(kitchen.workspace.path("b/b.txt"), ns=(1000, 1000))
+    assert all_kept(kitchen.cook())
+    record = json.loads(kitchen.workspace.files_path("b").read_text())
+    assert record["b/b.txt"][:2] == [2, 1000]  # it is hashed once
+    kitchen.workspace.files_path("c").unlink()
+    kitchen.workspace.files_path("b").write_text("[1]")
+    assert all_kept(kitchen.cook(verify=True))
+
+
+def test_what_follows_a_changed_file_is_made_again_once_that_is_mended(kitchen: Kitchen) -> None:
+    kitchen.cook()
+    spoil(kitchen.workspace.path("b/b.txt"), "AB", same_time=False)
+    reports = kitchen.cook(first="c")
+    assert [describe(report) for report in reports[:2]] == [
+        "a: taken as it is",
+        "b: taken as it is; b/b.txt was changed since it was written",
+    ]
+    assert kitchen.workspace.path("c.txt").read_text() == "ABc"
+    reports = kitchen.cook()
+    assert [r.why for r in reports[1:]] == ["b/b.txt was changed since it was written", "b changed"]
+    assert kitchen.workspace.path("c.txt").read_text() == "abc"
+
+
 @pytest.mark.parametrize("writes_on", [True, False])
 def test_a_workspace_that_is_deleted_while_a_stage_runs_is_an_error(
     kitchen: Kitchen, writes_on: bool
@@ -248,7 +308,7 @@ def test_first_and_last(kitchen: Kitchen) -> None:
     reports = kitchen.cook(first="b")
     assert [(r.name, r.state) for r in reports] == [("a", "skipped"), ("b", "run"), ("c", "run")]
     reports = kitchen.cook(first="b", last="b")
-    assert [(r.state, r.why) for r in reports] == [("skipped", "--from"), ("run", "asked for")]
+    assert [(r.state, r.why) for r in reports] == [("skipped", ""), ("run", "asked for")]
     # what follows was asked for as well, and is still to be done
     assert [r.why for r in kitchen.cook()] == ["", "", "not done yet"]
     with pytest.raises(OptionError, match="--until a stands before --from c"):
