@@ -22,6 +22,7 @@ from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.report.renderers import REPORT_HTML
 from megloc_kapture.evaluation.report.reports import RECALL_JSON
+from megloc_kapture.features.image_bound import extract_bounded
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.localization.absolute_pose import absolute_pose
@@ -290,7 +291,7 @@ def extract(features: str, image: Image, **options: Any) -> ImageFeatures:
     PluginError, MissingWeightsError : there is no such extractor, or it cannot be made.
     """
     pixels = image if isinstance(image, np.ndarray) else read_image_rgb(Path(image))
-    found = load_plugin(LOCAL_FEATURES, features, options).extract(pixels)
+    found = extract_bounded(load_plugin(LOCAL_FEATURES, features, options), pixels)
     height, width = pixels.shape[:2]
     return ImageFeatures(found.keypoints_px, found.descriptors, width, height)
 

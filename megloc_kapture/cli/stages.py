@@ -67,6 +67,12 @@ class ExtractLocal(Linked, StageCommand):
                         if "images_with_mask" in counts
                         else ""
                     )
+                    + (
+                        f"; {counts['images_reduced']} images were reduced meanwhile "
+                        "(max_megapixels)"
+                        if "images_reduced" in counts
+                        else ""
+                    )
                 )
         return 0
 

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from pydantic import Field
 
+from megloc_kapture.features.image_bound import BoundedOptions
 from megloc_kapture.io.weights import WeightsFile, find_weights, read_weights, sha256_of
 from megloc_kapture.nets.aliked import AlikedNet, aliked_from
 from megloc_kapture.nets.runtime import NetworkOptions, image_tensor, inference, pick_device
@@ -25,7 +26,7 @@ from megloc_kapture.values import LocalFeatures
 _TEMPERATURE = 0.1  # of the sub-pixel position, the one the network was trained with
 
 
-class AlikedOptions(NetworkOptions):
+class AlikedOptions(NetworkOptions, BoundedOptions):
     """Options of ALIKED."""
 
     weights: str = Field(

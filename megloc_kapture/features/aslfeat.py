@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from torch.nn import functional
 
+from megloc_kapture.features.image_bound import BoundedOptions
 from megloc_kapture.io.weights import WeightsFile, find_weights, read_weights, sha256_of
 from megloc_kapture.nets.aslfeat import (
     DESCRIPTOR_SIZE,
@@ -39,7 +40,7 @@ _SMALLEST_SIDE_PX = 128
 _BLUR_PX = 0.8  # of the smaller image, before each step
 
 
-class AslFeatOptions(NetworkOptions):
+class AslFeatOptions(NetworkOptions, BoundedOptions):
     """Options of ASLFeat."""
 
     weights: str = Field(default="aslfeat", description="name in the registry, or a file")

@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from megloc_kapture.features.image_bound import BoundedOptions
 from megloc_kapture.io.colmap import extract_sift
-from megloc_kapture.values import LocalFeatures, Options
+from megloc_kapture.values import LocalFeatures
 
 _NO_LIMIT = 2**31 - 1
 
 
-class ColmapSiftOptions(Options):
+class ColmapSiftOptions(BoundedOptions):
     """Options of COLMAP's SIFT; the defaults are COLMAP's, and so what official models have."""
 
     max_keypoints: int = Field(

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from torch.nn import functional
 
+from megloc_kapture.features.image_bound import BoundedOptions
 from megloc_kapture.io.weights import WeightsFile, find_weights, read_weights, sha256_of
 from megloc_kapture.nets.r2d2 import (
     DESCRIPTOR_SIZE,
@@ -27,7 +28,7 @@ _DEFAULT_WEIGHTS = "r2d2_WASF_N16"
 _PATCH_PX = 32.0  # the scale of a keypoint found at the image's own size, as the authors write it
 
 
-class R2D2Options(NetworkOptions):
+class R2D2Options(NetworkOptions, BoundedOptions):
     """Options of R2D2; the authors' but for the number of keypoints."""
 
     weights: str = Field(default=_DEFAULT_WEIGHTS, description="name in the registry, or a file")

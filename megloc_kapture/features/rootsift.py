@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.values import LocalFeatures, Options
+from megloc_kapture.features.image_bound import BoundedOptions
+from megloc_kapture.values import LocalFeatures
 
 
-class RootSiftOptions(Options):
+class RootSiftOptions(BoundedOptions):
     """Options of RootSIFT."""
 
     max_keypoints: int = Field(default=5000, gt=0, description="strongest responses kept")

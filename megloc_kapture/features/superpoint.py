@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.errors import OptionError
+from megloc_kapture.features.image_bound import BoundedOptions
 from megloc_kapture.io.weights import WeightsFile, find_weights, read_weights, sha256_of
 from megloc_kapture.nets.runtime import NetworkOptions, inference, pick_device
 from megloc_kapture.nets.score_maps import select_pixels, suppress_non_maxima
@@ -35,7 +36,7 @@ from megloc_kapture.values import LocalFeatures
 _OFFICIAL_WEIGHTS = "superpoint_v1"
 
 
-class SuperPointOptions(NetworkOptions):
+class SuperPointOptions(NetworkOptions, BoundedOptions):
     """Options of SuperPoint; radius, threshold and border are the authors' own."""
 
     weights: str = Field(

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from torch.nn import functional
 
+from megloc_kapture.features.image_bound import BoundedOptions
 from megloc_kapture.io.weights import WeightsFile, find_weights, read_weights, sha256_of
 from megloc_kapture.nets.runtime import NetworkOptions, image_tensor, inference, pick_device
 from megloc_kapture.nets.score_maps import select_keypoints, suppress_non_maxima
@@ -24,7 +25,7 @@ from megloc_kapture.nets.xfeat import (
 from megloc_kapture.values import LocalFeatures
 
 
-class XFeatOptions(NetworkOptions):
+class XFeatOptions(NetworkOptions, BoundedOptions):
     """Options of XFeat."""
 
     weights: str = Field(default="xfeat", description="name in the registry, or a file")

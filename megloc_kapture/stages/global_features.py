@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
 from megloc_kapture.errors import DataError, OptionError, PluginError
+from megloc_kapture.features.image_bound import bounded_image
 from megloc_kapture.features.vlad import VladOptions
 from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
 from megloc_kapture.plugins import (
@@ -146,6 +147,8 @@ def describe_images(
 ) -> NDArray[np.float32]:
     """Vectors of RGB images of one size: float32 (B, D), unit length.
 
+    Images of more than 8 megapixels are reduced to that, whatever the extractor.
+
     Parameters
     ----------
     label : names the images in messages.
@@ -154,6 +157,7 @@ def describe_images(
     ------
     PluginError : the extractor returns something else.
     """
+    images = [bounded_image(image) for image in images]
     at_once: Any = getattr(extractor, "describe_many", None)
     if at_once is not None and len(images) > 1:
         found = at_once(images)

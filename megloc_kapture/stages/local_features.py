@@ -12,6 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, PluginError
+from megloc_kapture.features.image_bound import (
+    bounded_size,
+    extract_bounded,
+    max_megapixels_of,
+)
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
 from megloc_kapture.io.tables import write_mask_counts
@@ -52,8 +57,9 @@ def extract_local_features(
 
     Returns
     -------
-    Counts for the log: images, keypoints, and where there are masks the images that have one and
-    the keypoints that they removed.
+    Counts for the log: images, keypoints, where there are any the images that were reduced because
+    they are very large, and where there are masks the images that have one and the keypoints that
+    they removed.
 
     Raises
     ------
@@ -82,6 +88,11 @@ def extract_local_features(
         if job.has_mask:
             masked[job.image] = features.num_masked
     counts = {"images": len(jobs), "keypoints": total}
+    bound = max_megapixels_of(extractor)
+    cameras = (job.folder.open().read().camera_of(job.image) for job in jobs)
+    sizes = ((camera.width, camera.height) for camera in cameras)
+    if reduced := sum(bounded_size(*size, bound) != size for size in sizes):
+        counts["images_reduced"] = reduced
     if masked:
         write_mask_counts(output, extractor.name, masked)
         counts |= {"images_with_mask": len(masked), "keypoints_masked": sum(masked.values())}
@@ -186,7 +197,11 @@ def extract_checked(
     mask: NDArray[np.bool_] | None,
     image: str,
 ) -> LocalFeatures:
-    """What a plugin makes of an image; ``image`` is its name, for messages.
+    """What a plugin makes of an image, a very large one reduced meanwhile.
+
+    Parameters
+    ----------
+    image : its name, for messages.
 
     Raises
     ------
@@ -196,7 +211,7 @@ def extract_checked(
     def refuse(what: str) -> PluginError:
         return PluginError(f"plugin {extractor.name!r} on image {image}: {what}")
 
-    features: Any = extractor.extract(pixels, mask)
+    features: Any = extract_bounded(extractor, pixels, mask)
 
     if not isinstance(features, LocalFeatures):
         raise refuse(f"extract returned {type(features).__name__}, not LocalFeatures")
