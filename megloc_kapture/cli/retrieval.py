@@ -170,6 +170,7 @@ class PairsQuery(Reading, StageCommand):
         _refuse_existing(self.output, force=self.force)
         mapping = self.kapture(self.input)
         query = self.kapture(self.query)
+        mapping.check_features_apart(query)
         changes: dict[str, object] = {"by": "exhaustive" if self.exhaustive else "retrieval"}
         if self.topk is not None:
             changes["top_k"] = self.topk

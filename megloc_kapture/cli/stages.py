@@ -113,6 +113,7 @@ class Match(Reading, StageCommand):
         first, verification = mapping, options.verify_mapping()
         if self.query is not None:
             first = self.kapture(self.query)
+            mapping.check_features_apart(first)
             verification = options.verify_queries()
         pairs = read_pairs(self.pairs)
         _check_images_of(pairs, first, mapping, self.pairs)

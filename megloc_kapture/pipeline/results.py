@@ -56,6 +56,7 @@ class Results(Mapping[str, Pose | Failure]):
             raise OptionError(f"{workers} workers cannot work; give 1 or more")
         self.localizer = localizer
         self.folder = folder if isinstance(folder, KaptureFolder) else KaptureFolder(folder)
+        localizer.map.folder.check_features_apart(self.folder)
         self.queries = KaptureQueries(self.folder, localizer.map)
         # what is wrong is found before the first query
         localizer.map.check()

@@ -268,6 +268,40 @@ def test_map_images_localize_in_their_own_map(
     assert median_m < 0.01
 
 
+@pytest.fixture
+def namesake(dataset: Path) -> Path:
+    """The dataset with a query that has the name of a map image, and shows something else."""
+    query = dataset / "query" / "sensors"
+    (query / "records_data" / "0001.jpg").rename(query / "records_data" / "0000.jpg")
+    records = query / "records_camera.txt"
+    records.write_text(records.read_text().replace("0001.jpg", "0000.jpg"))
+    return dataset
+
+
+def test_an_image_is_not_given_the_features_of_another_of_its_name(
+    megloc: Any, finished: Path, namesake: Path, tmp_path: Path
+) -> None:
+    told = (
+        "rootsift/keypoints/0000.jpg.kpt: 0000.jpg is another image in .* than in .*/query, and "
+        "both would get these keypoints; give each its own --features-dir"
+    )
+    output = ["-o", tmp_path / "new", "--features-dir", finished]
+    query = ["--query", namesake / "query"]
+    megloc("localize", "-i", finished / "map", *query, *output).refused(told)
+    pairs = tmp_path / "pairs.txt"
+    pairs.write_text("0000.jpg, 0002.jpg, 1\n")
+    for command in (["match", "--pairs", pairs], ["pairs-query"]):
+        megloc(*command, "-i", finished / "mapping", *query, *output).refused(told)
+    assert not (tmp_path / "new").exists()
+    # with features of its own it is localized, whatever its name
+    extracted = tmp_path / "features"
+    small = ["--set", "local_features.options.max_keypoints=800", "--executor", "inline"]
+    assert megloc("extract-local", "-i", namesake / "query", "-o", extracted, *small).status == 0
+    output = ["-o", tmp_path / "new", "--features-dir", extracted]
+    done = megloc("localize", "-i", finished / "map", *query, *output)
+    assert done.out.startswith("4 of 4"), done
+
+
 def test_no_query_localized_is_no_error_and_a_fallback_is_marked(
     megloc: Any, finished: Path, dataset: Path, tmp_path: Path
 ) -> None:

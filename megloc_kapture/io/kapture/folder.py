@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import filecmp
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -70,6 +71,30 @@ class KaptureFolder:
         return KaptureFolder(
             self.root, features_dirs=features_dirs, allow_links_below=self.allow_links_below
         )
+
+    def check_features_apart(self, other: KaptureFolder) -> None:
+        """Refuse two images that share a name and, because features go by names, their features.
+
+        They may share both where they are the same file. Features that cannot be read are left to
+        those who need them.
+
+        Raises
+        ------
+        DataError : names the image and the features.
+        """
+        for image in sorted(set(self.read().image_names()) & set(other.read().image_names())):
+            if _same_content(self.image_path(image), other.image_path(image)):
+                continue
+            for kind in _ARRAY_KINDS:
+                for type_name in sorted(set(self.types(kind)) & set(other.types(kind))):
+                    mine, theirs = (one._features(kind, type_name) for one in (self, other))
+                    if image in mine and image in theirs and _same_array(mine, theirs, image):
+                        raise DataError(
+                            f"{image} is another image in {self.root} than in {other.root}, and "
+                            f"both would get these {kind}; give each its own --features-dir, or "
+                            "another name",
+                            path=theirs.where(image),
+                        )
 
     def read(self) -> KaptureData:
         """Sensors, rigs, trajectories and records; parsed once.
@@ -313,6 +338,21 @@ class KaptureFolder:
                     f"image is {size[0]}x{size[1]}, its camera {expected[0]}x{expected[1]}",
                     path=path,
                 )
+
+
+def _same_content(first: Path, second: Path) -> bool:
+    try:
+        return first.samefile(second) or filecmp.cmp(first, second, shallow=False)
+    except OSError:
+        return False
+
+
+def _same_array(first: FeatureReader, second: FeatureReader, image: str) -> bool:
+    try:
+        a, b = first.read(image), second.read(image)
+    except DataError:
+        return False
+    return a.size > 0 and a.shape == b.shape and a.tobytes() == b.tobytes()
 
 
 def _check_finite(reader: FeatureReader) -> None:
