@@ -248,12 +248,15 @@ class KaptureQueries:
     Attributes
     ----------
     names : of the images, sorted; iterating yields the queries in this order.
+    faults : why the features that a query brings cannot be used, known when they have been read;
+        such a query has neither features nor candidates.
     """
 
     def __init__(self, folder: KaptureFolder, kapture_map: KaptureMap) -> None:
         self._folder, self._map = folder, kapture_map
         self._data = folder.read()
         self.names = self._data.image_names()
+        self.faults: dict[str, str] = {}
         stored = kapture_map.stored_types()
         self._stored = stored
         wanted = {other for name in stored for other in equivalent_types(name)}
@@ -288,21 +291,14 @@ class KaptureQueries:
         Raises
         ------
         DataError : there are no images; an image is needed and absent, broken or not of its
-            camera's size; or features are truncated, of different length, or not as wide as the
-            map's.
+            camera's size; or features are not as wide as the map's.
         """
         if not self.names:
             raise DataError("there are no query images", path=self._folder.root)
         self._check_widths()
         for name in self.names:
-            brought = [readers for readers in self._local.values() if name in readers[0]]
-            for keypoints, descriptors in brought:
-                check_lengths(keypoints, descriptors, name)
-            if not brought:
+            if not any(name in keypoints for keypoints, _ in self._local.values()):
                 check_image(self._folder, name)
-            for vectors in self._globals.values():
-                if name in vectors:
-                    vectors.length(name)
 
     def _check_widths(self) -> None:
         pairs = [
@@ -349,14 +345,21 @@ class KaptureQueries:
 
     def query(self, name: str) -> Query:
         """The query of a name."""
-        vectors = {t: reader.read(name) for t, reader in self._globals.items() if name in reader}
+        candidates: tuple[str, ...] | None = None
+        try:
+            features = self._features(name)
+            of_image = {t: one.read(name) for t, one in self._globals.items() if name in one}
+        except DataError as error:
+            self.faults[name] = str(error)
+            features, of_image, candidates = self._no_features(), {}, ()
         return Query(
             camera=self._map.to_colmap(self._data.camera_of(name)),
             image=self._folder.image_path(name),
             name=name,
-            features=self._features(name),
-            global_features=vectors,
+            features=features,
+            global_features=of_image,
             prior=self._prior(name),
+            candidates=candidates,
             mask=mask_path(self._folder, name),
             depth=partial(depth_of, self._folder, name) if self._data.records_depth else None,
         )
@@ -392,3 +395,13 @@ class KaptureQueries:
                 descriptors.read(name),
             )
         return found
+
+    def _no_features(self) -> dict[str, LocalFeatures]:
+        return {
+            local_type: LocalFeatures(
+                np.zeros((0, 2), np.float32),
+                np.zeros(0, np.float32),
+                np.zeros((0, descriptors.config.dsize), descriptors.config.dtype),
+            )
+            for local_type, (_, descriptors) in self._local.items()
+        }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -136,14 +137,18 @@ class Results(Mapping[str, Pose | Failure]):
             results = self.localizer.localize_units(units, executor, candidates=self._candidates)
             tracked = track(results, len(self._units), "localizing")
             for names, found in zip(self._units, tracked, strict=True):
-                yield from zip(names, found, strict=True)
+                for name, result in zip(names, found, strict=True):
+                    if isinstance(result, Failure) and name in self.queries.faults:
+                        yield name, replace(result, reason=self.queries.faults[name])
+                    else:
+                        yield name, result
 
     def _best_candidates(self) -> dict[str, tuple[str, RigidTransform]]:
         """Failed query to its best candidate and that image's pose."""
         poses = self.localizer.map.poses
         best = {}
         for name, result in self.items():
-            if result:
+            if result or name in self.queries.faults:
                 continue
             if self._candidates is None:
                 ranked: Sequence[str] = self.localizer.ranked(self.queries.query(name))

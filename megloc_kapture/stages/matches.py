@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, MatchesWriter, read_pairs
 from megloc_kapture.io.tables import PairCount, write_match_counts
@@ -292,15 +293,24 @@ _cache = FeatureCache()
 def cached_features(
     spec: FolderSpec, folder: KaptureFolder, local_type: str, image: str
 ) -> Features:
-    """The features of an image of a folder that a work item opened; kept in this process."""
-    return _cache.get(
-        (*spec.key, local_type, image),
-        lambda: Features.of(
-            folder.read().camera_of(image),
-            folder.keypoints(local_type).read(image),
-            folder.descriptors(local_type).read(image),
-        ),
-    )
+    """The features of an image of a folder that a work item opened; kept in this process.
+
+    Raises
+    ------
+    DataError : features are missing, broken or not finite, or of different number.
+    """
+
+    def read() -> Features:
+        descriptors = folder.descriptors(local_type)
+        found, described = folder.keypoints(local_type).read(image), descriptors.read(image)
+        if len(found) != len(described):
+            raise DataError(
+                f"{len(described)} descriptors for {len(found)} keypoints",
+                path=descriptors.where(image),
+            )
+        return Features.of(folder.read().camera_of(image), found, described)
+
+    return _cache.get((*spec.key, local_type, image), read)
 
 
 def iterate_candidates(pairs: Sequence[ImagePair]) -> Iterator[tuple[str, list[str]]]:

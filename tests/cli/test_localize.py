@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -266,6 +267,61 @@ def test_map_images_localize_in_their_own_map(
     assert done.out.startswith("7 of 7"), done
     _, median_m, _ = medians(tmp_path / "localized", scene / "mapping")
     assert median_m < 0.01
+
+
+def not_finite(content: bytes) -> bytes:
+    values = np.frombuffer(content, "<f4").copy()
+    values[7] = np.nan
+    return values.tobytes()
+
+
+KEYPOINTS = "local_features/rootsift/keypoints/{}.kpt"
+DESCRIPTORS = "local_features/rootsift/descriptors/{}.desc"
+VECTORS = "global_features/vlad_rootsift/global_features/{}.gfeat"
+
+
+@pytest.mark.parametrize(
+    ("path", "change", "reason"),
+    [
+        (KEYPOINTS, not_finite, "not all values are finite"),
+        (DESCRIPTORS, not_finite, "not all values are finite"),
+        (VECTORS, not_finite, "not all values are finite"),
+        (KEYPOINTS, lambda content: content[:-3], "are not whole rows of 2 x float32; truncated?"),
+        (DESCRIPTORS, lambda content: content[:-512], "799 descriptors for 800 keypoints"),
+        (VECTORS, lambda content: content[:-4], "are not exactly one row of"),
+    ],
+)
+def test_broken_features_of_a_query_fail_it_and_those_of_the_map_end_the_run(
+    megloc: Any,
+    finished: Path,
+    scene: Path,
+    tmp_path: Path,
+    path: str,
+    change: Callable[[bytes], bytes],
+    reason: str,
+) -> None:
+    features, output = tmp_path / "features", tmp_path / "localized"
+    for part in ("local_features", "global_features"):
+        shutil.copytree(finished / part, features / part)
+    spoilt = features / path.format("0001.jpg")
+    spoilt.write_bytes(change(spoilt.read_bytes()))
+    queries = ["--query", scene / "query", "--features-dir", features]
+    top = ["--set", "query_pairs.top_k=3"]  # or nothing would be ranked
+    done = megloc("localize", "-i", finished / "map", *queries, *top, "-o", output)
+    assert done.out.startswith("3 of 4"), done
+    assert "Warning" not in done.err
+    status = read_status(output / "status.csv")["0001.jpg"]
+    assert status.status == "failed"
+    assert status.reason.startswith(f"{spoilt}: ") and reason in status.reason
+    # the map's own, given beside it
+    spoilt = features / path.format("0000.jpg")
+    spoilt.write_bytes(change(spoilt.read_bytes()))
+    bare = tmp_path / "map"
+    shutil.copytree(finished / "map", bare, symlinks=True)
+    for kind in ("keypoints", "descriptors", "global_features"):
+        shutil.rmtree(bare / "reconstruction" / kind)
+    done = megloc("localize", "-i", bare, *queries, *top, "-o", tmp_path / "none")
+    done.refused(f"{spoilt}: .*{reason}")
 
 
 @pytest.fixture

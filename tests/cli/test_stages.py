@@ -281,6 +281,19 @@ def test_pairs_of_images_that_are_not_there(megloc: Any, finished: Path, tmp_pat
     assert not (tmp_path / "new").exists()
 
 
+def test_match_compares_the_numbers_of_keypoints_and_descriptors(
+    megloc: Any, workspace: Path, tmp_path: Path
+) -> None:
+    spoilt = workspace / "local_features/rootsift/descriptors/0002.jpg.desc"
+    content = spoilt.read_bytes()
+    spoilt.unlink()
+    spoilt.write_bytes(content[:-512])
+    places = ["-i", workspace / "mapping", "--pairs", workspace / "pairs/mapping.txt"]
+    done = megloc("match", *places, "--features-dir", workspace, "-o", tmp_path / "new", *INLINE)
+    done.refused(f"{spoilt}: 799 descriptors for 800 keypoints")
+    assert not (tmp_path / "new").exists()
+
+
 def test_import_links_images_and_prefixes_queries(megloc: Any, scene: Path, tmp_path: Path) -> None:
     done = megloc("import", "kapture", scene, "-o", tmp_path / "in", "--query-prefix", "q/")
     counts = dict(line.rsplit(maxsplit=1) for line in done.out.splitlines())

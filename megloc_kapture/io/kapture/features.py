@@ -237,12 +237,14 @@ class FeatureReader:
 
         Raises
         ------
-        DataError : no features of that image, or a truncated file.
+        DataError : no features of that image, a truncated file, or values that are not finite.
         """
         source, name = self._source(image)
         content = source.read(name)
         rows = self._rows(source, name, len(content))
         array = np.frombuffer(content, dtype=self.config.dtype)
+        if not np.isfinite(array).all():
+            raise DataError("not all values are finite", path=source.where(name))
         if self.kind == "global_features":
             return array
         return array.reshape(rows, self.config.dsize)
@@ -257,7 +259,7 @@ class FeatureReader:
         Raises
         ------
         ValueError : features of another kind, or rows of another shape or layout.
-        DataError : an image has none, or a truncated file.
+        DataError : an image has none, a truncated file, or values that are not finite.
         """
         if self.kind != "global_features":
             raise ValueError(f"{self.kind} have no fixed number of rows")
@@ -284,6 +286,8 @@ class FeatureReader:
                 f"{len(todo)} images have no global feature of type {self.type_name}, "
                 f"the first is {images[int(todo[0])]}"
             )
+        for k in np.flatnonzero(~np.isfinite(rows).all(axis=1)).tolist():
+            raise DataError("not all values are finite", path=self.where(images[k]))
 
     def map_rows(self, images: Sequence[str]) -> NDArray[Any] | None:
         """Global features (N, dsize) where they lie, if they lie alike in one tar; else None.

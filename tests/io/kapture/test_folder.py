@@ -238,11 +238,13 @@ def test_broken_images_are_found_by_a_deep_check(root: Path) -> None:
     refuse(root, r"a\.jpg: image is 9x6, its camera 8x6", deep=True)
 
 
-def test_features_that_are_not_finite_are_found_by_a_deep_check(root: Path) -> None:
+def test_features_that_are_not_finite_are_found_without_a_deep_check(root: Path) -> None:
     with FeatureWriter(root, "global_features", "G", FeatureConfig("g", FLOAT, 3)) as features:
         features.write("a.jpg", np.array([1, np.nan, 2]))
-    KaptureFolder(root).validate()
-    refuse(root, r"a\.jpg\.gfeat: not all values are finite", deep=True)
+    refuse(root, r"a\.jpg\.gfeat: not all values are finite")
+    rows = np.zeros((1, 3), FLOAT)
+    with pytest.raises(DataError, match=r"a\.jpg\.gfeat: not all values are finite"):
+        KaptureFolder(root).global_features("G").read_rows(["a.jpg"], rows)
 
 
 def test_real_folders_are_read_and_valid(shared_data: Path) -> None:
