@@ -194,6 +194,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         # who reads our output has gone; the flush at exit must not complain about it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         status = DONE
+    except OSError as error:
+        # closed to us, or too long a name
+        if error.filename is None:
+            raise
+        if debug:
+            traceback.print_exc()
+        print(f"megloc: {error.filename}: {error.strerror}", file=sys.stderr)
+        status = USER_ERROR
     finally:
         if arguments is None:
             _ignore_signals()  # or Python would print tracebacks of its own ending

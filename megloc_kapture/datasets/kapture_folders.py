@@ -25,6 +25,7 @@ from megloc_kapture.io.dataset_tables import (
     read_protocol,
     read_relocalization,
     read_world,
+    table_path,
     write_groups,
     write_names,
     write_nowhere,
@@ -78,8 +79,8 @@ def input_files(root: Path) -> Iterator[Path]:
         NAMES_FILE,
         RELOCALIZATION_FILE,
     ):
-        if (root / SIDE_TABLES / name).is_file():
-            yield root / SIDE_TABLES / name
+        if (table := table_path(root / SIDE_TABLES, name)).is_file():
+            yield table
 
 
 def files_of(folder: KaptureFolder, *, images: bool = True) -> Iterator[Path]:

@@ -23,6 +23,7 @@ from megloc_kapture.io.paths import check_relative
 from megloc_kapture.values import RigidTransform
 
 RowT = TypeVar("RowT")
+_MAX_BYTES = 1 << 31
 _MAX_UNIT_ERROR = 1e-6  # of the length of a quaternion that is written with every digit
 
 
@@ -39,7 +40,7 @@ def read_csv_table(
     DataError : the file cannot be read, its header is not made of ``columns``, a row has too many
         or too few fields, or a quote is left open; names file and line.
     """
-    reader = csv.reader(io.StringIO(read_text(path), newline=""), strict=True)
+    reader = csv.reader(io.StringIO(read_text(path, _MAX_BYTES), newline=""), strict=True)
     header: list[str] | None = None
     try:
         for fields in reader:

@@ -32,7 +32,7 @@ from pydantic import Field, field_validator, model_validator
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.csv_table import IMAGE, TEXT, ZERO_ONE, Column, Table
 from megloc_kapture.io.files import read_json_model, read_text, write_bytes, write_json_model
-from megloc_kapture.io.paths import check_relative
+from megloc_kapture.io.paths import check_no_escape, check_relative
 from megloc_kapture.values import Options, RigidTransform
 
 SIDE_TABLES = "megloc"
@@ -44,6 +44,7 @@ NAMES_FILE = "names.csv"
 RELOCALIZATION_FILE = "relocalization.csv"
 # in the folder of the true poses
 NOWHERE_FILE = "nowhere.txt"
+_MAX_BYTES = 1 << 28
 
 # how far a quaternion may be off unit length before it is refused; below, it is normalised
 MAX_QUATERNION_NORM_ERROR = 1e-3
@@ -222,13 +223,28 @@ _NAMES = Table(
 _RELOCALIZATION = Table(RelocalizationPair, dict.fromkeys(("file", "reference", "query"), IMAGE))
 
 
+def table_path(folder: Path | str, name: str) -> Path:
+    """The path of a table, which need not exist.
+
+    Raises
+    ------
+    DataError : a link that leaves the dataset, no plain file, or far larger than any such table.
+    """
+    path = check_no_escape(Path(folder).parent, Path(folder) / name)
+    if path.exists() and not path.is_file():
+        raise DataError("not a plain file", path=path)
+    if path.is_file() and path.stat().st_size > _MAX_BYTES:
+        raise DataError(f"larger than {_MAX_BYTES >> 20} MB, which no such table is", path=path)
+    return path
+
+
 def read_groups(folder: Path | str) -> dict[str, ImageGroup]:
     """Read ``groups.csv``: image -> group, sorted by image."""
     return {
         row.image: ImageGroup(
             condition=row.condition, frame=row.frame, location=row.location, scored=row.scored
         )
-        for row in sorted(_GROUPS.read_if_there(Path(folder) / GROUPS_FILE))
+        for row in sorted(_GROUPS.read_if_there(table_path(folder, GROUPS_FILE)))
     }
 
 
@@ -247,7 +263,7 @@ def read_priors(folder: Path | str) -> dict[str, tuple[str, ...]]:
     A query that is not in the table is not restricted.
     """
     permitted: dict[str, tuple[str, ...]] = {}
-    for query, group in sorted(_PRIORS.read_if_there(Path(folder) / PRIORS_FILE)):
+    for query, group in sorted(_PRIORS.read_if_there(table_path(folder, PRIORS_FILE))):
         permitted[query] = (*permitted.get(query, ()), group)
     return permitted
 
@@ -274,7 +290,7 @@ def read_names(folder: Path | str) -> dict[str, str]:
     ------
     DataError : broken table; an image or a name that is given twice, or holds white space.
     """
-    return dict(_NAMES.read_if_there(Path(folder) / NAMES_FILE))
+    return dict(_NAMES.read_if_there(table_path(folder, NAMES_FILE)))
 
 
 def write_names(folder: Path | str, names: Mapping[str, str]) -> None:
@@ -284,7 +300,7 @@ def write_names(folder: Path | str, names: Mapping[str, str]) -> None:
 
 def read_relocalization(folder: Path | str) -> list[RelocalizationPair]:
     """Read ``relocalization.csv`` in its order."""
-    return list(_RELOCALIZATION.read_if_there(Path(folder) / RELOCALIZATION_FILE))
+    return list(_RELOCALIZATION.read_if_there(table_path(folder, RELOCALIZATION_FILE)))
 
 
 def write_relocalization(folder: Path | str, pairs: Iterable[RelocalizationPair]) -> None:
@@ -294,7 +310,7 @@ def write_relocalization(folder: Path | str, pairs: Iterable[RelocalizationPair]
 
 def read_world(folder: Path | str) -> World:
     """Read ``world.json``."""
-    path = Path(folder) / WORLD_FILE
+    path = table_path(folder, WORLD_FILE)
     return read_json_model(path, World) if path.exists() else World()
 
 
@@ -305,7 +321,7 @@ def write_world(folder: Path | str, world: World) -> None:
 
 def read_protocol(folder: Path | str) -> Protocol:
     """Read ``protocol.json``."""
-    path = Path(folder) / PROTOCOL_FILE
+    path = table_path(folder, PROTOCOL_FILE)
     return read_json_model(path, Protocol) if path.exists() else Protocol()
 
 

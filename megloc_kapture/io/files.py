@@ -31,6 +31,7 @@ from pydantic import BaseModel, ValidationError
 from megloc_kapture.errors import DataError, OutputError
 
 MARKER = ".megloc"
+_MAX_JSON_BYTES = 1 << 28
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
@@ -38,17 +39,20 @@ ModelT = TypeVar("ModelT", bound=BaseModel)
 # ------------------------------------------------------------------------------------ reading
 
 
-def read_content(path: Path | str) -> bytes:
+def read_content(path: Path | str, max_bytes: int | None = None) -> bytes:
     """All bytes of a plain file.
 
     Raises
     ------
-    DataError : missing, not readable, or no plain file: reading a pipe or a device might never end.
+    DataError : missing, not readable, larger than ``max_bytes``, or no plain file: reading a pipe
+        or a device might never end.
     """
     path = Path(path)
     try:
         if path.exists() and not path.is_file():
             raise DataError("not a plain file", path=path)
+        if max_bytes is not None and path.stat().st_size > max_bytes:
+            raise DataError(f"larger than {max_bytes >> 20} MB, which no such file is", path=path)
         return path.read_bytes()
     except FileNotFoundError as error:
         raise DataError("cannot read: the file is missing", path=path) from error
@@ -56,7 +60,7 @@ def read_content(path: Path | str) -> bytes:
         raise DataError(f"cannot read: {error.strerror or error}", path=path) from error
 
 
-def read_text(path: Path | str) -> str:
+def read_text(path: Path | str, max_bytes: int | None = None) -> str:
     """The text of a UTF-8 file (ASCII included); a byte order mark is dropped.
 
     Line ends are left as they are.
@@ -66,7 +70,7 @@ def read_text(path: Path | str) -> str:
     DataError : see :func:`read_content`; or it is not UTF-8 or holds a NUL; names the file and the
         line where the text breaks.
     """
-    content = read_content(path)
+    content = read_content(path, max_bytes)
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -425,7 +429,7 @@ def read_json_model(path: Path | str, model: type[ModelT]) -> ModelT:
     DataError : the file cannot be read, is not JSON (names the line; NaN and infinity are not
         JSON), or does not fit the model (names the field).
     """
-    text = read_text(path)
+    text = read_text(path, _MAX_JSON_BYTES)
     try:
         content = json.loads(text, parse_constant=_refuse_constant)
     except json.JSONDecodeError as error:

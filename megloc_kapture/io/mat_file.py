@@ -145,7 +145,7 @@ def _variable_at(offset: int, where: Path | str) -> Iterator[None]:
     """A DataError that names the variable, of all that may be wrong with its bytes."""
     try:
         yield
-    except (_BrokenError, struct.error, UnicodeDecodeError, zlib.error) as error:
+    except (_BrokenError, struct.error, ValueError, zlib.error) as error:
         raise DataError(
             f"not a MAT file that can be read: {error}, in the variable at byte {offset}",
             path=where,

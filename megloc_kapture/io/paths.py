@@ -15,6 +15,9 @@ from megloc_kapture.errors import DataError, OutputError
 Roots = Path | tuple[Path, ...]
 
 
+_MAX_FOLDERS = 250  # Python makes a folder's parents one within the other
+
+
 def has_control_characters(text: str) -> bool:
     """True for a text with characters that no name or line should have (NUL, tab, ...)."""
     if text.isprintable():
@@ -27,9 +30,9 @@ def check_relative(text: str) -> str:
 
     Raises
     ------
-    DataError : empty, absolute, ``.`` or ``..`` or an empty component, a backslash, or a control
-        character (NUL included) in it. A ``.`` or empty component is harmless, but would give
-        one file two names, and names are identities in kapture.
+    DataError : empty, absolute, deeper than 250 folders, ``.`` or ``..`` or an empty component, a
+        backslash, or a control character (NUL included) in it. A ``.`` or empty component is
+        harmless, but would give one file two names, and names are identities in kapture.
     """
     if not text:
         raise DataError("empty path")
@@ -37,6 +40,8 @@ def check_relative(text: str) -> str:
         raise DataError(f"backslash in path {text!r}")
     if has_control_characters(text):
         raise DataError(f"control character in path {text!r}")
+    if text.count("/") > _MAX_FOLDERS:
+        raise DataError(f"path of {text.count('/')} folders: {text[:20]!r}...")
     if text.startswith("/"):
         raise DataError(f"absolute path {text!r}; it must be relative to its folder")
     for component in text.split("/"):

@@ -12,6 +12,7 @@ import json
 import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from stat import S_ISREG
 from typing import Any
 
 from pydantic import Field
@@ -84,6 +85,8 @@ class FileHashes:
         """Hash of one file's content; raises DataError when it cannot be read."""
         try:
             stat = os.stat(path)
+            if not S_ISREG(stat.st_mode):
+                raise DataError("not a plain file", path=path)
             key = str(path)
             state = [stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino]
             known = self._known.get(key)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import re
 import shutil
 from collections.abc import Callable
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 
 from megloc_kapture.io.images import write_image
+from megloc_kapture.io.tables import read_status
 
 Contents = Callable[[Path], dict[str, bytes]]
 Spoil = Callable[[Path], Any]
@@ -139,13 +141,6 @@ def test_info_finds_the_same_faults(megloc: Any, gallery: Path, spoil: Spoil, me
 
 QUERIES: dict[str, tuple[Spoil, str]] = {
     "no records": (remove(RECORDS), r"query: there are no query images"),
-    "keypoints cut": (cut(f"{KEYPOINTS}/{QUERY}.kpt"), r"rgb_00267\.jpg\.kpt: .*truncated"),
-    "descriptors cut": (cut(f"{DESCRIPTORS}/{QUERY}.desc"), r"rgb_00267\.jpg\.desc: .*truncated"),
-    "global cut": (cut(f"{GLOBAL}/{QUERY}.gfeat"), r"rgb_00267\.jpg\.gfeat: .*truncated"),
-    "lengths differ": (
-        cut(f"{KEYPOINTS}/{QUERY}.kpt", 3 * 4 * 400),
-        r"rgb_00267\.jpg\.desc: 500 descriptors for 400 keypoints",
-    ),
     "no features of one": (
         remove(f"{KEYPOINTS}/{QUERY}.kpt"),
         r"the weights r2d2_WASF_N16 are missing.*megloc weights fetch r2d2_WASF_N16",
@@ -166,6 +161,28 @@ def test_localize_refuses_bad_queries(
     spoil(gallery / "query")
     megloc(*localize(gallery)).refused(message)
     assert not (gallery.parent / "new").exists()
+
+
+BROKEN_FEATURES: dict[str, tuple[Spoil, str]] = {
+    "keypoints cut": (cut(f"{KEYPOINTS}/{QUERY}.kpt"), r"rgb_00267\.jpg\.kpt: .*truncated"),
+    "descriptors cut": (cut(f"{DESCRIPTORS}/{QUERY}.desc"), r"rgb_00267\.jpg\.desc: .*truncated"),
+    "global cut": (cut(f"{GLOBAL}/{QUERY}.gfeat"), r"rgb_00267\.jpg\.gfeat: .*truncated"),
+    "lengths differ": (
+        cut(f"{KEYPOINTS}/{QUERY}.kpt", 3 * 4 * 400),
+        r"rgb_00267\.jpg\.desc: 500 descriptors for 400 keypoints",
+    ),
+}
+
+
+@pytest.mark.parametrize(("spoil", "message"), BROKEN_FEATURES.values(), ids=BROKEN_FEATURES)
+def test_broken_features_of_one_query_fail_that_query(
+    megloc: Any, gallery: Path, spoil: Spoil, message: str
+) -> None:
+    spoil(gallery / "query")
+    done = megloc(*localize(gallery))
+    assert (done.status, done.out[:6]) == (0, "3 of 4")
+    failed = read_status(gallery.parent / "new/localized/status.csv")[QUERY]
+    assert re.search(message, failed.reason)
 
 
 def without_descriptors(root: Path) -> None:
@@ -405,3 +422,17 @@ def test_every_command_names_what_is_missing(
 ) -> None:
     megloc(*(argument.format(dataset) for argument in arguments)).refused("/nowhere|/mapping")
     assert not (dataset / "new").exists()
+
+
+def test_a_folder_that_is_closed_to_us_is_told_in_one_line(
+    megloc: Any, dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def closed(path: Path, **how: Any) -> Any:
+        if path.is_relative_to(dataset / "query"):
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return real(path, **how)
+
+    real = Path.stat  # whoever runs the tests may be allowed everything
+    monkeypatch.setattr(Path, "stat", closed)
+    arguments = ["--root", dataset, "--workspace", tmp_path / "run"]
+    megloc("eval", "kapture", *arguments).refused(f"{dataset}/query.*: Permission denied")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -239,3 +240,33 @@ def test_a_pose_file_outside_is_refused(tmp_path: Path) -> None:
         read_relocalization(tmp_path)
     with pytest.raises(DataError):
         write_relocalization(tmp_path, [RelocalizationPair("/etc/x", "a", "b")])
+
+
+READERS = {
+    "groups.csv": read_groups,
+    "priors.csv": read_priors,
+    "names.csv": read_names,
+    "relocalization.csv": read_relocalization,
+    "world.json": read_world,
+    "protocol.json": read_protocol,
+}
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_what_is_no_plain_table_of_the_dataset_is_refused(name: str, tmp_path: Path) -> None:
+    place = tmp_path / "dataset" / "megloc" / name
+    place.parent.mkdir(parents=True)
+    os.mkfifo(place)
+    with pytest.raises(DataError, match=f"{name}: not a plain file"):
+        READERS[name](place.parent)
+    place.unlink()
+    with open(place, "wb") as file:
+        file.truncate(1 << 34)  # takes no room on the disk
+    with pytest.raises(DataError, match=f"{name}: larger than 256 MB"):
+        READERS[name](place.parent)
+    for target in ("/dev/zero", tmp_path / "elsewhere"):
+        place.unlink()
+        place.symlink_to(target)
+        (tmp_path / "elsewhere").write_text("{}")
+        with pytest.raises(DataError, match=f"{name}: is or lies behind a link that leaves"):
+            READERS[name](place.parent)

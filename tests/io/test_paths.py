@@ -72,3 +72,9 @@ def test_the_root_itself_may_be_a_link_and_share_a_prefix_with_others(tmp_path: 
     (tmp_path / "root" / "other").symlink_to(tmp_path / "root2" / "file")
     with pytest.raises(DataError):
         check_no_escape(tmp_path / "root", tmp_path / "root" / "other")
+
+
+def test_a_name_of_a_thousand_folders_is_refused(tmp_path: Path) -> None:
+    """Python makes the parents of a folder one within the other, and gives up."""
+    with pytest.raises(DataError, match="path of 1000 folders: 'a/a/a"):
+        safe_join(tmp_path, "a/" * 1000 + "x.jpg")

@@ -135,7 +135,11 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
     def _connect(self) -> sqlite3.Connection:
         path = quote(str(self.path.resolve()))
         with self._reading():
-            return sqlite3.connect(f"file:{path}?mode=ro&immutable=1", uri=True)
+            connection = sqlite3.connect(f"file:{path}?mode=ro&immutable=1", uri=True)
+        # what a column computes could be of any length, what stands in the file could not
+        longest = max(1_000_000, self.path.stat().st_size)
+        connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(longest, 2**31 - 1))
+        return connection
 
     def _read_images(self) -> dict[str, DatabaseImage]:
         images = {}

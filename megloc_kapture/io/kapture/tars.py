@@ -164,7 +164,10 @@ def index_tar(path: Path, *, repair: bool = False) -> tuple[dict[str, tuple[int,
                 raise DataError(f"broken or truncated after byte {end}", path=path)
     except FileNotFoundError as error:
         raise DataError("file is missing", path=path) from error
-    except (tarfile.TarError, OSError, ValueError, EOFError, RecursionError, KeyError) as error:
+    except (
+        *(tarfile.TarError, OSError, ValueError, EOFError, RecursionError, KeyError),
+        *(OverflowError, MemoryError),  # a size that no file has
+    ) as error:
         if repair and index:
             return index, end
         raise DataError(f"not a readable uncompressed tar ({error})", path=path) from error

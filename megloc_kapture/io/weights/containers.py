@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import re
 import tarfile
+import zipfile
 import zlib
 from collections.abc import Callable, Mapping
 from pathlib import PurePath
@@ -72,6 +73,19 @@ def read_checkpoint(
     return _of_torch(content, where)
 
 
+def _check_unpacked(size: int, content: bytes, where: str) -> None:
+    """Weights hardly shrink: refuse what says that it is very much larger when it is unpacked."""
+    if size > 8 * len(content) + (1 << 26):
+        raise DataError(
+            f"{len(content)} bytes that unpack to {size} at least are no weights", path=where
+        )
+
+
+def _check_zip(content: bytes, where: str) -> None:
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        _check_unpacked(sum(member.file_size for member in archive.infolist()), content, where)
+
+
 def _of_torch(content: bytes, where: str) -> dict[str, torch.Tensor]:
     from pickle import UnpicklingError  # the error that torch raises
 
@@ -81,8 +95,12 @@ def _of_torch(content: bytes, where: str) -> dict[str, torch.Tensor]:
 
     is_apgem = holds_pca(content)
     try:
+        if content.startswith(b"PK"):
+            _check_zip(content, where)
         with torch.serialization.safe_globals(stand_ins() if is_apgem else _dropped()):
             found = torch.load(io.BytesIO(content), weights_only=True, map_location="cpu")
+    except DataError:
+        raise
     except Exception as error:  # torch's reader raises what it likes for broken bytes
         foreign = sorted(set(re.findall(r"GLOBAL ([\w.]+)", str(error))))
         if isinstance(error, UnpicklingError) and foreign:
@@ -154,8 +172,13 @@ def _of_safetensors(content: bytes, where: str) -> dict[str, torch.Tensor]:
 
 def _npz(content: bytes, where: str) -> dict[str, NDArray[Any]]:
     try:
+        _check_zip(content, where)
         with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in arrays.files}
+            found = {name: arrays[name] for name in arrays.files}
+        # a member that is no array comes as its bytes
+        return {name: array for name, array in found.items() if isinstance(array, np.ndarray)}
+    except DataError:
+        raise
     except Exception as error:  # zip, zlib and numpy's header each raise their own
         raise DataError(f"not an npz file that can be read: {error}", path=where) from error
 
@@ -203,7 +226,11 @@ def _tar(content: bytes, where: str) -> dict[str, NDArray[Any]]:
 
     try:
         with tarfile.open(fileobj=io.BytesIO(content)) as archive:
-            members = {m.name: m for m in archive.getmembers() if m.isreg()}
+            members = {}
+            for member in archive:
+                _check_unpacked(member.offset_data + member.size, content, where)
+                if member.isreg():
+                    members[member.name] = member
             # a Mac adds ._NAME beside each NAME
             stems = [
                 name.removesuffix(_INDEX)
@@ -225,7 +252,7 @@ def _tar(content: bytes, where: str) -> dict[str, NDArray[Any]]:
                 return file.read()
 
             return read_tensor_bundle(read(_INDEX), read, f"{where}/{stems[0]}{_INDEX}")
-    except (tarfile.TarError, OSError, EOFError, zlib.error) as error:
+    except (tarfile.TarError, OSError, EOFError, zlib.error, ValueError, OverflowError) as error:
         problem = str(error).partition("\n")[0]  # of gz, bz2 and xz, tarfile tells each
         raise DataError(f"not a tar file that can be read: {problem}", path=where) from error
 

@@ -175,6 +175,26 @@ def test_a_view_that_never_ends_is_not_looked_into(tmp_path: Path) -> None:
         ColmapDatabase(tmp_path / "d.db")
 
 
+def test_a_column_that_computes_more_than_the_file_holds_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "d.db"
+    write_with_kapture(path)
+    connection = sqlite3.connect(path)
+    connection.execute("DROP TABLE keypoints")
+    connection.execute(
+        "CREATE TABLE keypoints (image_id INTEGER PRIMARY KEY, rows INTEGER, cols INTEGER, "
+        "data BLOB GENERATED ALWAYS AS (zeroblob(900000000)) VIRTUAL)"
+    )
+    connection.execute("INSERT INTO keypoints VALUES (1, 37500000, 6)")
+    connection.commit()
+    name = connection.execute("SELECT name FROM images WHERE image_id = 1").fetchone()[0]
+    connection.close()
+    with (
+        ColmapDatabase(path) as database,
+        pytest.raises(DataError, match="d.db: no readable COLMAP database: .*too big"),
+    ):
+        database.keypoints(name)
+
+
 @pytest.mark.parametrize("content", [b"", b"SQLite format 3\0", b"no database at all" * 100])
 def test_files_that_are_no_databases(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "d.db"

@@ -368,3 +368,26 @@ def test_damage_is_met_as_tarfile_alone_meets_it(
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tars, "_plain_members", lambda *_: [])
         assert found == outcome()
+
+
+@pytest.mark.parametrize("size", [str(2**62), str(2**63), "9" * 30])
+@pytest.mark.parametrize("form", ["of a member", "of all"])
+def test_a_pax_header_of_a_huge_size_is_refused(tmp_path: Path, size: str, form: str) -> None:
+    path = tmp_path / "keypoints.tar"
+    headers = {"size": size}
+    of_all = headers if form == "of all" else {}
+    with tarfile.open(path, "w", format=tarfile.PAX_FORMAT, pax_headers=of_all) as tar:
+        member = tarfile.TarInfo("a.kpt")
+        member.pax_headers = {} if of_all else headers
+        tar.addfile(member)
+        tar.addfile(tarfile.TarInfo("b.kpt"))
+    with pytest.raises(DataError, match="keypoints.tar: "):
+        index_tar(path)
+    # the length of the header itself
+    content = path.read_bytes()
+    with tarfile.open(path, "w") as tar:
+        header = tarfile.TarInfo("././@PaxHeader")
+        header.type, header.size = tarfile.XHDTYPE, 2**50
+        tar.fileobj.write(header.tobuf(tarfile.GNU_FORMAT) + content[512:])  # type: ignore[union-attr]
+    with pytest.raises(DataError, match="keypoints.tar: "):
+        index_tar(path)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import sys
 import tarfile
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -299,3 +300,30 @@ def test_without_the_package_onnx_the_extra_is_named(monkeypatch: pytest.MonkeyP
     monkeypatch.setitem(sys.modules, "onnx", None)
     with pytest.raises(OptionError, match=r"x\.onnx: .* pip install 'megloc-kapture\[convert\]'"):
         read(onnx_model(), "x.onnx")
+
+
+def test_what_unpacks_to_far_more_than_it_is_is_refused() -> None:
+    """50 kB of each took 6 GB of memory."""
+    zeros = torch.zeros(40_000_000)
+    plain, npz, packed, archive = (io.BytesIO() for _ in range(4))
+    np.savez_compressed(npz, a=zeros.numpy())
+    torch.save({"a": zeros}, plain)
+    with zipfile.ZipFile(plain) as old, zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as new:
+        for member in old.infolist():
+            new.writestr(member.filename, old.read(member))
+    with tarfile.open(fileobj=archive, mode="w:gz") as tar:
+        member = tarfile.TarInfo("a.index")
+        member.size = 4 * len(zeros)
+        tar.addfile(member, io.BytesIO(zeros.numpy().tobytes()))
+    for file, name in ((npz, "a.npz"), (packed, "a.pth"), (archive, "a.tar.gz")):
+        with pytest.raises(DataError, match=f"{name}: .* bytes that unpack to 160"):
+            read_checkpoint(file.getvalue(), name, lambda _: b"")
+
+
+def test_what_is_no_array_in_an_npz_is_left_out() -> None:
+    content = io.BytesIO()
+    np.savez(content, a=np.ones(3, np.float32))
+    with zipfile.ZipFile(content, "a") as archive:
+        archive.writestr("readme.txt", "read me")
+    found = read_checkpoint(content.getvalue(), "a.npz", lambda _: b"")
+    assert list(found) == ["a"]
