@@ -88,18 +88,22 @@ class Workspace:
                     "another --workspace"
                 )
             self._lock = handle
-            for left in (self.root / PARTIAL).glob("*"):
-                with contextlib.suppress(OSError):
-                    remove(left)
+            self._clear_partial()
             for folder in (self.root, self.root / "stages"):
                 clear_leftovers(folder)
             try:
                 yield
             finally:
                 self._lock = None
+                self._clear_partial()  # workers that were ended after the stage's own clearing
                 self._release_if_unused()
         finally:
             os.close(handle)
+
+    def _clear_partial(self) -> None:
+        for left in (self.root / PARTIAL).glob("*"):
+            with contextlib.suppress(OSError):
+                remove(left)
 
     def _release_if_unused(self) -> None:
         stages = self.root / "stages"
