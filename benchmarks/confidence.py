@@ -30,7 +30,12 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 import megloc_kapture as megloc
-from megloc_kapture.evaluation.confidence import calibration_error, reliability, risk_by_score
+from megloc_kapture.evaluation.confidence import (
+    calibration_error,
+    least_area,
+    reliability,
+    risk_by_score,
+)
 from megloc_kapture.evaluation.metrics import confidence_interval
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
@@ -250,7 +255,8 @@ def report(table: pd.DataFrame, found: NDArray[np.float64], accepted: float) -> 
     by_inliers = risk_by_score(table.num_inliers.to_numpy(np.float64)[posed], right).mean()
     print(
         f"calibration error {calibration_error(bins):.3f}; area under risk against coverage "
-        f"{risk_by_score(found[posed], right).mean():.4f}, by inliers {by_inliers:.4f}"
+        f"{risk_by_score(found[posed], right).mean():.4f}, by inliers {by_inliers:.4f}, at best "
+        f"{least_area(right):.4f}"
     )
     for one in bins:
         bounds = f"{one.low:.1f}-{one.high:.1f}"
@@ -284,7 +290,7 @@ def main() -> None:
     fitting = commands.add_parser("fit")
     fitting.add_argument("tables", type=Path, nargs="+")
     fitting.add_argument("--terms", nargs="+", choices=list(TERMS), default=list(TERMS))
-    fitting.add_argument("--accepted", type=float, default=0.5)
+    fitting.add_argument("--accepted", type=float, default=0.6)
     fitting.add_argument("--write", action="store_true")
     options = parser.parse_args()
     if options.command == "collect":

@@ -108,7 +108,7 @@ class Deciding(Choosing):
 
     min_confidence: float | None = None
     """A pose that is less likely to be right (0 to 1) is a failure; 0: every pose is kept, for
-    challenges, where a wrong answer costs nothing. 0.5 unless given."""
+    challenges, where a wrong answer costs nothing. 0.6 unless given."""
 
     def assignments(self) -> tuple[str, ...]:
         """What is set by --set and by flags of its own."""

@@ -62,7 +62,8 @@ class Confidence:
     calibration_error : mean distance of a bin's confidence from its share of right poses, by poses.
     coverage, risk : (num_poses,) of all queries the share that is accepted, and of these the share
         that is wrong, as poses are accepted from the most confident on.
-    area : under the curve of risk over the poses; 0 where no wrong pose comes before a right one.
+    area : under the curve of risk over the poses.
+    least_area : what it would be if every right pose came before every wrong one.
     area_by_inliers : the same with the number of inliers instead; None where it is not known.
     """
 
@@ -78,6 +79,7 @@ class Confidence:
     coverage: tuple[float, ...]
     risk: tuple[float, ...]
     area: float
+    least_area: float
     area_by_inliers: float | None
 
 
@@ -126,6 +128,7 @@ def confidence_of(
         coverage=tuple((np.arange(1, len(posed) + 1) / num_queries).tolist()),
         risk=tuple(risk.tolist()),
         area=float(risk.mean()) if posed else 0.0,
+        least_area=least_area(right),
         area_by_inliers=by_inliers,
     )
 
@@ -160,3 +163,10 @@ def risk_by_score(scores: NDArray[np.float64], right: NDArray[np.bool_]) -> NDAr
     wrong = np.bincount(inverse, weights=~right) / counts
     cumulated = np.cumsum(wrong[inverse][order])
     return np.asarray(cumulated / np.arange(1, len(scores) + 1))
+
+
+def least_area(right: NDArray[np.bool_]) -> float:
+    """Area under risk against coverage where every right pose comes first; 0 without poses."""
+    if not len(right):
+        return 0.0
+    return float(risk_by_score(right.astype(np.float64), right).mean())

@@ -339,7 +339,7 @@ def read_nowhere(truth: Path | str) -> tuple[str, ...]:
     ------
     DataError : the file cannot be read, or a name stands in it twice; names file and line.
     """
-    path = Path(truth) / NOWHERE_FILE
+    path = table_path(truth, NOWHERE_FILE)
     if not path.is_file():
         return ()
     names: dict[str, int] = {}

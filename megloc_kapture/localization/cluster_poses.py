@@ -290,23 +290,18 @@ def _sources(
     """Where the matches of a cluster come from, and what its images see."""
     number = {image: at for at, image in enumerate(cluster)}
     center_of = np.array([centers[image] for image in cluster]).reshape(-1, 3)
-    similarities, support, images, noise, seen = [], [], [], [], []
-    types: list[NDArray[np.int64]] = []
+    support, images, noise, seen = [], [], [], []
     for view, of_types in zip(views, found, strict=True):
         for typed, own in zip(view.matches, of_types, strict=True):
             rows = np.array([number.get(image, -1) for image, _, _ in typed.matches], np.int64)
-            similarities.append(own.similarities)
             support.append(own.support)
             images.append(rows[own.image_rows])
             noise.append(np.full(len(own.support), typed.index.noise_rad))
-            types.append(np.full(len(own.support), len(types)))
         seen.append(
             np.concatenate([np.zeros((0, 3)), *(m.index.seen_by(cluster) for m in view.matches)])
         )
     rows_of_images = np.concatenate(images)
     return MatchSources(
-        similarities=np.concatenate(similarities),
-        types=np.concatenate(types),
         support=np.concatenate(support),
         centers=center_of[rows_of_images],
         images=rows_of_images,

@@ -2,8 +2,8 @@
 
 A number of inliers says little by itself: of a thousand matches some agree with any pose. What is
 looked at (:func:`evidence_of`) is how far the inliers exceed chance, what share of all matches and
-of all that could match they are, how well they fit, whether their descriptors are more alike than
-those of the other matches, how firmly they hold the pose, and from how far away they were seen.
+of all that could match they are, how well they fit, by themselves and beside the map's own images,
+how firmly they hold the pose, and from where, and how many, map images saw them.
 A logistic model weighs it (:class:`Calibration`). Its weights are fitted by
 ``benchmarks/confidence.py`` and stand, with their origin, in ``confidence.toml`` beside this file.
 """
@@ -37,8 +37,6 @@ _MIN_NOISE_PX = 0.3
 # an image of the scene fits worse than the map's own by less than that, and fewer inliers than
 # these say nothing about it
 _USUAL_RATIO, _FEW = 3.3, 20
-# the area under the ROC curve of similarities before any is seen, and how many pairs that is worth
-_USUAL_SIMILARITY, _USUAL_PAIRS = 0.75, 20.0
 
 TERMS: dict[str, str] = {
     "surprise": "hardly more matches agree than would by chance",
@@ -46,7 +44,6 @@ TERMS: dict[str, str] = {
     "matched_share": "few of the points that the camera would see were matched",
     "residual": "the inliers fit badly",
     "misfit": "many inliers fit, and all of them worse than the map's own images do",
-    "similarity": "the inliers are no more alike than the other matches",
     "deviation": "the inliers hold the pose loosely",
     "viewing_angle": "the map's images saw these points from elsewhere",
     "distance_ratio": "the map's images saw these points from another distance",
@@ -61,9 +58,6 @@ class MatchSources:
 
     Attributes
     ----------
-    similarities : float64 (N,), of the descriptors, higher is better; of one keypoints type they
-        can be compared.
-    types : int64 (N,), the view and keypoints type of each, counted from 0.
     support : int64 (N,), number of map images that say so.
     centers : float64 (sum of support, 3), where these images were taken, match by match.
     images : int64 (sum of support,), these images.
@@ -73,8 +67,6 @@ class MatchSources:
     seen : of each view the points (K, 3) that the map images of the cluster observe.
     """
 
-    similarities: NDArray[np.float64]
-    types: NDArray[np.int64]
     support: NDArray[np.int64]
     centers: NDArray[np.float64]
     images: NDArray[np.int64]
@@ -115,7 +107,6 @@ def evidence_of(
         "matched_share": math.log(count / max(matchable, count)),
         "residual": math.log(max(float(np.median(errors_px[inliers])), 0.1) / max_error_px),
         "misfit": _misfit(problem, errors_px, inliers, sources),
-        "similarity": _similarity(sources, inliers),
         "deviation": math.log(
             max(center_deviation(pose.covariance) / float(np.median(distances)), 1e-5)
         ),
@@ -231,23 +222,6 @@ def _num_visible(
             size = (view.camera.width, view.camera.height)
             total += every * int(((px >= 0) & (px <= size)).all(axis=1).sum())
     return int(total)
-
-
-def _similarity(sources: MatchSources, inliers: NDArray[np.bool_]) -> float:
-    """Probability that an inlier's descriptors are more alike than another match's of its type.
-
-    The area under the ROC curve, drawn towards what is usual where there are few pairs to compare.
-    """
-    better, pairs = _USUAL_SIMILARITY * _USUAL_PAIRS, _USUAL_PAIRS
-    for own in range(int(sources.types.max(initial=-1)) + 1):
-        of_type = sources.types == own
-        yes = sources.similarities[of_type & inliers]
-        no = np.sort(sources.similarities[of_type & ~inliers])
-        better += 0.5 * float(
-            np.searchsorted(no, yes, "left").sum() + np.searchsorted(no, yes, "right").sum()
-        )
-        pairs += float(len(yes) * len(no))
-    return better / pairs
 
 
 def _viewpoints(

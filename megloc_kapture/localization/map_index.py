@@ -128,14 +128,12 @@ class Correspondences:
     keypoint_ids : int64 (N,), rows of the query's keypoints, ascending.
     point_ids : int64 (N,), rows of the map's points.
     support : int64 (N,), number of map images that say so.
-    similarities : float64 (N,), of the most similar of them; higher is better.
     image_rows : int64 (sum of support,), these images, match by match.
     """
 
     keypoint_ids: NDArray[np.int64]
     point_ids: NDArray[np.int64]
     support: NDArray[np.int64]
-    similarities: NDArray[np.float64]
     image_rows: NDArray[np.int64]
 
 
@@ -179,7 +177,7 @@ class ObservedMatches:
         taken = np.flatnonzero(rows[self.image_rows])
         if len(taken) == 0:
             none = np.zeros(0, dtype=np.int64)
-            return Correspondences(none, none, none, np.zeros(0), none)
+            return Correspondences(none, none, none, none)
         # both in one number: equals are the same pair, and their order does not matter
         taken = taken[np.argsort((self.keypoint_ids[taken] << 32) | self.point_ids[taken])]
         keypoints, points = self.keypoint_ids[taken], self.point_ids[taken]
@@ -198,7 +196,6 @@ class ObservedMatches:
             keypoints[chosen],
             points[chosen],
             support[chosen],
-            best[chosen],
             self.image_rows[taken][np.repeat(chosen, support)],
         )
 

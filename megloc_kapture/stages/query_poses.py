@@ -65,7 +65,7 @@ class LocalizationOptions(Options):
     rank: PluginChoice = PluginChoice(name="distinctive")
     pose: AbsolutePoseOptions = AbsolutePoseOptions()
     min_confidence: float = Field(
-        default=0.5,
+        default=0.6,
         ge=0,
         le=1,
         description="a pose that is less likely to be right is a failure; 0: none is",

@@ -42,10 +42,7 @@ def scene(
     pose = rig_pose([view], AbsolutePoseOptions(max_error_px=ERROR_PX, min_inliers=4))
     assert isinstance(pose, Pose)
     count = right + wrong
-    similarities = np.r_[rng.normal(0.9, 0.03, right), rng.normal(0.8, 0.03, wrong)]
     sources = MatchSources(
-        similarities=similarities,
-        types=np.zeros(count, np.int64),
         support=np.ones(count, np.int64),
         centers=np.zeros((count, 3)),
         images=np.zeros(count, np.int64),
@@ -79,15 +76,6 @@ def test_terms_of_known_worth() -> None:
     assert 0.03 < found["viewing_angle"] * 90 < 6
     assert found["distance_ratio"] < 0.2
     assert found["support"] == pytest.approx(math.log(2.0))
-
-
-def test_similarity_is_the_area_under_the_curve() -> None:
-    problem, pose, sources = scene(100, 100)
-    assert pose.inliers is not None
-    same = replace(sources, similarities=np.ones(200))
-    assert evidence_of(problem, pose, same, ERROR_PX)["similarity"] == pytest.approx(0.5, abs=0.01)
-    best = replace(sources, similarities=pose.inliers.astype(float))
-    assert evidence_of(problem, pose, best, ERROR_PX)["similarity"] == pytest.approx(1.0, abs=0.01)
 
 
 def test_surprise_against_the_binomial_distribution() -> None:
@@ -130,7 +118,6 @@ def test_right_and_chance() -> None:
     assert isinstance(found, Pose) and found.confidence is not None and found.confidence > 0.9
     assert found.evidence == evidence_of(problem, pose, sources, ERROR_PX)
     problem, pose, sources = scene(4, 600, noise_px=0.1)
-    sources = replace(sources, similarities=np.linspace(0, 1, 604))
     refused = with_confidence(problem, pose, sources, ERROR_PX, 0.5)
     assert isinstance(refused, Failure) and refused.num_inliers == pose.num_inliers
     assert (

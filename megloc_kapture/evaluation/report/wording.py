@@ -161,7 +161,7 @@ def confidence_sentences(confidence: Confidence, coarsest: Threshold) -> list[st
         than = "" if by_inliers is None else f" ({by_inliers:.4f} by number of inliers)"
         said.append(
             f"calibration error {confidence.calibration_error:.3f}; area under risk against "
-            f"coverage {confidence.area:.4f}{than}"
+            f"coverage {confidence.area:.4f}{than}, at best {confidence.least_area:.4f}"
         )
     if confidence.num_nowhere:
         said.append(
