@@ -223,6 +223,7 @@ def _by_centers(
         pools=benchmark.protocol.pools,
         label=result.label,
         nowhere=nowhere,
+        confidences=result.confidences,
     )
 
 

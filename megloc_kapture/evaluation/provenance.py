@@ -6,10 +6,12 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import BaseModel, Field
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.files import write_json
+from megloc_kapture.io.files import read_json_model, write_json
 
 # what can change a pose or a figure of the report
 _PACKAGES = (
@@ -81,6 +83,22 @@ def write_provenance(
     path = provenance_path(target)
     write_json(path, ours | dict(provenance))
     return path
+
+
+class _Scores(BaseModel):
+    confidence: dict[str, Annotated[float, Field(ge=0, le=1)]] = {}
+
+
+def read_confidences(target: Path | str) -> dict[str, float]:
+    """Image -> confidence of its pose, as the provenance beside a pose file has it under
+    ``confidence``; empty where there is none.
+
+    Raises
+    ------
+    DataError : the provenance is broken, or has something else there.
+    """
+    path = provenance_path(target)
+    return read_json_model(path, _Scores).confidence if path.is_file() else {}
 
 
 def _sha256(path: Path) -> str:

@@ -16,6 +16,7 @@ from megloc_kapture.evaluation.pose_files import (
     timestamp_of,
 )
 from megloc_kapture.evaluation.protocols import Benchmark
+from megloc_kapture.evaluation.provenance import read_confidences
 from megloc_kapture.io.dataset_tables import (
     PROTOCOL_FILE,
     SIDE_TABLES,
@@ -181,6 +182,8 @@ class Result:
     images : every query the result is about, with or without a pose; sorted. A pose file tells
         only those that have one.
     statuses : rows of ``status.csv``; None without one.
+    confidences : image -> probability that its pose is right, where the provenance beside a pose
+        file says it; ``statuses`` have their own.
     by_pair : of MLAD's pose files, the query's ``cam_from_world`` of each row; None of others.
     context : what a report of it can show.
     """
@@ -189,6 +192,7 @@ class Result:
     poses: Poses
     images: tuple[str, ...]
     statuses: Mapping[str, QueryStatus] | None = None
+    confidences: Mapping[str, float] = field(default_factory=dict)
     by_pair: Mapping[RelocalizationPair, RigidTransform] | None = None
     context: ResultContext = field(default_factory=ResultContext)
 
@@ -236,7 +240,7 @@ def read_result(
     poses = poses_by_image(read_pose_file(path), images, benchmark.names)
     if benchmark.world != World():
         poses = {image: benchmark.world.pose_in_local(pose) for image, pose in poses.items()}
-    return Result(label, poses, tuple(sorted(poses)))
+    return Result(label, poses, tuple(sorted(poses)), confidences=read_confidences(path))
 
 
 def result_in_memory(

@@ -224,6 +224,7 @@ def evaluate_poses(
     label: str = "",
     errors: PoseErrors | None = None,
     nowhere: Collection[str] = (),
+    confidences: Mapping[str, float] | None = None,
 ) -> Evaluation:
     """Errors, recall and outcomes of ``estimated``.
 
@@ -241,6 +242,7 @@ def evaluate_poses(
     errors : of exactly the counted queries, sorted by name, where they are measured in another
         way than by camera centres and rotation angle.
     nowhere : images that are known to show nothing of the map.
+    confidences : of poses, where ``statuses`` do not say them.
 
     Raises
     ------
@@ -259,13 +261,13 @@ def evaluate_poses(
     if errors is None:
         errors = pose_errors(estimated, truth, counted)
     queries = tuple(
-        _query_result(name, position_m, angle_deg, conditions, statuses)
+        _query_result(name, position_m, angle_deg, conditions, statuses, confidences or {})
         for name, position_m, angle_deg in zip(
             counted, errors.position_m.tolist(), errors.angle_deg.tolist(), strict=True
         )
     )
     strays = tuple(
-        _query_result(name, error, error, conditions, statuses)
+        _query_result(name, error, error, conditions, statuses, confidences or {})
         for name in sorted(nowhere)
         for error in (1e9 if name in estimated else np.inf,)
     )
@@ -294,6 +296,7 @@ def _query_result(
     angle_deg: float,
     conditions: Mapping[str, str] | None,
     statuses: Mapping[str, QueryStatus] | None,
+    confidences: Mapping[str, float],
 ) -> QueryResult:
     status = None if statuses is None else statuses.get(image)
     outcome: Outcome = "localized"
@@ -318,7 +321,7 @@ def _query_result(
         num_inliers=None if status is None else status.num_inliers,
         fallback=fallback,
         candidates=() if status is None else status.candidates,
-        confidence=None if status is None else status.confidence,
+        confidence=confidences.get(image) if status is None else status.confidence,
     )
 
 

@@ -51,6 +51,7 @@ class _Result:
     poses: Mapping[str, RigidTransform]
     guesses: Collection[str]
     from_rig: Collection[str]
+    confidences: Mapping[str, float]
 
 
 @dataclass(frozen=True)
@@ -158,9 +159,11 @@ def write_submission(
         "from_rig": sum(image in result.from_rig for image in content.posed),
         "dummies": len(content.missing) if rules.pose_file == "mlad" else 0,
     }
+    posed = set(content.posed)
     entries = {
         **provenance,
         "weights": dict(weights or {}),
+        "confidence": {i: c for i, c in sorted(result.confidences.items()) if i in posed},
         "dataset_fingerprint": _dataset_fingerprint(beside),
         "dummies" if rules.pose_file == "mlad" else "missing": content.missing,
     }
@@ -224,7 +227,13 @@ def _read_result(localized: Path, beside: Path | None, *, from_rig: bool) -> _Re
         derived = poses_through_rig(data, poses, statuses)
     guesses = {image for image, s in statuses.items() if s.fallback == "retrieval"}
     by_stage = {image for image, s in statuses.items() if s.fallback == "rig"}
-    return _Result(data, poses | derived, guesses - derived.keys(), by_stage | derived.keys())
+    confidences = {
+        image: s.confidence
+        for image, s in statuses.items()
+        if s.confidence is not None and s.status == "localized"
+    }
+    from_rigs = by_stage | derived.keys()
+    return _Result(data, poses | derived, guesses - derived.keys(), from_rigs, confidences)
 
 
 def _ltvl(result: _Result, tables: Path | None, rules: Protocol) -> _Content:

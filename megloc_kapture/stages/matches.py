@@ -301,8 +301,8 @@ def cached_features(
     """
 
     def read() -> Features:
-        descriptors = folder.descriptors(local_type)
-        found, described = folder.keypoints(local_type).read(image), descriptors.read(image)
+        keypoints, descriptors = folder.keypoints(local_type), folder.descriptors(local_type)
+        found, described = keypoints.read(image), descriptors.read(image)
         if len(found) != len(described):
             raise DataError(
                 f"{len(described)} descriptors for {len(found)} keypoints",

@@ -130,3 +130,16 @@ def test_in_memory_and_on_a_page(tmp_path: Path) -> None:
     assert "Does it know when it does not know?" in (tmp_path / "report.html").read_text()
     data = json.loads((tmp_path / "recall.json").read_text())
     assert data["confidence"]["num_poses"] == 1
+
+
+def test_confidences_beside_a_pose_file(tmp_path: Path) -> None:
+    poses = tmp_path / "poses.txt"
+    poses.write_text("a 1 0 0 0 0 0 0\nb 1 0 0 0 50 0 0\n")
+    truth = {"a": at(0.0), "b": at(0.0)}
+    assert evaluate(poses, truth).confidence is None
+    (tmp_path / "poses.txt.json").write_text('{"confidence": {"a": 0.9, "b": 0.2}, "preset": "x"}')
+    known = evaluate(poses, truth).confidence
+    assert known is not None and known.risk == (0.0, 0.5) and known.area_by_inliers is None
+    (tmp_path / "poses.txt.json").write_text('{"confidence": {"a": 7}}')
+    with pytest.raises(DataError, match=r"poses\.txt\.json"):
+        evaluate(poses, truth)

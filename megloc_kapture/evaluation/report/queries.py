@@ -186,6 +186,8 @@ def _facts(query: QueryResult) -> tuple[str, ...]:
             facts.append(f"fallback pose ({query.reason})")
     if query.num_inliers is not None:
         facts.append(f"{query.num_inliers} inliers of {query.num_matches}")
+    if query.confidence is not None:
+        facts.append(f"confidence {query.confidence:.2f}")
     return tuple(facts)
 
 
