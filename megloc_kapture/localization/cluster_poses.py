@@ -25,6 +25,7 @@ from megloc_kapture.localization.estimation import (
     estimate_pose,
     split_by_view,
 )
+from megloc_kapture.localization.focal_check import focal_remark
 from megloc_kapture.localization.map_index import (
     Correspondences,
     MapIndex,
@@ -161,6 +162,8 @@ def localize_in_clusters(
         if min_confidence is not None and isinstance(result, Pose):
             sources = _sources(views, attempts[best].found, ranked[best].images, centers or {})
             result = with_confidence(problem, result, sources, options.max_error_px, min_confidence)
+            if isinstance(result, Pose) and (remark := focal_remark(problem, result)):
+                result = replace(result, remarks=(remark,))
             clock.lap("confidence")
     result = replace(result, candidates=ranked[best].images, clusters=ranked, seconds=clock.seconds)
     if isinstance(result, Pose):

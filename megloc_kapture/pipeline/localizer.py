@@ -228,7 +228,7 @@ class Localizer:
             ):
                 if isinstance(result, Pose):
                     result = self.refiners.refine(image.query.name, image.camera, result, scene)
-                found.append(replace(result, remarks=told))
+                found.append(replace(result, remarks=(*result.remarks, *told)))
             return found
 
     def _solve(
