@@ -457,3 +457,53 @@ def test_info_of_a_map_whose_descriptors_are_missing(megloc: Any, gallery: Path)
     (gallery / "map" / "sensors" / "records_data").rename(gallery / "away")
     told = described(megloc("info", gallery / "map").out)
     assert told["retrieval"] == "not possible without the map's descriptors"
+
+
+def test_a_map_that_contradicts_itself_is_not_localized_in_silently(
+    megloc: Any, foreign: Path, scene: Path, tmp_path: Path
+) -> None:
+    path = foreign / "map" / "reconstruction" / "points3d.txt"
+    table = np.loadtxt(path, delimiter=",")
+    table[:, [1, 2]] = table[:, [2, 1]]
+    np.savetxt(path, table, delimiter=", ", header="X, Y, Z, R, G, B")
+    inputs = ("-i", foreign / "map", "--query", foreign / "query", "-o", tmp_path / "localized")
+    text = megloc("localize", *inputs).refused("the points do not fit the keypoints")
+    assert "points read as (x, z, y)" in text and "--force" in text
+    assert not (tmp_path / "localized").exists()
+    out = megloc("info", foreign / "map").out
+    assert re.search(r"FAULT +the points do not fit .* with points read as \(x, z, y\)", out)
+    # who insists gets poses that are right in that world, or reasons
+    assert megloc("localize", *inputs, "-f").status == 0
+    assert len(read_status(tmp_path / "localized" / "status.csv")) == 4
+
+
+def test_strangers_are_refused_and_that_is_right(
+    megloc: Any, dataset: Path, tmp_path: Path
+) -> None:
+    """A query that shows nothing of the map: refused, counted as right, with every pose wanted."""
+    query = dataset / "query"
+    data = KaptureFolder(query).read()
+    first = data.image_names()[0]
+    camera = data.camera_of(first)
+    rng = np.random.default_rng(0)
+    coarse = rng.integers(0, 255, (camera.height // 8, camera.width // 8, 3), dtype=np.uint8)
+    noise = np.kron(coarse, np.ones((8, 8, 1), np.uint8))
+    time, sensor = data.record_of(first)
+    pixels = np.zeros((camera.height, camera.width, 3), np.uint8)
+    pixels[: noise.shape[0], : noise.shape[1]] = noise
+    write_image(query / "sensors" / "records_data" / "stranger.png", pixels)
+    with (query / "sensors" / "records_camera.txt").open("a") as file:
+        file.write(f"{int(time) + 1000}, {sensor}, stranger.png\n")
+    (dataset / "query_gt" / "nowhere.txt").write_text("stranger.png\n")
+    workspace = tmp_path / "workspace"
+    done = megloc(
+        "eval", "kapture", "--root", dataset, "-w", workspace, "--executor", "inline",
+        "--set", "local_features.options.max_keypoints=800",
+    )  # fmt: skip
+    assert done.status == 0
+    text = " ".join((workspace / "evaluation" / "recall.txt").read_text().split())
+    assert "1 query shows nothing of the map: 1 refused, 0 given a pose" in text
+    assert (workspace / "query_gt" / "nowhere.txt").read_text() == "stranger.png\n"
+    rows = read_status(workspace / "localized" / "status.csv")
+    assert rows["stranger.png"].status == "failed"
+    assert all(row.confidence is not None for row in rows.values() if row.status == "localized")

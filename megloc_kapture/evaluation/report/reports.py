@@ -184,12 +184,13 @@ def _recall_sections(evaluations: Sequence[Evaluation]) -> list[Section]:
 
 
 def _confidence_sections(evaluations: Sequence[Evaluation]) -> list[Section]:
-    return [
-        _lines(Paragraph(f"Confidence{f' of {e.label}' if evaluations[1:] else ''}: {sentence}."))
-        for e in evaluations
-        if (confidence := e.confidence) is not None
-        for sentence in confidence_sentences(confidence, e.thresholds[-1])
-    ]
+    sections = []
+    for evaluation in evaluations:
+        if (confidence := evaluation.confidence) is not None:
+            whose = f" of {evaluation.label}" if evaluations[1:] else ""
+            told = "; ".join(confidence_sentences(confidence, evaluation.thresholds[-1]))
+            sections.append(_lines(Paragraph(f"Confidence{whose}: {told}.")))
+    return sections
 
 
 def _note_sections(evaluations: Sequence[Evaluation]) -> list[Section]:

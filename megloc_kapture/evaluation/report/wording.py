@@ -157,8 +157,9 @@ def confidence_sentences(confidence: Confidence, coarsest: Threshold) -> list[st
             f"{coarsest}): {format_share(confidence.num_wrong, confidence.num_poses)} % "
             f"({interval})"
         )
+    if confidence.num_wrong:
         by_inliers = confidence.area_by_inliers
-        than = "" if by_inliers is None else f" ({by_inliers:.4f} by number of inliers)"
+        than = "" if by_inliers is None else f", by the number of inliers {by_inliers:.4f}"
         said.append(
             f"calibration error {confidence.calibration_error:.3f}; area under risk against "
             f"coverage {confidence.area:.4f}{than}, at best {confidence.least_area:.4f}"
