@@ -239,6 +239,7 @@ CASES: dict[str, Case] = {
     "localization.pose.max_iterations": Case("1", context=HASTY),
     "localization.pose.confidence": Case("0.0001", context=HASTY),
     "localization.pose.seed": Case("9", context=HASTY),
+    "localization.min_confidence": Case("1.0"),
     "localization.rigs": Case("true", scene="with_rig"),
     "localization.fallback": Case('"retrieval"', context=("localization.pose.min_inliers=100000",)),
     "pose_refinement.by": Case(
