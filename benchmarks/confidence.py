@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -37,12 +38,14 @@ from megloc_kapture.evaluation.confidence import (
     risk_by_score,
 )
 from megloc_kapture.evaluation.metrics import confidence_interval
+from megloc_kapture.geometry.cameras import shift_principal_point
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.localization import confidence
 from megloc_kapture.localization.confidence import TERMS
 from megloc_kapture.pipeline.localizer import Localizer
-from megloc_kapture.values import ONE_FOCAL_MODELS, Camera, Pose, RigidTransform
+from megloc_kapture.preprocessing.resampling import scaled_camera
+from megloc_kapture.values import Camera, Pose, RigidTransform
 
 MAX_ERROR, MAX_ANGLE_DEG = 0.1, 10.0
 # a term that speaks for a pose may not be given a weight against it, and the reverse
@@ -70,20 +73,6 @@ def images_of(folder: Path, truth: Path | None = None, most: int = 10_000) -> It
         yield name, "", pixels, data.camera_of(name), poses.cam_from_world(name)
 
 
-def with_params(camera: Camera, width: int, height: int, shift: tuple[float, float]) -> Camera:
-    """The camera of an image scaled to this size, or cut to it from ``shift`` on."""
-    params = list(camera.params)
-    at = 1 if camera.model in ONE_FOCAL_MODELS else 2
-    if shift == (0.0, 0.0):
-        scales = width / camera.width, height / camera.height
-        for k in range(at):
-            params[k] *= scales[k % 2]
-        params[at], params[at + 1] = params[at] * scales[0], params[at + 1] * scales[1]
-    else:
-        params[at], params[at + 1] = params[at] - shift[0], params[at + 1] - shift[1]
-    return Camera(camera.model, width, height, tuple(params))
-
-
 def worse(
     pixels: Pixels, camera: Camera, rng: np.random.Generator
 ) -> Iterator[tuple[str, Pixels, Camera]]:
@@ -92,7 +81,7 @@ def worse(
     for name, share in (("half", 0.5), ("third", 0.33)):
         size = int(width * share), int(height * share)
         small = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
-        yield name, small, with_params(camera, *size, (0.0, 0.0))
+        yield name, small, scaled_camera(camera, *size)
     yield "blurred", cv2.GaussianBlur(pixels, (0, 0), width / 400).astype(np.uint8), camera
     dark = 64 * (pixels / 255.0) ** 2 + rng.normal(0, 4, pixels.shape)
     yield "dark", dark.clip(0, 255).astype(np.uint8), camera
@@ -101,7 +90,8 @@ def worse(
         x = 1 + int((width - size[0] - 1) * rng.random())
         y = 1 + int((height - size[1] - 1) * rng.random())
         part = np.ascontiguousarray(pixels[y : y + size[1], x : x + size[0]])
-        yield name, part, with_params(camera, *size, (x, y))
+        cropped = replace(camera, width=size[0], height=size[1])
+        yield name, part, shift_principal_point(cropped, -x, -y)
     covered = pixels.copy()
     x, y = int(0.3 * width * rng.random()), int(0.3 * height * rng.random())
     covered[y : y + int(0.7 * height), x : x + int(0.7 * width)] = rng.integers(0, 255, 3)

@@ -69,8 +69,8 @@ def input_files(root: Path) -> Iterator[Path]:
         folder = KaptureFolder(root / part)
         if (folder.root / "sensors").is_dir():
             yield from files_of(folder, images=part != QUERY_GT)
-    if (root / QUERY_GT / NOWHERE_FILE).is_file():
-        yield root / QUERY_GT / NOWHERE_FILE
+    if (nowhere := table_path(root / QUERY_GT, NOWHERE_FILE)).is_file():
+        yield nowhere
     for name in (
         GROUPS_FILE,
         PRIORS_FILE,
@@ -182,8 +182,7 @@ def import_mapping(mapping: KaptureFolder, output: Path) -> dict[str, float]:
 def mapping_files(mapping: KaptureFolder) -> Iterator[Path]:
     """Every file that :func:`import_mapping` depends on."""
     yield from files_of(mapping)
-    groups = _tables_beside(mapping) / GROUPS_FILE
-    if groups.is_file():
+    if (groups := table_path(_tables_beside(mapping), GROUPS_FILE)).is_file():
         yield groups
 
 

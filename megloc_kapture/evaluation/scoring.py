@@ -261,15 +261,16 @@ def evaluate_poses(
     if errors is None:
         errors = pose_errors(estimated, truth, counted)
     queries = tuple(
-        _query_result(name, position_m, angle_deg, conditions, statuses, confidences or {})
+        _query_result(
+            name, (position_m, angle_deg), name in estimated, conditions, statuses, confidences
+        )
         for name, position_m, angle_deg in zip(
             counted, errors.position_m.tolist(), errors.angle_deg.tolist(), strict=True
         )
     )
     strays = tuple(
-        _query_result(name, error, error, conditions, statuses, confidences or {})
+        _query_result(name, (np.inf, np.inf), name in estimated, conditions, statuses, confidences)
         for name in sorted(nowhere)
-        for error in (1e9 if name in estimated else np.inf,)
     )
     members = row_members(
         [query.condition for query in queries], order=condition_order, pools=pools
@@ -292,17 +293,17 @@ def evaluate_poses(
 
 def _query_result(
     image: str,
-    position_m: float,
-    angle_deg: float,
+    errors: tuple[float, float],
+    has_pose: bool,
     conditions: Mapping[str, str] | None,
     statuses: Mapping[str, QueryStatus] | None,
-    confidences: Mapping[str, float],
+    confidences: Mapping[str, float] | None,
 ) -> QueryResult:
     status = None if statuses is None else statuses.get(image)
     outcome: Outcome = "localized"
     reason = ""
     fallback: Fallback = "none"
-    if not np.isfinite(position_m):
+    if not has_pose:
         outcome = "missing"
         reason = "no pose in the result" if status is None else status.reason
         if status is not None and status.status == "localized":
@@ -315,13 +316,13 @@ def _query_result(
         condition="" if conditions is None else conditions.get(image, ""),
         outcome=outcome,
         reason=reason,
-        position_m=position_m,
-        angle_deg=angle_deg,
+        position_m=errors[0],
+        angle_deg=errors[1],
         num_matches=None if status is None else status.num_matches,
         num_inliers=None if status is None else status.num_inliers,
         fallback=fallback,
         candidates=() if status is None else status.candidates,
-        confidence=confidences.get(image) if status is None else status.confidence,
+        confidence=(confidences or {}).get(image) if status is None else status.confidence,
     )
 
 

@@ -18,7 +18,9 @@ __all__ = [
     "principal_point_px",
     "project",
     "px_from_cam",
+    "scale_focal",
     "shift_principal_point",
+    "swap_principal_point",
 ]
 
 
@@ -39,13 +41,27 @@ def principal_point_px(camera: Camera) -> tuple[float, float]:
     return camera.params[k], camera.params[k + 1]
 
 
-def shift_principal_point(camera: Camera, shift_px: float) -> Camera:
-    """The camera with its principal point moved by the same shift in x and y."""
+def shift_principal_point(camera: Camera, x_px: float, y_px: float | None = None) -> Camera:
+    """The camera with its principal point moved, in y as in x unless ``y_px`` is given."""
     k = _principal_point_index(camera)
     params = list(camera.params)
-    params[k] += shift_px
-    params[k + 1] += shift_px
+    params[k] += x_px
+    params[k + 1] += x_px if y_px is None else y_px
     return replace(camera, params=tuple(params))
+
+
+def scale_focal(camera: Camera, factor: float) -> Camera:
+    """The camera with its focal length, or both of them, so many times as long."""
+    k = _principal_point_index(camera)
+    params = tuple(factor * value for value in camera.params[:k]) + camera.params[k:]
+    return replace(camera, params=params)
+
+
+def swap_principal_point(camera: Camera) -> Camera:
+    """The camera with cx and cy exchanged."""
+    k = _principal_point_index(camera)
+    cx, cy = camera.params[k : k + 2]
+    return replace(camera, params=(*camera.params[:k], cy, cx, *camera.params[k + 2 :]))
 
 
 def bearing_rays(camera: Camera, points_px: NDArray[np.floating[Any]]) -> NDArray[np.float64]:

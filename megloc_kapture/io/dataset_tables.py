@@ -31,7 +31,13 @@ from pydantic import Field, field_validator, model_validator
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.csv_table import IMAGE, TEXT, ZERO_ONE, Column, Table
-from megloc_kapture.io.files import read_json_model, read_text, write_bytes, write_json_model
+from megloc_kapture.io.files import (
+    check_plain,
+    read_json_model,
+    read_text,
+    write_bytes,
+    write_json_model,
+)
 from megloc_kapture.io.paths import check_no_escape, check_relative
 from megloc_kapture.values import Options, RigidTransform
 
@@ -231,10 +237,7 @@ def table_path(folder: Path | str, name: str) -> Path:
     DataError : a link that leaves the dataset, no plain file, or far larger than any such table.
     """
     path = check_no_escape(Path(folder).parent, Path(folder) / name)
-    if path.exists() and not path.is_file():
-        raise DataError("not a plain file", path=path)
-    if path.is_file() and path.stat().st_size > _MAX_BYTES:
-        raise DataError(f"larger than {_MAX_BYTES >> 20} MB, which no such table is", path=path)
+    check_plain(path, _MAX_BYTES)
     return path
 
 

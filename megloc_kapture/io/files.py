@@ -49,15 +49,22 @@ def read_content(path: Path | str, max_bytes: int | None = None) -> bytes:
     """
     path = Path(path)
     try:
-        if path.exists() and not path.is_file():
-            raise DataError("not a plain file", path=path)
-        if max_bytes is not None and path.stat().st_size > max_bytes:
-            raise DataError(f"larger than {max_bytes >> 20} MB, which no such file is", path=path)
+        check_plain(path, max_bytes)
         return path.read_bytes()
     except FileNotFoundError as error:
         raise DataError("cannot read: the file is missing", path=path) from error
     except OSError as error:
         raise DataError(f"cannot read: {error.strerror or error}", path=path) from error
+
+
+def check_plain(path: Path, max_bytes: int | None = None) -> None:
+    """Raise DataError for what is there and is no plain file, or larger than ``max_bytes``."""
+    if not path.exists():
+        return
+    if not path.is_file():
+        raise DataError("not a plain file", path=path)
+    if max_bytes is not None and path.stat().st_size > max_bytes:
+        raise DataError(f"larger than {max_bytes >> 20} MB, which no such file is", path=path)
 
 
 def read_text(path: Path | str, max_bytes: int | None = None) -> str:

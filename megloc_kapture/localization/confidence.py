@@ -22,7 +22,11 @@ from numpy.typing import NDArray
 
 from megloc_kapture.geometry.cameras import focal_px, project
 from megloc_kapture.localization.absolute_pose import center_deviation
-from megloc_kapture.localization.estimation import PoseProblem, reprojection_errors_px
+from megloc_kapture.localization.estimation import (
+    PoseProblem,
+    reprojection_errors_px,
+    split_by_view,
+)
 from megloc_kapture.values import Failure, Pose, RigidTransform
 
 # of an a contrario test: matches that a pose is made of
@@ -150,14 +154,12 @@ def _surprise(problem: PoseProblem, errors_px: NDArray[np.float64], max_error_px
     The radius is the one that surprises most. Matches that stand together count once.
     """
     errors, shares = [], []
-    for view, first, last in zip(
-        problem.views, problem.starts[:-1].tolist(), problem.starts[1:].tolist(), strict=True
-    ):
+    for view, of_view in zip(problem.views, split_by_view(problem.views, errors_px), strict=True):
         width, height = view.camera.width, view.camera.height
-        cells = np.floor(problem.points_px[first:last] / max(_CELL * math.hypot(width, height), 1))
-        order = np.argsort(errors_px[first:last], kind="stable")
+        cells = np.floor(view.points_px / max(_CELL * math.hypot(width, height), 1))
+        order = np.argsort(of_view, kind="stable")
         kept = order[np.unique(cells[order], axis=0, return_index=True)[1]]
-        errors.append(errors_px[first:last][kept])
+        errors.append(of_view[kept])
         disc = np.pi * np.maximum(errors[-1], _MIN_ERROR_PX) ** 2
         shares.append(np.minimum(disc / (width * height), 1.0))
     error, share = np.concatenate(errors), np.concatenate(shares)

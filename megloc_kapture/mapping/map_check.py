@@ -7,41 +7,32 @@ other tools get wrong is mostly one of a few conventions, and each can be tried.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import permutations, product
 
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.geometry.cameras import focal_px, normalized_from_px, project
+from megloc_kapture.geometry.cameras import (
+    focal_px,
+    normalized_from_px,
+    project,
+    scale_focal,
+    swap_principal_point,
+)
 from megloc_kapture.geometry.cameras import principal_point_px as principal_point
-from megloc_kapture.values import ONE_FOCAL_MODELS, Camera, RigidTransform
+from megloc_kapture.mapping.pixel_origin import ObservedKeypoints
+from megloc_kapture.values import Camera, RigidTransform
 
 # of the larger side of an image: no map that serves is worse, none that is made wrongly is better
 _MAX_SHARE = 0.01
 _MIN_LIMIT_PX = 8.0
 # images that may fail: some poses of a good map are wrong
 _MAX_FAILING = 0.2
+# y up and z to the back, against y down and z to the front
+_COLMAP_FROM_OPENGL = RigidTransform((0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 _UNITS = {1000.0: "millimetres", 100.0: "centimetres", 1 / 1000: "kilometres", 1 / 0.3048: "feet"}
-
-
-@dataclass(frozen=True, eq=False)
-class ObservedKeypoints:
-    """A map image with its observations.
-
-    Attributes
-    ----------
-    keypoints_px : (K, 2), all of the image, in COLMAP's convention.
-    rows, points : int (M,), rows of the keypoints and of the map's points that they observe.
-    """
-
-    name: str
-    camera: Camera
-    cam_from_world: RigidTransform
-    keypoints_px: NDArray[np.floating]
-    rows: NDArray[np.integer]
-    points: NDArray[np.integer]
 
 
 # of an image: camera, pose, observed pixels (M, 2) and points (M, 3)
@@ -184,16 +175,16 @@ def _readings(
     yield "translations read as camera centres", changed(pose=_centre_given)
     yield (
         "poses read with OpenGL's axes",
-        changed(pose=lambda p: RigidTransform((0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 0.0)) @ p),
+        changed(pose=lambda p: _COLMAP_FROM_OPENGL @ p),
     )
     yield (
         "poses read as OpenGL's world_from_cam",
-        changed(pose=lambda p: RigidTransform((0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 0.0)) @ p.inverse()),
+        changed(pose=lambda p: _COLMAP_FROM_OPENGL @ p.inverse()),
     )
     for scale, unit in _UNITS.items():
         yield f"points in {unit}", changed(points=partial(np.multiply, 1 / scale))
         yield f"poses in {unit}", changed(pose=partial(_scaled, 1 / scale))
-    yield "cx and cy exchanged", changed(camera=_centre_exchanged)
+    yield "cx and cy exchanged", changed(camera=swap_principal_point)
     for by in (1, -1):
         yield (
             f"each pose given to the image {'after' if by > 0 else 'before'} it",
@@ -218,7 +209,7 @@ def _readings(
         else:
             yield (
                 f"a focal length {factor:.3g} times as long",
-                changed(camera=partial(_focal_scaled, factor)),
+                changed(camera=partial(scale_focal, factor=factor)),
             )
 
 
@@ -283,17 +274,3 @@ def _centre_given(pose: RigidTransform) -> RigidTransform:
 def _scaled(factor: float, pose: RigidTransform) -> RigidTransform:
     x, y, z = pose.translation
     return RigidTransform(pose.quat_wxyz, (factor * x, factor * y, factor * z))
-
-
-def _centre_exchanged(camera: Camera) -> Camera:
-    params = list(camera.params)
-    at = 1 if camera.model in ONE_FOCAL_MODELS else 2
-    params[at], params[at + 1] = params[at + 1], params[at]
-    return replace(camera, params=tuple(params))
-
-
-def _focal_scaled(factor: float, camera: Camera) -> Camera:
-    params = list(camera.params)
-    for k in range(1 if camera.model in ONE_FOCAL_MODELS else 2):
-        params[k] *= factor
-    return replace(camera, params=tuple(params))

@@ -27,13 +27,28 @@ _MIN_GAIN = 0.005
 
 
 @dataclass(frozen=True, eq=False)
-class ObservedImage:
-    """Keypoints (N, 2) of a map image as stored, and the points (N, 3) they observe."""
+class ObservedKeypoints:
+    """A map image with its observations.
 
+    Attributes
+    ----------
+    keypoints_px : (K, 2), all of the image.
+    rows, points : int (M,), rows of the keypoints and of the map's points that they observe.
+    """
+
+    name: str
     camera: Camera
     cam_from_world: RigidTransform
     keypoints_px: NDArray[np.floating]
-    points_world: NDArray[np.float64]
+    rows: NDArray[np.integer]
+    points: NDArray[np.integer]
+
+    def errors_px(self, xyz: NDArray[np.float64], shift_px: float = 0.0) -> NDArray[np.float64]:
+        """Distances (M,) of the points (N, 3), seen by the camera, from the keypoints moved by
+        ``shift_px``; NaN for a point behind it."""
+        with np.errstate(invalid="ignore"):
+            seen = project(self.camera, self.cam_from_world, xyz[self.points])
+            return np.linalg.norm(seen - (self.keypoints_px[self.rows] + shift_px), axis=1)
 
 
 @dataclass(frozen=True)
@@ -65,7 +80,8 @@ class PixelOrigin:
 
 
 def find_pixel_origin(
-    images: Sequence[ObservedImage],
+    images: Sequence[ObservedKeypoints],
+    xyz: NDArray[np.float64],
     *,
     cameras: Sequence[Camera],
     keypoints_at: Origin | None = None,
@@ -74,11 +90,12 @@ def find_pixel_origin(
 
     Parameters
     ----------
-    images : a sample of the map's images with their observations.
+    images : a sample of the map's images, keypoints as stored.
+    xyz : (N, 3), all points.
     cameras : all cameras of the map.
     keypoints_at : the keypoints' origin where it is known.
     """
-    errors = {shift: _median_error(images, shift) for shift in (0.0, _HALF, -_HALF)}
+    errors = {shift: _median_error(images, xyz, shift) for shift in (0.0, _HALF, -_HALF)}
     centred = bool(cameras) and all(_centred_on_pixel(camera) for camera in cameras)
     shared: Origin = keypoints_at or ("centre" if centred else "corner")
     best = 0.0
@@ -115,19 +132,11 @@ def find_pixel_origin(
     return PixelOrigin(intrinsics, keypoints, by_origin, reason)
 
 
-def _median_error(images: Sequence[ObservedImage], shift_px: float) -> float:
-    residuals = [
-        np.linalg.norm(
-            project(image.camera, image.cam_from_world, image.points_world)
-            - (image.keypoints_px + shift_px),
-            axis=1,
-        )
-        for image in images
-        if len(image.points_world)
-    ]
-    if not residuals:
-        return float("nan")
-    return float(np.nanmedian(np.concatenate(residuals)))
+def _median_error(
+    images: Sequence[ObservedKeypoints], xyz: NDArray[np.float64], shift_px: float
+) -> float:
+    errors = [image.errors_px(xyz, shift_px) for image in images if len(image.rows)]
+    return float(np.nanmedian(np.concatenate(errors))) if errors else float("nan")
 
 
 def _centred_on_pixel(camera: Camera) -> bool:

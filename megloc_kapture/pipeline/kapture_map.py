@@ -17,18 +17,13 @@ from megloc_kapture.io.dataset_tables import PROTOCOL_FILE, SIDE_TABLES
 from megloc_kapture.io.kapture import FeatureReader, KaptureFolder
 from megloc_kapture.io.weights.registry import registry
 from megloc_kapture.localization.map_index import MapIndex
-from megloc_kapture.mapping.map_check import ObservedKeypoints, map_fault
-from megloc_kapture.mapping.pixel_origin import (
-    ObservedImage,
-    Origin,
-    PixelOrigin,
-    find_pixel_origin,
-)
+from megloc_kapture.mapping.map_check import map_fault
+from megloc_kapture.mapping.pixel_origin import Origin, PixelOrigin, find_pixel_origin
 from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.plugins import LOCAL_FEATURES, PluginChoice, plugin_names
 from megloc_kapture.stages.map_refinement import REPORT_FILE
 from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
-from megloc_kapture.stages.shared_index import index_map
+from megloc_kapture.stages.shared_index import index_map, observed_keypoints
 from megloc_kapture.values import Camera, RigidTransform
 
 PixelOriginChoice = Literal["auto", "corner", "centre"]
@@ -275,16 +270,13 @@ class KaptureMap:
             run, number = 10, _SAMPLED_IMAGES // 10
             starts = np.linspace(0, max(len(images) - run, 0), number).astype(int).tolist()
             taken = sorted({at for start in starts for at in range(start, start + run)})
-            sample = [
-                ObservedKeypoints(
-                    image,
-                    self.camera(image),
-                    self.poses[image],
-                    keypoints.keypoints_px(image)[:, :2],
-                    *keypoints.index.observed(image),
-                )
-                for image in (images[at] for at in taken if at < len(images))
-            ]
+            # half a pixel of another origin is far within what a map may err by
+            sample = observed_keypoints(
+                self.folder,
+                name,
+                keypoints.index,
+                (images[at] for at in taken if at < len(images)),
+            )
             found = map_fault(sample, keypoints.index.xyz)
             if found is not None:
                 return found if len(self.keypoints) == 1 else f"{name}: {found}"
@@ -371,14 +363,11 @@ def _find_origin(folder: KaptureFolder, local_type: str, index: MapIndex) -> Pix
                 path=folder.root / "reconstruction" / "observations.txt",
             )
     step = max(1, len(images) // _SAMPLED_IMAGES)
-    sample = []
-    for image in images[::step]:
-        rows, points = index.observed(image)
-        stored = keypoints.read(image)
-        sample.append(
-            ObservedImage(data.camera_of(image), poses[image], stored[rows, :2], index.xyz[points])
-        )
+    sample = observed_keypoints(folder, local_type, index, images[::step])
     known: Origin | None = "corner" if _is_ours(folder, local_type) else None
     return find_pixel_origin(
-        sample, cameras=[data.camera_of(image) for image in images], keypoints_at=known
+        sample,
+        index.xyz,
+        cameras=[data.camera_of(image) for image in images],
+        keypoints_at=known,
     )

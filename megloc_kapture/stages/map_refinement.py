@@ -35,7 +35,7 @@ from megloc_kapture.mapping.depth import (
     DepthVerificationOptions,
     contradicted_by_depth,
 )
-from megloc_kapture.mapping.pixel_origin import ObservedImage, find_pixel_origin
+from megloc_kapture.mapping.pixel_origin import ObservedKeypoints, find_pixel_origin
 from megloc_kapture.mapping.rejection import (
     ConsistencyOptions,
     ObservedPoints,
@@ -348,14 +348,18 @@ def _keypoints_of(
         keypoints[rows] = reader.read(seen.image_names[image])[seen.keypoint_ids[rows], :2]
         if image in sampled:
             sample.append(
-                ObservedImage(
+                ObservedKeypoints(
+                    seen.image_names[image],
                     observed.cameras[image],
                     observed.cams_from_world[image],
                     keypoints[rows],
-                    observed.xyz[seen.point_ids[rows]],
+                    np.arange(len(rows)),
+                    seen.point_ids[rows],
                 )
             )
-    origin = find_pixel_origin(sample, cameras=[observed.cameras[image] for image in usable])
+    origin = find_pixel_origin(
+        sample, observed.xyz, cameras=[observed.cameras[image] for image in usable]
+    )
     return keypoints + np.float32(origin.keypoints_shift_px - origin.intrinsics_shift_px)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -19,11 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.geometry.cameras import focal_px, project
+from megloc_kapture.geometry.cameras import focal_px
 from megloc_kapture.io.files import atomic_write, output_error, owned_name, write_bytes
 from megloc_kapture.io.kapture import KaptureFolder, Observations
 from megloc_kapture.io.kapture.points import read_point_covariances
 from megloc_kapture.localization.map_index import MapIndex
+from megloc_kapture.mapping.pixel_origin import ObservedKeypoints
 
 _IMAGES = "images.json"
 # name -> numbers per row (0: a plain list) and type
@@ -65,23 +66,34 @@ def index_map(folder: KaptureFolder, local_type: str) -> MapIndex:
     return replace(index, noise_rad=_noise_rad(folder, local_type, index))
 
 
+def observed_keypoints(
+    folder: KaptureFolder, local_type: str, index: MapIndex, images: Iterable[str]
+) -> list[ObservedKeypoints]:
+    """Images that have a pose and keypoints, which are as they are stored."""
+    data, keypoints = folder.read(), folder.keypoints(local_type)
+    poses = data.poses()
+    return [
+        ObservedKeypoints(
+            image,
+            data.camera_of(image),
+            poses[image],
+            keypoints.read(image)[:, :2],
+            *index.observed(image),
+        )
+        for image in images
+    ]
+
+
 def _noise_rad(folder: KaptureFolder, local_type: str, index: MapIndex) -> float:
     """Median angle between observations and their points, of a sample of the images."""
-    if local_type not in folder.types("keypoints"):
+    if not len(index.point_ids) or local_type not in folder.types("keypoints"):
         return math.nan
-    data, keypoints = folder.read(), folder.keypoints(local_type)
-    images = [i for i in index.row_of_image if i in keypoints and data.cam_from_world(i)]
-    errors = [np.zeros(0)]
-    for image in images[:: max(1, len(images) // _SAMPLED_IMAGES)]:
-        camera, pose = data.camera_of(image), data.cam_from_world(image)
-        rows, points = index.observed(image)
-        stored = keypoints.read(image)
-        if pose is None or not len(rows) or rows[-1] >= len(stored):
-            continue
-        with np.errstate(invalid="ignore"):
-            offsets = project(camera, pose, index.xyz[points]) - stored[rows, :2]
-        errors.append(np.linalg.norm(offsets, axis=1) / focal_px(camera))
-    found = np.concatenate(errors)
+    keypoints, poses = folder.keypoints(local_type), folder.read().poses()
+    images = [image for image in index.row_of_image if image in keypoints and image in poses]
+    sample = images[:: max(1, len(images) // _SAMPLED_IMAGES)]
+    observed = observed_keypoints(folder, local_type, index, sample)
+    errors = [one.errors_px(index.xyz) / focal_px(one.camera) for one in observed]
+    found = np.concatenate(errors) if errors else np.zeros(0)
     found = found[np.isfinite(found)]
     return float(np.median(found)) if len(found) else math.nan
 
