@@ -8,6 +8,8 @@ from pathlib import Path
 import tyro
 
 from megloc_kapture.cli.common import Common, Force, Output, Working
+from megloc_kapture.datasets.kapture_folders import QUERY
+from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.files import staged_output
 from megloc_kapture.pipeline.datasets import (
     KAPTURE,
@@ -19,6 +21,7 @@ from megloc_kapture.pipeline.datasets import (
 )
 from megloc_kapture.pipeline.executors import open_executor
 from megloc_kapture.pipeline.presets import assigned
+from megloc_kapture.stages.unreadable import set_aside_unreadable
 from megloc_kapture.stages.work import Work
 
 DATASET = "dataset"
@@ -57,10 +60,14 @@ class Import(Common):
         choice.check()
         with staged_output(self.output, kind=DATASET, force=self.force) as out:
             counts = choice.import_to(self.root, out)
+            work = Work(track=console.track)
+            unreadable = set_aside_unreadable(out / QUERY, out / SIDE_TABLES, work)
             summary = out / SUMMARY_FILE
             text = summary.read_text(encoding="utf-8") if summary.is_file() else ""
         for what, value in counts.items():
             console.result(f"{what.replace('_', ' '):44s}{value:>8g}")
+        for name, reason in unreadable.items():
+            console.say(f"warning: query {name} cannot be used and will fail: {reason}")
         if text:
             console.result(text.rstrip())
         return 0

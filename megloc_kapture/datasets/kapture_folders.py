@@ -98,7 +98,9 @@ def files_of(folder: KaptureFolder, *, images: bool = True) -> Iterator[Path]:
         if folder.depth_path(name).is_file():
             yield folder.depth_path(name)
     for image in folder.read().image_names():
-        yield folder.image_path(image)
+        # what is missing is said by who reads it
+        if (path := folder.image_path(image)).is_file():
+            yield path
         mask = sensors / "masks" / f"{image}.png"
         if mask.is_file():
             yield mask
@@ -130,8 +132,7 @@ def import_kapture_folders(
     root = check_root(root)
     mapping, query = KaptureFolder(root / MAPPING), KaptureFolder(root / QUERY)
     map_data, query_data = mapping.read(), query.read()
-    for folder in (mapping, query):
-        check_images(folder)
+    check_images(mapping)
     poses = _map_poses(mapping)
     if not query_data.records_camera:
         raise DataError("there are no query images", path=query.root)

@@ -8,6 +8,7 @@ names.csv           image, name: what each scored query is called in the pose fi
                     the challenge's list, where no rule says it
 relocalization.csv  file, reference, query: the pairs an MLAD challenge asks for, in its order;
                     ``file`` is the name of the pose file to hand in
+unreadable.csv      image, reason: queries whose image cannot be used, which were left out
 world.json          ``official_from_local`` and the unit of the local frame
 protocol.json       thresholds, the pose file's format and names, conditions and how they are pooled
 ==================  ================================================================================
@@ -48,6 +49,7 @@ WORLD_FILE = "world.json"
 PROTOCOL_FILE = "protocol.json"
 NAMES_FILE = "names.csv"
 RELOCALIZATION_FILE = "relocalization.csv"
+UNREADABLE_FILE = "unreadable.csv"
 # in the folder of the true poses
 NOWHERE_FILE = "nowhere.txt"
 _MAX_BYTES = 1 << 28
@@ -192,6 +194,11 @@ class _NameRow(NamedTuple):
     name: str
 
 
+class _UnreadableRow(NamedTuple):
+    image: str
+    reason: str
+
+
 @dataclass(frozen=True, slots=True)
 class RelocalizationPair:
     """One row of an MLAD relocalization file: both images by their kapture names."""
@@ -226,6 +233,7 @@ _PRIORS = Table(
 _NAMES = Table(
     _NameRow, {"image": IMAGE, "name": Column("one word", _word)}, keys=[("image",), ("name",)]
 )
+_UNREADABLE = Table(_UnreadableRow, {"image": IMAGE, "reason": TEXT}, keys=[("image",)])
 _RELOCALIZATION = Table(RelocalizationPair, dict.fromkeys(("file", "reference", "query"), IMAGE))
 
 
@@ -299,6 +307,18 @@ def read_names(folder: Path | str) -> dict[str, str]:
 def write_names(folder: Path | str, names: Mapping[str, str]) -> None:
     """Write ``names.csv`` in the order of ``names``."""
     _NAMES.write(Path(folder) / NAMES_FILE, [_NameRow(*item) for item in names.items()])
+
+
+def read_unreadable(folder: Path | str) -> dict[str, str]:
+    """Read ``unreadable.csv``: image -> reason, sorted by image."""
+    return dict(sorted(_UNREADABLE.read_if_there(table_path(folder, UNREADABLE_FILE))))
+
+
+def write_unreadable(folder: Path | str, reasons: Mapping[str, str]) -> None:
+    """Write ``unreadable.csv``, sorted by image."""
+    _UNREADABLE.write(
+        Path(folder) / UNREADABLE_FILE, [_UnreadableRow(*row) for row in sorted(reasons.items())]
+    )
 
 
 def read_relocalization(folder: Path | str) -> list[RelocalizationPair]:

@@ -43,6 +43,7 @@ from megloc_kapture.stages.pyramid_queries import PyramidQueries
 from megloc_kapture.stages.query_poses import LocalizeQueries
 from megloc_kapture.stages.reranking import RerankQueries
 from megloc_kapture.stages.stage import Hashes, PipelineStage, Stage, StageWork, is_below
+from megloc_kapture.stages.unreadable import set_aside_unreadable
 from megloc_kapture.values import Options
 
 WORLD = "world"
@@ -168,7 +169,7 @@ class Import(_RunStage):
     """Import the dataset as kapture."""
 
     name = "import"
-    version = 3
+    version = 4
     writes = (MAPPING, QUERY, QUERY_GT, SIDE_TABLES, REFERENCE)
 
     @property
@@ -195,7 +196,8 @@ class Import(_RunStage):
         counts = source.import_to(root, work.out, self._change)
         if not counts["queries"]:
             raise DataError("no query image is left to localize", path=root)
-        return counts
+        unreadable = set_aside_unreadable(work.out / QUERY, work.out / SIDE_TABLES, work)
+        return counts | ({"unreadable_queries": len(unreadable)} if unreadable else {})
 
     def _change(self, given: Protocol) -> Protocol:
         if given.dataset == Protocol().dataset:

@@ -27,6 +27,7 @@ from megloc_kapture.io.dataset_tables import (
     read_names,
     read_protocol,
     read_relocalization,
+    read_unreadable,
     read_world,
 )
 from megloc_kapture.io.files import write_bytes
@@ -151,7 +152,7 @@ def write_submission(
         content = _ltvl(result, tables, rules)
         write_bytes(place, content.files[""].encode("utf-8"))
     counts = {
-        "queries": len(result.data.records_camera),
+        "queries": len(result.data.records_camera) + len(_unreadable(tables)),
         "scored": len(content.posed) + len(content.missing),
         "poses": len(content.posed),
         "missing": len(content.missing),
@@ -242,12 +243,16 @@ def _ltvl(result: _Result, tables: Path | None, rules: Protocol) -> _Content:
     images = list(names)
     if not names:
         groups = {} if tables is None else read_groups(tables)
-        every = result.data.image_names()
+        every = sorted({*result.data.image_names(), *_unreadable(tables)})
         images = [image for image in every if groups.get(image, ImageGroup()).scored]
     posed = [image for image in images if image in result.poses]
     official = {image: world.pose_in_official(result.poses[image]) for image in posed}
     text = format_pose_file(official, names=names or rules.pose_file_names)
     return _Content({"": text}, posed, [image for image in images if image not in result.poses])
+
+
+def _unreadable(tables: Path | None) -> Mapping[str, str]:
+    return {} if tables is None else read_unreadable(tables)
 
 
 def _mlad(result: _Result, tables: Path) -> _Content:

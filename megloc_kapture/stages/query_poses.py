@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +55,7 @@ from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.rigs import Unit, query_units
 from megloc_kapture.stages.shared_index import index_map, open_index, shared_index
 from megloc_kapture.stages.stage import LOCAL_TYPES, PipelineStage, StageWork
+from megloc_kapture.stages.unreadable import unreadable_queries
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
 from megloc_kapture.values import Failure, Options, Pose, RigidTransform
 
@@ -332,7 +334,7 @@ class LocalizeQueries(PipelineStage):
         return write_localized(
             work.out / self.layout.poses,
             work.folder(QUERY),  # as imported: the poses are theirs as well
-            results,
+            chain(results, unreadable_queries(work.path(SIDE_TABLES))),
             fallback=options.fallback,
             first_candidates=first_candidates(pairs, work.folder(MAPPING)),
             timing=work.out / TIMING,

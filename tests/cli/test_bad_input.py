@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import re
 import shutil
 from collections.abc import Callable
@@ -283,11 +284,11 @@ def test_localize_leaves_what_others_wrote(megloc: Any, gallery: Path, kind: str
 
 
 def not_an_image(root: Path) -> None:
-    (root / "query/sensors/records_data/0004.jpg").write_text("GIF? no.\n")
+    (root / "mapping/sensors/records_data/0005.jpg").write_text("GIF? no.\n")
 
 
 def other_size(root: Path) -> None:
-    place = root / "query/sensors/records_data/0004.jpg"
+    place = root / "mapping/sensors/records_data/0005.jpg"
     write_image(place, np.zeros((100, 200, 3), np.uint8))
 
 
@@ -301,8 +302,8 @@ DATASETS: dict[str, tuple[Spoil, str]] = {
         remove("mapping/sensors/records_data/0005.jpg"),
         r"mapping/sensors/records_data/0005\.jpg: ",
     ),
-    "not an image": (not_an_image, r"records_data/0004\.jpg: not an image"),
-    "other size": (other_size, r"records_data/0004\.jpg: .*200x100.*400x300"),
+    "not an image": (not_an_image, r"records_data/0005\.jpg: not an image"),
+    "other size": (other_size, r"records_data/0005\.jpg: .*200x100.*400x300"),
     "pose column": (line(f"mapping/{TIMES}", 4, NO_COLUMN), r"mapping/.*trajectories\.txt:4: "),
     "true pose column": (line(f"query_gt/{TIMES}", 4, NO_COLUMN), r"query_gt/.*txt:4: "),
     "pose of nan": (line(f"mapping/{TIMES}", 3, NAN), r"mapping/.*trajectories\.txt:3: .*nan"),
@@ -339,16 +340,49 @@ def test_a_bad_dataset_is_refused(
     assert contents(dataset) == before
 
 
-def test_a_truncated_image_stops_the_run_where_it_is_read(megloc: Any, dataset: Path) -> None:
-    cut("query/sensors/records_data/0004.jpg", 20_000)(dataset)
+def test_a_truncated_image_of_the_map_stops_the_run_where_it_is_read(
+    megloc: Any, dataset: Path
+) -> None:
+    cut("mapping/sensors/records_data/0005.jpg", 20_000)(dataset)
     run = dataset.parent / "run"
     done = megloc(
         *("eval", "kapture", "--root", dataset, "--workspace", run),
         *("--executor", "inline", "--quiet"),
     )
-    done.refused(r"records_data/0004\.jpg: .*(broken|truncated)")
+    done.refused(r"records_data/0005\.jpg: .*(broken|truncated)")
     assert not (run / "local_features").exists()
     assert [path.name for path in (run / "stages").glob("[a-z]*.json")] == ["import.json"]
+
+
+def test_broken_images_of_queries_fail_these_queries(megloc: Any, dataset: Path) -> None:
+    images = dataset / "query/sensors/records_data"
+    cut("query/sensors/records_data/0004.jpg", 20_000)(dataset)
+    write_image(images / "0007.jpg", np.zeros((100, 200, 3), np.uint8))
+    (images / "0010.jpg").unlink()
+    run = dataset.parent / "run"
+    megloc(
+        *("eval", "kapture", "--root", dataset, "--workspace", run),
+        *("--executor", "inline", "--quiet"),
+    )
+    statuses = read_status(run / "localized" / "status.csv")
+    reasons = {name: one.reason for name, one in statuses.items() if one.status == "failed"}
+    assert set(statuses) - set(reasons) == {"0001.jpg"} and set(reasons) == {
+        *("0004.jpg", "0007.jpg", "0010.jpg")
+    }
+    assert all(one.startswith("the image cannot be used: ") for one in reasons.values())
+    assert "200x100, its camera says 400x300" in reasons["0007.jpg"]
+    # they count as misses, and the pose file's record names them
+    recall = json.loads((run / "evaluation" / "recall.json").read_text())
+    assert recall["rows"][-1]["num_queries"] == 4
+    (pose_file,) = (run / "submissions").glob("*.txt")
+    assert pose_file.read_text().split()[0] == "0001.jpg"
+    for image in images.iterdir():
+        if image.name != "0001.jpg":
+            image.write_bytes(b"")
+    (images / "0001.jpg").write_bytes(b"")
+    megloc(
+        *("eval", "kapture", "--root", dataset, "--workspace", dataset.parent / "other"), "--quiet"
+    ).refused(r"records_data/0001\.jpg: empty file")
 
 
 EVALUATION: dict[str, tuple[list[str], str]] = {
