@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from megloc_kapture.errors import DataError, MeglocError, OptionError, OutputError, PluginError
 
 if TYPE_CHECKING:
+    __version__: str
     from megloc_kapture.api import Map, build_map, extract, match, open_map, run, solve_pose
     from megloc_kapture.evaluation.evaluate import evaluate
     from megloc_kapture.pipeline.kapture_map import KaptureMap
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from megloc_kapture.values import Camera, Failure, LocalFeatures, Pose, RigidTransform
 
 __all__ = [
+    "__version__",
     "Camera",
     "DataError",
     "Failure",
@@ -69,6 +71,10 @@ _LAZY = {
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("megloc-kapture")
     if name in _LAZY:
         return getattr(import_module(_LAZY[name]), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

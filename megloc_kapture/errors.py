@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from difflib import get_close_matches
 from pathlib import Path
 
 
@@ -46,3 +48,10 @@ class OutputError(MeglocError):
 
 class PluginError(MeglocError):
     """A plugin is unknown, cannot be loaded, or does not fulfil its protocol."""
+
+
+def suggestion(name: str, known: Iterable[str], *, listed: str = "known: ") -> str:
+    """What an error says behind a name that there is not: a like one that there is, and all."""
+    names = list(known)
+    near = get_close_matches(name, names, n=1)
+    return f"{f'did you mean {near[0]!r}? ' if near else ''}{listed}{', '.join(names) or 'none'}"

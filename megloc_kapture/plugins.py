@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError, model_validator
 
-from megloc_kapture.errors import MeglocError, PluginError
+from megloc_kapture.errors import MeglocError, PluginError, suggestion
 from megloc_kapture.values import (
     Camera,
     ImageFeatures,
@@ -408,8 +408,8 @@ def plugin_class(group: str, name: str) -> Any:
     """
     found = [entry for entry in entry_points(group=group) if entry.name == name]
     if not found:
-        known = ", ".join(plugin_names(group)) or "none"
-        raise PluginError(f"no plugin {name!r} in {group}; registered: {known}")
+        known = suggestion(name, plugin_names(group), listed="registered: ")
+        raise PluginError(f"no plugin {name!r} in {group}; {known}")
     origins = {entry.value for entry in found}
     if len(origins) > 1:
         raise PluginError(f"plugin {name!r} of {group} is registered twice: {sorted(origins)}")

@@ -6,6 +6,7 @@ import logging
 import sys
 import time
 from collections.abc import Iterable, Iterator
+from datetime import timedelta
 from typing import TypeVar
 
 Item = TypeVar("Item")
@@ -45,12 +46,14 @@ class Console:
                 transient=True,
             )
         else:
-            shown = time.monotonic()
+            started = shown = time.monotonic()
             for number, item in enumerate(items, start=1):
                 yield item
-                if time.monotonic() - shown > _LINE_EVERY_S and number < total:
-                    shown = time.monotonic()
-                    self.say(f"  {label}: {number} of {total}")
+                now = time.monotonic()
+                if now - shown > _LINE_EVERY_S and number < total:
+                    shown = now
+                    left = timedelta(seconds=round((now - started) / number * (total - number)))
+                    self.say(f"  {label}: {number} of {total}, {left} left")
 
 
 def configure_logging(level: str) -> None:

@@ -130,7 +130,7 @@ class Eval(Deciding, Working, Common):
                 last=self.until,
                 dry_run=self.dry_run,
                 verify=self.verify,
-                on_start=lambda name, why: console.say(f"{name}: {why}"),
+                on_start=console.say,
                 on_report=lambda report: console.say(describe(report)),
             )
             if self.ablate and not self.dry_run:
@@ -167,7 +167,7 @@ class Eval(Deciding, Working, Common):
                     planned,
                     workspace,
                     work,
-                    on_start=lambda name, why: console.say(f"{name}: {why}"),
+                    on_start=console.say,
                     on_report=lambda report: console.say(describe(report)),
                 )
             outcomes.append(outcome(f"without {variant.name}", workspace, planned))

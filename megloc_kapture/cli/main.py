@@ -100,6 +100,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "List, fetch, add, convert and check the weights of networks.",
     ),
     "info": ("info:Info", "Say what is in a kapture folder, and what a map allows."),
+    "options": (
+        "options:OptionsCommand",
+        "List the options that --set takes, with value, type and meaning.",
+    ),
     "doctor": (
         "doctor:Doctor",
         "Check the environment: versions, known-bad combinations, GPU, weights.",
@@ -168,6 +172,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         if arguments is None:
             _obey_signals()
+        if list(given) == ["--version"]:
+            from megloc_kapture import __version__
+
+            print(f"megloc-kapture {__version__}")
+            sys.exit(DONE)
         import tyro
 
         from megloc_kapture.cli.arguments import one_line_errors

@@ -44,7 +44,7 @@ class OutsideStage(Working, Common):
                 [stage],
                 workspace,
                 Work(executor, console.track, self.workers or available_cores()),
-                on_start=lambda name, why: console.say(f"{name}: {why}"),
+                on_start=console.say,
                 on_report=lambda report: console.say(describe(report)),
             )
         return 0

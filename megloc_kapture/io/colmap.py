@@ -92,8 +92,12 @@ _NEVER = 2**31 - 1
 class TriangulationOptions(Options):
     """Options of COLMAP's triangulation with known poses; defaults are COLMAP's but where said."""
 
-    max_reprojection_error_px: float = Field(default=4.0, gt=0)
-    min_angle_deg: float = Field(default=1.5, ge=0)
+    max_reprojection_error_px: float = Field(
+        default=4.0, gt=0, description="of an observation; one that is farther off is left out"
+    )
+    min_angle_deg: float = Field(
+        default=1.5, ge=0, description="between the rays of a point; narrower ones make none"
+    )
     two_view_tracks: bool = Field(
         default=False, description="keep points that only two images observe"
     )

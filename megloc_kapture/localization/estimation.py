@@ -164,10 +164,12 @@ class AbsolutePoseOptions(Options):
         description="noise of the keypoints that the map's points come from, as a share of the "
         "residuals'; 0: points count as exact",
     )
-    min_iterations: int = Field(default=100, gt=0)
-    max_iterations: int = Field(default=20_000, gt=0)
-    confidence: float = Field(default=0.9999, gt=0, lt=1)
-    seed: int = Field(default=0, ge=0)
+    min_iterations: int = Field(default=100, gt=0, description="RANSAC's")
+    max_iterations: int = Field(default=20_000, gt=0, description="RANSAC's")
+    confidence: float = Field(
+        default=0.9999, gt=0, lt=1, description="RANSAC stops when it is as sure of its best pose"
+    )
+    seed: int = Field(default=0, ge=0, description="of RANSAC's samples")
 
     def for_poselib(self) -> dict[str, Any]:
         """The RANSAC options in poselib's names."""

@@ -48,7 +48,11 @@ class GuidedPyramidOptions(Options):
     min_matches: int = Field(
         default=100, gt=0, description="a pair with fewer verified matches is tried again"
     )
-    scales: tuple[float, ...] = Field(default=(1 / 3, 0.5, 1.0, 2.0, 3.0), min_length=1)
+    scales: tuple[float, ...] = Field(
+        default=(1 / 3, 0.5, 1.0, 2.0, 3.0),
+        min_length=1,
+        description="sizes at which the images of a pair with few matches are matched again",
+    )
     rotations_deg: tuple[int, ...] = Field(
         default=(0, 90, 180, 270), min_length=1, description="multiples of 90"
     )

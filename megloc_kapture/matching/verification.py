@@ -44,12 +44,16 @@ class KnownPoseOptions(Options):
 class TwoViewOptions(Options):
     """Options of two-view verification; calibrated, so a plane is no degenerate case."""
 
-    max_error_px: float = Field(default=4.0, gt=0)
-    min_matches: int = Field(default=15, ge=5)
-    max_iterations: int = Field(default=1000, gt=0)
-    min_iterations: int = Field(default=100, gt=0)
-    confidence: float = Field(default=0.999, gt=0, lt=1)
-    seed: int = Field(default=0, ge=0)
+    max_error_px: float = Field(
+        default=4.0, gt=0, description="distance from the epipolar line of an inlier"
+    )
+    min_matches: int = Field(default=15, ge=5, description="a pair with fewer inliers has none")
+    max_iterations: int = Field(default=1000, gt=0, description="RANSAC's")
+    min_iterations: int = Field(default=100, gt=0, description="RANSAC's")
+    confidence: float = Field(
+        default=0.999, gt=0, lt=1, description="RANSAC stops when it is as sure of its best model"
+    )
+    seed: int = Field(default=0, ge=0, description="of RANSAC's samples")
 
 
 def essential_matrix(b_from_a: RigidTransform) -> Floats:

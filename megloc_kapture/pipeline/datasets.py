@@ -22,7 +22,7 @@ from megloc_kapture.datasets.kapture_folders import (
     input_files,
 )
 from megloc_kapture.datasets.official import OfficialDataset, write_official
-from megloc_kapture.errors import OptionError, PluginError
+from megloc_kapture.errors import OptionError, PluginError, suggestion
 from megloc_kapture.evaluation.protocols import TWIN_PREFIX
 from megloc_kapture.io.dataset_tables import SIDE_TABLES, Protocol
 from megloc_kapture.io.files import write_bytes
@@ -199,7 +199,7 @@ def choose_dataset(
         an option the dataset does not have.
     """
     if name not in dataset_names():
-        raise OptionError(f"unknown dataset {name!r}; known: {', '.join(dataset_names())}")
+        raise OptionError(f"unknown dataset {name!r}; {suggestion(name, dataset_names())}")
     layout = name.removeprefix(TWIN_PREFIX)
     adapter: DatasetAdapter | None = None
     if layout not in (KAPTURE, SYNTHETIC):

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, Literal
 
-from megloc_kapture.errors import OptionError
+from megloc_kapture.errors import OptionError, suggestion
 from megloc_kapture.evaluation.provenance import package_versions
 from megloc_kapture.io.files import write_bytes, write_json_model
 from megloc_kapture.pipeline.manifests import FileHashes, Manifest, fingerprint, read_manifest
@@ -32,6 +32,9 @@ class StageReport:
     why: str
 
 
+_NOT_DONE = "not done yet"
+
+
 def run_plan(
     stages: Sequence[Stage],
     workspace: Workspace,
@@ -41,7 +44,7 @@ def run_plan(
     last: str | None = None,
     dry_run: bool = False,
     verify: bool = False,
-    on_start: Callable[[str, str], None] = lambda name, why: None,
+    on_start: Callable[[str], None] = lambda text: None,
     on_report: Callable[[StageReport], None] = lambda report: None,
 ) -> list[StageReport]:
     """Run the stages that have to be run.
@@ -54,6 +57,7 @@ def run_plan(
         not, is run again in any case.
     last : stages behind it are left out.
     dry_run : say what would run, run nothing.
+    on_start : told in one line which stage starts, and why it has to run.
     verify : compare the content of all files that stages wrote with what it was then; otherwise
         their sizes and times alone.
 
@@ -64,7 +68,7 @@ def run_plan(
     names = [stage.name for stage in stages]
     for name in (first, last):
         if name is not None and name not in names:
-            raise OptionError(f"no stage {name!r}; stages: {', '.join(names)}")
+            raise OptionError(f"no stage {name!r}; {suggestion(name, names, listed='stages: ')}")
     fingerprints: dict[str, str] = {}
     reports = []
     start = names.index(first) if first else 0
@@ -100,7 +104,8 @@ def run_plan(
         elif dry_run:
             report = StageReport(stage.name, "pending", 0.0, {}, why)
         else:
-            on_start(stage.name, why)
+            said = "starting" if why == _NOT_DONE else why
+            on_start(f"{stage.name}, stage {number + 1} of {stop}: {said}")
             former = [] if manifest is None else _former_outputs(stage, manifest)
             report = _run(stage, workspace, work, mark, settings, inputs, why, former)
         reports.append(report)
@@ -173,7 +178,7 @@ def _why(
 ) -> str:
     """Why a stage has to run; empty when it need not."""
     if manifest is None:
-        return "not done yet"
+        return _NOT_DONE
     gone = [output for output in manifest.outputs if not workspace.path(output).exists()]
     if gone:
         return f"{gone[0]} is gone"

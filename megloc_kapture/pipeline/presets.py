@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from pydantic import ValidationError
 
-from megloc_kapture.errors import OptionError
+from megloc_kapture.errors import OptionError, suggestion
 from megloc_kapture.mapping.rejection import UncertaintyOptions
 from megloc_kapture.matching.guided_pyramid import GuidedPyramidOptions
 from megloc_kapture.pipeline.assignments import check_assigned
@@ -94,7 +96,7 @@ def options_of_preset(
         an option which nothing acts on.
     """
     if preset not in PRESETS:
-        raise OptionError(f"unknown preset {preset!r}; known: {', '.join(PRESETS)}")
+        raise OptionError(f"unknown preset {preset!r}; {suggestion(preset, PRESETS)}")
     tree = PRESETS[preset].model_dump()
     for change in changes:
         _merge(tree, change)
@@ -106,7 +108,7 @@ def options_of_preset(
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
-            raise OptionError(f"unknown option {where}; known here: {_known(where)}") from error
+            raise OptionError(f"unknown option {where}; {_known(where)}") from error
         raise OptionError(f"option {where}: {first['msg']}") from error
     check_assigned(options, typed, used=used)
     return options
@@ -140,14 +142,48 @@ def _typed(assignments: Sequence[str] | Mapping[str, Any]) -> Iterator[tuple[str
 
 
 def _known(path: str) -> str:
-    """The options beside one that does not exist."""
+    """A like option to one that does not exist, and those beside it."""
     model: Any = PipelineOptions
-    for part in path.split(".")[:-1]:
+    *parents, name = path.split(".")
+    for part in parents:
         annotation = model.model_fields[part].annotation if part in model.model_fields else None
         if not (isinstance(annotation, type) and issubclass(annotation, Options)):
             break
         model = annotation
-    return ", ".join(sorted(model.model_fields))
+    known = sorted(model.model_fields)
+    elsewhere = [one.key for one in options_of(PipelineOptions()) if one.key.endswith(f".{name}")]
+    if elsewhere:
+        return f"did you mean {' or '.join(elsewhere)}? known here: {', '.join(known)}"
+    return suggestion(name, known, listed="known here: ")
+
+
+@dataclass(frozen=True)
+class Option:
+    """One option of a model: ``key.key``, its value there, its type and meaning in words."""
+
+    key: str
+    value: Any
+    kind: str
+    meaning: str
+
+
+def options_of(options: Options, prefix: str = "") -> Iterator[Option]:
+    """Every option of a model and of the models in it, in their order."""
+    for name, field in type(options).model_fields.items():
+        value = getattr(options, name)
+        if isinstance(value, Options) and not isinstance(value, PluginChoice):
+            yield from options_of(value, f"{prefix}{name}.")
+        else:
+            yield Option(
+                f"{prefix}{name}", value, _type_name(field.annotation), field.description or ""
+            )
+
+
+def _type_name(annotation: Any) -> str:
+    """A type as a person reads it: choices one by one, classes without their modules."""
+    text = annotation.__name__ if isinstance(annotation, type) else str(annotation)
+    text = re.sub(r"[A-Za-z_]\w*\.(?=[A-Za-z_])", "", text)
+    return re.sub(r"Literal\[(.*?)\]", lambda m: m[1].replace("', '", "' | '"), text)
 
 
 def _merge(tree: dict[str, Any], changes: dict[str, Any]) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from megloc_kapture.datasets.kapture_folders import MAPPING, QUERY
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import DataError, OptionError, suggestion
 from megloc_kapture.evaluation.pose_files import (
     RelativePose,
     format_mlad_file,
@@ -98,7 +98,7 @@ def check_dataset(dataset: str, protocol: Protocol, *, tables: Path | None) -> N
 def check_known(dataset: str) -> None:
     """Refuse a dataset that nobody knows; raises OptionError with those that are known."""
     if dataset not in dataset_names():
-        raise OptionError(f"unknown dataset {dataset!r}; known: {', '.join(dataset_names())}")
+        raise OptionError(f"unknown dataset {dataset!r}; {suggestion(dataset, dataset_names())}")
 
 
 def place_of(folder: Path, stem: str, protocol: Protocol) -> Path:

@@ -26,7 +26,9 @@ _POOL = 5  # images looked at for each that a diversified ranking keeps
 class QueryPairsOptions(Options):
     """How a query's candidates among the map's images are chosen."""
 
-    by: Literal["retrieval", "exhaustive"] = "retrieval"
+    by: Literal["retrieval", "exhaustive"] = Field(
+        default="retrieval", description="the most similar map images, or all"
+    )
     top_k: int = Field(default=50, gt=0, description="most similar map images per query")
     diversity: DiversityOptions | None = Field(
         default=None, description="few views of one place; none: as similar as they are"

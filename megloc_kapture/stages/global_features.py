@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
-from megloc_kapture.errors import DataError, OptionError, PluginError
+from megloc_kapture.errors import DataError, OptionError, PluginError, suggestion
 from megloc_kapture.features.image_bound import bounded_image
 from megloc_kapture.features.vlad import VladOptions
 from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
@@ -80,7 +80,7 @@ class GlobalFeaturesChoice(PluginChoice):
         known = plugin_names(PLUGINS)
         if self.name not in known:
             raise OptionError(
-                f"unknown global features {self.name!r}; known: {', '.join([VLAD, *known])}"
+                f"unknown global features {self.name!r}; {suggestion(self.name, [VLAD, *known])}"
             )
         extractor: GlobalFeatureExtractor = load_plugin(PLUGINS, self.name, self.options)
         return extractor

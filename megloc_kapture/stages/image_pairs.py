@@ -57,7 +57,9 @@ PairingMethod = Literal["poses", "covisibility", "retrieval", "sequence", "exhau
 class MappingPairsOptions(Options):
     """How the map's images are paired: the union of the methods named."""
 
-    by: tuple[PairingMethod, ...] = Field(default=("retrieval",), min_length=1)
+    by: tuple[PairingMethod, ...] = Field(
+        default=("retrieval",), min_length=1, description="methods, of whose pairs all are matched"
+    )
     top_k: int = Field(default=20, gt=0, description="most similar images per image (retrieval)")
     poses: PairsByPosesOptions = PairsByPosesOptions()
     covisibility: PairsByCovisibilityOptions = PairsByCovisibilityOptions()

@@ -64,7 +64,10 @@ class LocalizationOptions(Options):
     """How a query's pose is found from its matches."""
 
     clusters: ClusterOptions = ClusterOptions()
-    rank: PluginChoice = PluginChoice(name="distinctive")
+    rank: PluginChoice = Field(
+        default=PluginChoice(name="distinctive"),
+        description="which of the clusters' poses is the query's",
+    )
     pose: AbsolutePoseOptions = AbsolutePoseOptions()
     min_confidence: float = Field(
         default=0.6,
@@ -72,8 +75,12 @@ class LocalizationOptions(Options):
         le=1,
         description="a pose that is less likely to be right is a failure; 0: none is",
     )
-    rigs: bool = False
-    fallback: Fallback = "none"
+    rigs: bool = Field(default=False, description="one pose for all cameras of a rig's moment")
+    fallback: Fallback = Field(
+        default="none",
+        description="what a query that failed gets: nothing, the pose of its first candidate, or "
+        "its pose through the rig",
+    )
 
     def make_ranker(self) -> PoseRanker:
         """The ranker of candidate poses; raises PluginError."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -71,8 +72,10 @@ def reasons(err: str) -> dict[str, str]:
     """Why a stage was run, as told before it was."""
     found: dict[str, str] = {}
     for line in err.splitlines():
-        stage, _, told = line.partition(": ")
+        place, _, told = line.partition(": ")
+        stage, _, numbered = place.partition(", stage ")
         if stage in STAGES:
+            assert not numbered or re.fullmatch(r"\d+ of \d+", numbered)
             found.setdefault(stage, told)
     return found
 
@@ -263,7 +266,7 @@ def test_a_broken_manifest_counts_as_none(evaluate: Any, scene: Path, workspace:
     (workspace / "stages" / "submission.json").write_text('{"stage": "submi')
     done = evaluate(scene, workspace)
     assert ran(done.err) == ["submission"]
-    assert reasons(done.err)["submission"] == "not done yet"
+    assert reasons(done.err)["submission"] == "starting"
 
 
 # ------------------------------------------------------------------ parts of a run
@@ -506,7 +509,7 @@ def test_verify_finds_what_size_and_time_do_not_show(
     os.utime(spoilt, ns=(time.st_atime_ns, time.st_mtime_ns))
     assert "nothing to do" in evaluate(scene, workspace).err
     done = evaluate(scene, workspace, "--verify")
-    assert f"local_features: {name} was changed since it was written" in done.err
+    assert reasons(done.err)["local_features"] == f"{name} was changed since it was written"
     assert [stage for stage, state in states(done.err).items() if state != "up to date"] == [
         "local_features"
     ]

@@ -100,7 +100,7 @@ def processes_of(session: int) -> list[int]:
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
 def test_workers_end_with_a_killed_run(scene: Path, tmp_path: Path) -> None:
     run = start(scene, tmp_path / "run")
-    wait_for(run, "local_features: not done yet")
+    wait_for(run, "local_features, stage 2 of 12: starting")
     while len(processes_of(run.pid)) < 4:  # the run, the fork server, two workers
         time.sleep(0.02)
         assert run.poll() is None
@@ -114,7 +114,7 @@ def test_workers_end_with_a_killed_run(scene: Path, tmp_path: Path) -> None:
 
 def test_a_run_ended_at_the_keyboard_says_how_to_go_on(scene: Path, tmp_path: Path) -> None:
     run = start(scene, tmp_path / "run")
-    wait_for(run, "local_features: not done yet")
+    wait_for(run, "local_features, stage 2 of 12: starting")
     while not any((tmp_path / "run" / ".partial").rglob("*.desc")):
         time.sleep(0.01)
         assert run.poll() is None

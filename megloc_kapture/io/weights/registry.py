@@ -14,7 +14,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, field_validator
 
-from megloc_kapture.errors import OptionError
+from megloc_kapture.errors import OptionError, suggestion
 from megloc_kapture.io.paths import check_component, check_relative
 
 _TABLE = Path(__file__).with_suffix(".toml")
@@ -105,7 +105,8 @@ def registry() -> Mapping[str, Weights]:
 def lookup(name: str) -> Weights:
     """The entry of a network; raises OptionError, which lists the names there are."""
     if name not in registry():
-        raise OptionError(f"no weights {name!r} in the registry; there are {', '.join(registry())}")
+        told = suggestion(name, registry(), listed="there are ")
+        raise OptionError(f"no weights {name!r} in the registry; {told}")
     return registry()[name]
 
 
