@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     __version__: str
     from megloc_kapture.api import Map, build_map, extract, match, open_map, run, solve_pose
     from megloc_kapture.evaluation.evaluate import evaluate
+    from megloc_kapture.pipeline.export import export
     from megloc_kapture.pipeline.kapture_map import KaptureMap
     from megloc_kapture.pipeline.localizer import Localizer
     from megloc_kapture.pipeline.queries import Query
@@ -43,6 +44,7 @@ __all__ = [
     "RigidTransform",
     "build_map",
     "evaluate",
+    "export",
     "extract",
     "match",
     "open_map",
@@ -62,6 +64,7 @@ _LAZY = {
     "Map": "megloc_kapture.api",
     "build_map": "megloc_kapture.api",
     "evaluate": "megloc_kapture.evaluation.evaluate",
+    "export": "megloc_kapture.pipeline.export",
     "extract": "megloc_kapture.api",
     "match": "megloc_kapture.api",
     "open_map": "megloc_kapture.api",

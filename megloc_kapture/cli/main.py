@@ -95,6 +95,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "Compare localized queries (kapture folders or pose files) with their true poses, and two "
         "or more results with each other.",
     ),
+    "export": (
+        "export:Export",
+        "Write a map, localized queries or both for COLMAP, nerfstudio, evo and viewers.",
+    ),
     "weights": (
         "weights:WeightsCommand",
         "List, fetch, add, convert and check the weights of networks.",

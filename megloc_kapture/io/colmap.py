@@ -342,6 +342,54 @@ def _collect(reconstruction: Any, offset: NDArray[np.float64]) -> TriangulatedPo
     )
 
 
+def write_model(
+    output: Path,
+    images: Sequence[MapImage],
+    observed: Sequence[tuple[NDArray[np.integer[Any]], NDArray[np.integer[Any]]]],
+    xyz: NDArray[np.float64],
+    colours: NDArray[np.floating],
+) -> None:
+    """Write a model in COLMAP's binary format; every camera is a rig of its own.
+
+    Images, cameras and points have the numbers of their rows, from 1 on.
+
+    Parameters
+    ----------
+    observed : of each image rows of its keypoints and of the points that they observe.
+    xyz, colours : (N, 3), the latter from 0 to 255. A point that no image observes is written too.
+
+    Raises
+    ------
+    OutputError : the folder cannot be written to.
+    """
+    pycolmap = _pycolmap()
+    model = pycolmap.Reconstruction()
+    camera_ids: dict[Camera, int] = {}
+    tracks: list[list[Any]] = [[] for _ in xyz]
+    for number, (image, (rows, points)) in enumerate(zip(images, observed, strict=True), start=1):
+        if image.camera not in camera_ids:
+            camera = pycolmap.Camera(_colmap_camera(image.camera).todict())
+            camera.camera_id = camera_ids[image.camera] = len(camera_ids) + 1
+            model.add_camera_with_trivial_rig(camera)
+        keypoints = np.ascontiguousarray(image.keypoints_px[:, :2], dtype=np.float64)
+        camera_id = camera_ids[image.camera]
+        entry = pycolmap.Image(
+            image_id=number, name=image.name, camera_id=camera_id, keypoints=keypoints
+        )
+        model.add_image_with_trivial_frame(entry, _rigid3d(image.cam_from_world))
+        for row, point in zip(rows.tolist(), points.tolist(), strict=True):
+            tracks[point].append(pycolmap.TrackElement(number, row))
+    rgb = np.clip(np.rint(colours), 0, 255).astype(np.uint8)
+    for point, elements, colour in zip(xyz, tracks, rgb, strict=True):
+        model.add_point3D(point, pycolmap.Track(elements), colour)
+    model.update_point_3d_errors()
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+        model.write(str(output))
+    except (OSError, RuntimeError, ValueError) as error:
+        raise OutputError(f"{output}: COLMAP cannot write its model: {error}") from error
+
+
 def extract_sift(
     image: NDArray[np.uint8],
     *,

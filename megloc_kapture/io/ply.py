@@ -1,7 +1,8 @@
-"""Coloured points as a binary PLY file, which every viewer opens."""
+"""Coloured points, and lines between them, as a binary PLY file, which every viewer opens."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,13 @@ from megloc_kapture.io.files import atomic_write
 _TYPE_NAMES = {"<f8": "double", "<f4": "float", "|u1": "uchar"}
 
 
-def write_ply(path: Path, xyz: ArrayLike, colours: ArrayLike, **properties: ArrayLike) -> None:
+def write_ply(
+    path: Path,
+    xyz: ArrayLike,
+    colours: ArrayLike,
+    edges: Sequence[tuple[int, int]] = (),
+    **properties: ArrayLike,
+) -> None:
     """Write points.
 
     Coordinates are float64: a map in a world frame keeps its digits.
@@ -21,6 +28,7 @@ def write_ply(path: Path, xyz: ArrayLike, colours: ArrayLike, **properties: Arra
     ----------
     xyz : (N, 3).
     colours : uint8 (N, 3), red, green, blue.
+    edges : pairs of rows that a line joins.
     properties : further values (N,), one float32 each, by name.
 
     Raises
@@ -41,6 +49,9 @@ def write_ply(path: Path, xyz: ArrayLike, colours: ArrayLike, **properties: Arra
         rows[name] = values
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
     header += [f"property {_TYPE_NAMES[kind]} {name}" for name, _, kind in columns]
+    if edges:
+        header += [f"element edge {len(edges)}", "property int vertex1", "property int vertex2"]
     with atomic_write(path) as file:
         file.write("\n".join([*header, "end_header", ""]).encode())
         file.write(rows.tobytes())
+        file.write(np.array(edges, dtype="<i4").tobytes())

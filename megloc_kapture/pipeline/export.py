@@ -1,0 +1,167 @@
+"""A map and localized queries, as other tools read them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+
+from megloc_kapture.errors import DataError, OptionError, OutputError, suggestion
+from megloc_kapture.io.files import staged_output
+from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.pipeline import export_formats as formats
+from megloc_kapture.pipeline.export_formats import GeoOrigin, PosedImage, Scene
+from megloc_kapture.pipeline.kapture_map import KaptureMap
+
+ExportFormat = Literal["colmap", "nerfstudio", "tum", "kitti", "ply", "geojson"]
+_KIND = "export"
+_NO_ROWS = np.zeros(0, np.int64)
+
+
+def export(
+    name: ExportFormat,
+    output: Path | str,
+    *,
+    map: KaptureMap | Path | str | None = None,
+    query: Path | str | None = None,
+    sensor: str | None = None,
+    origin: GeoOrigin | None = None,
+    force: bool = False,
+) -> int:
+    """Write a map, localized queries, or both in the format of another tool.
+
+    Parameters
+    ----------
+    name : colmap and nerfstudio, which are folders; tum, kitti, ply and geojson, which are files.
+    map : kapture map, or a kapture folder of images with poses.
+    query : kapture folder of localized queries, with the map's world. Trajectories are of the
+        queries alone where they are given.
+    sensor : images of this camera only.
+    origin : of geojson, where the world's origin lies on earth.
+
+    Returns
+    -------
+    Number of images written.
+
+    Raises
+    ------
+    DataError : something is missing, broken, or cannot be said in the format.
+    OptionError : no such format, or what it needs was not given.
+    OutputError : the output is there already, unless ``force``, or cannot be written.
+    """
+    if name not in get_args(ExportFormat):
+        raise OptionError(f"unknown format {name!r}; {suggestion(name, get_args(ExportFormat))}")
+    if map is None and query is None:
+        raise OptionError("nothing to export: give a map, or localized queries")
+    if (name == "geojson") != (origin is not None):
+        raise OptionError(
+            "geojson needs to know where the world's origin lies, and nothing else does "
+            "(--geo-origin LATITUDE,LONGITUDE[,HEIGHT]; its axes are East, North, Up)"
+        )
+    scene = _scene(map, query, sensor, trajectory=name in ("tum", "kitti"))
+    if not scene.images:
+        raise DataError("no image has a pose" + (f" of camera {sensor!r}" if sensor else ""))
+    output = Path(output)
+    if name in ("colmap", "nerfstudio"):
+        with staged_output(output, kind=_KIND, force=force) as out:
+            if name == "colmap":
+                formats.export_colmap(scene, out)
+            else:
+                formats.export_nerfstudio(scene, out, beside=output)
+        return len(scene.images)
+    if output.exists() and not force:
+        raise OutputError(f"{output}: is there already; --force overwrites it")
+    if origin is not None:
+        formats.export_geojson(scene, output, origin)
+    else:
+        {"tum": formats.export_tum, "kitti": formats.export_kitti, "ply": formats.export_ply}[name](
+            scene, output
+        )
+    return len(scene.images)
+
+
+def _scene(
+    given: KaptureMap | Path | str | None,
+    query: Path | str | None,
+    sensor: str | None,
+    *,
+    trajectory: bool,
+) -> Scene:
+    opened: KaptureMap | None = None
+    images: list[PosedImage] = []
+    if given is not None and not (trajectory and query is not None):
+        if isinstance(given, KaptureMap):
+            opened = given
+        else:
+            folder = KaptureFolder(given)
+            opened = KaptureMap.open(given) if folder.has_points() else None
+            if opened is None:
+                images += _of_folder(folder, None, sensor, is_query=False)
+        if opened is not None:
+            images += _of_map(opened, sensor)
+    if query is not None:
+        images += _of_folder(KaptureFolder(query), opened, sensor, is_query=True)
+    points = np.zeros((0, 6)) if opened is None else opened.folder.points3d()
+    return Scene(images, points)
+
+
+def _of_map(opened: KaptureMap, sensor: str | None) -> list[PosedImage]:
+    """The images of a map, keypoints of all types one behind the other."""
+    data = opened.folder.read()
+    found = []
+    for image, pose in sorted(data.poses().items()):
+        timestamp, device = data.record_of(image)
+        if sensor not in (None, device):
+            continue
+        keypoints, rows, points = [np.zeros((0, 2))], [_NO_ROWS], [_NO_ROWS]
+        for typed in opened.keypoints.values():
+            if image in typed:
+                before = sum(map(len, keypoints))
+                keypoints.append(typed.keypoints_px(image)[:, :2].astype(np.float64))
+                own_rows, own_points = typed.index.observed(image)
+                rows.append(own_rows.astype(np.int64) + before)
+                points.append(own_points.astype(np.int64))
+        found.append(
+            PosedImage(
+                name=image,
+                path=opened.folder.image_path(image),
+                camera=opened.camera(image),
+                cam_from_world=pose,
+                timestamp=timestamp,
+                sensor=device,
+                is_query=False,
+                keypoints_px=np.concatenate(keypoints),
+                rows=np.concatenate(rows),
+                points=np.concatenate(points),
+            )
+        )
+    return found
+
+
+def _of_folder(
+    folder: KaptureFolder, convention: KaptureMap | None, sensor: str | None, *, is_query: bool
+) -> list[PosedImage]:
+    """The images of a folder that have a pose, without observations."""
+    data = folder.read()
+    found = []
+    for image, pose in sorted(data.poses().items()):
+        timestamp, device = data.record_of(image)
+        if sensor not in (None, device):
+            continue
+        camera = data.camera_of(image)
+        found.append(
+            PosedImage(
+                name=image,
+                path=folder.image_path(image),
+                camera=camera if convention is None else convention.to_colmap(camera),
+                cam_from_world=pose,
+                timestamp=timestamp,
+                sensor=device,
+                is_query=is_query,
+                keypoints_px=np.zeros((0, 2)),
+                rows=_NO_ROWS,
+                points=_NO_ROWS,
+            )
+        )
+    return found

@@ -1,0 +1,312 @@
+"""Poses, cameras and points in the formats of other tools.
+
+colmap      a model, as COLMAP writes it
+nerfstudio  ``transforms.json`` and ``sparse_pc.ply``
+tum         ``timestamp tx ty tz qx qy qz qw``, as evo reads it
+kitti       twelve numbers, ``world_from_cam`` row by row, as evo reads it
+ply         points and camera frusta, which every viewer of meshes opens
+geojson     camera centres as points of WGS84 (RFC 7946)
+
+Trajectories hold ``world_from_cam`` in the camera axes of COLMAP and kapture: x right, y down, z
+ahead. nerfstudio's are OpenGL's: x right, y up, z back.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.geometry.cameras import bearing_rays, focal_px, principal_point_px
+from megloc_kapture.io.colmap import MapImage, write_model
+from megloc_kapture.io.files import write_bytes
+from megloc_kapture.io.ply import write_ply
+from megloc_kapture.values import ONE_FOCAL_MODELS, Camera, RigidTransform
+
+_MAP_COLOUR, _QUERY_COLOUR = (120, 120, 120), (220, 50, 32)
+# of WGS84: semi-major axis in metres, flattening
+_A, _F = 6_378_137.0, 1 / 298.257223563
+_E2 = _F * (2 - _F)
+# fx fy cx cy and distortion, by COLMAP's order of parameters
+_NERFSTUDIO: dict[str, tuple[str, tuple[str, ...]]] = {
+    "SIMPLE_PINHOLE": ("OPENCV", ()),
+    "PINHOLE": ("OPENCV", ()),
+    "SIMPLE_RADIAL": ("OPENCV", ("k1",)),
+    "RADIAL": ("OPENCV", ("k1", "k2")),
+    "OPENCV": ("OPENCV", ("k1", "k2", "p1", "p2")),
+    "OPENCV_FISHEYE": ("OPENCV_FISHEYE", ("k1", "k2", "k3", "k4")),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class PosedImage:
+    """An image with its pose.
+
+    Attributes
+    ----------
+    path : its file; None where there is none.
+    camera : in COLMAP's convention.
+    timestamp, sensor : of its record in kapture.
+    is_query : localized, not of the map.
+    keypoints_px : (K, 2); empty where nothing is observed.
+    rows, points : int (M,), rows of keypoints and of the scene's points that they observe.
+    """
+
+    name: str
+    path: Path | None
+    camera: Camera
+    cam_from_world: RigidTransform
+    timestamp: int
+    sensor: str
+    is_query: bool
+    keypoints_px: NDArray[np.floating]
+    rows: NDArray[np.integer]
+    points: NDArray[np.integer]
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What is exported: images, and points float64 (N, 6) as X Y Z R G B."""
+
+    images: Sequence[PosedImage]
+    points: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class GeoOrigin:
+    """Where on WGS84 the world's origin lies; its axes are East, North and Up there.
+
+    Parameters
+    ----------
+    latitude_deg, longitude_deg : geodetic.
+    height_m : above the ellipsoid.
+    """
+
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float = 0.0
+
+
+def export_colmap(scene: Scene, output: Path) -> None:
+    """Write a model: cameras, rigs, frames, images, points3D, in COLMAP's binary format.
+
+    Every camera is a rig of its own. Queries bring no observations.
+
+    Raises
+    ------
+    DataError : map and queries share a name.
+    """
+    _check_names(scene)
+    images = [MapImage(i.name, i.camera, i.cam_from_world, i.keypoints_px) for i in scene.images]
+    observed = [(image.rows, image.points) for image in scene.images]
+    write_model(output, images, observed, scene.points[:, :3], scene.points[:, 3:])
+
+
+def export_nerfstudio(scene: Scene, output: Path, *, beside: Path | None = None) -> None:
+    """Write ``transforms.json``, with intrinsics per frame, and ``sparse_pc.ply``.
+
+    Parameters
+    ----------
+    beside : folder that the images' paths are relative to, where it is not ``output``.
+
+    Raises
+    ------
+    DataError : an image without a file, or a camera model that nerfstudio has not.
+    """
+    frames = []
+    for image in scene.images:
+        if image.path is None or not image.path.is_file():
+            raise DataError(f"nerfstudio needs the file of {image.name!r}", path=image.path)
+        file = os.path.relpath(image.path.resolve(), (beside or output).resolve())
+        frames.append(
+            {
+                "file_path": Path(file).as_posix(),
+                **_nerfstudio_camera(image.camera),
+                "transform_matrix": (_matrix(image) @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist(),
+            }
+        )
+    content: dict[str, Any] = {"frames": frames}
+    if len(scene.points):
+        write_ply(output / "sparse_pc.ply", scene.points[:, :3], scene.points[:, 3:])
+        content["ply_file_path"] = "sparse_pc.ply"
+    write_bytes(output / "transforms.json", (json.dumps(content, indent=1) + "\n").encode())
+
+
+def export_tum(scene: Scene, output: Path) -> None:
+    """Write a TUM trajectory, timestamps as kapture has them.
+
+    Raises
+    ------
+    DataError : images of two cameras have one timestamp, which such a file cannot tell apart.
+    """
+    rows = []
+    for image in sorted(scene.images, key=lambda one: one.timestamp):
+        world_from_cam = image.cam_from_world.inverse()
+        w, *vector = world_from_cam.quat_wxyz
+        numbers = (*world_from_cam.translation, *vector, w)
+        rows.append((image.timestamp, " ".join(_number(value) for value in numbers)))
+    stamps = [stamp for stamp, _ in rows]
+    if len(set(stamps)) != len(stamps):
+        raise DataError(
+            "several images have one timestamp; choose one camera with --sensor: "
+            f"{', '.join(sorted({image.sensor for image in scene.images}))}"
+        )
+    write_bytes(output, "".join(f"{stamp} {row}\n" for stamp, row in rows).encode())
+
+
+def export_kitti(scene: Scene, output: Path) -> None:
+    """Write a KITTI trajectory in the order of the names, which ``OUTPUT.names.txt`` has."""
+    images = sorted(scene.images, key=lambda image: image.name)
+    lines = [" ".join(_number(v) for v in _matrix(image)[:3].ravel()) for image in images]
+    write_bytes(output, "".join(f"{line}\n" for line in lines).encode())
+    names = "".join(f"{image.name}\n" for image in images)
+    write_bytes(output.with_name(f"{output.name}.names.txt"), names.encode())
+
+
+def export_ply(scene: Scene, output: Path) -> None:
+    """Write the points, and every camera as five vertices and eight edges.
+
+    A frustum is as deep as a twentieth of what the cameras see in the median.
+    """
+    depths = [
+        float(np.median(image.cam_from_world.apply(scene.points[image.points, :3])[:, 2]))
+        for image in scene.images
+        if len(image.points)
+    ]
+    centres = np.array([image.cam_from_world.center() for image in scene.images]).reshape(-1, 3)
+    extent = float(np.ptp(centres, axis=0).max()) if len(centres) > 1 else 1.0
+    depth = 0.05 * (float(np.median(depths)) if depths else extent or 1.0)
+    vertices, colours = [scene.points[:, :3]], [scene.points[:, 3:]]
+    edges: list[tuple[int, int]] = []
+    for image in scene.images:
+        first = sum(len(part) for part in vertices)
+        vertices.append(frustum(image.camera, image.cam_from_world, depth))
+        colours.append(np.tile(_QUERY_COLOUR if image.is_query else _MAP_COLOUR, (5, 1)))
+        edges += [(first, first + k) for k in (1, 2, 3, 4)]
+        edges += [(first + k, first + k % 4 + 1) for k in (1, 2, 3, 4)]
+    write_ply(output, np.concatenate(vertices), np.concatenate(colours), edges=edges)
+
+
+def export_geojson(scene: Scene, output: Path, origin: GeoOrigin) -> None:
+    """Write the camera centres as points, with name, heading and role.
+
+    Raises
+    ------
+    DataError : the origin is no place on earth.
+    """
+    features = []
+    for image in scene.images:
+        world_from_cam = image.cam_from_world.inverse()
+        east, north, _ = world_from_cam.rotation_matrix()[:, 2]
+        longitude, latitude, height = _geodetic(np.array(world_from_cam.translation), origin)
+        features.append(
+            {
+                "type": "Feature",
+                "geometry": {"type": "Point", "coordinates": [longitude, latitude, height]},
+                "properties": {
+                    "name": image.name,
+                    "role": "query" if image.is_query else "map",
+                    "heading_deg": math.degrees(math.atan2(east, north)) % 360.0,
+                },
+            }
+        )
+    content = {"type": "FeatureCollection", "features": features}
+    write_bytes(output, (json.dumps(content, indent=1) + "\n").encode())
+
+
+def frustum(camera: Camera, cam_from_world: RigidTransform, depth: float) -> NDArray[np.float64]:
+    """Centre and corners (5, 3) of what a camera sees up to a depth, in the world.
+
+    A corner that the distortion cannot be undone at is where it would be without.
+    """
+    width, height = camera.width, camera.height
+    corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float64)
+    rays = bearing_rays(camera, corners)
+    flat = (corners - principal_point_px(camera)) / focal_px(camera)
+    rays = np.where(np.isfinite(rays), rays, np.concatenate([flat, np.ones((4, 1))], axis=1))
+    return cam_from_world.inverse().apply(np.concatenate([np.zeros((1, 3)), depth * rays]))
+
+
+def _check_names(scene: Scene) -> None:
+    names = [image.name for image in scene.images]
+    if len(set(names)) != len(names):
+        twice = min(name for name in names if names.count(name) > 1)
+        raise DataError(f"map and queries both have an image {twice!r}; COLMAP knows one")
+
+
+def _matrix(image: PosedImage) -> NDArray[np.float64]:
+    """``world_from_cam`` (4, 4)."""
+    world_from_cam = image.cam_from_world.inverse()
+    matrix = np.eye(4)
+    matrix[:3, :3] = world_from_cam.rotation_matrix()
+    matrix[:3, 3] = world_from_cam.translation
+    return matrix
+
+
+def _nerfstudio_camera(camera: Camera) -> Mapping[str, Any]:
+    if camera.model not in _NERFSTUDIO:
+        raise DataError(
+            f"nerfstudio has no camera model {camera.model}; undistort first "
+            "(`megloc preprocess --set undistort=true`)"
+        )
+    model, names = _NERFSTUDIO[camera.model]
+    cx, cy = principal_point_px(camera)
+    fx, fy = camera.params[0], camera.params[0 if camera.model in ONE_FOCAL_MODELS else 1]
+    distortion = camera.params[len(camera.params) - len(names) :]
+    return {
+        "camera_model": model,
+        **{"w": camera.width, "h": camera.height, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy},
+        **dict(zip(names, distortion, strict=True)),
+    }
+
+
+def _number(value: float) -> str:
+    return f"{value:.17g}"
+
+
+def _geodetic(
+    east_north_up_m: NDArray[np.float64], origin: GeoOrigin
+) -> tuple[float, float, float]:
+    """Longitude and latitude in degrees, and height in metres, of a point near the origin.
+
+    By way of earth-centred coordinates, and back by iteration on the latitude.
+    """
+    if not (-90 <= origin.latitude_deg <= 90 and -180 <= origin.longitude_deg <= 180):
+        raise DataError(f"{origin.latitude_deg}, {origin.longitude_deg} is no latitude, longitude")
+    phi, lam = math.radians(origin.latitude_deg), math.radians(origin.longitude_deg)
+    sin_phi, cos_phi, sin_lam, cos_lam = math.sin(phi), math.cos(phi), math.sin(lam), math.cos(lam)
+    radius = _A / math.sqrt(1 - _E2 * sin_phi**2)
+    start = np.array(
+        [
+            (radius + origin.height_m) * cos_phi * cos_lam,
+            (radius + origin.height_m) * cos_phi * sin_lam,
+            (radius * (1 - _E2) + origin.height_m) * sin_phi,
+        ]
+    )
+    ecef_from_enu = np.array(
+        [
+            [-sin_lam, -sin_phi * cos_lam, cos_phi * cos_lam],
+            [cos_lam, -sin_phi * sin_lam, cos_phi * sin_lam],
+            [0.0, cos_phi, sin_phi],
+        ]
+    )
+    x, y, z = start + ecef_from_enu @ east_north_up_m
+    distance, height = math.hypot(x, y), 0.0
+    latitude = math.atan2(z, distance * (1 - _E2))
+    for _ in range(8):
+        radius = _A / math.sqrt(1 - _E2 * math.sin(latitude) ** 2)
+        latitude = math.atan2(z + _E2 * radius * math.sin(latitude), distance)
+    # of the two formulas the one that does not divide by a small number
+    if abs(latitude) < math.pi / 4:
+        height = distance / math.cos(latitude) - radius
+    else:
+        height = z / math.sin(latitude) - radius * (1 - _E2)
+    return math.degrees(math.atan2(y, x)), math.degrees(latitude), height

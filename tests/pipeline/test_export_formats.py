@@ -1,0 +1,143 @@
+"""Exports of cameras and places on earth, against formulas and COLMAP."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.geometry.cameras import project
+from megloc_kapture.pipeline.export_formats import (
+    GeoOrigin,
+    PosedImage,
+    Scene,
+    export_geojson,
+    export_nerfstudio,
+    export_tum,
+    frustum,
+)
+from megloc_kapture.values import Camera, RigidTransform
+
+NO_ROWS = np.zeros(0, np.int64)
+
+
+def image(
+    camera: Camera, pose: RigidTransform, *, timestamp: int = 0, path: Path | None = None
+) -> PosedImage:
+    pixels = np.zeros((0, 2))
+    return PosedImage(
+        "a.jpg", path, camera, pose, timestamp, "cam", False, pixels, NO_ROWS, NO_ROWS
+    )
+
+
+def scene(*images: PosedImage) -> Scene:
+    return Scene(images, np.zeros((0, 6)))
+
+
+def centred_at(centre: tuple[float, float, float]) -> RigidTransform:
+    """A camera at a centre that looks north, its y axis down."""
+    world_from_cam = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    return RigidTransform.from_matrix(world_from_cam, np.array(centre)).inverse()
+
+
+def ecef(latitude_deg: float, longitude_deg: float, height_m: float) -> np.ndarray:
+    """The textbook's formula, with WGS84's semi-axes."""
+    a, b = 6378137.0, 6356752.314245179
+    phi, lam = math.radians(latitude_deg), math.radians(longitude_deg)
+    n = a * a / math.hypot(a * math.cos(phi), b * math.sin(phi))
+    flat = (n + height_m) * math.cos(phi)
+    up = (b * b / (a * a) * n + height_m) * math.sin(phi)
+    return np.array([flat * math.cos(lam), flat * math.sin(lam), up])
+
+
+@given(
+    st.floats(-89, 89),
+    st.floats(-179, 179),
+    st.floats(-100, 5000),
+    st.tuples(*[st.floats(-5000, 5000)] * 3),
+)
+def test_places_on_earth_are_as_far_from_the_origin_as_in_the_world(
+    tmp_path_factory: pytest.TempPathFactory,
+    latitude: float,
+    longitude: float,
+    height: float,
+    centre: tuple[float, float, float],
+) -> None:
+    out = tmp_path_factory.getbasetemp() / "a.geojson"
+    camera = Camera.pinhole(640, 480, 500)
+    export_geojson(
+        scene(image(camera, centred_at(centre))), out, GeoOrigin(latitude, longitude, height)
+    )
+    feature = json.loads(out.read_text())["features"][0]
+    found_longitude, found_latitude, found_height = feature["geometry"]["coordinates"]
+    moved = ecef(found_latitude, found_longitude, found_height) - ecef(latitude, longitude, height)
+    phi, lam = math.radians(latitude), math.radians(longitude)
+    east = np.array([-math.sin(lam), math.cos(lam), 0.0])
+    up = np.array([math.cos(phi) * math.cos(lam), math.cos(phi) * math.sin(lam), math.sin(phi)])
+    north = np.cross(up, east)
+    np.testing.assert_allclose([moved @ east, moved @ north, moved @ up], centre, atol=1e-5)
+    assert feature["properties"]["heading_deg"] % 360 == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        Camera("SIMPLE_RADIAL", 640, 480, (500, 320, 240, 0.1)),
+        Camera("RADIAL", 640, 480, (500, 320, 240, 0.1, 0.01)),
+        Camera("OPENCV", 640, 480, (500, 510, 320, 240, 0.1, 0.01, 0.001, 0.002)),
+        Camera("OPENCV_FISHEYE", 640, 480, (500, 510, 320, 240, 0.1, 0.01, 0.001, 0.002)),
+        Camera("PINHOLE", 640, 480, (500, 510, 320, 240)),
+    ],
+    ids=lambda camera: camera.model,
+)
+def test_cameras_of_nerfstudio(camera: Camera, tmp_path: Path) -> None:
+    """Its parameters in OpenCV's own functions project as COLMAP does."""
+    import cv2
+
+    (tmp_path / "a.jpg").touch()
+    posed = image(camera, RigidTransform.identity(), path=tmp_path / "a.jpg")
+    export_nerfstudio(scene(posed), tmp_path)
+    frame = json.loads((tmp_path / "transforms.json").read_text())["frames"][0]
+    matrix = np.array(
+        [[frame["fl_x"], 0, frame["cx"]], [0, frame["fl_y"], frame["cy"]], [0, 0, 1.0]]
+    )
+    points = np.random.default_rng(0).uniform((-1, -1, 3), (1, 1, 5), (20, 3))
+    fisheye = frame["camera_model"] == "OPENCV_FISHEYE"
+    names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2")
+    distortion = np.array([frame.get(name, 0.0) for name in names])
+    zero = np.zeros(3)
+    if fisheye:
+        pixels, _ = cv2.fisheye.projectPoints(points[:, None], zero, zero, matrix, distortion)
+    else:
+        pixels, _ = cv2.projectPoints(points, zero, zero, matrix, distortion)
+    expected = project(camera, RigidTransform.identity(), points)
+    np.testing.assert_allclose(pixels.reshape(-1, 2), expected, atol=1e-8)
+
+
+def test_what_a_format_cannot_say_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.jpg").touch()
+    odd = Camera("THIN_PRISM_FISHEYE", 640, 480, (500, 500, 320, 240, *[0.0] * 8))
+    pose = RigidTransform.identity()
+    with pytest.raises(DataError, match="no camera model THIN_PRISM_FISHEYE; undistort"):
+        export_nerfstudio(scene(image(odd, pose, path=tmp_path / "a.jpg")), tmp_path)
+    with pytest.raises(DataError, match="needs the file"):
+        export_nerfstudio(scene(image(Camera.pinhole(6, 4, 5), pose)), tmp_path)
+    two = image(Camera.pinhole(6, 4, 5), pose), image(Camera.pinhole(6, 4, 5), pose)
+    with pytest.raises(DataError, match="one timestamp"):
+        export_tum(scene(*two), tmp_path / "a.tum")
+
+
+def test_a_frustum_is_what_the_camera_sees() -> None:
+    camera = Camera("OPENCV", 640, 480, (500, 510, 320, 240, -0.1, 0.01, 0.001, 0.002))
+    pose = centred_at((1.0, 2.0, 3.0))
+    corners = frustum(camera, pose, 2.0)
+    np.testing.assert_allclose(corners[0], (1, 2, 3), atol=1e-12)
+    np.testing.assert_allclose(pose.apply(corners[1:])[:, 2], 2.0)
+    expected = [(0, 0), (640, 0), (640, 480), (0, 480)]
+    np.testing.assert_allclose(project(camera, pose, corners[1:]), expected, atol=1e-6)
