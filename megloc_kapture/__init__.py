@@ -8,11 +8,18 @@
 
 # pycolmap 4.1.1 to 4.2.1 corrupt the heap when they are imported before zlib; this import
 # must stay the first of the package (tests/test_import_order.py).
+import sys
 import zlib  # noqa: F401
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from megloc_kapture.errors import DataError, MeglocError, OptionError, OutputError, PluginError
+
+if sys.platform == "win32":
+    raise ImportError(
+        "megloc-kapture needs what Linux and macOS have and Windows has not (file locks, fork "
+        "servers); on Windows it runs under WSL 2"
+    )
 
 if TYPE_CHECKING:
     __version__: str

@@ -55,3 +55,15 @@ def suggestion(name: str, known: Iterable[str], *, listed: str = "known: ") -> s
     names = list(known)
     near = get_close_matches(name, names, n=1)
     return f"{f'did you mean {near[0]!r}? ' if near else ''}{listed}{', '.join(names) or 'none'}"
+
+
+# packages that an extra brings, and the extra
+_EXTRAS = {"torch": "torch", "kornia": "kornia", "onnx": "convert", "distributed": "cluster"}
+
+
+def missing_extra(error: BaseException) -> str | None:
+    """What to install where an import failed for want of a package that an extra brings."""
+    package = (getattr(error, "name", None) or "").partition(".")[0]
+    if not isinstance(error, ModuleNotFoundError) or package not in _EXTRAS:
+        return None
+    return f'{package} is not installed: pip install "megloc-kapture[{_EXTRAS[package]}]"'

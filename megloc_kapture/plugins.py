@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError, model_validator
 
-from megloc_kapture.errors import MeglocError, PluginError, suggestion
+from megloc_kapture.errors import MeglocError, PluginError, missing_extra, suggestion
 from megloc_kapture.values import (
     Camera,
     ImageFeatures,
@@ -416,8 +416,9 @@ def plugin_class(group: str, name: str) -> Any:
     try:
         kind = found[0].load()
     except Exception as error:  # whatever a foreign module raises while it is imported
+        reason = missing_extra(error) or error
         raise PluginError(
-            f"plugin {name!r} ({found[0].value}) cannot be loaded: {error}"
+            f"plugin {name!r} ({found[0].value}) cannot be loaded: {reason}"
         ) from error
     protocol = _PROTOCOLS[group]
     missing = [member for member in _members(protocol) if not hasattr(kind, member)]

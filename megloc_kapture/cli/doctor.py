@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from megloc_kapture.cli.common import Common
 from megloc_kapture.cli.weights import summary
-from megloc_kapture.errors import MeglocError
+from megloc_kapture.errors import MeglocError, missing_extra
 from megloc_kapture.evaluation.provenance import installed_version
 
 _PACKAGES = (
@@ -45,9 +45,10 @@ class Doctor(Common):
 
 def gpu() -> str:
     """Name of the GPU that torch sees."""
-    if importlib.util.find_spec("torch") is None:
-        return "unknown: torch is not installed"
-    import torch
+    try:
+        import torch
+    except ModuleNotFoundError as error:
+        return f"unknown: {missing_extra(error) or error}"
 
     return torch.cuda.get_device_name(0) if torch.cuda.is_available() else "none"
 

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import Annotated, Any, NoReturn, Protocol
 
-from megloc_kapture.errors import MeglocError
+from megloc_kapture.errors import MeglocError, missing_extra
 
 DONE, DEFECT, USER_ERROR, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
 
@@ -203,6 +203,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except Terminated:
         print("megloc: terminated; run the same command again to go on", file=sys.stderr)
         status = TERMINATED
+    except ModuleNotFoundError as error:
+        if (hint := missing_extra(error)) is None:
+            raise
+        if debug:
+            traceback.print_exc()
+        print(f"megloc: {hint}", file=sys.stderr)
+        status = USER_ERROR
     except BrokenPipeError:
         # who reads our output has gone; the flush at exit must not complain about it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -8,11 +8,11 @@ Imported where they are called, not where their module is: numba costs half a se
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
+from numba import get_num_threads
 
 from megloc_kapture.compiling import compiled_loop
 from megloc_kapture.geometry.projection import PINHOLES, distorted, project_point
@@ -30,7 +30,7 @@ def in_chunks(count: int, size: int, work: Callable[[int, int], object]) -> None
         for first, last in chunks:
             work(first, last)
         return
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as executor:
+    with ThreadPoolExecutor(get_num_threads()) as executor:  # cores open to the process
         for done in [executor.submit(work, first, last) for first, last in chunks]:
             done.result()
 
