@@ -293,13 +293,15 @@ def _sources(
     """Where the matches of a cluster come from, and what its images see."""
     number = {image: at for at, image in enumerate(cluster)}
     center_of = np.array([centers[image] for image in cluster]).reshape(-1, 3)
-    support, images, noise, seen = [], [], [], []
+    support, images, seen = [], [], []
+    noise: list[NDArray[np.float64]] = []
     for view, of_types in zip(views, found, strict=True):
         for typed, own in zip(view.matches, of_types, strict=True):
             rows = np.array([number.get(image, -1) for image, _, _ in typed.matches], np.int64)
             support.append(own.support)
             images.append(rows[own.image_rows])
-            noise.append(np.full(len(own.support), typed.index.noise_rad))
+            index = typed.index
+            noise.append(np.tile([index.noise_rad, index.noise_px], (len(own.support), 1)))
         seen.append(
             np.concatenate([np.zeros((0, 3)), *(m.index.seen_by(cluster) for m in view.matches)])
         )
@@ -309,8 +311,9 @@ def _sources(
         centers=center_of[rows_of_images],
         images=rows_of_images,
         num_keypoints=sum(len(m.keypoints_px) for view in views for m in view.matches),
-        noise_rad=np.concatenate(noise),
+        noise=np.concatenate(noise),
         seen=seen,
+        local_types={own.index.local_type for view in views for own in view.matches},
     )
 
 

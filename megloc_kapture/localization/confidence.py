@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib import resources
@@ -66,17 +66,19 @@ class MatchSources:
     centers : float64 (sum of support, 3), where these images were taken, match by match.
     images : int64 (sum of support,), these images.
     num_keypoints : of the query, in all its views and types.
-    noise_rad : (N,) median angle between an observation of the map, of the match's type, and its
-        point; NaN where that is not known.
+    noise : float64 (N, 2), of the match's type the median angle between an observation of the map
+        and its point, and their distance in pixels; NaN where that is not known.
     seen : of each view the points (K, 3) that the map images of the cluster observe.
+    local_types : keypoints types of the matches.
     """
 
     support: NDArray[np.int64]
     centers: NDArray[np.float64]
     images: NDArray[np.int64]
     num_keypoints: int
-    noise_rad: NDArray[np.float64]
+    noise: NDArray[np.float64]
     seen: Sequence[NDArray[np.float64]]
+    local_types: Collection[str] = ()
 
 
 def evidence_of(
@@ -129,7 +131,7 @@ def with_confidence(
 ) -> Pose | Failure:
     """The pose with its confidence and the evidence for it; a failure where that is too little."""
     evidence = evidence_of(problem, pose, sources, max_error_px)
-    model = calibration()
+    model = calibration_for(sources.local_types)
     confidence = model.probability(evidence)
     if confidence >= min_confidence:
         return replace(pose, confidence=confidence, evidence=evidence)
@@ -204,7 +206,10 @@ def _misfit(
     """
     lengths = np.diff(problem.starts)
     focals = np.repeat([focal_px(view.camera) for view in problem.views], lengths)[inliers]
-    own = np.maximum(sources.noise_rad[inliers], _MIN_NOISE_PX / focals)
+    # seen from as far the map's points are no better than they are, and a keypoint of a smaller
+    # image is off by as many of its larger pixels
+    noise_rad, noise_px = sources.noise[inliers].T
+    own = np.maximum(noise_rad, np.maximum(noise_px, _MIN_NOISE_PX) / focals)
     ratios = (errors_px[inliers] / focals / own)[np.isfinite(own)]
     if len(ratios) <= _FEW:
         return 0.0
@@ -271,9 +276,25 @@ class Calibration:
         return TERMS[min(self.weights, key=lambda name: self.weights[name] * evidence[name])]
 
 
+OF_ALL = "all"
+
+
 @lru_cache(maxsize=1)
-def calibration() -> Calibration:
-    """The calibration that the package brings."""
+def calibrations() -> Mapping[str, Calibration]:
+    """The calibrations that the package brings: :data:`OF_ALL`, and those of keypoints types, by
+    what the types' names begin with."""
     text = resources.files(__package__).joinpath("confidence.toml").read_text(encoding="utf-8")
-    table = tomllib.loads(text)
-    return Calibration(table["origin"], table["bias"], table["weights"])
+    return {
+        name: Calibration(table["origin"], table["bias"], table["weights"])
+        for name, table in tomllib.loads(text).items()
+    }
+
+
+def calibration_for(local_types: Collection[str]) -> Calibration:
+    """The calibration of the keypoints types, where all of them share one of their own."""
+    known = calibrations()
+    found = {
+        next((name for name in known if name != OF_ALL and one.startswith(name)), OF_ALL)
+        for one in local_types
+    }
+    return known[found.pop() if len(found) == 1 else OF_ALL]

@@ -24,8 +24,9 @@ class MapIndex:
     point_ids : int32 (O,), rows of ``xyz``.
     covariances : float64 (N, 6) of the points as xx, xy, xz, yy, yz, zz in the map's unit squared,
         for a measurement noise of 1 px, NaN where unknown; None where the map has none.
-    noise_rad : median angle between an observation and its point, seen by the map's image; NaN
-        where it is not known.
+    local_type : the keypoints type that it is of; empty where nobody asks.
+    noise_rad, noise_px : median angle, and distance in the image, between an observation and its
+        point, seen by the map's image; NaN where they are not known.
     """
 
     xyz: NDArray[np.float64]
@@ -34,7 +35,9 @@ class MapIndex:
     keypoint_ids: NDArray[np.int32]
     point_ids: NDArray[np.int32]
     covariances: NDArray[np.float64] | None = None
+    local_type: str = ""
     noise_rad: float = math.nan
+    noise_px: float = math.nan
 
     @classmethod
     def build(

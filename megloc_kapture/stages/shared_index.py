@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -63,7 +63,8 @@ def index_map(folder: KaptureFolder, local_type: str) -> MapIndex:
         observations.point_ids,
         read_point_covariances(folder.root, len(points)),
     )
-    return replace(index, noise_rad=_noise_rad(folder, local_type, index))
+    noise_rad, noise_px = _noise(folder, local_type, index)
+    return replace(index, local_type=local_type, noise_rad=noise_rad, noise_px=noise_px)
 
 
 def observed_keypoints(
@@ -84,18 +85,25 @@ def observed_keypoints(
     ]
 
 
-def _noise_rad(folder: KaptureFolder, local_type: str, index: MapIndex) -> float:
-    """Median angle between observations and their points, of a sample of the images."""
+def _noise(folder: KaptureFolder, local_type: str, index: MapIndex) -> tuple[float, float]:
+    """Median angle and distance between observations and their points, of a sample of the images;
+    NaN where there is none."""
     if not len(index.point_ids) or local_type not in folder.types("keypoints"):
-        return math.nan
+        return math.nan, math.nan
     keypoints, poses = folder.keypoints(local_type), folder.read().poses()
     images = [image for image in index.row_of_image if image in keypoints and image in poses]
     sample = images[:: max(1, len(images) // _SAMPLED_IMAGES)]
-    observed = observed_keypoints(folder, local_type, index, sample)
-    errors = [one.errors_px(index.xyz) / focal_px(one.camera) for one in observed]
-    found = np.concatenate(errors) if errors else np.zeros(0)
-    found = found[np.isfinite(found)]
-    return float(np.median(found)) if len(found) else math.nan
+    errors_rad, errors_px = [np.zeros(0)], [np.zeros(0)]
+    for image in observed_keypoints(folder, local_type, index, sample):
+        errors_px.append(image.errors_px(index.xyz))
+        errors_rad.append(errors_px[-1] / focal_px(image.camera))
+    return _finite_median(errors_rad), _finite_median(errors_px)
+
+
+def _finite_median(parts: Sequence[NDArray[np.float64]]) -> float:
+    values = np.concatenate(parts)
+    values = values[np.isfinite(values)]
+    return float(np.median(values)) if len(values) else math.nan
 
 
 def write_index(index: MapIndex, folder: Path) -> None:
@@ -110,8 +118,8 @@ def write_index(index: MapIndex, folder: Path) -> None:
     if index.covariances is not None:
         _write_array(folder / "covariances.npy", index.covariances)
     names = sorted(index.row_of_image, key=index.row_of_image.__getitem__)
-    noise = None if math.isnan(index.noise_rad) else index.noise_rad
-    content = {"images": names, "noise_rad": noise}
+    noise = [None if math.isnan(one) else one for one in (index.noise_rad, index.noise_px)]
+    content = {"images": names, "local_type": index.local_type, "noise": noise}
     write_bytes(folder / _IMAGES, json.dumps(content).encode())
 
 
@@ -129,14 +137,23 @@ def open_index(folder: Path) -> MapIndex:
     path = folder / _IMAGES
     try:
         content = json.loads(path.read_bytes())
-        names, noise = content["images"], content["noise_rad"]
+        names, local_type = content["images"], str(content["local_type"])
+        noise_rad, noise_px = (
+            math.nan if noise is None else float(noise) for noise in content["noise"]
+        )
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"cannot read: {error}", path=path) from error
     rows = {name: row for row, name in enumerate(names)}
     if len(arrays["offsets"]) != len(names) + 1:
         raise DataError(f"{len(names)} images for {len(arrays['offsets'])} offsets", path=path)
-    noise_rad = math.nan if noise is None else float(noise)
-    return MapIndex(row_of_image=rows, covariances=covariances, noise_rad=noise_rad, **arrays)
+    return MapIndex(
+        row_of_image=rows,
+        covariances=covariances,
+        local_type=local_type,
+        noise_rad=noise_rad,
+        noise_px=noise_px,
+        **arrays,
+    )
 
 
 @contextmanager

@@ -15,10 +15,12 @@ from scipy.stats import binom
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.localization.absolute_pose import rig_pose
 from megloc_kapture.localization.confidence import (
+    OF_ALL,
     TERMS,
     Calibration,
     MatchSources,
-    calibration,
+    calibration_for,
+    calibrations,
     evidence_of,
     with_confidence,
 )
@@ -47,7 +49,7 @@ def scene(
         centers=np.zeros((count, 3)),
         images=np.zeros(count, np.int64),
         num_keypoints=2 * count,
-        noise_rad=np.full(count, noise_px / 500),
+        noise=np.tile([noise_px / 500, noise_px], (count, 1)),
         seen=[points],
     )
     return PoseProblem.of([view]), pose, sources
@@ -106,9 +108,9 @@ def test_the_number_of_views_does_not_matter() -> None:
 
 
 def test_more_wrong_matches_never_speak_for_a_pose() -> None:
-    model = calibration()
-    found = [model.probability(terms(40, wrong)) for wrong in (0, 40, 160, 640)]
-    assert found == sorted(found, reverse=True)
+    for model in calibrations().values():
+        found = [model.probability(terms(40, wrong)) for wrong in (0, 40, 160, 640)]
+        assert found == sorted(found, reverse=True)
 
 
 def test_right_and_chance() -> None:
@@ -129,18 +131,31 @@ def test_right_and_chance() -> None:
 
 def test_a_map_without_noise_or_points_in_sight() -> None:
     problem, pose, sources = scene(50, 10)
-    unknown = replace(sources, noise_rad=np.full(60, np.nan), seen=[np.zeros((0, 3))])
+    unknown = replace(sources, noise=np.full((60, 2), np.nan), seen=[np.zeros((0, 3))])
     found = evidence_of(problem, pose, unknown, ERROR_PX)
     assert found["misfit"] == 0.0 and found["matched_share"] == 0.0
 
 
 def test_misfit_of_a_map_that_is_better_than_the_query() -> None:
     problem, pose, sources = scene(200, 0, noise_px=3.0)
-    exact = replace(sources, noise_rad=np.full(200, 0.3 / 500))
+    exact = replace(sources, noise=np.tile([0.3 / 500, 0.3], (200, 1)))
     expected = math.log(1.177 * 10 / 3.3) * math.log(10)
     assert evidence_of(problem, pose, sources, ERROR_PX)["misfit"] == 0.0
     found = evidence_of(problem, pose, exact, ERROR_PX)["misfit"]
     assert found == pytest.approx(expected, rel=0.1)
+
+
+def test_keypoints_of_a_small_image_are_as_good_in_pixels() -> None:
+    problem, pose, sources = scene(200, 0, noise_px=0.5)
+    # the map's images are four times as large: as good in pixels, four times so in angles
+    of_large = replace(sources, noise=np.tile([0.5 / 2000, 0.5], (200, 1)))
+    assert evidence_of(problem, pose, of_large, ERROR_PX)["misfit"] == 0.0
+    of_better = replace(sources, noise=np.tile([0.1 / 500, 0.1], (200, 1)))
+    # never better than a third of a pixel
+    assert evidence_of(problem, pose, of_better, ERROR_PX)["misfit"] == 0.0
+    problem, pose, sources = scene(200, 0, noise_px=2.0)
+    of_better = replace(sources, noise=np.tile([0.5 / 2000, 0.5], (200, 1)))
+    assert evidence_of(problem, pose, of_better, ERROR_PX)["misfit"] > 0.5
 
 
 @given(st.dictionaries(st.sampled_from(sorted(TERMS)), st.floats(-1e6, 1e6)), st.floats(-50, 50))
@@ -153,9 +168,14 @@ def test_probabilities(weights: dict[str, float], bias: float) -> None:
     assert (probability > 0.5) == (logit > 0) or abs(logit) < 1e-6 * (1 + abs(bias))
 
 
-def test_the_calibration_of_the_package() -> None:
-    model = calibration()
-    assert model.origin and set(model.weights) <= set(TERMS)
+def test_the_calibrations_of_the_package() -> None:
+    known = calibrations()
+    for model in known.values():
+        assert model.origin and set(model.weights) <= set(TERMS)
+    of_all, of_aliked = known[OF_ALL], known["aliked"]
+    assert calibration_for(["rootsift"]) is of_all and calibration_for([]) is of_all
+    assert calibration_for(["aliked-n16", "aliked-n16_pyramid"]) is of_aliked
+    assert calibration_for(["aliked-n16", "xfeat"]) is of_all
 
 
 def test_evidence_needs_inliers_and_covariance() -> None:
