@@ -14,6 +14,10 @@ class MeglocError(Exception):
     prints it and exits with 2; anything that is not a ``MeglocError`` is a defect of ours.
     """
 
+    def lines(self) -> list[str]:
+        """The message as the command line prints it: one line, or one for each of several."""
+        return [" ".join(str(self).split())]
+
 
 class DataError(MeglocError):
     """Data is missing, broken or inconsistent; names the file and, where it can, the line."""

@@ -195,7 +195,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except MeglocError as error:
         if debug:
             traceback.print_exc()
-        print(f"megloc: {' '.join(str(error).split())}", file=sys.stderr)
+        for line in error.lines():
+            print(f"megloc: {line}", file=sys.stderr)
         status = USER_ERROR
     except KeyboardInterrupt:
         print("megloc: interrupted; run the same command again to go on", file=sys.stderr)

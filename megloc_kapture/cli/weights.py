@@ -27,8 +27,14 @@ from megloc_kapture.io.weights import (
 )
 from megloc_kapture.io.weights.fetch import fetch
 from megloc_kapture.io.weights.registry import PublishedFile, Weights, lookup, registry
+from megloc_kapture.pipeline.missing_weights import check_weights
+from megloc_kapture.pipeline.presets import options_of_preset
 
 WRONG_FILES = 2
+
+
+class LicenceError(MeglocError):
+    """Weights under a licence that was not agreed to."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,8 +63,10 @@ class List(Common):
 class Fetch(Common):
     """Download weights from where they are published, check them, and keep them."""
 
-    names: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="NAME...")]
+    names: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[NAME...]")] = ()
     """Networks, by their names in the list."""
+    preset: str | None = None
+    """All that a preset needs and has not."""
     accept_licence: bool = False
     """Agree to a licence that does not plainly allow commercial use."""
     force: Force = False
@@ -67,11 +75,26 @@ class Fetch(Common):
     def run(self) -> int:
         """Run it."""
         console = self.console()
-        if not self.names:
+        names = self.names
+        if self.preset is not None:
+            missing = _missing(self.preset)
+            if not (missing or names):
+                console.result(f"{self.preset}: no weights are missing")
+            names = tuple(dict.fromkeys((*names, *missing)))
+        elif not names:
             raise OptionError(f"say which weights to fetch: {', '.join(registry())}")
-        wanted = [_fetchable(lookup(name), self.accept_licence) for name in self.names]
+        wanted, refused = [], []
+        for name in names:
+            try:
+                wanted.append(_fetchable(lookup(name), self.accept_licence))
+            except (MissingWeightsError, LicenceError) as error:
+                if self.preset is None:
+                    raise
+                refused.append(str(error))
         for weights, file, url in wanted:
             self._fetch(console, weights, file, url)
+        if refused:
+            raise MissingWeightsError("\n".join(refused))
         return 0
 
     def _fetch(self, console: Console, weights: Weights, file: PublishedFile, url: str) -> None:
@@ -178,6 +201,15 @@ def summary() -> str:
     return f"{len(there)} of {len(registry())} in {weights_folder()}{names}"
 
 
+def _missing(preset: str) -> tuple[str, ...]:
+    """The weights that a preset needs and has not."""
+    try:
+        check_weights(options_of_preset(preset))
+    except MissingWeightsError as error:
+        return error.names
+    return ()
+
+
 def _fetchable(weights: Weights, accepted: bool) -> tuple[Weights, PublishedFile, str]:
     file = weights.to_fetch
     if file is None or file.url is None:
@@ -186,7 +218,7 @@ def _fetchable(weights: Weights, accepted: bool) -> tuple[Weights, PublishedFile
             "run: megloc weights add FILE"
         )
     if not (weights.commercial or accepted):
-        raise MeglocError(
+        raise LicenceError(
             f"{weights.name} has a licence to agree to: {weights.licence}: {weights.terms} "
             f"(whole text at {weights.page}); if you do, add --accept-licence"
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from megloc_kapture.io.weights import MissingWeightsError
+from megloc_kapture.io.weights import MissingWeightsError, all_missing
 from megloc_kapture.plugins import (
     LOCAL_FEATURES,
     MATCHERS,
@@ -25,14 +25,14 @@ def check_weights(options: PipelineOptions) -> None:
     MissingWeightsError : names each checkpoint that is not there, and how to get it.
     PluginError : a plugin is not there, or refuses its options.
     """
-    missing: dict[str, None] = {}
+    missing = []
     for make in _makers(options):
         try:
             make()
         except MissingWeightsError as error:
-            missing[str(error)] = None
+            missing.append(error)
     if missing:
-        raise MissingWeightsError("\n".join(missing))
+        raise all_missing(missing)
 
 
 def _makers(options: PipelineOptions) -> list[Callable[[], object]]:

@@ -39,7 +39,10 @@ def served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """Folder that a server gives out, and a registry of what is in it."""
     folder = tmp_path / "served"
     folder.mkdir()
-    for name, content in (("free.pth", FREE), ("bound.pth", BOUND), ("unknown.pth", UNKNOWN)):
+    for name, content in (
+        *(("free.pth", FREE), ("bound.pth", BOUND), ("unknown.pth", UNKNOWN)),
+        ("aliked-n16.pth", FREE),
+    ):
         (folder / name).write_bytes(content)
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     monkeypatch.setenv("MEGLOC_WEIGHTS", str(tmp_path / "weights"))
@@ -77,6 +80,7 @@ def registry_text(address: str) -> str:
         + entry("bound", BOUND, commercial=False)
         + entry("unknown", None, commercial=True)
         + entry("by-hand", None, commercial=True, url=False)
+        + entry("aliked-n16", FREE, commercial=True)
     )
 
 
@@ -100,6 +104,24 @@ def test_fetch(megloc: Any, folder: Path) -> None:
     assert (again.out, again.err) == (f"free: already there, {folder}/free.pth\n", "")
 
 
+def test_fetch_for_a_preset(megloc: Any, folder: Path) -> None:
+    fetched = megloc("weights", "fetch", "--preset", "modern", "-q").out
+    assert fetched.startswith(f"aliked-n16: {folder}/aliked-n16.pth")
+    again = megloc("weights", "fetch", "--preset", "modern").out
+    assert again == "modern: no weights are missing\n"
+    megloc("weights", "fetch", "--preset", "moden").refused("did you mean 'modern'")
+
+
+def test_each_missing_file_of_a_preset_has_a_line(
+    megloc: Any, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MEGLOC_WEIGHTS", str(tmp_path / "none"))
+    done = megloc("eval", "kapture", "--root", scene, "--preset", "megloc", "--dry-run")
+    lines = done.err.splitlines()
+    assert done.status == 2 and len(lines) > 5
+    assert all(line.startswith("megloc: the weights ") and len(line) < 500 for line in lines)
+
+
 def test_consent(megloc: Any, folder: Path) -> None:
     told = megloc("weights", "fetch", "free", "bound").refused(
         r"bound has a licence to agree to: SHORT: for looking at only \(whole text at http",
@@ -113,7 +135,9 @@ def test_consent(megloc: Any, folder: Path) -> None:
 
 def test_fetch_refuses(megloc: Any, served: Path, folder: Path) -> None:
     megloc("weights", "fetch").refused("say which weights to fetch: free, bound")
-    megloc("weights", "fetch", "fre").refused("no weights 'fre' in the registry; there are free")
+    megloc("weights", "fetch", "fre").refused(
+        "no weights 'fre' in the registry; did you mean 'free'\\? there are free"
+    )
     megloc("weights", "fetch", "by-hand").refused(
         "by-hand cannot be fetched by a program: download it from http.*/page and run: megloc "
         "weights add FILE"

@@ -10,7 +10,7 @@ import glob
 import hashlib
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -37,7 +37,26 @@ UNVERIFIED = "unverified"  # folder of files that a user has instead of the publ
 
 
 class MissingWeightsError(DataError):
-    """A checkpoint is not there; says where it is published and the command that adds it."""
+    """Checkpoints are not there; says where each is published and the command that adds it.
+
+    Attributes
+    ----------
+    names : the networks in the registry.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        names: Sequence[str] = (),
+        path: Path | str | None = None,
+        line: int | None = None,
+    ) -> None:
+        super().__init__(message, path=path, line=line)
+        self.names = tuple(names)
+
+    def lines(self) -> list[str]:
+        return str(self).splitlines()
 
 
 @dataclass(frozen=True)
@@ -91,7 +110,7 @@ def find_weights(name: str) -> WeightsFile:
         weights = registry()[name]
         path = next(files_of(weights), None)
         if path is None:
-            raise MissingWeightsError(how_to_get(weights))
+            raise MissingWeightsError(how_to_get(weights), names=[name])
         return describe(weights.name, path)
     path = Path(name).expanduser()
     if not path.is_file():
@@ -114,10 +133,17 @@ def find_all_weights(names: Sequence[str]) -> list[WeightsFile]:
         try:
             found.append(find_weights(name))
         except MissingWeightsError as error:
-            missing.append(str(error))
+            missing.append(error)
     if missing:
-        raise MissingWeightsError("\n".join(missing))
+        raise all_missing(missing)
     return found
+
+
+def all_missing(errors: Iterable[MissingWeightsError]) -> MissingWeightsError:
+    """One error for several, each told once, a line each."""
+    by_line = {line: None for error in errors for line in error.lines()}
+    names = dict.fromkeys(name for error in errors for name in error.names)
+    return MissingWeightsError("\n".join(by_line), names=list(names))
 
 
 def files_of(weights: Weights) -> Iterator[Path]:
