@@ -27,6 +27,7 @@ from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.localization.absolute_pose import absolute_pose
 from megloc_kapture.localization.estimation import AbsolutePoseOptions
+from megloc_kapture.pipeline.colmap_maps import kapture_of
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation, plan_map
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
@@ -147,10 +148,12 @@ def open_map(
     features_dirs: Sequence[Path | str] = (),
     pixel_origin: PixelOriginChoice = "auto",
 ) -> Map:
-    """Open a kapture map, ours or another tool's, with all keypoints types that have points.
+    """Open a map, ours or another tool's, with all keypoints types that have points.
 
     Parameters
     ----------
+    path : kapture map, or a COLMAP model or workspace, which is imported into the user's cache
+        when it is new or has changed (:func:`megloc_kapture.pipeline.colmap_maps.kapture_of`).
     preset, set : how it is localized in; ``{"localization.rank.name": "perceptual"}``.
     features_dirs : folders with features beside the map.
     pixel_origin : where the map's intrinsics put the pixel origin; auto finds it out.
@@ -162,7 +165,9 @@ def open_map(
     """
     options = options_of_preset(preset, assignments=set or {}, used=LOCALIZING)
     opened = KaptureMap.open(
-        path, features_dirs=[Path(one) for one in features_dirs], pixel_origin=pixel_origin
+        kapture_of(path),
+        features_dirs=[Path(one) for one in features_dirs],
+        pixel_origin=pixel_origin,
     )
     if fault := opened.fault():
         raise DataError(f"{fault}; the poses would be wrong", path=Path(path))

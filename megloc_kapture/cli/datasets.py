@@ -10,6 +10,9 @@ import tyro
 from megloc_kapture.cli.common import Common, Force, Output, Working
 from megloc_kapture.datasets.kapture_folders import QUERY
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
+from megloc_kapture.cli.console import Console
+from megloc_kapture.datasets.colmap_map import find_colmap, import_colmap
+from megloc_kapture.errors import OptionError
 from megloc_kapture.io.files import staged_output
 from megloc_kapture.pipeline.datasets import (
     KAPTURE,
@@ -22,21 +25,29 @@ from megloc_kapture.pipeline.datasets import (
 from megloc_kapture.pipeline.executors import open_executor
 from megloc_kapture.pipeline.presets import assigned
 from megloc_kapture.stages.unreadable import set_aside_unreadable
+from megloc_kapture.stages.layout import MAP
 from megloc_kapture.stages.work import Work
 
-DATASET = "dataset"
+DATASET, COLMAP = "dataset", "colmap"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Import(Common):
-    """Bring a dataset into DIR/{mapping,query,query_gt,megloc}; images are linked, not copied."""
+    """Bring a dataset into DIR/{mapping,query,query_gt,megloc}, or a COLMAP model into a map.
+
+    Images are linked, not copied."""
 
     dataset: tyro.conf.Positional[str]
-    """aachen, robotcar, 4seasons, inloc, or kapture: any pair of kapture folders."""
+    """aachen, robotcar, 4seasons, inloc, kapture: any pair of kapture folders; colmap: a model."""
     root: tyro.conf.Positional[Path]
-    """Folder of the dataset, laid out as it is published."""
+    """Folder of the dataset, laid out as it is published; of colmap the model (sparse/0), or the
+    workspace around it."""
     output: Output
     """Where to."""
+    images: Path | None = None
+    """Of colmap: folder of the images; images/ beside the model or around it unless given."""
+    database: Path | None = None
+    """Of colmap: the features; database.db beside the model or around it unless given."""
     allow_missing: bool = False
     """Import what is there of a partial download."""
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
@@ -50,6 +61,10 @@ class Import(Common):
         """Run it."""
         console = self.console()
         name = self.dataset.removeprefix(TWIN_PREFIX)
+        if name == COLMAP:
+            return self._import_colmap(console)
+        if self.images or self.database:
+            raise OptionError(f"--images and --database are of colmap, not of {self.dataset}")
         choice = choose_dataset(
             KAPTURE if name == SYNTHETIC else name,
             self.root,
@@ -70,6 +85,26 @@ class Import(Common):
             console.say(f"warning: query {name} cannot be used and will fail: {reason}")
         if text:
             console.result(text.rstrip())
+        return 0
+
+    def _import_colmap(self, console: Console) -> int:
+        unused = {
+            "--set": self.set,
+            "--query-prefix": self.query_prefix,
+            "--allow-missing": self.allow_missing,
+        }
+        if given := [flag for flag, value in unused.items() if value]:
+            raise OptionError(f"{given[0]} changes nothing of a COLMAP model")
+        source = find_colmap(self.root, images=self.images, database=self.database)
+        for what, found in (("images", source.images), ("database", source.database)):
+            console.say(f"{what}: {found or 'none'}")
+        with (
+            staged_output(self.output, kind=MAP, force=self.force) as out,
+            open_executor("processes") as executor,
+        ):
+            counts = import_colmap(source, out, work=Work(executor, console.track))
+        for what, value in counts.items():
+            console.result(f"{what.replace('_', ' '):44s}{value:>8g}")
         return 0
 
 

@@ -10,7 +10,7 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from megloc_kapture.cli.common import Common, Reading, existing
+from megloc_kapture.cli.common import Common, Reading, existing, opened_map
 from megloc_kapture.cli.console import Console
 from megloc_kapture.cli.refine_map import report_lines
 from megloc_kapture.errors import MeglocError
@@ -34,7 +34,7 @@ class Info(Reading, Common):
     """Say what is in a kapture folder, and what a map allows."""
 
     input: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="KAPTURE")]
-    """Kapture folder."""
+    """Kapture folder, or a COLMAP model."""
     keypoints_type: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """Keypoints type to look at; may be repeated; all that have points unless given."""
     pixel_origin: PixelOriginChoice = "auto"
@@ -45,21 +45,21 @@ class Info(Reading, Common):
     def run(self) -> int:
         """Print it."""
         console = self.console()
-        folder = self.kapture(self.input)
+        folder = self.kapture(opened_map(self.input, console))
         describe_content(console, folder)
         folder.validate(deep=self.deep)
         checked = "everything, image by image" if self.deep else "files: no fault found"
         line(console, "checked", checked)
         if folder.has_points():
-            self._describe_map(console)
+            self._describe_map(console, folder.root)
         else:
             line(console, "localizing", "not possible: no points3d and observations")
         return 0
 
-    def _describe_map(self, console: Console) -> None:
+    def _describe_map(self, console: Console, root: Path) -> None:
         try:
             opened = KaptureMap.open(
-                self.input,
+                root,
                 keypoints_types=self.keypoints_type,
                 features_dirs=existing(self.features_dir),
                 pixel_origin=self.pixel_origin,

@@ -11,7 +11,16 @@ from typing import Annotated, Any
 
 import tyro
 
-from megloc_kapture.cli.common import Common, Deciding, Force, Input, Output, Reading, existing
+from megloc_kapture.cli.common import (
+    Common,
+    Deciding,
+    Force,
+    Input,
+    Output,
+    Reading,
+    existing,
+    opened_map,
+)
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.files import staged_output
 from megloc_kapture.io.kapture import KaptureFolder, read_pairs
@@ -30,7 +39,7 @@ class Localize(Reading, Deciding, Common):
     """Localize the images of a kapture folder in a kapture map."""
 
     input: Input
-    """Kapture map: keypoints, points3d and observations. Read only."""
+    """Kapture map: keypoints, points3d and observations; or a COLMAP model. Read only."""
     query: Path
     """Kapture folder with the queries, and their features where the map's cannot be extracted."""
     output: Output = Path("localized")
@@ -52,7 +61,7 @@ class Localize(Reading, Deciding, Common):
         console = self.console()
         workers = available_cores() if self.workers is None else self.workers
         kapture_map = KaptureMap.open(
-            self.input,
+            opened_map(self.input, console),
             keypoints_types=self.keypoints_type,
             features_dirs=existing(self.features_dir),
             pixel_origin=self.pixel_origin,

@@ -42,7 +42,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     ),
     "import": (
         "datasets:Import",
-        "Bring a dataset into DIR/{mapping,query,query_gt,megloc}; images are linked, not copied.",
+        "Bring a dataset into DIR/{mapping,query,query_gt,megloc}, or a COLMAP model into a map.",
     ),
     "synth": (
         "datasets:Synth",

@@ -6,11 +6,12 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.datasets.formats.colmap_database import ColmapDatabase
+from megloc_kapture.datasets.formats.colmap_database import ColmapDatabase, FeatureType
 from megloc_kapture.datasets.formats.sparse_points import SparsePoints, image_order
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.files import link_records
@@ -24,7 +25,6 @@ from megloc_kapture.io.kapture import (
     write_sensors,
 )
 
-_KEYPOINTS = FeatureConfig("SIFT", np.dtype(np.float32), 2)
 # a database of another model has its features elsewhere; this one's differ by printed digits
 _MAX_SHIFT_PX = 1.0
 
@@ -52,6 +52,7 @@ def write_reference_map(
     *,
     keypoints_type: str = "sift",
     database: Path | None = None,
+    database_names: Mapping[str, str] | None = None,
 ) -> dict[str, int]:
     """Write a sparse model as a kapture map: sensors, poses, keypoints, points, observations.
 
@@ -73,6 +74,7 @@ def write_reference_map(
     keypoints_type : the type name of keypoints and descriptors.
     database : COLMAP database with the features of the model; its images have the names of
         ``image_names``, or these with another suffix.
+    database_names : of images that have quite another name there.
 
     Returns
     -------
@@ -98,9 +100,12 @@ def write_reference_map(
         features: _SeenFeatures | _DatabaseFeatures = _SeenFeatures(points)
         if database is not None:
             opened = stack.enter_context(ColmapDatabase(database))
-            features = _DatabaseFeatures(points, opened, output, keypoints_type)
+            features = _DatabaseFeatures(
+                points, opened, output, keypoints_type, database_names or {}
+            )
             stack.callback(features.close)
-        writer = FeatureWriter(output, "keypoints", keypoints_type, _KEYPOINTS)
+        config = FeatureConfig(keypoints_type.upper(), np.dtype(np.float32), 2)
+        writer = FeatureWriter(output, "keypoints", keypoints_type, config)
         stack.enter_context(writer)
         observations = _write_features(names, image_names, points, features, writer)
     write_observations(output, {keypoints_type: observations})
@@ -138,8 +143,19 @@ class _DatabaseFeatures:
     complete = True
 
     def __init__(
-        self, points: SparsePoints, database: ColmapDatabase, output: Path, keypoints_type: str
+        self,
+        points: SparsePoints,
+        database: ColmapDatabase,
+        output: Path,
+        keypoints_type: str,
+        names: Mapping[str, str],
     ) -> None:
+        self._type = database.feature_type() or FeatureType(keypoints_type, "u1")
+        if self._type.name != keypoints_type:
+            raise DataError(
+                f"has features of type {self._type.name}, not {keypoints_type}", path=database.path
+            )
+        self._names = names
         self._points = points
         self._database = database
         self._output = output
@@ -169,7 +185,7 @@ class _DatabaseFeatures:
         keypoints = self._database.keypoints(name_there)
         numbers = self._points.feature_ids[rows].astype(np.int64)
         self._check(name_there, keypoints, numbers, self._points.xy_px[rows])
-        descriptors = self._database.descriptors(name_there)
+        descriptors = self._database.descriptors(name_there, self._type)
         if descriptors is not None:
             self._write_descriptors(name, name_there, descriptors, len(keypoints))
         elif len(keypoints) == 0:
@@ -181,10 +197,12 @@ class _DatabaseFeatures:
         """Write empty descriptors where there are no keypoints, and close what was opened."""
         if self._writer is not None:
             for name in self._without:
-                self._writer.write(name, np.empty((0, self._writer.config.dsize), np.uint8))
+                empty = np.empty((0, self._writer.config.dsize), self._writer.config.dtype)
+                self._writer.write(name, empty)
             self._writer.close()
 
     def _name_there(self, name: str) -> str | None:
+        name = self._names.get(name, name)
         if name in self._database.images:
             return name
         found = self._by_stem.get(_without_suffix(name), [])
@@ -223,11 +241,15 @@ class _DatabaseFeatures:
             )
 
     def _write_descriptors(
-        self, name: str, name_there: str, descriptors: NDArray[np.uint8], num_keypoints: int
+        self, name: str, name_there: str, descriptors: NDArray[Any], num_keypoints: int
     ) -> None:
         if self._writer is None:
             config = FeatureConfig(
-                "SIFT", np.dtype(np.uint8), descriptors.shape[1], self._keypoints_type, "L2"
+                self._type.name.upper(),
+                descriptors.dtype,
+                descriptors.shape[1],
+                self._keypoints_type,
+                "L2",
             )
             self._writer = FeatureWriter(self._output, "descriptors", self._keypoints_type, config)
         expected = (num_keypoints, self._writer.config.dsize)

@@ -247,6 +247,12 @@ def _exchange(first: Path, second: Path) -> bool:
 # ------------------------------------------------------------------------------------ folders
 
 
+def user_cache() -> Path:
+    """The folder of what is kept for a user between commands; it need not be there."""
+    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(cache) / "megloc-kapture"
+
+
 @dataclass(frozen=True)
 class Claim:
     """A folder that was made ours, and what it was before.

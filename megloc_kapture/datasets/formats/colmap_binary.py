@@ -19,22 +19,23 @@ from megloc_kapture.datasets.formats.colmap_model import (
     BINARY_FEATURE,
     BINARY_IMAGE,
     BINARY_POINT,
-    CAMERA_MODELS,
     MAX_IMAGE_ID,
     MAX_SIZE,
     ColmapImage,
     ImageTable,
+    camera_of,
+    model_of_id,
 )
 from megloc_kapture.datasets.formats.sparse_points import Tracks
 from megloc_kapture.datasets.formats.text_lines import check_plain, image_name
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.kapture.sensors import unit_quaternion
-from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, RigidTransform
+from megloc_kapture.values import Camera, RigidTransform
 
 _MAX_NAME_BYTES = 4096
 
 
-class _BinaryFile(AbstractContextManager["_BinaryFile"]):
+class BinaryFile(AbstractContextManager["BinaryFile"]):
     """A little-endian file; every count is compared with the size before memory is taken."""
 
     def __init__(self, path: Path) -> None:
@@ -110,21 +111,21 @@ class _BinaryFile(AbstractContextManager["_BinaryFile"]):
 def read_binary_cameras(path: Path) -> dict[int, Camera]:
     """Cameras by id; DataError names the file and the byte."""
     cameras: dict[int, Camera] = {}
-    with _BinaryFile(path) as file:
-        for _ in range(file.count("cameras", BINARY_CAMERA.size + 3 * 8)):
+    with BinaryFile(path) as file:
+        for _ in range(file.count("cameras", BINARY_CAMERA.size + 2 * 8)):
             start = file.position
             camera_id, model_id, width, height = file.unpack(BINARY_CAMERA, "a camera")
-            if not 0 <= model_id < len(CAMERA_MODELS):
-                raise file.error(f"unknown camera model {model_id}", start)
-            model = CAMERA_MODELS[model_id]
-            params = struct.Struct(f"<{CAMERA_MODEL_NUM_PARAMS[model]}d")
-            values = file.unpack(params, "a camera")
+            try:
+                model, num_params = model_of_id(model_id)
+            except DataError as error:
+                raise file.error(error.message, start) from None
+            values = file.unpack(struct.Struct(f"<{num_params}d"), "a camera")
             if camera_id in cameras:
                 raise file.error(f"camera {camera_id} is listed twice", start)
             if max(width, height) > MAX_SIZE:
                 raise file.error(f"image size {width}x{height} is out of range", start)
             try:
-                cameras[camera_id] = Camera(model, width, height, values)
+                cameras[camera_id] = camera_of(model, width, height, values)
             except DataError as error:
                 raise file.error(error.message, start) from None
         file.finish("the cameras")
@@ -133,7 +134,7 @@ def read_binary_cameras(path: Path) -> dict[int, Camera]:
 
 def add_binary_images(path: Path, images: ImageTable) -> None:
     """Add the images and what tracks need of their features; DataError names file and byte."""
-    with _BinaryFile(path) as file:
+    with BinaryFile(path) as file:
         for _ in range(file.count("images", BINARY_IMAGE.size + 1 + BINARY_COUNT.size)):
             start = file.position
             try:
@@ -153,7 +154,7 @@ def add_binary_images(path: Path, images: ImageTable) -> None:
         file.finish("the images")
 
 
-def _read_image(file: _BinaryFile) -> ColmapImage:
+def _read_image(file: BinaryFile) -> ColmapImage:
     image_id, w, x, y, z, tx, ty, tz, camera_id = file.unpack(BINARY_IMAGE, "an image")
     name = image_name(file.name("an image's name"))
     if image_id > MAX_IMAGE_ID:
@@ -166,7 +167,7 @@ def _read_image(file: _BinaryFile) -> ColmapImage:
 
 def read_binary_points(path: Path) -> Tracks:
     """Points, with COLMAP's ids of images; DataError names the file and byte or point."""
-    with _BinaryFile(path) as file:
+    with BinaryFile(path) as file:
         head = BINARY_POINT.itemsize
         count = file.count("points", head)
         begin = file.position

@@ -11,21 +11,40 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import quote
 
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.datasets.formats.colmap_model import CAMERA_MODELS
+from megloc_kapture.datasets.formats.colmap_model import camera_of, model_of_id
 from megloc_kapture.datasets.formats.text_lines import check_plain, image_name
 from megloc_kapture.errors import DataError
-from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera
+from megloc_kapture.values import Camera
 
 _SIZE_END = 2**31
-_SIFT = 0
 # x y; x y scale orientation; x y and an affine shape
 _KEYPOINT_COLUMNS = (2, 4, 6)
+
+
+class FeatureType(NamedTuple):
+    """A type of features in a database: what kapture calls it, and the numbers of descriptors."""
+
+    name: str
+    dtype: str
+
+
+# COLMAP's feature/types.h; names are those of our extractors, of their weights where these differ.
+# COLMAP keeps all descriptors as bytes, those of networks are float32 behind one another.
+_SIFT = 0
+_TYPES = {
+    _SIFT: FeatureType("sift", "u1"),
+    1: FeatureType("aliked-n16rot", "<f4"),
+    2: FeatureType("aliked-n32", "<f4"),
+    3: FeatureType("loma-b", "<f4"),
+    4: FeatureType("loma-b128", "<f4"),
+}
+_SIFT_SIZE = 128
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,15 +103,14 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
             "cameras", "camera_id, model, width, height, params"
         ):
             what = f"camera {camera_id!r}"
-            self._check_integer(model_id, 0, len(CAMERA_MODELS), f"{what}: model")
+            self._check_integer(model_id, 0, _SIZE_END, f"{what}: model")
             self._check_integer(width, 0, _SIZE_END, f"{what}: width")
             self._check_integer(height, 0, _SIZE_END, f"{what}: height")
-            model = CAMERA_MODELS[model_id]
-            params = self._array(content, "<f8", (CAMERA_MODEL_NUM_PARAMS[model],), what)
-            try:
-                cameras[int(camera_id)] = Camera(model, width, height, tuple(params.tolist()))
-            except DataError as error:
-                raise self._error(f"{what}: {error.message}") from None
+            with self._about(what):
+                model, num_params = model_of_id(model_id)
+            params = self._array(content, "<f8", (num_params,), what)
+            with self._about(what):
+                cameras[int(camera_id)] = camera_of(model, width, height, params.tolist())
         return dict(sorted(cameras.items()))
 
     def keypoints(self, name: str) -> NDArray[np.float32]:
@@ -114,20 +132,53 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
             raise self._error(f"{what} are not finite")
         return np.ascontiguousarray(array)
 
-    def descriptors(self, name: str) -> NDArray[np.uint8] | None:
-        """SIFT descriptors of an image, uint8 (N, D); None where it has none.
+    def feature_type(self) -> FeatureType | None:
+        """The type of all features; None where there are no descriptors to tell it.
+
+        Types that we do not know have COLMAP's number in their name, and bytes.
 
         Raises
         ------
-        DataError : no such image, another kind of descriptors, or a row that does not fit its own
+        DataError : features of several types.
+        """
+        if "descriptors" not in self._tables:
+            return None
+        condition = "WHERE rows > 0"
+        if self._has_types():
+            kinds: set[Any] = set()
+            for (kind,) in self._rows("descriptors", "DISTINCT type", condition):
+                self._check_integer(kind, -1, _SIZE_END, "a type of descriptors")
+                kinds.add(kind)
+        else:  # before version 4; who brought features of his own could not say what they are
+            sizes = {size for (size,) in self._rows("descriptors", "DISTINCT cols", condition)}
+            kinds = {_SIFT if size == _SIFT_SIZE else "undefined" for size in sizes}
+        found = [_TYPES.get(kind) or FeatureType(f"colmap-{kind}", "u1") for kind in kinds]
+        if len(found) > 1:
+            told = ", ".join(sorted(kind.name for kind in found))
+            raise self._error(f"has descriptors of several types: {told}")
+        return found[0] if found else None
+
+    def descriptors(self, name: str, expected: FeatureType = _TYPES[_SIFT]) -> NDArray[Any] | None:
+        """Descriptors of an image, (N, D) of the type's numbers; None where it has none.
+
+        Raises
+        ------
+        DataError : no such image, another type of descriptors, or a row that does not fit its own
             sizes.
         """
         found = self._blob("descriptors", name)
         if found is None or found[0] == 0:
             return None
         rows, columns, content = found
-        self._check_sift(name)
-        return self._array(content, "u1", (rows, columns), f"descriptors of {name!r}")
+        if expected == _TYPES[_SIFT]:
+            self._check_sift(name)
+        size, rest = divmod(columns, np.dtype(expected.dtype).itemsize)
+        if rest:
+            raise self._error(f"descriptors of {name!r}: {columns} bytes are no whole numbers")
+        array = self._array(content, expected.dtype, (rows, size), f"descriptors of {name!r}")
+        if not np.isfinite(array).all():
+            raise self._error(f"descriptors of {name!r} are not finite")
+        return array
 
     def __exit__(self, *raised: object) -> None:
         self._connection.close()
@@ -146,10 +197,8 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
         for image_id, name, camera_id in self._rows("images", "image_id, name, camera_id"):
             if not isinstance(name, str) or not isinstance(camera_id, int):
                 raise self._error(f"image {image_id!r} has no name or no camera")
-            try:
+            with self._about(f"image {image_id}"):
                 known = image_name(name)
-            except DataError as error:
-                raise self._error(f"image {image_id}: {error.message}") from None
             if known in images:
                 raise self._error(f"image {known!r} is listed twice")
             images[known] = DatabaseImage(int(image_id), camera_id)
@@ -180,13 +229,16 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
 
     def _check_sift(self, name: str) -> None:
         """Since version 4 there may be others, whose numbers are no bytes."""
-        with self._reading():
-            columns = {row[1] for row in self._connection.execute("PRAGMA table_info(descriptors)")}
-        if "type" in columns:
+        if self._has_types():
             condition = f"WHERE image_id = {self.images[name].image_id:d}"
             kinds = [kind for (kind,) in self._rows("descriptors", "type", condition)]
             if kinds != [_SIFT]:
                 raise self._error(f"descriptors of {name!r} are not SIFT (type {kinds[0]!r})")
+
+    def _has_types(self) -> bool:
+        with self._reading():
+            columns = self._connection.execute("PRAGMA table_info(descriptors)")
+            return any(column[1] == "type" for column in columns)
 
     def _check_integer(self, value: Any, first: int, end: int, what: str) -> None:
         if not isinstance(value, int) or not first <= value < end:
@@ -205,6 +257,14 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
             yield
         except (sqlite3.Error, UnicodeDecodeError, OverflowError) as error:
             raise self._error(f"no readable COLMAP database: {error}") from error
+
+    @contextmanager
+    def _about(self, what: str) -> Iterator[None]:
+        """Errors of values say which, and name the file."""
+        try:
+            yield
+        except DataError as error:
+            raise self._error(f"{what}: {error.message}") from None
 
     def _error(self, message: str) -> DataError:
         return DataError(message, path=self.path)

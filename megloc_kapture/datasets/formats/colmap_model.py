@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,18 @@ from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, RigidTransfor
 
 # the ids of camera models, as binary models and databases have them
 CAMERA_MODELS: tuple[str, ...] = tuple(CAMERA_MODEL_NUM_PARAMS)
+# the models that follow them since version 4, which kapture does not have; number of parameters
+_LATER_MODELS = {
+    "RAD_TAN_THIN_PRISM_FISHEYE": 16,
+    "SIMPLE_DIVISION": 4,
+    "DIVISION": 5,
+    "SIMPLE_FISHEYE": 3,
+    "FISHEYE": 4,
+    "EUCM": 6,
+    "EQUIRECTANGULAR": 2,
+}
+# of those, the models that are others without distortion
+_SAME_AS = {"SIMPLE_FISHEYE": "SIMPLE_RADIAL_FISHEYE", "FISHEYE": "OPENCV_FISHEYE"}
 # COLMAP's own limit; its databases pack two ids into one number
 MAX_IMAGE_ID = 2**31 - 2
 MAX_SIZE = 2**31 - 1  # of images, in px
@@ -61,6 +73,44 @@ class ColmapModel:
     cameras: dict[int, Camera]
     images: tuple[ColmapImage, ...]
     points: SparsePoints
+
+
+def model_of_id(model_id: int) -> tuple[str, int]:
+    """Name and number of parameters of a camera model.
+
+    Raises
+    ------
+    DataError : no model has this number; does not name the file.
+    """
+    counts = {**CAMERA_MODEL_NUM_PARAMS, **_LATER_MODELS}
+    if not 0 <= model_id < len(counts):
+        raise DataError(f"unknown camera model {model_id}")
+    name = tuple(counts)[model_id]
+    return name, counts[name]
+
+
+def camera_of(model: str, width: int, height: int, params: Sequence[float]) -> Camera:
+    """The camera of a model of COLMAP's, in one that kapture has.
+
+    Raises
+    ------
+    DataError : kapture has none, or see :class:`Camera`; does not name the file.
+    """
+    if len(params) == _LATER_MODELS.get(model) and model in _SAME_AS:
+        same = _SAME_AS[model]
+        more = (0.0,) * (CAMERA_MODEL_NUM_PARAMS[same] - len(params))
+        return Camera(same, width, height, (*params, *more))
+    if model == "EQUIRECTANGULAR":
+        raise DataError(
+            f"cameras of the model {model} are no kapture cameras; cut the panoramas into "
+            "perspective images (COLMAP's panorama_sfm.py does) and make the model of these"
+        )
+    if model in _LATER_MODELS and model not in _SAME_AS:
+        raise DataError(
+            f"cameras of the model {model} are no kapture cameras; `colmap image_undistorter` "
+            "makes a model and images with PINHOLE cameras"
+        )
+    return Camera(model, width, height, tuple(params))
 
 
 class ImageTable:

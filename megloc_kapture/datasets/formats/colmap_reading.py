@@ -1,8 +1,8 @@
 """Readers of COLMAP's sparse models; here those of text: ``cameras.txt``, ...
 
 Of a folder the cameras, images and points3D files are read; rigs and frames, which COLMAP writes
-since version 4, say nothing that the images' poses do not. In ``images.txt`` an image has two
-lines, of which the second, its features, may be empty: it is taken by its position.
+since version 4, say nothing of poses that the images' do not (see colmap_rigs). In ``images.txt`` an image has
+two lines, of which the second, its features, may be empty: it is taken by its position.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from megloc_kapture.datasets.formats.colmap_model import (
     ColmapImage,
     ColmapModel,
     ImageTable,
+    camera_of,
 )
 from megloc_kapture.datasets.formats.sparse_points import (
     MAX_FEATURE_ID,
@@ -62,7 +63,7 @@ def colmap_model_files(folder: Path, *, with_points: bool = True) -> tuple[Path,
     ------
     DataError : the folder holds no model.
     """
-    names = BINARY_FILES if _is_binary(folder) else TEXT_FILES
+    names = BINARY_FILES if is_binary(folder) else TEXT_FILES
     return tuple(Path(folder) / name for name in (names if with_points else names[:2]))
 
 
@@ -77,7 +78,7 @@ def read_colmap_model(folder: Path, *, with_points: bool = True) -> ColmapModel:
     ------
     DataError : no model, or a broken one; names the file and the line or byte.
     """
-    binary = _is_binary(folder)
+    binary = is_binary(folder)
     cameras_file, images_file, points_file = (
         Path(folder) / name for name in (BINARY_FILES if binary else TEXT_FILES)
     )
@@ -90,7 +91,8 @@ def read_colmap_model(folder: Path, *, with_points: bool = True) -> ColmapModel:
     return images.model(points_file)
 
 
-def _is_binary(folder: Path) -> bool:
+def is_binary(folder: Path) -> bool:
+    """Whether the binary files of a folder count; raises DataError where it holds no model."""
     if (Path(folder) / BINARY_FILES[1]).exists():
         return True
     if (Path(folder) / TEXT_FILES[1]).exists():
@@ -118,7 +120,7 @@ def _text_cameras(path: Path) -> dict[int, Camera]:
         height = line.count_of(fields[3], "height", MAX_SIZE + 1)
         params = line.numbers_of(fields[4:], "camera parameter")
         try:
-            cameras[camera_id] = Camera(fields[1], width, height, tuple(params))
+            cameras[camera_id] = camera_of(fields[1], width, height, params)
         except DataError as error:
             raise line.error(error.message) from None
     return cameras

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from megloc_kapture.errors import DataError, OptionError, OutputError
-from megloc_kapture.io.files import atomic_write, write_bytes
+from megloc_kapture.io.files import atomic_write, user_cache, write_bytes
 from megloc_kapture.io.weights.containers import read_checkpoint
 from megloc_kapture.io.weights.registry import (
     PublishedFile,
@@ -94,8 +94,7 @@ def weights_folder() -> Path:
     """The folder of weights; it need not be there."""
     if folder := os.environ.get(FOLDER_VARIABLE):
         return Path(os.path.abspath(Path(folder).expanduser()))
-    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(cache) / "megloc-kapture" / "weights"
+    return user_cache() / "weights"
 
 
 def find_weights(name: str) -> WeightsFile:

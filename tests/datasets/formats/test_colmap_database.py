@@ -120,7 +120,8 @@ def test_a_database_that_is_still_being_written_is_refused(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("statement", "match"),
     [
-        ("UPDATE cameras SET model = 11", "camera 1: model is 11"),
+        ("UPDATE cameras SET model = 18", "camera 1: unknown camera model 18"),
+        ("UPDATE cameras SET model = 12", "camera 1: cameras of the model SIMPLE_DIVISION"),
         ("UPDATE cameras SET model = 'x'", "camera 1: model is 'x'"),
         ("UPDATE cameras SET width = 2.5", "camera 1: width is 2.5"),
         ("UPDATE cameras SET height = -1", "camera 1: height is -1"),

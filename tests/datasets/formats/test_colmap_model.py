@@ -22,6 +22,7 @@ from megloc_kapture.datasets.formats.colmap_reading import colmap_model_files, r
 from megloc_kapture.datasets.formats.sparse_points import SparsePoints
 from megloc_kapture.datasets.formats.text_lines import TextFile
 from megloc_kapture.errors import DataError
+from megloc_kapture.io.colmap import px_from_cam
 from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, RigidTransform
 
 import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
@@ -374,7 +375,9 @@ def test_counts_are_checked_before_memory_is_taken(tmp_path: Path, name: str, co
 @pytest.mark.parametrize(
     ("name", "offset", "value", "match"),
     [
-        ("cameras.bin", 12, struct.pack("<i", 11), "unknown camera model 11"),
+        ("cameras.bin", 12, struct.pack("<i", 18), "unknown camera model 18"),
+        ("cameras.bin", 12, struct.pack("<i", 16), "the model EUCM .*image_undistorter"),
+        ("cameras.bin", 12, struct.pack("<i", 17), "the model EQUIRECTANGULAR .*panorama_sfm"),
         ("cameras.bin", 12, struct.pack("<i", -1), "unknown camera model -1"),
         ("cameras.bin", 16, struct.pack("<Q", 0), "image size 0x480"),
         ("cameras.bin", 16, struct.pack("<Q", 2**63), "is out of range"),
@@ -414,6 +417,31 @@ def test_an_endless_name_is_refused(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:72] + b"x" * 10_000)
     with pytest.raises(DataError, match=r"images\.bin: an image's name does not end \(byte 72"):
         read_colmap_model(tmp_path)
+
+
+@pytest.mark.parametrize("form", ["text", "binary"])
+def test_later_camera_models(tmp_path: Path, form: str) -> None:
+    """Those that are others without distortion become these, the rest is refused by name."""
+    rays = np.random.default_rng(0).uniform((-2, -2, 0.1), (2, 2, 1), (100, 3))
+    for model, params in {
+        "SIMPLE_FISHEYE": (500.0, 320.0, 240.0),
+        "FISHEYE": (500.0, 510.0, 320.0, 240.0),
+        "DIVISION": (500.0, 510.0, 320.0, 240.0, 0.01),
+        "SIMPLE_DIVISION": (500.0, 320.0, 240.0, 0.01),
+        "RAD_TAN_THIN_PRISM_FISHEYE": (500.0, 500.0, 320.0, 240.0, *[0.001] * 12),
+    }.items():
+        theirs = pycolmap.Camera(camera_id=1, model=model, width=640, height=480, params=params)
+        written = pycolmap.Reconstruction()
+        written.add_camera_with_trivial_rig(theirs)
+        getattr(written, f"write_{form}")(tmp_path)
+        if model in ("SIMPLE_FISHEYE", "FISHEYE"):
+            ours = read_colmap_model(tmp_path).cameras[1]
+            np.testing.assert_allclose(
+                px_from_cam(ours, rays), theirs.img_from_cam(rays), rtol=0, atol=1e-9
+            )
+        else:
+            with pytest.raises(DataError, match=f"cameras.* the model {model} .*undistorter"):
+                read_colmap_model(tmp_path)
 
 
 def test_both_forms_read_the_same(tmp_path: Path) -> None:

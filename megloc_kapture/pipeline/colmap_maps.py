@@ -1,0 +1,104 @@
+"""COLMAP models where a kapture map is expected: imported once, kept in the user's cache.
+
+A model is imported again when one of its files, or its database, has another size or time. Weights
+lie in the same cache, see :mod:`megloc_kapture.io.weights.folder`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+from pydantic import BaseModel
+
+from megloc_kapture.datasets.colmap_map import find_colmap, import_colmap, is_colmap
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.files import (
+    clear_leftovers,
+    output_error,
+    read_json_model,
+    remove,
+    replace_directory,
+    temporary_name,
+    user_cache,
+    write_json_model,
+)
+from megloc_kapture.stages.work import HERE, Work
+
+_STAMP = "colmap.json"
+_VERSION = 1  # of the import: another one makes all maps anew
+
+
+class _Stamp(BaseModel):
+    """What a map was imported from: paths, and size and time of each file."""
+
+    version: int
+    images: str | None
+    files: dict[str, tuple[int, int]]
+
+
+def colmap_maps_folder() -> Path:
+    """The folder of the imported maps; it need not be there, and may be deleted."""
+    return user_cache() / "maps"
+
+
+def kapture_of(path: Path | str, *, work: Work = HERE) -> Path:
+    """The kapture folder of a map: the path itself, or where a COLMAP model is imported to.
+
+    Parameters
+    ----------
+    path : kapture folder, or a COLMAP model or workspace, see
+        :func:`~megloc_kapture.datasets.colmap_map.find_colmap`.
+    work : where features are extracted, if they have to be.
+
+    Raises
+    ------
+    DataError : it is a COLMAP model that cannot be imported.
+    OutputError : the cache cannot be written.
+    """
+    path = Path(path)
+    if not is_colmap(path):
+        return path
+    source = find_colmap(path)
+    stamp = _stamp(source.images, source.files())
+    place = Path(os.path.realpath(source.model))
+    digest = hashlib.sha256(os.fsencode(place)).hexdigest()[:16]
+    folder = colmap_maps_folder()
+    kept = folder / f"{place.name[:40]}-{digest}"
+    if _read_stamp(kept) == stamp:
+        return kept
+    made = folder / temporary_name()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        clear_leftovers(folder)
+        made.mkdir()
+        import_colmap(source, made, work=work)
+        write_json_model(made / _STAMP, stamp)
+        replace_directory(made, kept)
+    except OSError as error:
+        raise output_error(folder, error) from error
+    finally:
+        remove(made)
+    return kept
+
+
+def _stamp(images: Path | None, files: Iterable[Path]) -> _Stamp:
+    found = {}
+    for file in files:
+        try:
+            status = file.stat()
+        except OSError as error:
+            raise DataError(f"cannot read: {error.strerror}", path=file) from error
+        found[os.path.realpath(file)] = (status.st_size, status.st_mtime_ns)
+    where = None if images is None else os.path.realpath(images)
+    return _Stamp(version=_VERSION, images=where, files=found)
+
+
+def _read_stamp(folder: Path) -> _Stamp | None:
+    """The stamp of an imported map; None where there is none that can be read."""
+    try:
+        return read_json_model(folder / _STAMP, _Stamp)
+    except DataError:
+        return None
