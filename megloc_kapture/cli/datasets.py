@@ -11,9 +11,10 @@ from megloc_kapture.cli.common import Common, Force, Output, Working
 from megloc_kapture.datasets.kapture_folders import QUERY
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.cli.console import Console
-from megloc_kapture.datasets.colmap_map import find_colmap, import_colmap
+from megloc_kapture.datasets.colmap_map import find_colmap
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.files import staged_output
+from megloc_kapture.pipeline.colmap_maps import import_colmap
 from megloc_kapture.pipeline.datasets import (
     KAPTURE,
     SUMMARY_FILE,
@@ -96,13 +97,13 @@ class Import(Common):
         if given := [flag for flag, value in unused.items() if value]:
             raise OptionError(f"{given[0]} changes nothing of a COLMAP model")
         source = find_colmap(self.root, images=self.images, database=self.database)
-        for what, found in (("images", source.images), ("database", source.database)):
-            console.say(f"{what}: {found or 'none'}")
         with (
             staged_output(self.output, kind=MAP, force=self.force) as out,
             open_executor("processes") as executor,
         ):
             counts = import_colmap(source, out, work=Work(executor, console.track))
+        for what, found in (("images", source.images), ("database", source.database)):
+            console.say(f"{what}: {found or 'none'}")
         for what, value in counts.items():
             console.result(f"{what.replace('_', ' '):44s}{value:>8g}")
         return 0

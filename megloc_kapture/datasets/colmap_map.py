@@ -12,6 +12,7 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from megloc_kapture.datasets.formats.colmap_database import ColmapDatabase
 from megloc_kapture.datasets.formats.colmap_model import (
@@ -110,7 +111,8 @@ def find_colmap(
 
 def _models(path: Path) -> list[Path]:
     """The models of a folder: itself, else that of its ``sparse``, else those in there."""
-    for places in ([path], [path / SPARSE], sorted((path / SPARSE).glob("*"))):
+    around = path if path.name == SPARSE else path / SPARSE
+    for places in ([path], [around], sorted(around.glob("*"))):
         found = [place for place in places if _holds_model(place)]
         if found:
             return found
@@ -122,80 +124,142 @@ def _holds_model(folder: Path) -> bool:
     return any(sum((folder / n).is_file() for n in ns) > 1 for ns in (BINARY_FILES, TEXT_FILES))
 
 
-def import_colmap(source: ColmapFolders, output: Path, *, work: Work = HERE) -> dict[str, float]:
-    """Write a COLMAP reconstruction as a kapture map; ``output`` is empty.
+class OtherFeaturesError(DataError):
+    """A model without descriptors, whose features are none that we could extract again."""
 
-    Poses are those of the images; rigs of several cameras are kept beside them, and the images of a
-    frame share a timestamp, the frame's id. Elsewhere the timestamp is the image's id.
 
-    Returns
-    -------
-    Counts for the log; without descriptors in a database ``found_again``, the share of the
-    observations whose keypoints were found again.
+@dataclass(frozen=True, eq=False)
+class ColmapReconstruction:
+    """A reconstruction that was read, and what it is in kapture.
 
-    Raises
-    ------
-    DataError : something is missing or broken, a camera model that kapture does not have, names of
-        images that kapture cannot hold; or there is no database, and the model is not made of SIFT.
+    Attributes
+    ----------
+    data : sensors, rigs, records and poses. The images of a frame of a rig share a timestamp, the
+        frame's id; elsewhere the timestamp is the image's id.
+    names : name in kapture of each image of the model, by its name there.
     """
-    binary = is_binary(source.model)
-    model = read_colmap_model(source.model)
-    if not len(model.points):
-        raise DataError("the model has no points to localize with", path=source.model)
-    names = kapture_names(model, source.model)
-    data = kapture_data(model, names, read_colmap_rigs(source.model, binary=binary))
-    renamed = {new: old for old, new in names.items() if new != old}
-    links = _links(source, names, renamed)
-    database = source.database
-    local_type = None
-    if database is not None:
-        with ColmapDatabase(database) as opened:
-            found = opened.feature_type()
-            local_type = None if found is None else found.name
-    ordered = [names[image.name] for image in model.images]
-    if local_type is not None:
-        counts: dict[str, float] = dict(
-            write_reference_map(
-                output,
-                data,
-                links,
-                ordered,
-                model.points,
-                keypoints_type=local_type,
-                database=database,
-                database_names=renamed,
-            )
-        )
-        _check_descriptors(KaptureFolder(output), local_type, source)
-        return counts
-    if source.images is None:
-        raise DataError(
-            "there are no descriptors to match queries with: give the database that the model was "
-            "made of (--database), or the images to extract them from (--images)",
-            path=source.model,
-        )
-    with tempfile.TemporaryDirectory(prefix=".megloc-", dir=output) as scratch:
-        reference, images, features = (Path(scratch) / n for n in ("reference", "images", "sift"))
-        write_reference_map(reference, data, links, ordered, model.points, keypoints_type=_SIFT)
-        # a folder of its own: the model's keypoints would come before the extracted ones
-        write_sensors(images, data)
-        link_records(images, links)
-        mapping = KaptureFolder(images, features_dirs=[features])
-        extract_local_features([mapping], load_plugin(LOCAL_FEATURES, _SIFT), features, work=work)
-        try:
-            counts = given_map(KaptureFolder(reference), mapping, output)
-        except DataError as error:
-            if error.path != reference:
-                raise
+
+    source: ColmapFolders
+    model: ColmapModel
+    data: KaptureData
+    names: dict[str, str]
+
+    @classmethod
+    def read(cls, source: ColmapFolders) -> ColmapReconstruction:
+        """Read the model.
+
+        Raises
+        ------
+        DataError : something is missing or broken, a camera model that kapture does not have, or
+            names of images that it cannot hold.
+        """
+        model = read_colmap_model(source.model)
+        names = kapture_names(model, source.model)
+        rigs = read_colmap_rigs(source.model, binary=is_binary(source.model))
+        if source.images is not None:
+            missing = sorted(name for name in names if not (source.images / name).is_file())
+            if missing:
+                raise DataError(
+                    f"{len(missing)} of the model's {len(names)} images are not here, the first "
+                    f"is {missing[0]}; --images names their folder",
+                    path=source.images,
+                )
+        return cls(source, model, kapture_data(model, names, rigs), names)
+
+    @property
+    def renamed(self) -> dict[str, str]:
+        """Names in kapture that are others than in the model, to these."""
+        return {new: old for old, new in self.names.items() if new != old}
+
+    def write_images(self, output: Path) -> None:
+        """Write sensors, poses and links to the images, as a kapture folder without a map."""
+        write_sensors(output, self.data)
+        self.link_images(output)
+
+    def link_images(self, output: Path) -> None:
+        """Link the images of a kapture folder, instead of what is linked there."""
+        link = output / "sensors" / "records_data"
+        if link.is_symlink():
+            link.unlink()
+        link_records(output, self._links())
+
+    def write_map(self, output: Path, *, work: Work = HERE) -> dict[str, float]:
+        """Write the map; ``output`` is empty.
+
+        Returns
+        -------
+        Counts for the log; without descriptors in a database ``found_again``, the share of the
+        observations whose keypoints were found again.
+
+        Raises
+        ------
+        OtherFeaturesError : no points; or no database, and points of other features than SIFT.
+        DataError : the database is broken or that of another model, or there is neither a database
+            nor a folder of images.
+        """
+        source = self.source
+        local_type = None
+        if source.database is not None:
+            with ColmapDatabase(source.database) as opened:
+                found = opened.feature_type()
+                local_type = None if found is None else found.name
+        if local_type is None and source.images is None:
             raise DataError(
-                f"{error.message.replace('given map', 'model')}; give the database that it was "
-                "made of (--database)",
+                "there are no descriptors to match queries with: give the database that the model "
+                "was made of (--database), or the images to extract them from (--images)",
                 path=source.model,
-            ) from None
-    # what was linked to was the scratch folder
-    (output / "sensors" / "records_data").unlink()
-    link_records(output, links)
-    return counts
+            )
+        if not len(self.model.points):
+            raise OtherFeaturesError("the model has no points", path=source.model)
+        if local_type is None:
+            return self._write_with_sift(output, work)
+        counts = self._write_reference(
+            output,
+            keypoints_type=local_type,
+            database=source.database,
+            database_names=self.renamed,
+        )
+        folder = KaptureFolder(output)
+        descriptors = folder.descriptors(local_type)
+        for image in folder.keypoints(local_type).names:
+            if image not in descriptors:
+                raise DataError(f"image {image!r} has no descriptors", path=source.database)
+        return counts
+
+    def _write_with_sift(self, output: Path, work: Work) -> dict[str, float]:
+        with tempfile.TemporaryDirectory(prefix=".megloc-", dir=output) as scratch:
+            reference, images, sift = (Path(scratch) / n for n in ("reference", "images", _SIFT))
+            self._write_reference(reference, keypoints_type=_SIFT)
+            # a folder of its own: the model's keypoints would come before the extracted ones
+            self.write_images(images)
+            mapping = KaptureFolder(images, features_dirs=[sift])
+            extractor = load_plugin(LOCAL_FEATURES, _SIFT)
+            extract_local_features([mapping], extractor, sift, work=work)
+            try:
+                counts = given_map(KaptureFolder(reference), mapping, output)
+            except DataError as error:
+                if error.path != reference:
+                    raise
+                message = error.message.replace("the given map", "the model")
+                raise OtherFeaturesError(message, path=self.source.model) from None
+        self.link_images(output)  # what was linked to was the scratch folder
+        return counts
+
+    def _write_reference(self, output: Path, **features: Any) -> dict[str, float]:
+        ordered = [self.names[image.name] for image in self.model.images]
+        points = self.model.points
+        return dict(
+            write_reference_map(output, self.data, self._links(), ordered, points, **features)
+        )
+
+    def _links(self) -> dict[str, Path]:
+        """Links to the images: their folder, or each where some have other names in kapture."""
+        images = self.source.images
+        if images is None:
+            return {}
+        if not self.renamed:
+            return {"": images}
+        return {new: images / old for old, new in self.names.items()}
 
 
 def kapture_names(model: ColmapModel, folder: Path) -> dict[str, str]:
@@ -253,28 +317,3 @@ def kapture_data(model: ColmapModel, names: dict[str, str], rigs: ColmapRigs) ->
         data.records_camera[record] = names[image.name]
         data.trajectories[record] = image.cam_from_world
     return data
-
-
-def _links(
-    source: ColmapFolders, names: dict[str, str], renamed: dict[str, str]
-) -> dict[str, Path]:
-    """Links to the images, to each where some have other names in kapture."""
-    if source.images is None:
-        return {}
-    missing = sorted(name for name in names if not (source.images / name).is_file())
-    if missing:
-        raise DataError(
-            f"{len(missing)} of the model's {len(names)} images are not here, the first is "
-            f"{missing[0]}; --images names their folder",
-            path=source.images,
-        )
-    if not renamed:
-        return {"": source.images}
-    return {new: source.images / old for old, new in names.items()}
-
-
-def _check_descriptors(folder: KaptureFolder, local_type: str, source: ColmapFolders) -> None:
-    descriptors = folder.descriptors(local_type)
-    for image in folder.keypoints(local_type).names:
-        if image not in descriptors:
-            raise DataError(f"image {image!r} has no descriptors", path=source.database)

@@ -6,14 +6,23 @@ lie in the same cache, see :mod:`megloc_kapture.io.weights.folder`.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import logging
 import os
+import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 
 from pydantic import BaseModel
 
-from megloc_kapture.datasets.colmap_map import find_colmap, import_colmap, is_colmap
+from megloc_kapture.datasets.colmap_map import (
+    ColmapFolders,
+    ColmapReconstruction,
+    OtherFeaturesError,
+    find_colmap,
+    is_colmap,
+)
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.files import (
     clear_leftovers,
@@ -25,7 +34,16 @@ from megloc_kapture.io.files import (
     user_cache,
     write_json_model,
 )
+from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.pipeline.evaluation_plan import plan_map
+from megloc_kapture.pipeline.executors import single_threaded
+from megloc_kapture.pipeline.plan import run_plan
+from megloc_kapture.pipeline.presets import DEFAULT_PRESET, options_of_preset
+from megloc_kapture.pipeline.workspace import Workspace
+from megloc_kapture.stages.layout import MAP
 from megloc_kapture.stages.work import HERE, Work
+
+_log = logging.getLogger(__name__)
 
 _STAMP = "colmap.json"
 _VERSION = 1  # of the import: another one makes all maps anew
@@ -42,6 +60,41 @@ class _Stamp(BaseModel):
 def colmap_maps_folder() -> Path:
     """The folder of the imported maps; it need not be there, and may be deleted."""
     return user_cache() / "maps"
+
+
+def import_colmap(source: ColmapFolders, output: Path, *, work: Work = HERE) -> dict[str, float]:
+    """Write a COLMAP reconstruction as a kapture map; ``output`` is empty.
+
+    Where the model's features cannot be had (no points; no database, and no SIFT), its images are
+    mapped anew with its poses, by the default preset, and a warning is logged.
+
+    Returns
+    -------
+    Counts for the log.
+
+    Raises
+    ------
+    DataError : see :class:`~megloc_kapture.datasets.colmap_map.ColmapReconstruction`.
+    """
+    read = ColmapReconstruction.read(source)
+    try:
+        return read.write_map(output, work=work)
+    except OtherFeaturesError as error:
+        _log.warning("%s; its images are mapped anew with its poses", error)
+    with tempfile.TemporaryDirectory(prefix=".megloc-", dir=output) as scratch:
+        images = Path(scratch) / "images"
+        read.write_images(images)
+        workspace = Workspace(Path(scratch) / "workspace")
+        stages = plan_map(KaptureFolder(images), options_of_preset(DEFAULT_PRESET))
+        with workspace.lock(), single_threaded():
+            run_plan(stages, workspace, work)
+        for made in workspace.path(MAP).iterdir():
+            made.rename(output / made.name)
+    read.link_images(output)
+    folder = KaptureFolder(output)
+    seen = sum(len(found) for found in folder.observations().values())
+    counts = {"images": len(read.names), "points": len(folder.points3d()), "observations": seen}
+    return dict(counts)
 
 
 def kapture_of(path: Path | str, *, work: Work = HERE) -> Path:
@@ -80,7 +133,8 @@ def kapture_of(path: Path | str, *, work: Work = HERE) -> Path:
     except OSError as error:
         raise output_error(folder, error) from error
     finally:
-        remove(made)
+        with contextlib.suppress(OSError):
+            remove(made)
     return kept
 
 

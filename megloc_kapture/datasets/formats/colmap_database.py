@@ -36,8 +36,9 @@ class FeatureType(NamedTuple):
 
 # COLMAP's feature/types.h; names are those of our extractors, of their weights where these differ.
 # COLMAP keeps all descriptors as bytes, those of networks are float32 behind one another.
-_SIFT = 0
+_SIFT, _UNDEFINED = 0, -1
 _TYPES = {
+    _UNDEFINED: FeatureType("colmap-undefined", "u1"),
     _SIFT: FeatureType("sift", "u1"),
     1: FeatureType("aliked-n16rot", "<f4"),
     2: FeatureType("aliked-n32", "<f4"),
@@ -147,11 +148,11 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
         if self._has_types():
             kinds: set[Any] = set()
             for (kind,) in self._rows("descriptors", "DISTINCT type", condition):
-                self._check_integer(kind, -1, _SIZE_END, "a type of descriptors")
+                self._check_integer(kind, _UNDEFINED, _SIZE_END, "a type of descriptors")
                 kinds.add(kind)
         else:  # before version 4; who brought features of his own could not say what they are
             sizes = {size for (size,) in self._rows("descriptors", "DISTINCT cols", condition)}
-            kinds = {_SIFT if size == _SIFT_SIZE else "undefined" for size in sizes}
+            kinds = {_SIFT if size == _SIFT_SIZE else _UNDEFINED for size in sizes}
         found = [_TYPES.get(kind) or FeatureType(f"colmap-{kind}", "u1") for kind in kinds]
         if len(found) > 1:
             told = ", ".join(sorted(kind.name for kind in found))

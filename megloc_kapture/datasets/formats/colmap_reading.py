@@ -1,8 +1,9 @@
 """Readers of COLMAP's sparse models; here those of text: ``cameras.txt``, ...
 
 Of a folder the cameras, images and points3D files are read; rigs and frames, which COLMAP writes
-since version 4, say nothing of poses that the images' do not (see colmap_rigs). In ``images.txt`` an image has
-two lines, of which the second, its features, may be empty: it is taken by its position.
+since version 4, say nothing of poses that the images' do not (see colmap_rigs). In ``images.txt``
+an image has two lines, of which the second, its features, may be empty: it is taken by its
+position.
 """
 
 from __future__ import annotations

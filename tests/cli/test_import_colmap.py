@@ -1,0 +1,83 @@
+"""``megloc import colmap`` and COLMAP models given to ``megloc localize`` and ``megloc info``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from colmap_room import write_workspace
+
+from megloc_kapture.evaluation.evaluate import evaluate
+from megloc_kapture.io.kapture import KaptureFolder
+
+
+@pytest.fixture(scope="module")
+def room(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("colmap") / "room"
+    write_workspace(root, scene)
+    return root
+
+
+def check(result: Path, scene: Path) -> None:
+    row = evaluate(result, scene / "query_gt").row()
+    assert row.num_localized == row.num_queries == 4
+    assert row.median_position_m is not None and row.median_position_m < 0.01
+
+
+def test_two_commands_to_poses(megloc: Any, room: Path, scene: Path, tmp_path: Path) -> None:
+    done = megloc("import", "colmap", room, "-o", tmp_path / "map")
+    assert done.status == 0 and "observations" in done.out, done
+    assert f"database: {room}/database.db" in done.err
+    queries = ("--query", scene / "query", "-o", tmp_path / "localized")
+    done = megloc("localize", "-i", tmp_path / "map", *queries)
+    assert done.out.startswith("4 of 4 queries localized"), done
+    check(tmp_path / "localized", scene)
+
+
+def test_a_model_is_taken_for_a_map(
+    megloc: Any, room: Path, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    model = room / "sparse" / "0"
+    queries = ("--query", scene / "query", "-o", tmp_path / "localized")
+    done = megloc("localize", "-i", model, *queries)
+    assert (
+        f"{model}: a COLMAP model, as kapture in {tmp_path}/cache/megloc-kapture/maps" in done.err
+    )
+    check(tmp_path / "localized", scene)
+    told = megloc("info", model).out
+    assert "7 (7 PINHOLE), 7 with a pose" in told and "extracted by plugin sift" in told
+
+
+def test_images_and_database_can_be_given(megloc: Any, room: Path, tmp_path: Path) -> None:
+    model = tmp_path / "model"
+    model.symlink_to(room / "sparse" / "0")
+    given = ("--images", room / "images", "--database", room / "database.db")
+    done = megloc("import", "colmap", model, *given, "-o", tmp_path / "map")
+    assert done.status == 0
+    folder = KaptureFolder(tmp_path / "map")
+    assert all(folder.image_path(name).is_file() for name in folder.read().image_names())
+    # without both there is nothing to match queries with
+    refused = megloc("import", "colmap", model, "-o", tmp_path / "none").refused("--database")
+    assert "--images" in refused and not (tmp_path / "none").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("colmap", "{room}", "--allow-missing"), "--allow-missing changes nothing of a COLMAP"),
+        (("colmap", "{room}", "--set", "a=1"), "--set changes nothing of a COLMAP model"),
+        (("colmap", "{room}", "--query-prefix", "q"), "--query-prefix changes nothing"),
+        (("kapture", "{scene}", "--images", "."), "--images and --database are of colmap"),
+        (("kapture", "{scene}", "--database", "d"), "--images and --database are of colmap"),
+        (("colmap", "{room}/images"), "images: no COLMAP model: neither images.bin nor"),
+        (("colmap", "{room}", "--images", "none"), "none: no such folder of images"),
+    ],
+)
+def test_what_changes_nothing_is_refused(
+    megloc: Any, room: Path, scene: Path, tmp_path: Path, arguments: tuple[str, ...], told: str
+) -> None:
+    words = [word.format(room=room, scene=scene) for word in arguments]
+    megloc("import", *words, "-o", tmp_path / "map").refused(told)
+    assert not (tmp_path / "map").exists()
