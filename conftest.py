@@ -56,6 +56,16 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+@pytest.fixture(scope="session")
+def colmap_room(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The scene's map as a COLMAP workspace, made by COLMAP; not to be written into."""
+    from colmap_workspace import write_workspace
+
+    root = tmp_path_factory.mktemp("colmap") / "room"
+    write_workspace(root, scene)
+    return root
+
+
 @pytest.fixture(scope="session", autouse=True)
 def no_weights(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """What the machine's user has of weights changes nothing; tests that need some say where."""

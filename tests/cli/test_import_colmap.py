@@ -6,17 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from colmap_room import write_workspace
+from colmap_workspace import write_workspace
 
 from megloc_kapture.evaluation.evaluate import evaluate
 from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.plugins import LOCAL_FEATURES, load_plugin
 
-
-@pytest.fixture(scope="module")
-def room(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("colmap") / "room"
-    write_workspace(root, scene)
-    return root
+import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
 
 
 def check(result: Path, scene: Path) -> None:
@@ -25,10 +21,10 @@ def check(result: Path, scene: Path) -> None:
     assert row.median_position_m is not None and row.median_position_m < 0.01
 
 
-def test_two_commands_to_poses(megloc: Any, room: Path, scene: Path, tmp_path: Path) -> None:
-    done = megloc("import", "colmap", room, "-o", tmp_path / "map")
+def test_two_commands_to_poses(megloc: Any, colmap_room: Path, scene: Path, tmp_path: Path) -> None:
+    done = megloc("import", "colmap", colmap_room, "-o", tmp_path / "map")
     assert done.status == 0 and "observations" in done.out, done
-    assert f"database: {room}/database.db" in done.err
+    assert f"database: {colmap_room}/database.db" in done.err
     queries = ("--query", scene / "query", "-o", tmp_path / "localized")
     done = megloc("localize", "-i", tmp_path / "map", *queries)
     assert done.out.startswith("4 of 4 queries localized"), done
@@ -36,24 +32,22 @@ def test_two_commands_to_poses(megloc: Any, room: Path, scene: Path, tmp_path: P
 
 
 def test_a_model_is_taken_for_a_map(
-    megloc: Any, room: Path, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    megloc: Any, colmap_room: Path, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    model = room / "sparse" / "0"
+    model = colmap_room / "sparse" / "0"
     queries = ("--query", scene / "query", "-o", tmp_path / "localized")
     done = megloc("localize", "-i", model, *queries)
-    assert (
-        f"{model}: a COLMAP model, as kapture in {tmp_path}/cache/megloc-kapture/maps" in done.err
-    )
+    assert f"{model}: a COLMAP model, as kapture in {tmp_path}/cache/" in done.err
     check(tmp_path / "localized", scene)
     told = megloc("info", model).out
     assert "7 (7 PINHOLE), 7 with a pose" in told and "extracted by plugin sift" in told
 
 
-def test_images_and_database_can_be_given(megloc: Any, room: Path, tmp_path: Path) -> None:
+def test_images_and_database_can_be_given(megloc: Any, colmap_room: Path, tmp_path: Path) -> None:
     model = tmp_path / "model"
-    model.symlink_to(room / "sparse" / "0")
-    given = ("--images", room / "images", "--database", room / "database.db")
+    model.symlink_to(colmap_room / "sparse" / "0")
+    given = ("--images", colmap_room / "images", "--database", colmap_room / "database.db")
     done = megloc("import", "colmap", model, *given, "-o", tmp_path / "map")
     assert done.status == 0
     folder = KaptureFolder(tmp_path / "map")
@@ -66,18 +60,64 @@ def test_images_and_database_can_be_given(megloc: Any, room: Path, tmp_path: Pat
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (("colmap", "{room}", "--allow-missing"), "--allow-missing changes nothing of a COLMAP"),
-        (("colmap", "{room}", "--set", "a=1"), "--set changes nothing of a COLMAP model"),
-        (("colmap", "{room}", "--query-prefix", "q"), "--query-prefix changes nothing"),
+        (
+            ("colmap", "{colmap_room}", "--allow-missing"),
+            "--allow-missing changes nothing of a COLMAP",
+        ),
+        (("colmap", "{colmap_room}", "--set", "a=1"), "--set changes nothing of a COLMAP model"),
+        (("colmap", "{colmap_room}", "--query-prefix", "q"), "--query-prefix changes nothing"),
         (("kapture", "{scene}", "--images", "."), "--images and --database are of colmap"),
         (("kapture", "{scene}", "--database", "d"), "--images and --database are of colmap"),
-        (("colmap", "{room}/images"), "images: no COLMAP model: neither images.bin nor"),
-        (("colmap", "{room}", "--images", "none"), "none: no such folder of images"),
+        (("colmap", "{colmap_room}/images"), "images: no COLMAP model: neither images.bin nor"),
+        (("colmap", "{colmap_room}", "--images", "none"), "none: no such folder of images"),
     ],
 )
 def test_what_changes_nothing_is_refused(
-    megloc: Any, room: Path, scene: Path, tmp_path: Path, arguments: tuple[str, ...], told: str
+    megloc: Any,
+    colmap_room: Path,
+    scene: Path,
+    tmp_path: Path,
+    arguments: tuple[str, ...],
+    told: str,
 ) -> None:
-    words = [word.format(room=room, scene=scene) for word in arguments]
+    words = [word.format(colmap_room=colmap_room, scene=scene) for word in arguments]
     megloc("import", *words, "-o", tmp_path / "map").refused(told)
     assert not (tmp_path / "map").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "kind", "local_type", "max_m"),
+    [
+        ("fountain_p11", None, "sift", 0.01),
+        ("herzjesu_p25", "ALIKED_N16ROT", "aliked-n16rot", 0.02),
+        ("herzjesu_p25", "ALIKED_N32", "aliked-n32", 0.02),
+    ],
+)
+def test_photographs(
+    megloc: Any,
+    shared_data: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    name: str,
+    kind: str | None,
+    local_type: str,
+    max_m: float,
+) -> None:
+    """Surveyed poses, COLMAP's points: of its SIFT, and of the networks whose features it has."""
+    scene = shared_data / "scenes" / name
+    monkeypatch.setenv("MEGLOC_WEIGHTS", str(shared_data / "weights"))
+    extractor = None
+    if kind is not None:
+        # COLMAP's wheels come without its networks: ours has the same weights
+        extractor = load_plugin(LOCAL_FEATURES, "aliked", {"weights": local_type})
+    types = pycolmap.FeatureExtractorType.__members__
+    write_workspace(tmp_path / "ws", scene, extractor=extractor, kind=types.get(kind))
+    done = megloc("import", "colmap", tmp_path / "ws", "-o", tmp_path / "map")
+    assert done.status == 0, done
+    places = ("-i", tmp_path / "map", "--query", scene / "query", "-o", tmp_path / "localized")
+    done = megloc("localize", *places)
+    assert f"localizing with {local_type}" in done.err
+    row = evaluate(tmp_path / "localized", scene / "query_gt").row()
+    assert row.num_localized == row.num_queries
+    assert row.median_position_m is not None and row.median_position_m < max_m

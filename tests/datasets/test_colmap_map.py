@@ -11,7 +11,6 @@ from typing import Any
 import kapture.io.csv
 import numpy as np
 import pytest
-from colmap_room import write_workspace
 from kapture.converter.colmap.database import COLMAPDatabase
 
 from megloc_kapture.datasets.colmap_map import (
@@ -30,17 +29,10 @@ from megloc_kapture.pipeline.localizer import Localizer
 import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
 
 
-@pytest.fixture(scope="module")
-def workspace(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("colmap") / "room"
-    write_workspace(root, scene)
-    return root
-
-
 @pytest.fixture
-def own(workspace: Path, tmp_path: Path) -> Path:
-    """A copy of the workspace, to be spoilt."""
-    return Path(shutil.copytree(workspace, tmp_path / "own", symlinks=True))
+def own(colmap_room: Path, tmp_path: Path) -> Path:
+    """A copy of the colmap_room, to be spoilt."""
+    return Path(shutil.copytree(colmap_room, tmp_path / "own", symlinks=True))
 
 
 def import_colmap(source: ColmapFolders, output: Path) -> dict[str, float]:
@@ -148,18 +140,18 @@ def errors(found: Any, scene: Path) -> list[tuple[float, float]]:
 
 @pytest.mark.parametrize("with_database", [True, False])
 def test_queries_are_localized(
-    workspace: Path, scene: Path, tmp_path: Path, with_database: bool
+    colmap_room: Path, scene: Path, tmp_path: Path, with_database: bool
 ) -> None:
     """With the database's features, or with SIFT extracted again, once."""
-    found = find_colmap(workspace)
-    assert found.database == workspace / "database.db"
+    found = find_colmap(colmap_room)
+    assert found.database == colmap_room / "database.db"
     source = found if with_database else ColmapFolders(found.model, found.images, None)
     folder, counts = imported(source, tmp_path / "map")
-    read = pycolmap.Reconstruction(workspace / "sparse" / "0")
+    read = pycolmap.Reconstruction(colmap_room / "sparse" / "0")
     assert counts["points"] == len(read.points3D)
     if with_database:
         assert counts["observations"] == read.compute_num_observations()
-        with sqlite3.connect(workspace / "database.db") as database:
+        with sqlite3.connect(colmap_room / "database.db") as database:
             rows = database.execute("SELECT SUM(rows) FROM keypoints").fetchone()[0]
         assert counts["keypoints"] == rows
     else:
@@ -167,7 +159,7 @@ def test_queries_are_localized(
     assert folder.descriptors("sift").names == folder.read().image_names()
     assert sorted(p.name for p in (tmp_path / "map").iterdir()) == ["reconstruction", "sensors"]
     link = tmp_path / "map" / "sensors" / "records_data"
-    assert os.readlink(link) == str((workspace / "images").resolve())
+    assert os.readlink(link) == str((colmap_room / "images").resolve())
     opened = KaptureMap.open(tmp_path / "map")
     assert opened.fault() is None and opened.pixel_origin.intrinsics == "corner"
     localizer = Localizer(opened)
@@ -227,14 +219,14 @@ def test_an_image_without_descriptors_is_named(own: Path, tmp_path: Path) -> Non
         import_colmap(find_colmap(own), tmp_path)
 
 
-def test_the_database_of_an_older_version(workspace: Path, own: Path, tmp_path: Path) -> None:
+def test_the_database_of_an_older_version(colmap_room: Path, own: Path, tmp_path: Path) -> None:
     """Its schema has no types; a model before version 4 has no rigs."""
     for name in ("rigs.bin", "frames.bin"):
         (own / "sparse" / "0" / name).unlink()
     (own / "database.db").unlink()
     database = COLMAPDatabase.connect(str(own / "database.db"))
     database.create_tables()
-    with sqlite3.connect(workspace / "database.db") as newer:
+    with sqlite3.connect(colmap_room / "database.db") as newer:
         for row in newer.execute("SELECT camera_id, model, width, height, params FROM cameras"):
             database.add_camera(*row[1:4], np.frombuffer(row[4]), camera_id=row[0])
         for image_id, name, camera_id in newer.execute("SELECT * FROM images").fetchall():
@@ -249,7 +241,7 @@ def test_the_database_of_an_older_version(workspace: Path, own: Path, tmp_path: 
     newer.close()
     database.commit()
     database.close()
-    new, _ = imported(find_colmap(workspace), tmp_path / "new")
+    new, _ = imported(find_colmap(colmap_room), tmp_path / "new")
     old, _ = imported(find_colmap(own), tmp_path / "old")
     assert old.read().poses() == new.read().poses()
     for image in new.read().image_names():
@@ -347,8 +339,8 @@ def test_what_is_missing_is_said_before_the_work(own: Path, tmp_path: Path) -> N
     assert list(output.iterdir()) == []
 
 
-def test_a_map_without_images(workspace: Path, tmp_path: Path) -> None:
-    found = find_colmap(workspace)
+def test_a_map_without_images(colmap_room: Path, tmp_path: Path) -> None:
+    found = find_colmap(colmap_room)
     folder, _ = imported(ColmapFolders(found.model, None, found.database), tmp_path / "map")
     assert not KaptureMap.open(folder.root).has_images()
 

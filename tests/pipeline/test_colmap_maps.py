@@ -8,7 +8,6 @@ import time
 from pathlib import Path
 
 import pytest
-from colmap_room import write_workspace
 
 import megloc_kapture as megloc
 from megloc_kapture.datasets.colmap_map import find_colmap
@@ -18,18 +17,11 @@ from megloc_kapture.pipeline.colmap_maps import colmap_maps_folder, import_colma
 import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
 
 
-@pytest.fixture(scope="module")
-def made(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("colmap") / "room"
-    write_workspace(root, scene)
-    return root
-
-
 @pytest.fixture
-def workspace(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def workspace(colmap_room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A copy of the workspace, and an empty cache."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    return Path(shutil.copytree(made, tmp_path / "room", symlinks=True))
+    return Path(shutil.copytree(colmap_room, tmp_path / "room", symlinks=True))
 
 
 def state(root: Path) -> dict[str, tuple[int, int]]:

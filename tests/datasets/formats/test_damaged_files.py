@@ -24,12 +24,15 @@ from megloc_kapture.datasets.formats.colmap_model import (
     write_colmap_text,
 )
 from megloc_kapture.datasets.formats.colmap_reading import read_colmap_model
+from megloc_kapture.datasets.formats.colmap_rigs import read_colmap_rigs
 from megloc_kapture.datasets.formats.nvm import NvmModel, read_nvm, write_nvm
 from megloc_kapture.datasets.formats.query_list import read_query_list
 from megloc_kapture.datasets.formats.sparse_points import SparsePoints
 from megloc_kapture.datasets.formats.text_lines import TextFile, read_rigid_matrix
 from megloc_kapture.errors import DataError
 from megloc_kapture.values import Camera, RigidTransform
+
+import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
 
 TIME = 1602074877390449152
 POSE = "-0.06,0.05,-0.15,0,0.6,0,0.8"
@@ -187,6 +190,33 @@ def test_colmap_models(tmp_path: Path, name: str, edits: list[tuple[str, int, An
 
 
 @pytest.fixture(scope="module")
+def rigs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pycolmap.set_random_seed(3)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_cameras_per_rig, options.num_frames_per_rig, options.num_points3D = 3, 2, 10
+    made = pycolmap.synthesize_dataset(options)
+    folder = tmp_path_factory.mktemp("rigs")
+    made.write_text(folder)
+    made.write_binary(folder)
+    return folder
+
+
+@given(st.sampled_from(["rigs.txt", "frames.txt", "rigs.bin", "frames.bin"]), EDITS)
+@MANY
+def test_colmap_rigs(
+    tmp_path: Path, rigs: Path, name: str, edits: list[tuple[str, int, Any]]
+) -> None:
+    folder = tmp_path / name
+    shutil.copytree(rigs, folder, dirs_exist_ok=True)
+    (folder / name).write_bytes(changed((rigs / name).read_bytes(), edits))
+    found = outcome(lambda: read_colmap_rigs(folder, binary=name.endswith(".bin")), folder)
+    if not isinstance(found, str):
+        for cams_from_rig in found.cams_from_rig.values():
+            for pose in cams_from_rig.values():
+                assert np.isfinite([*pose.quat_wxyz, *pose.translation]).all()
+
+
+@pytest.fixture(scope="module")
 def database(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("database") / "good.db"
     opened = COLMAPDatabase.connect(str(path))
@@ -213,7 +243,7 @@ def test_colmap_database(tmp_path: Path, database: Path, edits: list[tuple[str, 
             features = {
                 name: (opened.keypoints(name), opened.descriptors(name)) for name in opened.images
             }
-            return opened.cameras(), features
+            return opened.cameras(), features, opened.feature_type()
 
     outcome(read, path)
     assert [entry.name for entry in tmp_path.iterdir()] == ["d.db"]
