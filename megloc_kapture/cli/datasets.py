@@ -8,11 +8,11 @@ from pathlib import Path
 import tyro
 
 from megloc_kapture.cli.common import Common, Force, Output, Working
-from megloc_kapture.datasets.kapture_folders import QUERY
-from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.cli.console import Console
 from megloc_kapture.datasets.colmap_map import find_colmap
+from megloc_kapture.datasets.kapture_folders import QUERY
 from megloc_kapture.errors import OptionError
+from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.files import staged_output
 from megloc_kapture.pipeline.colmap_maps import import_colmap
 from megloc_kapture.pipeline.datasets import (
@@ -25,8 +25,8 @@ from megloc_kapture.pipeline.datasets import (
 )
 from megloc_kapture.pipeline.executors import open_executor
 from megloc_kapture.pipeline.presets import assigned
-from megloc_kapture.stages.unreadable import set_aside_unreadable
 from megloc_kapture.stages.layout import MAP
+from megloc_kapture.stages.unreadable import set_aside_unreadable
 from megloc_kapture.stages.work import Work
 
 DATASET, COLMAP = "dataset", "colmap"
