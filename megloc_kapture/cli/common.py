@@ -10,13 +10,10 @@ from typing import Annotated, Literal
 import tyro
 
 from megloc_kapture.cli.console import Console, configure_logging
-from megloc_kapture.datasets.colmap_map import is_colmap
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.dataset_tables import PROTOCOL_FILE, SIDE_TABLES
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.pipeline.colmap_maps import kapture_of
 from megloc_kapture.pipeline.executors import ExecutorKind, open_executor
-from megloc_kapture.stages.work import Work
 
 Input = Annotated[Path, tyro.conf.arg(aliases=["-i"])]
 Output = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
@@ -33,6 +30,11 @@ def existing(folders: Sequence[Path]) -> tuple[Path, ...]:
 
 def opened_map(path: Path, console: Console) -> Path:
     """The kapture folder of a map; a COLMAP model's is made in the user's cache, and said."""
+    # commands that open no map do not wait for all stages
+    from megloc_kapture.datasets.colmap_map import is_colmap
+    from megloc_kapture.pipeline.colmap_maps import kapture_of
+    from megloc_kapture.stages.work import Work
+
     if not is_colmap(path):
         return path
     with open_executor("processes") as executor:
