@@ -2,7 +2,7 @@
 
 >>> import megloc_kapture as megloc
 >>> m = megloc.open_map("somebody_elses_map")                                 # doctest: +SKIP
->>> pose = m.localize("query.jpg", megloc.Camera.pinhole(1920, 1080, 1371))   # doctest: +SKIP
+>>> pose = m.localize("photo.jpg")                                            # doctest: +SKIP
 >>> m.localize("query_kapture/", refine="icp").save("localized")              # doctest: +SKIP
 """
 
@@ -25,6 +25,7 @@ from megloc_kapture.evaluation.report.reports import RECALL_JSON
 from megloc_kapture.features.image_bound import extract_bounded
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.photos import guessed_camera, photo_of, read_photo, turned_upright
 from megloc_kapture.localization.absolute_pose import absolute_pose
 from megloc_kapture.localization.estimation import AbsolutePoseOptions
 from megloc_kapture.pipeline.colmap_maps import kapture_of
@@ -32,8 +33,10 @@ from megloc_kapture.pipeline.evaluation_plan import plan_evaluation, plan_map
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
 from megloc_kapture.pipeline.localizer import LOCALIZING, Localizer
+from megloc_kapture.pipeline.photographs import Photographs
 from megloc_kapture.pipeline.plan import run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
+from megloc_kapture.pipeline.queries import Query
 from megloc_kapture.pipeline.results import Results
 from megloc_kapture.pipeline.run import choose_run
 from megloc_kapture.pipeline.workspace import Workspace
@@ -45,9 +48,11 @@ from megloc_kapture.values import Camera, Failure, ImageFeatures, Pose
 
 if TYPE_CHECKING:
     import pandas as pd
+    from PIL import Image
 
 Changes = Mapping[str, Any]
-Image = Path | str | NDArray[np.uint8]
+# not Sequence, which a text is too
+Files = list[str] | list[Path] | tuple[Path | str, ...]
 
 
 class Map:
@@ -82,7 +87,7 @@ class Map:
     @overload
     def localize(
         self,
-        query: Image,
+        query: Path | str,
         camera: Camera,
         *,
         prior: Sequence[str] | None = None,
@@ -92,52 +97,112 @@ class Map:
     @overload
     def localize(
         self,
-        query: KaptureFolder | Path | str,
-        camera: None = None,
+        query: NDArray[np.uint8] | Image.Image,
+        camera: Camera | None = None,
+        *,
+        prior: Sequence[str] | None = None,
+        refine: str | Sequence[str] = (),
+    ) -> Pose | Failure: ...
+
+    @overload
+    def localize(
+        self,
+        query: KaptureFolder | Files,
+        camera: Camera | None = None,
         *,
         refine: str | Sequence[str] = (),
         workers: int = 1,
     ) -> Results: ...
 
+    @overload
     def localize(
         self,
-        query: KaptureFolder | Image,
+        query: Path | str,
+        camera: None = None,
+        *,
+        prior: Sequence[str] | None = None,
+        refine: str | Sequence[str] = (),
+        workers: int = 1,
+    ) -> Any: ...
+
+    def localize(
+        self,
+        query: KaptureFolder | Files | Path | str | NDArray[np.uint8] | Image.Image,
         camera: Camera | None = None,
         *,
         prior: Sequence[str] | None = None,
         refine: str | Sequence[str] = (),
         workers: int = 1,
     ) -> Pose | Failure | Results:
-        """Localize one image of a camera, or all images of a kapture folder.
+        """Localize one image, or all images of a list or a folder.
 
         Parameters
         ----------
-        query : image file, or uint8 (H, W, 3) RGB; without a camera, a kapture folder.
-        camera : intrinsics of the image, COLMAP's models and pixel origin.
-        prior : names of the map images that the image may be matched with.
+        query : image file; uint8 (H, W, 3) RGB; an image of pillow; a list of image files; a
+            kapture folder, or a folder of plain images.
+        camera : intrinsics of the images' pixels as they are stored, COLMAP's models and pixel
+            origin. Without one an image is turned upright by its EXIF orientation, and its focal
+            length, EXIF's or a guess, is estimated with the pose: ``Pose.camera``.
+        prior : names of the map images that one image may be matched with.
         refine : pose refiners by name, one after another: icp, rendering.
-        workers : threads, for a folder.
+        workers : threads, for lists and folders.
 
         Returns
         -------
-        Pose, or Failure, which is falsy and says why; of a folder :class:`Results`, image name to
-        either, lazy.
+        Of one image Pose, or Failure, which is falsy and says why; of a list or a folder
+        :class:`Results`, image name to either, lazy.
 
         Raises
         ------
         DataError : something cannot be read, or features can neither be read nor extracted.
-        OptionError : an image without its camera.
+        OptionError : an argument that changes nothing for such a query.
         """
-        localizer = self.localizer(refine)
-        if camera is not None:
-            if isinstance(query, KaptureFolder):
-                raise OptionError(f"{query.root}: a kapture folder has cameras of its own")
-            return localizer.localize(query, camera, prior=prior)
-        if not isinstance(query, KaptureFolder):
-            if isinstance(query, np.ndarray) or Path(query).is_file():
-                raise OptionError("an image needs its camera: localize(image, camera)")
+        if isinstance(query, str):
+            query = Path(query)
+        if isinstance(query, Path) and (query / "sensors" / "sensors.txt").is_file():
             query = KaptureFolder(query)
-        return Results(localizer, query, workers=workers)
+        localizer = self.localizer(refine)
+        many: KaptureFolder | Photographs
+        if isinstance(query, KaptureFolder):
+            if camera is not None:
+                raise OptionError(f"{query.root}: a kapture folder has cameras of its own")
+            many = query
+        elif isinstance(query, list | tuple):
+            many = Photographs([Path(path) for path in query], camera)
+        elif isinstance(query, Path) and query.is_dir():
+            many = Photographs([query], camera)
+        else:
+            if workers != 1:
+                raise OptionError("workers: one image is localized by one thread")
+            return localizer.localize_query(_query_of(query, camera, prior))
+        if prior is not None:
+            raise OptionError("prior is of one image; a kapture dataset's stand in its tables")
+        return Results(localizer, many, workers=workers)
+
+
+def _query_of(
+    image: Path | NDArray[np.uint8] | Image.Image,
+    camera: Camera | None,
+    prior: Sequence[str] | None,
+) -> Query:
+    """The query of one image; raises DataError."""
+    name, orientation = "query", 1
+    permitted = None if prior is None else tuple(prior)
+    if isinstance(image, Path):
+        name = str(image)
+        if camera is None:
+            photo = read_photo(image)
+            camera, orientation = photo.upright_camera, photo.orientation
+    elif not isinstance(image, np.ndarray):
+        photo = photo_of(image)
+        image = np.asarray(image.convert("RGB"))
+        if camera is None:
+            camera, image = photo.upright_camera, turned_upright(image, photo.orientation)
+    elif camera is None:
+        if image.ndim != 3:
+            raise DataError(f"an image is uint8 (H, W, 3), got {image.dtype} {image.shape}")
+        camera = guessed_camera(image.shape[1], image.shape[0])
+    return Query(camera, image, name, prior=permitted, orientation=orientation)
 
 
 def open_map(
@@ -283,7 +348,7 @@ def run(
     return FinishedRun(opened.root, chosen.submission_below(opened.root), choice.options)
 
 
-def extract(features: str, image: Image, **options: Any) -> ImageFeatures:
+def extract(features: str, image: Path | str | NDArray[np.uint8], **options: Any) -> ImageFeatures:
     """Local features of an image, by the name of their extractor.
 
     Parameters

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -62,6 +63,8 @@ class Camera:
     width, height : image size in pixels.
     params : the model's parameters in COLMAP's order; pixels for focal lengths and principal
         point. The centre of the first pixel is (0.5, 0.5).
+    focal_deviation : standard deviation of the focal length, as a share of it. 0: it is known, and
+        stays as it is; else it is estimated with the pose.
 
     Raises
     ------
@@ -73,6 +76,7 @@ class Camera:
     width: int
     height: int
     params: tuple[float, ...]
+    focal_deviation: float = 0.0
 
     def __post_init__(self) -> None:
         expected = CAMERA_MODEL_NUM_PARAMS.get(self.model)
@@ -91,11 +95,32 @@ class Camera:
         focals = self.params[: 1 if self.model in ONE_FOCAL_MODELS else 2]
         if min(focals) <= 0:
             raise DataError(f"focal length {min(focals)} is not positive")
+        if not (math.isfinite(self.focal_deviation) and self.focal_deviation >= 0):
+            raise DataError(f"focal_deviation {self.focal_deviation} is not 0 or positive")
 
     @classmethod
     def pinhole(cls, width: int, height: int, focal: float) -> Camera:
         """A camera without distortion, its principal point in the middle; focal length in px."""
         return cls("SIMPLE_PINHOLE", width, height, (focal, width / 2, height / 2))
+
+    @classmethod
+    def from_colmap(cls, camera: Any) -> Camera:
+        """A ``pycolmap.Camera``; raises DataError for a model that is not supported."""
+        return cls(camera.model.name, camera.width, camera.height, tuple(camera.params))
+
+    @classmethod
+    def from_exif(cls, path: Path | str) -> Camera:
+        """The camera of a photograph's pixels as they are stored, by COLMAP's reading of its EXIF.
+
+        Its focal length is not certain (``focal_deviation``), and a guess where EXIF has none.
+
+        Raises
+        ------
+        DataError : missing, or not an image.
+        """
+        from megloc_kapture.io.photos import read_photo
+
+        return read_photo(path).camera
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,6 +185,12 @@ class RigidTransform:
                 [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
             ]
         )
+
+    def matrix(self) -> NDArray[np.float64]:
+        """As a matrix (4, 4) float64."""
+        found = np.eye(4)
+        found[:3, :3], found[:3, 3] = self.rotation_matrix(), self.translation
+        return found
 
     def inverse(self) -> RigidTransform:
         """``b_from_a`` of an ``a_from_b``."""
@@ -292,8 +323,12 @@ class Pose:
     cam_from_world : the pose, COLMAP axes.
     num_matches, num_inliers : of the 2D-3D matches.
     inliers : bool (num_matches,) or None.
+    inlier_points_px, inlier_points_world : float64 (num_inliers, 2) and (num_inliers, 3), in the
+        query's own pixels and in the map; None where they were not kept.
     covariance : float64 (6, 6) or None: rotation in radians, then translation in the map's unit,
         of a left perturbation of ``cam_from_world``.
+    camera : with the focal length that was estimated with the pose, and its deviation; None where
+        it was known.
     candidates : map images that took part, best first.
     clusters : all clusters of candidates that were tried, that of the best candidate first.
     cluster : the one this pose comes from, an index into ``clusters``.
@@ -303,7 +338,8 @@ class Pose:
     confidence : the probability that the pose is right, None where it was not asked for; of the
         pose before refinement by other means.
     evidence : the terms behind it, see :mod:`megloc_kapture.localization.confidence`.
-    seconds : by step.
+    name : of the query.
+    seconds : by step, from the extraction of features on.
     """
 
     cam_from_world: RigidTransform
@@ -311,6 +347,7 @@ class Pose:
     num_inliers: int
     inliers: NDArray[np.bool_] | None = None
     covariance: NDArray[np.float64] | None = None
+    camera: Camera | None = None
     candidates: tuple[str, ...] = ()
     clusters: tuple[ClusterPose, ...] = ()
     cluster: int | None = None
@@ -319,9 +356,17 @@ class Pose:
     confidence: float | None = None
     evidence: Mapping[str, float] = field(default_factory=dict)
     seconds: Mapping[str, float] = field(default_factory=dict)
+    inlier_points_px: NDArray[np.float64] | None = None
+    inlier_points_world: NDArray[np.float64] | None = None
+    name: str = ""
 
     def __bool__(self) -> Literal[True]:
         return True
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """``cam_from_world`` as a matrix (4, 4)."""
+        return self.cam_from_world.matrix()
 
 
 @dataclass(frozen=True)
@@ -332,7 +377,7 @@ class Failure:
     ----------
     num_matches, num_inliers, candidates : of the cluster that came nearest to a pose.
     confidence : of the pose that was found and not trusted; None where there was none.
-    clusters, remarks, seconds : as of :class:`Pose`.
+    clusters, remarks, seconds, name : as of :class:`Pose`.
     """
 
     reason: str
@@ -343,6 +388,7 @@ class Failure:
     remarks: tuple[str, ...] = ()
     confidence: float | None = None
     seconds: Mapping[str, float] = field(default_factory=dict, compare=False)
+    name: str = ""
 
     def __bool__(self) -> Literal[False]:
         return False

@@ -24,24 +24,35 @@ from megloc_kapture.cli.common import (
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.files import staged_output
 from megloc_kapture.io.kapture import KaptureFolder, read_pairs
+from megloc_kapture.io.tables import STATUS_FILE
 from megloc_kapture.pipeline.executors import available_cores
 from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
 from megloc_kapture.pipeline.localizer import LOCALIZING, Localizer
+from megloc_kapture.pipeline.photographs import Photographs
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, assigned, options_of_preset
 from megloc_kapture.pipeline.queries import KaptureQueries
 from megloc_kapture.pipeline.results import Results
 from megloc_kapture.stages.layout import LOCALIZED
 from megloc_kapture.stages.matches import iterate_candidates
+from megloc_kapture.values import Camera
 
 
 @dataclass(frozen=True, kw_only=True)
 class Localize(Reading, Deciding, Common):
-    """Localize the images of a kapture folder in a kapture map."""
+    """Localize photographs, or the images of a kapture folder, in a kapture map."""
 
     input: Input
     """Kapture map: keypoints, points3d and observations; or a COLMAP model. Read only."""
-    query: Path
+    query: Path | None = None
     """Kapture folder with the queries, and their features where the map's cannot be extracted."""
+    images: tuple[Path, ...] = ()
+    """Instead of --query: photographs and videos, or folders of them. Their focal lengths are taken
+    from EXIF or guessed, and estimated with the poses."""
+    camera: str | None = None
+    """Camera of all --images, whose pixels are then taken as they are stored:
+    MODEL,WIDTH,HEIGHT,PARAMETERS as COLMAP has them."""
+    every: int | None = None
+    """Of videos among --images every so many frames one is taken; 30 unless given."""
     output: Output = Path("localized")
     """Kapture folder with the queries' poses, and status.csv."""
     pairs: Path | None = None
@@ -59,6 +70,7 @@ class Localize(Reading, Deciding, Common):
     def run(self) -> int:
         """Run it."""
         console = self.console()
+        self._check_queries()
         workers = available_cores() if self.workers is None else self.workers
         kapture_map = KaptureMap.open(
             opened_map(self.input, console),
@@ -75,13 +87,18 @@ class Localize(Reading, Deciding, Common):
         options = options_of_preset(
             self.preset or DEFAULT_PRESET, assignments=self.assignments(), used=LOCALIZING
         )
-        folder = self.kapture(self.query)
+        folder: KaptureFolder | Photographs
+        if self.query is None:
+            camera = None if self.camera is None else camera_of_text(self.camera)
+            folder = Photographs(self.images, camera, every=self.every)
+        else:
+            folder = self.kapture(self.query)
         given = None if self.pairs is None else dict(iterate_candidates(read_pairs(self.pairs)))
         # what is wrong is found before the first query, and before anything is written
         localizer = Localizer(kapture_map, options=options)
         results = Results(localizer, folder, workers=workers, candidates=given, track=console.track)
         queries = results.queries
-        check_acted_on(assigned(self.set), localizer, queries, folder, pairs=given is not None)
+        check_acted_on(assigned(self.set), localizer, queries, pairs=given is not None)
         with staged_output(self.output, kind=LOCALIZED, force=self.force) as out:
             started = time.perf_counter()
             named = list(results.items())
@@ -94,8 +111,12 @@ class Localize(Reading, Deciding, Common):
         console.say(f"candidates: {how}")
         console.say(f"pixel origin: {kapture_map.pixel_origin.intrinsics}")
         remarks = Counter(remark for _, result in named for remark in result.remarks)
-        for remark, number in sorted(remarks.items()):
-            console.say(f"left out of {number} queries: {remark}")
+        focal = {remark for remark in remarks if "focal length" in remark}
+        for remark in sorted(remarks.keys() - focal):
+            console.say(f"left out of {remarks[remark]} queries: {remark}")
+        if focal:
+            number = sum(remarks[remark] for remark in focal)
+            console.say(f"focal length: {number} remarks in {STATUS_FILE}")
         console.result(
             f"{counts['localized']} of {counts['queries']} queries localized in {seconds:.1f} s; "
             f"poses and status.csv in {self.output}"
@@ -105,12 +126,33 @@ class Localize(Reading, Deciding, Common):
             console.say(f"warning: no query was localized; reasons are in {self.output}/status.csv")
         return 0
 
+    def _check_queries(self) -> None:
+        """Raise OptionError unless the queries are given, in one way."""
+        if (self.query is None) == (not self.images):
+            raise OptionError("give the queries: either --query, a kapture folder, or --images")
+        if self.query is not None:
+            for name, given in (("--camera", self.camera), ("--every", self.every)):
+                if given is not None:
+                    raise OptionError(f"{name} changes nothing: it is of --images")
+
+
+def camera_of_text(text: str) -> Camera:
+    """The camera of ``MODEL,WIDTH,HEIGHT,PARAMETERS``; raises OptionError."""
+    try:
+        model, width, height, *params = text.split(",")
+        return Camera(model.strip(), int(width), int(height), tuple(map(float, params)))
+    except (ValueError, DataError) as error:
+        reason = error.message if isinstance(error, DataError) else "not such a list"
+        raise OptionError(
+            f"--camera {text}: {reason}; give MODEL,WIDTH,HEIGHT,PARAMETERS, as in "
+            "SIMPLE_RADIAL,4032,3024,3100,2016,1512,0.02"
+        ) from error
+
 
 def check_acted_on(
     typed: Mapping[str, Any],
     localizer: Localizer,
-    queries: KaptureQueries,
-    folder: KaptureFolder,
+    queries: KaptureQueries | Photographs,
     *,
     pairs: bool,
 ) -> None:
@@ -146,11 +188,11 @@ def check_acted_on(
     elif shared and not localizer.compares_as_asked(shared):
         idle["global_features"] = f"map and queries bring {', '.join(shared)}, which is compared"
     localization = typed.get("localization", {})
-    if not folder.read().rigs:
+    if not queries.data().rigs:
         if localization.get("rigs"):
-            idle["localization"] = "rigs: the folder of the queries has none"
+            idle["localization"] = "rigs: the queries have none"
         elif localization.get("fallback") == "rig":
-            idle["localization"] = "fallback = rig: the folder of the queries has none"
+            idle["localization"] = "fallback = rig: the queries have none"
     for name in typed:
         if name in idle:
             raise OptionError(f"--set {name} changes nothing: {idle[name]}")

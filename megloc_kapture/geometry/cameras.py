@@ -12,16 +12,22 @@ from megloc_kapture.io.colmap import normalized_from_px, px_from_cam
 from megloc_kapture.values import ONE_FOCAL_MODELS, Camera, RigidTransform
 
 __all__ = [
+    "RADIAL_MODELS",
     "bearing_rays",
     "focal_px",
     "normalized_from_px",
     "principal_point_px",
     "project",
     "px_from_cam",
+    "radial_distortion",
     "scale_focal",
     "shift_principal_point",
     "swap_principal_point",
+    "with_distortion",
 ]
+
+# models whose first distortion parameter multiplies the squared radius
+RADIAL_MODELS = frozenset({"SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"})
 
 
 def focal_px(camera: Camera) -> float:
@@ -55,6 +61,17 @@ def scale_focal(camera: Camera, factor: float) -> Camera:
     k = _principal_point_index(camera)
     params = tuple(factor * value for value in camera.params[:k]) + camera.params[k:]
     return replace(camera, params=params)
+
+
+def radial_distortion(camera: Camera) -> float:
+    """The factor of the squared radius; of one of RADIAL_MODELS."""
+    return camera.params[_principal_point_index(camera) + 2]
+
+
+def with_distortion(camera: Camera, radial: float) -> Camera:
+    """The camera with this :func:`radial_distortion`."""
+    k = _principal_point_index(camera) + 2
+    return replace(camera, params=(*camera.params[:k], radial, *camera.params[k + 1 :]))
 
 
 def swap_principal_point(camera: Camera) -> Camera:

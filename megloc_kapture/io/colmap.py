@@ -43,14 +43,16 @@ def _pycolmap() -> Any:
     return pycolmap
 
 
-@lru_cache(maxsize=4096)
-def _colmap_camera(camera: Camera) -> Any:
+def _new_colmap_camera(camera: Camera) -> Any:
     return _pycolmap().Camera(
         model=camera.model,
         width=camera.width,
         height=camera.height,
         params=list(camera.params),
     )
+
+
+_colmap_camera = lru_cache(maxsize=4096)(_new_colmap_camera)
 
 
 def normalized_from_px(camera: Camera, points_px: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
@@ -83,7 +85,48 @@ def undistorted_pinhole(camera: Camera, *, blank_pixels: float = 0.0) -> Camera:
     options = pycolmap.UndistortCameraOptions()
     options.blank_pixels = blank_pixels
     found = pycolmap.undistort_camera(options, _colmap_camera(camera))
-    return Camera(found.model.name, found.width, found.height, tuple(found.params))
+    params = tuple(found.params)
+    return Camera(found.model.name, found.width, found.height, params, camera.focal_deviation)
+
+
+def focal_from_exif(jpeg: bytes) -> float | None:
+    """Focal length in pixels that COLMAP finds in the EXIF of a JPEG file; None without one."""
+    pycolmap = _pycolmap()
+    with tempfile.TemporaryDirectory(prefix=f".{owned_name()}") as folder:
+        path = Path(folder) / "blank.jpg"
+        path.write_bytes(jpeg)
+        camera = pycolmap.infer_camera_from_image(str(path))
+    return float(camera.mean_focal_length()) if camera.has_prior_focal_length else None
+
+
+def focal_from_matches(
+    points_px: NDArray[np.float64],
+    points: NDArray[np.float64],
+    camera: Camera,
+    max_error_px: float,
+    seed: int,
+) -> float | None:
+    """Focal length in pixels of a camera of which the rest is known: P4Pf in a RANSAC.
+
+    Parameters
+    ----------
+    points_px, points : (N, 2) and (N, 3), matched; not finite ones count as none.
+
+    Returns
+    -------
+    None where no pose agrees with enough matches.
+    """
+    usable = np.isfinite(points_px).all(axis=1) & np.isfinite(points).all(axis=1)
+    if np.count_nonzero(usable) < 4:
+        return None
+    pycolmap = _pycolmap()
+    options = pycolmap.AbsolutePoseEstimationOptions()
+    options.estimate_focal_length = True
+    options.ransac.max_error = max_error_px
+    options.ransac.random_seed = seed
+    changed = _new_colmap_camera(camera)  # the RANSAC writes into it
+    found = pycolmap.estimate_absolute_pose(points_px[usable], points[usable], changed, options)
+    return None if found is None else float(changed.mean_focal_length())
 
 
 _NEVER = 2**31 - 1

@@ -14,7 +14,7 @@ from megloc_kapture.io.files import read_content, write_bytes
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-WRITABLE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".tif", ".tiff")
+WRITABLE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".tif", ".tiff", ".webp")
 _JPEG = (".jpg", ".jpeg")
 
 
@@ -57,7 +57,7 @@ def image_size(path: Path | str) -> tuple[int, int]:
     from PIL import Image
 
     path = Path(path)
-    _check_file(path)
+    check_image_file(path)
     try:
         with Image.open(path) as image:
             return int(image.width), int(image.height)
@@ -120,7 +120,7 @@ def _encoded(path: Path, image: NDArray[np.uint8], jpeg_quality: int) -> bytes:
 
 
 def _content(path: Path) -> bytes:
-    _check_file(path)
+    check_image_file(path)
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -130,7 +130,8 @@ def _content(path: Path) -> bytes:
     return content
 
 
-def _check_file(path: Path) -> None:
+def check_image_file(path: Path) -> None:
+    """Raise DataError where there is no plain file; its content is not looked at."""
     try:
         present, plain = path.exists(), path.is_file()
     except OSError as error:

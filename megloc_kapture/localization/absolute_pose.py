@@ -88,21 +88,34 @@ def refine_pose(
             num_matches=count,
             num_inliers=len(rows),
         )
-    deviation = center_deviation(covariance) / _median(depths[rows])
-    if deviation > options.max_center_deviation:
-        return Failure(
-            f"the pose is unstable: its centre's standard deviation is {deviation:.2g} of the "
-            f"inliers' median depth, at most {options.max_center_deviation:g} is allowed",
-            num_matches=count,
-            num_inliers=len(rows),
-        )
     # a left perturbation acts in the camera frame: the covariance does not see the offset
-    return Pose(
+    found = Pose(
         cam_from_world=undo_recentring(RigidTransform.from_matrix(*pose), problem.offset),
         num_matches=count,
         num_inliers=len(rows),
         inliers=inliers,
         covariance=covariance,
+    )
+    return check_stable(found, _median(depths[rows]), options)
+
+
+def check_stable(pose: Pose, depth: float, options: AbsolutePoseOptions) -> Pose | Failure:
+    """The pose, or a Failure where its covariance says that the centre may be anywhere.
+
+    Parameters
+    ----------
+    depth : the median of the inliers', unit of the map.
+    """
+    if pose.covariance is None:
+        return pose
+    deviation = center_deviation(pose.covariance) / depth
+    if deviation <= options.max_center_deviation:
+        return pose
+    return Failure(
+        f"the pose is unstable: its centre's standard deviation is {deviation:.2g} of the "
+        f"inliers' median depth, at most {options.max_center_deviation:g} is allowed",
+        num_matches=pose.num_matches,
+        num_inliers=pose.num_inliers,
     )
 
 

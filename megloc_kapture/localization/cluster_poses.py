@@ -25,7 +25,12 @@ from megloc_kapture.localization.estimation import (
     estimate_pose,
     split_by_view,
 )
-from megloc_kapture.localization.focal_check import focal_remark
+from megloc_kapture.localization.focal_length import (
+    estimate_with_intrinsics,
+    focal_remark,
+    is_uncertain,
+    refine_with_intrinsics,
+)
 from megloc_kapture.localization.map_index import (
     Correspondences,
     MapIndex,
@@ -116,7 +121,7 @@ def localize_in_clusters(
     The pose, of a rig ``rig_from_world``; the mask of its inliers runs over the views, and in each
     over the keypoints types, in their order. Or a failure with its reason.
     """
-    clock = _Clock()
+    clock = Clock()
     matched = interleave([view.matched_images() for view in views])
     rank_of = {image: rank for rank, image in enumerate(matched)}
     clusters = [[image for image in cluster if image in rank_of] for cluster in clusters]
@@ -136,7 +141,10 @@ def localize_in_clusters(
         ]
         problem = PoseProblem.of(list(map(_view, views, found)))
         clock.lap("correspondences")
-        estimate = estimate_pose(problem, options)
+        if is_uncertain(problem):
+            problem, estimate = estimate_with_intrinsics(problem, options)
+        else:
+            estimate = estimate_pose(problem, options)
         hypothesis = None
         if isinstance(estimate, PoseEstimate):
             hypothesis = _hypothesis(tuple(cluster), views, problem, estimate, options)
@@ -157,17 +165,26 @@ def localize_in_clusters(
     if isinstance(estimate, Failure):
         result: Pose | Failure = _failure(ranked, best)
     else:
-        result = refine_pose(problem, estimate, options)
+        if is_uncertain(problem):
+            problem, result = refine_with_intrinsics(problem, estimate, options, views[0].camera)
+        else:
+            result = refine_pose(problem, estimate, options)
         clock.lap("refinement")
         if min_confidence is not None and isinstance(result, Pose):
             sources = _sources(views, attempts[best].found, ranked[best].images, centers or {})
             result = with_confidence(problem, result, sources, options.max_error_px, min_confidence)
-            if isinstance(result, Pose) and (remark := focal_remark(problem, result)):
-                result = replace(result, remarks=(remark,))
+            if isinstance(result, Pose) and result.camera is None:
+                remark = focal_remark(problem, result)
+                result = replace(result, remarks=(remark,) if remark else ())
             clock.lap("confidence")
     result = replace(result, candidates=ranked[best].images, clusters=ranked, seconds=clock.seconds)
     if isinstance(result, Pose):
-        result = replace(result, cluster=best)
+        result = replace(
+            result,
+            cluster=best,
+            inlier_points_px=problem.points_px[result.inliers],
+            inlier_points_world=problem.points[result.inliers] + problem.offset,
+        )
     return ClusterLocalization(result, tuple(len(view.points_px) for view in problem.views))
 
 
@@ -346,7 +363,7 @@ def _hypothesis(
     return PoseHypothesis(images, tuple(posed), options.max_error_px)
 
 
-class _Clock:
+class Clock:
     """Seconds by step."""
 
     def __init__(self) -> None:
@@ -372,9 +389,11 @@ def poses_of_cameras(
     if not isinstance(result, Pose) or result.inliers is None:
         raise ValueError("the rig has no pose, or its inliers are not known")
     masks = np.split(result.inliers, np.cumsum(found.matches_of_views)[:-1])
+    last = np.cumsum([mask.sum() for mask in masks])
     cameras: list[Pose | Failure] = []
-    for view, inliers in zip(views, masks, strict=True):
+    for view, inliers, end in zip(views, masks, last.tolist(), strict=True):
         num_inliers = int(inliers.sum())
+        own = slice(end - num_inliers, end)
         if num_inliers == 0:
             cameras.append(
                 Failure(
@@ -394,12 +413,18 @@ def poses_of_cameras(
                 num_matches=len(inliers),
                 num_inliers=num_inliers,
                 inliers=inliers,
+                inlier_points_px=_rows_of(result.inlier_points_px, own),
+                inlier_points_world=_rows_of(result.inlier_points_world, own),
                 covariance=None
                 if result.covariance is None
                 else transform_covariance(result.covariance, view.cam_from_rig),
             )
         )
     return cameras
+
+
+def _rows_of(points: NDArray[np.float64] | None, rows: slice) -> NDArray[np.float64] | None:
+    return None if points is None else points[rows]
 
 
 def _of_camera(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TypeVar
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.localization.cluster_poses import (
+    Clock,
     ImageMatches,
     QueryView,
     TypedMatches,
@@ -175,10 +176,15 @@ class Localizer:
         executor: Executor | None = None,
         *,
         candidates: Mapping[str, Sequence[str]] | None = None,
+        broken_images_fail: bool = False,
     ) -> Iterator[list[Pose | Failure]]:
         """Localize images, or the cameras of a rig together: one result per camera of each unit.
 
         A rig that has no pose is tried camera by camera. Parameters as of :meth:`localize_many`.
+
+        Parameters
+        ----------
+        broken_images_fail : an image that cannot be decoded is a Failure, not an error.
         """
         if candidates is not None:
             known = candidates
@@ -186,7 +192,8 @@ class Localizer:
                 tuple((replace(q, candidates=tuple(known.get(q.name, ()))), at) for q, at in unit)
                 for unit in units
             )
-        return ordered_map(self._localize_unit, units, executor)
+        localize = self._localize_readable if broken_images_fail else self._localize_unit
+        return ordered_map(localize, units, executor)
 
     def localize_query(self, query: Query) -> Pose | Failure:
         """Localize a query that may bring its features."""
@@ -218,17 +225,34 @@ class Localizer:
 
     # ------------------------------------------------------------------ the steps
 
+    def _localize_readable(self, unit: Unit) -> list[Pose | Failure]:
+        try:
+            return self._localize_unit(unit)
+        except DataError as error:
+            if error.path is None or error.path not in [query.image for query, _ in unit]:
+                raise
+            return [Failure(error.message, name=query.name) for query, _ in unit]
+
     def _localize_unit(self, unit: Unit) -> list[Pose | Failure]:
         with single_threaded():
             images = [self._preprocessor.of(query) for query, _ in unit]
             scene = self._scene(images)
             found = []
-            for image, result, told in zip(
+            for image, result, matched in zip(
                 images, *self._solve(localize_unit, unit, images, scene), strict=True
             ):
                 if isinstance(result, Pose):
-                    result = self.refiners.refine(image.query.name, image.camera, result, scene)
-                found.append(replace(result, remarks=(*result.remarks, *told)))
+                    camera = result.camera or image.camera
+                    result = self.refiners.refine(image.query.name, camera, result, scene)
+                    result = image.in_original(result)
+                found.append(
+                    replace(
+                        result,
+                        name=image.query.name,
+                        remarks=(*result.remarks, *matched.left_out),
+                        seconds={**matched.seconds, **result.seconds},
+                    )
+                )
             return found
 
     def _solve(
@@ -237,15 +261,15 @@ class Localizer:
         unit: Sequence[tuple[Query, RigidTransform]],
         images: Sequence[QueryImage],
         scene: KaptureScene,
-    ) -> tuple[Solved, list[tuple[str, ...]]]:
-        """What ``solve`` makes of the matches of all cameras, and each camera's remarks."""
+    ) -> tuple[Solved, list[_Matched]]:
+        """What ``solve`` makes of the matches of all cameras, and these."""
         matched = [
             self._match(image, cam_from_rig)
             for image, (_, cam_from_rig) in zip(images, unit, strict=True)
         ]
-        candidates = interleave([ranked for _, ranked, _ in matched])
+        candidates = interleave([one.candidates for one in matched])
         solved = solve(
-            [view for view, _, _ in matched],
+            [one.view for one in matched],
             candidates,
             [self.map.restrictions.frame(name) for name in candidates],
             self.options.localization,
@@ -253,7 +277,7 @@ class Localizer:
             ranker=self._ranker,
             scene=scene,
         )
-        return solved, [remarks for _, _, remarks in matched]
+        return solved, matched
 
     def _scene(self, images: Iterable[QueryImage]) -> KaptureScene:
         return KaptureScene(self.map.folder, QueryImages(images), map_camera=self.map.camera)
@@ -262,12 +286,12 @@ class Localizer:
     def _centers(self) -> dict[str, NDArray[np.float64]]:
         return {image: pose.center() for image, pose in self.map.poses.items()}
 
-    def _match(
-        self, image: QueryImage, cam_from_rig: RigidTransform
-    ) -> tuple[QueryView, list[str], tuple[str, ...]]:
-        """The matches of one camera, its candidates, best first, and what was left out."""
+    def _match(self, image: QueryImage, cam_from_rig: RigidTransform) -> _Matched:
+        clock = Clock()
         features = [local.of_query(image) for local in self.types]
+        clock.lap("extraction")
         ranked = self._candidates(image, features)
+        clock.lap("retrieval")
         of_types, kept = self._matched(features, ranked)
         typed, left_out = [], []
         for local, own, found in zip(self.types, features, of_types, strict=True):
@@ -277,8 +301,9 @@ class Localizer:
             keypoints_px, named, remark = local.match_again(own, named, image)
             left_out += [remark] if remark else []
             typed.append(TypedMatches(local.points.index, keypoints_px, named))
+        clock.lap("matching")
         view = QueryView(image.query.name, image.camera, tuple(typed), cam_from_rig)
-        return view, [ranked[at] for at in kept], tuple(left_out)
+        return _Matched(view, [ranked[at] for at in kept], tuple(left_out), clock.seconds)
 
     def _matched(
         self, features: Sequence[Features], ranked: Sequence[str]
@@ -350,6 +375,16 @@ class Localizer:
         if options.by == "exhaustive" or len(self.map.images) <= options.top_k:
             return f"all {len(self.map.images)} map images"
         return self._retrieval.describe(global_types)
+
+
+@dataclass(frozen=True, eq=False)
+class _Matched:
+    """The matches of one camera, its candidates, best first, what was left out, and seconds."""
+
+    view: QueryView
+    candidates: list[str]
+    left_out: tuple[str, ...]
+    seconds: Mapping[str, float]
 
 
 def _query_of(image: Path | str | NDArray[np.uint8], camera: Camera) -> Query:

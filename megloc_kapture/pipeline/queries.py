@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,11 @@ from numpy.typing import NDArray
 
 from megloc_kapture.datasets.kapture_folders import check_image
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.io.kapture import FeatureReader, KaptureFolder
+from megloc_kapture.io.files import link_images
+from megloc_kapture.io.images import read_image_rgb
+from megloc_kapture.io.kapture import FeatureReader, KaptureData, KaptureFolder
+from megloc_kapture.io.photos import turned_upright
+from megloc_kapture.localization.focal_length import estimate_remark
 from megloc_kapture.matching.guided_pyramid import equivalent_types
 from megloc_kapture.pipeline.kapture_map import KaptureMap, check_lengths
 from megloc_kapture.plugins import (
@@ -28,15 +32,15 @@ from megloc_kapture.preprocessing.masks import with_margin
 from megloc_kapture.stages.global_features import describe_images
 from megloc_kapture.stages.image_masks import ClassMasks, MaskOptions, ProcessedFrame
 from megloc_kapture.stages.local_features import (
+    check_size,
     extract_checked,
     mask_path,
-    read_image_of,
     read_mask,
 )
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.ranking_scene import depth_of
 from megloc_kapture.stages.rigs import query_units
-from megloc_kapture.values import Camera, LocalFeatures, RigidTransform
+from megloc_kapture.values import Camera, LocalFeatures, Pose, RigidTransform
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +60,8 @@ class Query:
     candidates : names of the map images it is matched with, best first, instead of retrieval.
     mask : bool (H, W), True = use, or the path of a mask image (0 = ignore), which may be absent.
     depth : a depth map that was taken with the image, or what reads one; for ``icp``.
+    orientation : EXIF's, by which the pixels of an image file are turned upright; the camera is of
+        the turned image. 1: they stay as they are stored.
     """
 
     camera: Camera
@@ -67,6 +73,7 @@ class Query:
     candidates: tuple[str, ...] | None = None
     mask: Path | NDArray[np.bool_] | None = None
     depth: DepthView | Callable[[], DepthView | None] | None = None
+    orientation: int = 1
 
     def read_mask(self) -> NDArray[np.bool_] | None:
         """The mask, bool (H, W), True = use; None where there is none. Raises DataError."""
@@ -102,7 +109,9 @@ class Query:
                 "be looked at"
             )
         if isinstance(self.image, str | Path):
-            return read_image_of(Path(self.image), self.camera)
+            image = turned_upright(read_image_rgb(Path(self.image)), self.orientation)
+            check_size(image, self.camera, self.image)
+            return image
         image = np.asarray(self.image)
         if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
             raise DataError(
@@ -171,9 +180,21 @@ class QueryImage:
     def __init__(self, query: Query, plan: FramePlan, preprocessor: Preprocessor) -> None:
         self.query, self._preprocessor = query, preprocessor
         self.camera: Camera = plan.processed
+        self._plan = plan
         self._frame = ProcessedFrame(
             query.name, plan, query.read_image, self._own_mask, lambda: preprocessor.classes
         )
+
+    def in_original(self, pose: Pose) -> Pose:
+        """The pose with its camera and its inliers' pixels in the original image."""
+        if pose.camera is not None:
+            camera = self._plan.original_of(pose.camera)
+            remark = estimate_remark(camera, self.query.camera)
+            pose = replace(pose, camera=camera, remarks=(*pose.remarks, remark))
+        if pose.inlier_points_px is not None and self._plan.changes_pixels:
+            carried = self._plan.pixel_map().original_from_processed(pose.inlier_points_px)
+            pose = replace(pose, inlier_points_px=carried)
+        return pose
 
     def _own_mask(self) -> dict[str, NDArray[np.bool_]]:
         own = self.query.read_mask()
@@ -248,6 +269,7 @@ class KaptureQueries:
     Attributes
     ----------
     names : of the images, sorted; iterating yields the queries in this order.
+    unreadable : none: a broken image ends the run, for somebody listed it.
     faults : why the features that a query brings cannot be used, known when they have been read;
         such a query has neither features nor candidates.
     """
@@ -256,6 +278,7 @@ class KaptureQueries:
         self._folder, self._map = folder, kapture_map
         self._data = folder.read()
         self.names = self._data.image_names()
+        self.unreadable: dict[str, str] = {}
         self.faults: dict[str, str] = {}
         stored = kapture_map.stored_types()
         self._stored = stored
@@ -291,14 +314,24 @@ class KaptureQueries:
         Raises
         ------
         DataError : there are no images; an image is needed and absent, broken or not of its
-            camera's size; or features are not as wide as the map's.
+            camera's size; features are not as wide as the map's, or would be taken for those of a
+            map image.
         """
+        self._map.folder.check_features_apart(self._folder)
         if not self.names:
             raise DataError("there are no query images", path=self._folder.root)
         self._check_widths()
         for name in self.names:
             if not any(name in keypoints for keypoints, _ in self._local.values()):
                 check_image(self._folder, name)
+
+    def data(self) -> KaptureData:
+        """Sensors, rigs and records."""
+        return self._data
+
+    def write_images(self, output: Path) -> None:
+        """Make the images and masks of a kapture folder links to these."""
+        link_images(self._folder.root, output)
 
     def _check_widths(self) -> None:
         pairs = [

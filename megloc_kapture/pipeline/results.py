@@ -1,4 +1,4 @@
-"""Results of the images of a kapture folder: localized when asked for, saved as kapture."""
+"""Results of a kapture folder or of photographs: localized when asked for, saved as kapture."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from megloc_kapture.io.files import staged_output
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.tables import CONSISTENCY_FILE, write_consistency
 from megloc_kapture.pipeline.localizer import Localizer
+from megloc_kapture.pipeline.photographs import Photographs
 from megloc_kapture.pipeline.queries import KaptureQueries
 from megloc_kapture.stages.layout import LOCALIZED
 from megloc_kapture.stages.localized_folder import query_status, write_localized
@@ -33,7 +34,8 @@ class Results(Mapping[str, Pose | Failure]):
 
     Parameters
     ----------
-    folder : kapture folder of the queries, and their features where they bring some.
+    folder : kapture folder of the queries, and their features where they bring some; or
+        photographs, of which those that cannot be read are failures.
     workers : threads that localize.
     candidates : query name to the map images it is matched with, instead of retrieval.
     track : shows progress.
@@ -47,7 +49,7 @@ class Results(Mapping[str, Pose | Failure]):
     def __init__(
         self,
         localizer: Localizer,
-        folder: KaptureFolder | Path | str,
+        folder: KaptureFolder | Path | str | Photographs,
         *,
         workers: int = 1,
         candidates: Candidates | None = None,
@@ -56,9 +58,12 @@ class Results(Mapping[str, Pose | Failure]):
         if workers < 1:
             raise OptionError(f"{workers} workers cannot work; give 1 or more")
         self.localizer = localizer
-        self.folder = folder if isinstance(folder, KaptureFolder) else KaptureFolder(folder)
-        localizer.map.folder.check_features_apart(self.folder)
-        self.queries = KaptureQueries(self.folder, localizer.map)
+        self.queries: KaptureQueries | Photographs
+        if isinstance(folder, Photographs):
+            self.queries = folder
+        else:
+            opened = folder if isinstance(folder, KaptureFolder) else KaptureFolder(folder)
+            self.queries = KaptureQueries(opened, localizer.map)
         # what is wrong is found before the first query
         localizer.map.check()
         self.queries.check()
@@ -69,6 +74,9 @@ class Results(Mapping[str, Pose | Failure]):
         self._found: dict[str, Pose | Failure | None] = {
             name: None for unit in self._units for name in unit
         }
+        if broken := self.queries.unreadable:
+            self._found |= {name: Failure(reason) for name, reason in broken.items()}
+            self._found = dict(sorted(self._found.items()))
         self._stream = self._localized(workers, track)
 
     def __getitem__(self, name: str) -> Pose | Failure:
@@ -84,6 +92,10 @@ class Results(Mapping[str, Pose | Failure]):
 
     def __len__(self) -> int:
         return len(self._found)
+
+    def __reduce__(self) -> tuple[type[dict[str, Pose | Failure]], tuple[Any, ...]]:
+        """Pickled, and copied to other processes, they are a plain dict."""
+        return dict, (list(self.items()),)
 
     def save(self, output: Path | str, *, force: bool = False) -> dict[str, int]:
         """Write a kapture folder of the localized images, with ``status.csv`` and its like.
@@ -106,8 +118,9 @@ class Results(Mapping[str, Pose | Failure]):
         fallback = self.localizer.options.localization.fallback
         best = self._best_candidates() if fallback == "retrieval" else {}
         counts = write_localized(
-            output, self.folder, self.items(), fallback=fallback, first_candidates=best
+            output, self.queries.data(), self.items(), fallback=fallback, first_candidates=best
         )
+        self.queries.write_images(output)
         tested = self.localizer.refiners.tested()
         if tested:
             write_consistency(output / CONSISTENCY_FILE, tested)
@@ -134,7 +147,12 @@ class Results(Mapping[str, Pose | Failure]):
     def _localized(self, workers: int, track: Track) -> Iterator[tuple[str, Pose | Failure]]:
         with ThreadPoolExecutor(workers) as executor:
             units = self.queries.read_units(rigs=self._rigs)
-            results = self.localizer.localize_units(units, executor, candidates=self._candidates)
+            results = self.localizer.localize_units(
+                units,
+                executor,
+                candidates=self._candidates,
+                broken_images_fail=isinstance(self.queries, Photographs),
+            )
             tracked = track(results, len(self._units), "localizing")
             for names, found in zip(self._units, tracked, strict=True):
                 for name, result in zip(names, found, strict=True):
@@ -148,10 +166,15 @@ class Results(Mapping[str, Pose | Failure]):
         poses = self.localizer.map.poses
         best = {}
         for name, result in self.items():
-            if result or name in self.queries.faults:
+            if result or name in self.queries.faults or name in self.queries.unreadable:
                 continue
             if self._candidates is None:
-                ranked: Sequence[str] = self.localizer.ranked(self.queries.query(name))
+                try:
+                    ranked: Sequence[str] = self.localizer.ranked(self.queries.query(name))
+                except DataError:
+                    if isinstance(self.queries, KaptureQueries):
+                        raise
+                    continue  # it could not be decoded either when it was localized
             else:
                 ranked = self._candidates.get(name, ())
             first = next((image for image in ranked if image in poses), None)
@@ -160,7 +183,7 @@ class Results(Mapping[str, Pose | Failure]):
         return best
 
 
-def _check_extractors(localizer: Localizer, queries: KaptureQueries) -> None:
+def _check_extractors(localizer: Localizer, queries: KaptureQueries | Photographs) -> None:
     """Make the extractors that queries without features need.
 
     Raises

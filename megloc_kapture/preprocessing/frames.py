@@ -16,7 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.geometry.cameras import bearing_rays, px_from_cam
+from megloc_kapture.geometry.cameras import (
+    RADIAL_MODELS,
+    bearing_rays,
+    focal_px,
+    principal_point_px,
+    px_from_cam,
+    radial_distortion,
+    scale_focal,
+    shift_principal_point,
+    with_distortion,
+)
 from megloc_kapture.preprocessing.resampling import (
     PixelMap,
     cropped_size,
@@ -205,6 +215,19 @@ class FramePlan:
         """True if the images become other ones."""
         size = (self.processed.width, self.processed.height)
         return self.warps or size != (self.original.width, self.original.height)
+
+    def original_of(self, estimated: Camera) -> Camera:
+        """The original camera, where ``estimated`` is what became known of the processed one."""
+        if not self.changes_pixels:
+            return estimated
+        # original pixels in a processed one
+        px = focal_px(self.original) / focal_px(self.processed)
+        shift = np.subtract(principal_point_px(estimated), principal_point_px(self.processed)) * px
+        found = shift_principal_point(self.original, *shift.tolist())
+        found = scale_focal(found, focal_px(estimated) / focal_px(self.processed))
+        if found.model in RADIAL_MODELS and estimated.model in RADIAL_MODELS:
+            found = with_distortion(found, radial_distortion(estimated))
+        return replace(found, focal_deviation=estimated.focal_deviation)
 
     def pixel_map(self) -> PixelMap:
         """Carries keypoints between the two."""

@@ -155,7 +155,7 @@ def scaled_camera(camera: Camera, width: int, height: int) -> Camera:
     else:
         fx, fy, cx, cy, *distortion = camera.params
         params = (fx * scale_x, fy * scale_y, cx * scale_x, cy * scale_y, *distortion)
-    return Camera(camera.model, width, height, params)
+    return replace(camera, width=width, height=height, params=params)
 
 
 def resized(image: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:

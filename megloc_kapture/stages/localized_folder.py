@@ -7,7 +7,7 @@ from pathlib import Path
 
 from megloc_kapture.io.csv_table import write_csv_table
 from megloc_kapture.io.files import link_images
-from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.io.tables import (
     CLUSTERS_FILE,
     REFINEMENT_FILE,
@@ -25,7 +25,7 @@ from megloc_kapture.values import Failure, Pose, RigidTransform
 
 def write_localized(
     output: Path,
-    query: KaptureFolder,
+    query: KaptureFolder | KaptureData,
     results: Iterable[tuple[str, Pose | Failure]],
     *,
     fallback: Fallback = "none",
@@ -34,16 +34,18 @@ def write_localized(
 ) -> dict[str, int]:
     """Write the localized queries as kapture, with ``status.csv`` and ``clusters.csv`` beside it.
 
-    Where pose refiners were at work, ``refinement.csv`` says what each made of a pose.
+    Where pose refiners were at work, ``refinement.csv`` says what each made of a pose. A query
+    whose focal length was estimated gets a camera of its own.
 
     Parameters
     ----------
+    query : sensors and records; of a folder the images are linked.
     fallback : what a query that failed gets: nothing; the pose of its best retrieved image; or its
         pose through the rig, from another camera of its moment, where that was localized.
     first_candidates : query -> (best retrieved map image, its pose), needed for "retrieval".
     timing : where to write seconds per query and step.
     """
-    data = query.read()
+    data = query.read() if isinstance(query, KaptureFolder) else query
     named = sorted(results, key=lambda result: result[0])
     guesses: Mapping[str, tuple[str, RigidTransform]] = {}
     if fallback == "retrieval":
@@ -52,25 +54,34 @@ def write_localized(
         found = {image: result for image, result in named if isinstance(result, Pose)}
         guesses = poses_through_rig(data, found)
     poses: dict[tuple[int, str], RigidTransform] = {}
+    sensors, records = dict(data.sensors), dict(data.records_camera)
     statuses = []
     for image, result in named:
         guess = None if result else guesses.get(image)
         statuses.append(query_status(image, result, "none" if guess is None else fallback))
         if isinstance(result, Pose):
-            poses[data.record_of(image)] = result.cam_from_world
+            record = data.record_of(image)
+            if result.camera is not None:
+                del records[record]
+                given = sensors[record[1]]
+                record = (record[0], f"{record[1]}-{record[0]}")
+                records[record] = image
+                sensors[record[1]] = Sensor.from_camera(result.camera, name=given.name)
+            poses[record] = result.cam_from_world
         elif guess is not None:
             poses[data.record_of(image)] = guess[1]
     write_sensors(
         output,
         KaptureData(
-            sensors=dict(data.sensors),
+            sensors=sensors,
             rigs={},
             trajectories=poses,
-            records_camera=dict(data.records_camera),
+            records_camera=records,
             records_depth={},
         ),
     )
-    link_images(query.root, output)
+    if isinstance(query, KaptureFolder):
+        link_images(query.root, output)
     write_status(output / STATUS_FILE, statuses)
     write_clusters(
         output / CLUSTERS_FILE,

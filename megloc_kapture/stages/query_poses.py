@@ -211,8 +211,10 @@ def _localize(job: _Job) -> list[tuple[str, Pose | Failure]]:
 
 def _for_writing(result: Pose | Failure, reading_s: float) -> Pose | Failure:
     result = replace(result, seconds={"reading": reading_s, **result.seconds})
-    # the mask is for who asked with arrays; the stage writes none of it
-    return replace(result, inliers=None) if isinstance(result, Pose) else result
+    if isinstance(result, Failure):
+        return result
+    # these are for who asked with arrays; the stage writes none of them
+    return replace(result, inliers=None, inlier_points_px=None, inlier_points_world=None)
 
 
 def _read_view(job: _Job, number: int) -> QueryView:

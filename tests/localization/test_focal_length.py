@@ -10,7 +10,7 @@ import pytest
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.localization.absolute_pose import rig_pose
 from megloc_kapture.localization.estimation import PoseProblem, View
-from megloc_kapture.localization.focal_check import focal_remark
+from megloc_kapture.localization.focal_length import focal_remark
 from megloc_kapture.values import Camera, Pose, RigidTransform
 
 ALONE = RigidTransform.identity()

@@ -1,0 +1,306 @@
+"""Intrinsics of one camera, from the matches of its pose.
+
+A wrong focal length hides in the pose: the camera is moved nearer or farther, and most matches
+still agree. What gives it away is perspective. With a pose at hand the focal length is set free
+(Gauss-Newton on rays, Cauchy weights), and what comes of it depends on the camera:
+
+- one that is known stays as it is; where another focal length fits better by far more than its
+  uncertainty, a remark says so;
+- one whose focal length is not certain (``Camera.focal_deviation``) gets the most probable one, and
+  principal point and radial distortion, where its model has one, with what was known before as a
+  prior. The first estimate is by P4Pf where P3P with the given focal length has fewer inliers. The
+  covariance of the pose has the uncertainty of the intrinsics in it.
+
+Of a flat scene seen straight on matches say nothing: then what was known before stays.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from megloc_kapture.geometry.cameras import (
+    RADIAL_MODELS,
+    focal_px,
+    normalized_from_px,
+    principal_point_px,
+    radial_distortion,
+    scale_focal,
+    shift_principal_point,
+    with_distortion,
+)
+from megloc_kapture.io.colmap import focal_from_matches
+from megloc_kapture.localization.absolute_pose import check_stable, refine_pose
+from megloc_kapture.localization.estimation import (
+    AbsolutePoseOptions,
+    PoseEstimate,
+    PoseProblem,
+    estimate_pose,
+)
+from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
+
+# errors of a map are alike in neighbouring points, and lenses are no pinholes: deviations that
+# take every match for independent are too small by a factor (measured: docs/photos.md)
+_CORRELATED = 5.0
+_MIN_CHANGE, _MIN_SIGMAS = 0.025, 5.0
+_MIN_INLIERS = 30
+_ROUNDS = 12
+_SMALL_STEP = 1e-4
+# intrinsics are settled when the focal length moves by less, as a share
+_SETTLED = 1e-4
+_MAX_UPDATES = 8
+# P4Pf's focal length may be that many deviations from what was known
+_MAX_DEVIATIONS = 3.0
+# standard deviations of what nobody tells of a camera: the principal point's as a share of the
+# larger side, and the radial distortion's
+_PRINCIPAL_POINT_DEVIATION, _DISTORTION_DEVIATION = 0.01, 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """The best change of a camera.
+
+    Attributes
+    ----------
+    change : float64 (1, 3 or 4,): logarithm of the focal length's factor; the principal point's
+        shift, as a share of the focal length; the radial distortion's.
+    deviation : of the logarithm.
+    rig_from_world : the pose that goes with it.
+    pose_covariance : float64 (6, 6), what the uncertainty of the camera adds to that of the pose.
+    depth : median of the inliers', unit of the map.
+    """
+
+    change: NDArray[np.float64]
+    deviation: float
+    rig_from_world: RigidTransform
+    pose_covariance: NDArray[np.float64]
+    depth: float
+
+
+def is_uncertain(problem: PoseProblem) -> bool:
+    """Whether the problem is of one camera whose focal length is not known for certain."""
+    return len(problem.views) == 1 and problem.views[0].camera.focal_deviation > 0
+
+
+def focal_remark(problem: PoseProblem, pose: Pose) -> str | None:
+    """In words, that another focal length fits better; None where the given one may be right.
+
+    Parameters
+    ----------
+    problem : of one camera on its own; of a rig nothing is said.
+    pose : of it, with its inliers.
+    """
+    if len(problem.views) != 1 or pose.inliers is None or pose.num_inliers < _MIN_INLIERS:
+        return None
+    found = _fit(problem, pose.cam_from_world, pose.inliers)
+    if found is None or abs(found.change[0]) < max(_MIN_CHANGE, _MIN_SIGMAS * found.deviation):
+        return None
+    given = focal_px(problem.views[0].camera)
+    better = given * math.exp(found.change[0])
+    return (
+        f"the focal length of {given:.0f} px does not fit: {better:.0f} +- "
+        f"{better * found.deviation:.0f} px would"
+    )
+
+
+def estimate_remark(camera: Camera, given: Camera) -> str:
+    """In words, the focal length that was estimated of an uncertain camera."""
+    found_px, given_px = focal_px(camera), focal_px(given)
+    return (
+        f"focal length estimated: {found_px:.0f} +- {camera.focal_deviation * found_px:.0f} px "
+        f"({given_px:.0f} px +- {100 * given.focal_deviation:.0f} % was assumed)"
+    )
+
+
+def estimate_with_intrinsics(
+    problem: PoseProblem, options: AbsolutePoseOptions
+) -> tuple[PoseProblem, PoseEstimate | Failure]:
+    """Estimate the pose and the intrinsics of an uncertain camera.
+
+    Returns
+    -------
+    The problem of the camera with these intrinsics, and the estimate of its pose.
+    """
+    given = problem.views[0].camera
+    found = estimate_pose(problem, options)
+    free = focal_from_matches(
+        problem.points_px, problem.points, given, options.max_error_px, options.seed
+    )
+    if free is not None and (
+        abs(math.log(free / focal_px(given))) < _MAX_DEVIATIONS * given.focal_deviation
+    ):
+        other = _with_camera(problem, scale_focal(given, free / focal_px(given)))
+        of_other = estimate_pose(other, options)
+        if isinstance(of_other, PoseEstimate) and of_other.num_inliers > found.num_inliers:
+            problem, found = other, of_other
+    if isinstance(found, PoseEstimate):
+        fit = _fit(problem, found.rig_from_world, found.inliers, given)
+        if fit is not None:
+            better = _with_camera(problem, _changed(problem.views[0].camera, fit.change))
+            of_better = estimate_pose(better, options)
+            if isinstance(of_better, PoseEstimate) and of_better.num_inliers >= found.num_inliers:
+                return better, of_better
+    return problem, found
+
+
+def refine_with_intrinsics(
+    problem: PoseProblem, estimate: PoseEstimate, options: AbsolutePoseOptions, given: Camera
+) -> tuple[PoseProblem, Pose | Failure]:
+    """Refine pose and intrinsics of an uncertain camera, in turns.
+
+    Parameters
+    ----------
+    given : the camera as it was given, with the deviation of its focal length.
+
+    Returns
+    -------
+    The problem of the refined camera, and the Pose, its ``camera`` that one with the deviation that
+    remains; or a Failure.
+    """
+    updates = 0
+    while True:
+        pose = refine_pose(problem, estimate, options)
+        if isinstance(pose, Failure) or pose.inliers is None or pose.covariance is None:
+            return problem, pose
+        fit = _fit(problem, pose.cam_from_world, pose.inliers, given)
+        if fit is None:
+            return problem, Failure(
+                "neither is the focal length known, nor do the matches determine it",
+                num_matches=pose.num_matches,
+                num_inliers=pose.num_inliers,
+            )
+        if abs(fit.change[0]) < _SETTLED or updates == _MAX_UPDATES:
+            camera = problem.views[0].camera
+            return problem, _with_uncertainty(pose, camera, fit, options)
+        updates += 1
+        problem = _with_camera(problem, _changed(problem.views[0].camera, fit.change))
+        estimate = replace(estimate, rig_from_world=fit.rig_from_world)
+
+
+def _with_uncertainty(
+    pose: Pose, camera: Camera, fit: _Fit, options: AbsolutePoseOptions
+) -> Pose | Failure:
+    if pose.covariance is None:
+        return pose
+    found = replace(
+        pose,
+        covariance=pose.covariance + fit.pose_covariance,
+        camera=replace(camera, focal_deviation=fit.deviation),
+    )
+    return check_stable(found, fit.depth, options)
+
+
+def _with_camera(problem: PoseProblem, camera: Camera) -> PoseProblem:
+    return PoseProblem.of([replace(problem.views[0], camera=camera)])
+
+
+def _changed(camera: Camera, change: NDArray[np.float64]) -> Camera:
+    focal = focal_px(camera)
+    camera = shift_principal_point(camera, *(focal * change[1:3]).tolist())
+    camera = scale_focal(camera, math.exp(change[0]))
+    if len(change) < 4:
+        return camera
+    return with_distortion(camera, radial_distortion(camera) + float(change[3]))
+
+
+def _prior_of(camera: Camera, given: Camera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The change that makes a camera the given one, and its standard deviations."""
+    focal = focal_px(camera)
+    shift = np.subtract(principal_point_px(given), principal_point_px(camera)) / focal
+    deviation = _PRINCIPAL_POINT_DEVIATION * max(camera.width, camera.height) / focal
+    change = [math.log(focal_px(given) / focal), *shift]
+    deviations = [given.focal_deviation, deviation, deviation]
+    if camera.model in RADIAL_MODELS:
+        change.append(radial_distortion(given) - radial_distortion(camera))
+        deviations.append(_DISTORTION_DEVIATION)
+    return np.array(change), np.array(deviations)
+
+
+def _fit(
+    problem: PoseProblem,
+    rig_from_world: RigidTransform,
+    inliers: NDArray[np.bool_],
+    given: Camera | None = None,
+) -> _Fit | None:
+    """The camera that fits the inliers best; None where nothing determines it.
+
+    Parameters
+    ----------
+    given : the camera as it is known before, with its deviation; None: nothing is known of the
+        focal length, and the rest is as it is.
+    """
+    (view,) = problem.views
+    rays = normalized_from_px(view.camera, problem.points_px[inliers])
+    start = view.cam_from_rig @ rig_from_world
+    points = start.apply(problem.points[inliers] + problem.offset)
+    rotation, translation = np.eye(3), np.zeros(3)
+    if given is None:
+        expected, prior_weight, min_inliers = np.zeros(1), np.zeros(1), _MIN_INLIERS
+    else:
+        expected, deviations = _prior_of(view.camera, given)
+        prior_weight, min_inliers = (_CORRELATED / deviations) ** 2, 4
+    change = np.zeros(len(expected))
+    own = np.arange(6, 6 + len(change))
+    for _ in range(_ROUNDS):
+        ahead = points[:, 2] > 0
+        if ahead.sum() < min_inliers:
+            return None
+        x, y, z = points[ahead].T
+        u, v = x / z, y / z
+        scale, shift, bend = math.exp(change[0]), change[1:3], change[3:].sum()
+        zero, one, radius2 = np.zeros_like(u), np.ones_like(u), u * u + v * v
+        slope = scale * (1 + bend * radius2)
+        at = np.stack([slope * u, slope * v], axis=1)
+        residuals = at - rays[ahead] + (shift if len(shift) else 0.0)
+        # columns: a left rotation, a translation in the camera (without the distortion's own slope,
+        # which changes nothing where the change is small), then those of ``change``
+        pose_columns = slope[:, None, None] * np.stack(
+            [
+                np.stack([-u * v, 1 + u * u, -v, 1 / z, zero, -u / z], axis=1),
+                np.stack([-1 - v * v, u * v, u, zero, 1 / z, -v / z], axis=1),
+            ],
+            axis=1,
+        )
+        columns = [
+            at,
+            np.stack([one, zero], axis=1),
+            np.stack([zero, one], axis=1),
+            (scale * radius2)[:, None] * np.stack([u, v], axis=1),
+        ]
+        camera_columns = np.stack(columns[: len(change)], axis=2)
+        jacobian = np.concatenate([pose_columns, camera_columns], axis=2)
+        squared = (residuals**2).sum(axis=1)
+        variance = max(float(np.median(squared)) / (2 * math.log(2)), 1e-14)
+        weights = 1 / (1 + squared / (5.7 * variance))
+        information = np.einsum("nik,n,nil->kl", jacobian, weights, jacobian)
+        gradient = np.einsum("nik,n,ni->k", jacobian, weights, residuals)
+        information[own, own] += variance * prior_weight
+        gradient[own] += variance * prior_weight * (change - expected)
+        size = np.sqrt(np.diagonal(information)) + 1e-300
+        values, vectors = np.linalg.eigh(information / np.outer(size, size))
+        if values[0] < 1e-10 * values[-1]:
+            return None
+        covariance = vectors @ np.diag(1 / values) @ vectors.T / np.outer(size, size)
+        step = -covariance @ gradient
+        if not np.isfinite(step).all() or abs(change[0] + step[6]) > 1.5:
+            return None
+        turn = Rotation.from_rotvec(step[:3]).as_matrix()
+        points = points @ turn.T + step[3:6]
+        rotation, translation = turn @ rotation, turn @ translation + step[3:6]
+        change = change + step[6:]
+        if abs(step[6]) < _SMALL_STEP:
+            break
+    moved = RigidTransform.from_matrix(rotation, translation) @ start
+    covariance = (1.0 if given is None else _CORRELATED**2) * variance * covariance
+    of_camera, between = covariance[6:, 6:], covariance[:6, 6:]
+    return _Fit(
+        change=change,
+        deviation=math.sqrt(of_camera[0, 0]),
+        rig_from_world=view.cam_from_rig.inverse() @ moved,
+        pose_covariance=between @ np.linalg.solve(of_camera, between.T),
+        depth=float(np.median(z)),
+    )
