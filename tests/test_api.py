@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import shutil
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image, ImageOps
 
 import megloc_kapture as megloc
 from megloc_kapture.cli.main import main
@@ -99,6 +101,82 @@ def test_the_command_writes_the_same_bytes(built: megloc.Map, scene: Path, tmp_p
         assert (tmp_path / "here" / name).read_bytes() == (tmp_path / "there" / name).read_bytes()
 
 
+@pytest.fixture
+def photos(scene: Path, tmp_path: Path) -> Path:
+    """The queries as photographs of a phone that was held upright: their pixels lie on the side."""
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    exif = Image.Exif()
+    exif[0x112] = 6  # to be turned clockwise
+    exif.get_ifd(0x8769)[0xA405] = 26  # 300 px
+    for path in (scene / "query").rglob("*.jpg"):
+        with Image.open(path) as image:
+            square = image.resize((400, 298))  # as the pixels of real cameras are
+        lying = square.transpose(Image.Transpose.ROTATE_90)
+        lying.save(folder / path.name, exif=exif, quality=95)
+    return folder
+
+
+def test_photographs_need_no_camera(built: megloc.Map, scene: Path, photos: Path) -> None:
+    paths = sorted(photos.iterdir())
+    one = built.localize(paths[0])
+    with Image.open(paths[0]) as image:
+        pillow = built.localize(image)
+        array = built.localize(np.asarray(ImageOps.exif_transpose(image)))
+    listed = built.localize(paths)
+    whole = built.localize(photos)
+    assert list(listed) == list(whole) == [path.name for path in paths]
+    found = [one, pillow, array, *whole.values()]
+    names = [paths[0].name] * 3 + list(whole)
+    for name, pose in zip(names, found, strict=True):
+        assert np.less(errors(scene, name, pose.cam_from_world), (0.05, 0.5)).all()
+        assert isinstance(pose, megloc.Pose) and pose.camera is not None
+        assert pose.camera.params[0] == pytest.approx(300, rel=0.015)
+        assert (pose.camera.width, pose.camera.height) == (400, 298)
+        assert any("focal length estimated" in remark for remark in pose.remarks)
+    first = listed[paths[0].name]
+    assert first and np.array_equal(first.matrix, one.matrix)
+    # a given camera is of the pixels as they are stored: the same place, another way up
+    lying = built.localize(paths[0], megloc.Camera.from_exif(paths[0]))
+    assert lying and lying.camera and (lying.camera.width, lying.camera.height) == (298, 400)
+    assert errors(scene, paths[0].name, lying.cam_from_world)[0] < 0.05
+
+
+def test_a_pose_says_what_it_rests_on(built: megloc.Map, scene: Path) -> None:
+    folder = KaptureFolder(scene / "query")
+    name = folder.read().image_names()[0]
+    camera = folder.read().camera_of(name)
+    found = built.localize(folder.image_path(name), camera)
+    assert found and found.camera is None and found.name == str(folder.image_path(name))
+    assert found.inlier_points_px is not None and found.inlier_points_world is not None
+    assert len(found.inlier_points_px) == len(found.inlier_points_world) == found.num_inliers
+    in_camera = found.inlier_points_world @ found.matrix[:3, :3].T + found.matrix[:3, 3]
+    projected = in_camera[:, :2] / in_camera[:, 2:] * camera.params[:2] + camera.params[2:]
+    assert np.linalg.norm(projected - found.inlier_points_px, axis=1).max() <= 12
+    assert {"extraction", "retrieval", "matching", "estimation"} <= found.seconds.keys()
+    # in pixels of the image as it was given, whatever was made of it
+    options = {**SMALL, "preprocessing.max_size_px": 320}
+    smaller = megloc.open_map(built.kapture_map.folder.root, set=options)
+    other = smaller.localize(folder.image_path(name), camera)
+    assert other and other.inlier_points_px is not None and other.inlier_points_world is not None
+    in_camera = other.inlier_points_world @ other.matrix[:3, :3].T + other.matrix[:3, 3]
+    projected = in_camera[:, :2] / in_camera[:, 2:] * camera.params[:2] + camera.params[2:]
+    assert np.linalg.norm(projected - other.inlier_points_px, axis=1).max() <= 15.1
+
+
+def test_results_travel(built: megloc.Map, scene: Path) -> None:
+    results = built.localize(scene / "query")
+    there = pickle.loads(pickle.dumps(results))
+    assert list(there) == list(results)
+    for name, pose in results.items():
+        assert pose and np.array_equal(there[name].matrix, pose.matrix)
+        assert there[name].name == name and there[name].evidence == pose.evidence
+    failure = megloc.Failure("dark", name="a.jpg")
+    assert pickle.loads(pickle.dumps(failure)) == failure
+    poses = built.kapture_map.poses
+    assert pickle.loads(pickle.dumps(poses)) == poses
+
+
 def test_a_run_and_the_map_it_made(scene: Path, tmp_path: Path) -> None:
     run = megloc.run("kapture", scene, set=SMALL, workspace=tmp_path / "run")
     assert run.recall.loc["all", "0.25 m, 2 deg"] == 1.0
@@ -151,8 +229,12 @@ def test_a_mask_that_changed_makes_the_map_anew(scene: Path, tmp_path: Path) -> 
 
 def test_refused(built: megloc.Map, scene: Path, tmp_path: Path) -> None:
     image = next((scene / "query").rglob("*.jpg"))
-    with pytest.raises(megloc.OptionError, match="an image needs its camera"):
-        built.localize(image)
+    with pytest.raises(megloc.OptionError, match="by one thread"):
+        built.localize(image, workers=2)
+    with pytest.raises(megloc.OptionError, match="prior is of one image"):
+        built.localize(scene / "query", prior=["0000.jpg"])
+    with pytest.raises(megloc.DataError, match="no such image"):
+        built.localize(tmp_path / "nowhere.jpg")
     with pytest.raises(megloc.OptionError, match="has cameras of its own"):
         camera: Any = megloc.Camera.pinhole(64, 48, 50)
         built.localize(KaptureFolder(scene / "query"), camera)

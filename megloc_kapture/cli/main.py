@@ -81,7 +81,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "refine_poses:RefinePoses",
         "Refine the poses of localized queries; a pose that gets no better stays, and says why.",
     ),
-    "localize": ("localize:Localize", "Localize the images of a kapture folder in a kapture map."),
+    "localize": (
+        "localize:Localize",
+        "Localize photographs, or the images of a kapture folder, in a kapture map.",
+    ),
     "submit": (
         "submit:Submit",
         "Write the pose file of a localized kapture folder, and its provenance beside it.",

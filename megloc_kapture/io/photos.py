@@ -11,6 +11,8 @@ rounded millimetres are in it, so a camera that comes from here is not certain o
 
 from __future__ import annotations
 
+import io
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -90,9 +92,11 @@ def photo_of(image: Image.Image) -> Photo:
     """The header of an image that pillow has opened."""
     width, height = image.size
     try:
-        exif = image.getexif()
-        orientation, make, model = (exif.get(tag) for tag in (_ORIENTATION, _MAKE, _MODEL))
-        focal = focal_from_exif(_blank_with_exif(exif, width, height)) if exif else None
+        with warnings.catch_warnings():  # pillow warns of what is broken in EXIF
+            warnings.simplefilter("ignore")
+            exif = image.getexif()
+            orientation, make, model = (exif.get(tag) for tag in (_ORIENTATION, _MAKE, _MODEL))
+            focal = focal_from_exif(_blank_with_exif(exif, width, height)) if exif else None
     except Exception:  # broken EXIF is as none: pillow raises many kinds on it
         orientation = make = model = focal = None
     # pillow and OpenCV have turned TIFF files already
@@ -127,8 +131,6 @@ def _blank_with_exif(exif: Image.Exif, width: int, height: int) -> bytes:
     COLMAP reads EXIF from files only, and decodes them; a blank one takes a tenth of the time, and
     may come from formats that COLMAP does not read.
     """
-    import io
-
     from PIL import Image
 
     kept = Image.Exif()

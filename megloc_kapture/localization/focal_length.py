@@ -45,7 +45,7 @@ from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
 # errors of a map are alike in neighbouring points, and lenses are no pinholes: deviations that
 # take every match for independent are too small by a factor (measured: docs/photos.md)
-_CORRELATED = 5.0
+_CORRELATED, _MIN_ERROR_PX = 5.0, 0.5
 _MIN_CHANGE, _MIN_SIGMAS = 0.025, 5.0
 _MIN_INLIERS = 30
 _ROUNDS = 12
@@ -278,8 +278,10 @@ def _fit(
         weights = 1 / (1 + squared / (5.7 * variance))
         information = np.einsum("nik,n,nil->kl", jacobian, weights, jacobian)
         gradient = np.einsum("nik,n,ni->k", jacobian, weights, residuals)
-        information[own, own] += variance * prior_weight
-        gradient[own] += variance * prior_weight * (change - expected)
+        # what lenses do is not noise: more matches do not average it out
+        trusted = max(variance, (_MIN_ERROR_PX / focal_px(view.camera)) ** 2)
+        information[own, own] += trusted * prior_weight
+        gradient[own] += trusted * prior_weight * (change - expected)
         size = np.sqrt(np.diagonal(information)) + 1e-300
         values, vectors = np.linalg.eigh(information / np.outer(size, size))
         if values[0] < 1e-10 * values[-1]:
@@ -295,7 +297,7 @@ def _fit(
         if abs(step[6]) < _SMALL_STEP:
             break
     moved = RigidTransform.from_matrix(rotation, translation) @ start
-    covariance = (1.0 if given is None else _CORRELATED**2) * variance * covariance
+    covariance = covariance * (variance if given is None else _CORRELATED**2 * trusted)
     of_camera, between = covariance[6:, 6:], covariance[:6, 6:]
     return _Fit(
         change=change,

@@ -1,4 +1,4 @@
-"""A focal length that does not fit is noticed; one that does is not."""
+"""A focal length that does not fit is noticed; one that is not known is estimated."""
 
 from __future__ import annotations
 
@@ -6,12 +6,24 @@ import re
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from megloc_kapture.geometry.cameras import project
-from megloc_kapture.localization.absolute_pose import rig_pose
-from megloc_kapture.localization.estimation import PoseProblem, View
-from megloc_kapture.localization.focal_length import focal_remark
-from megloc_kapture.values import Camera, Pose, RigidTransform
+from megloc_kapture.io.photos import guessed_camera
+from megloc_kapture.localization.absolute_pose import center_deviation, rig_pose
+from megloc_kapture.localization.estimation import (
+    AbsolutePoseOptions,
+    PoseEstimate,
+    PoseProblem,
+    View,
+    reprojection_errors_px,
+)
+from megloc_kapture.localization.focal_length import (
+    estimate_with_intrinsics,
+    focal_remark,
+    refine_with_intrinsics,
+)
+from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
 ALONE = RigidTransform.identity()
 
@@ -74,3 +86,91 @@ def test_few_inliers_and_rigs_say_nothing() -> None:
     pose = Pose(ALONE, 5, 5, np.ones(5, bool))
     assert focal_remark(PoseProblem.of([view]), pose) is None
     assert focal_remark(PoseProblem.of([view, view]), pose) is None
+
+
+def uncertain(
+    given_px: float, deviation: float, *, seed: int = 0, count: int = 400
+) -> tuple[Camera, Pose | Failure, RigidTransform]:
+    """Localize by a camera of 1400 px, off its middle and a little bent, that is said to be other.
+
+    Returns the true camera, the result and the true pose.
+    """
+    rng = np.random.default_rng(seed)
+    true = Camera("SIMPLE_RADIAL", 1600, 1200, (1400.0, 806.0, 595.0, -0.03))
+    rotation = Rotation.from_euler("xyz", [5, 20, 2], degrees=True).as_matrix()
+    pose = RigidTransform.from_matrix(rotation, np.array([0.3, -0.2, 0.5]))
+    points = rng.uniform((-5, -4, 8.0), (5, 4, 12.0), (count, 3))
+    pixels = project(true, pose, points) + rng.normal(0, 1, (count, 2))
+    pixels[: count // 4] = rng.uniform((0, 0), (1600, 1200), (count // 4, 2))
+    camera = Camera("SIMPLE_RADIAL", 1600, 1200, (given_px, 800.0, 600.0, 0.0), deviation)
+    problem = PoseProblem.of([View(camera, ALONE, pixels, points)])
+    options = AbsolutePoseOptions()
+    problem, estimate = estimate_with_intrinsics(problem, options)
+    assert isinstance(estimate, PoseEstimate)
+    problem, found = refine_with_intrinsics(problem, estimate, options, camera)
+    if isinstance(found, Pose) and found.camera:
+        # what is looked at afterwards is of the camera that the pose was found with
+        assert problem.views[0].camera.params == found.camera.params
+        assert found.inliers is not None
+        errors = reprojection_errors_px(problem, found.cam_from_world)
+        assert ((errors <= options.max_error_px) == found.inliers).all()
+    return true, found, pose
+
+
+@pytest.mark.parametrize(
+    ("given_px", "deviation"), [(1400 * k, 0.1) for k in (0.7, 0.97, 1, 1.2)] + [(1920, 0.7)]
+)
+@pytest.mark.parametrize("seed", range(3))
+def test_an_uncertain_camera_is_estimated(given_px: float, deviation: float, seed: int) -> None:
+    true, found, pose = uncertain(given_px, deviation, seed=seed)
+    assert isinstance(found, Pose) and found.camera is not None
+    off = found.camera.params[0] / 1400 - 1
+    assert abs(off) < min(0.01, 3 * found.camera.focal_deviation)
+    assert abs(found.camera.params[3] + 0.03) < 0.01
+    assert np.linalg.norm(found.cam_from_world.center() - pose.center()) < 0.06
+
+
+@pytest.mark.parametrize("focal_px", [500.0, 5000.0])
+def test_very_short_and_very_long_lenses(focal_px: float) -> None:
+    """COLMAP's guess is 1920 px."""
+    rng = np.random.default_rng(1)
+    true = Camera.pinhole(1600, 1200, focal_px)
+    half = 600 / focal_px
+    points = rng.uniform((-half, -half, 1), (half, half, 1), (300, 3)) * rng.uniform(
+        6, 14, (300, 1)
+    )
+    pixels = project(true, ALONE, points) + rng.normal(0, 0.5, (300, 2))
+    camera = guessed_camera(1600, 1200)
+    options = AbsolutePoseOptions()
+    problem, estimate = estimate_with_intrinsics(
+        PoseProblem.of([View(camera, ALONE, pixels, points)]), options
+    )
+    assert isinstance(estimate, PoseEstimate)
+    _, found = refine_with_intrinsics(problem, estimate, options, camera)
+    assert isinstance(found, Pose) and found.camera is not None
+    assert found.camera.params[0] == pytest.approx(focal_px, rel=0.02)
+
+
+def test_of_a_wall_seen_straight_on_what_was_known_stays() -> None:
+    rng = np.random.default_rng(0)
+    points = np.c_[rng.uniform(-4, 4, (200, 2)), np.full(200, 10.0)]
+    pixels = project(Camera.pinhole(1600, 1200, 1400.0), ALONE, points)
+    pixels = pixels + rng.normal(0, 1, (200, 2))
+    for deviation in (0.1, 0.7):
+        camera = Camera("SIMPLE_RADIAL", 1600, 1200, (1500.0, 800.0, 600.0, 0.0), deviation)
+        options = AbsolutePoseOptions()
+        problem, estimate = estimate_with_intrinsics(
+            PoseProblem.of([View(camera, ALONE, pixels, points)]), options
+        )
+        assert isinstance(estimate, PoseEstimate)
+        _, found = refine_with_intrinsics(problem, estimate, options, camera)
+        if deviation == 0.1:
+            assert isinstance(found, Pose) and found.camera is not None
+            assert 0.05 < found.camera.focal_deviation <= 0.1
+            assert found.covariance is not None
+            # the focal length's uncertainty is the distance's
+            assert center_deviation(found.covariance) == pytest.approx(
+                10.0 * found.camera.focal_deviation, rel=0.3
+            )
+        else:
+            assert isinstance(found, Failure) and "unstable" in found.reason

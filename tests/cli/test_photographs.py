@@ -1,0 +1,187 @@
+"""``megloc localize --images``: photographs without cameras, and what becomes of broken ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from kapture.io.csv import kapture_from_dir
+from PIL import Image
+
+from megloc_kapture.evaluation.evaluate import evaluate
+from megloc_kapture.io.images import image_size, write_image
+from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.tables import read_status
+
+INVERSE = {
+    1: None,
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_90,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_270,
+}
+
+
+def photograph(source: Path, path: Path, *, orientation: int = 1, focal_35mm: int = 0) -> None:
+    """The image as a camera with square pixels stores it that is held in this way."""
+    exif = Image.Exif()
+    exif[0x112] = orientation
+    if focal_35mm:
+        exif.get_ifd(0x8769)[0xA405] = focal_35mm
+    turned = INVERSE[orientation]
+    with Image.open(source) as image:
+        if image.size == (400, 300):  # the rendered room's, 300 px wide and 302 px high
+            image = image.resize((400, 298))
+        stored = image if turned is None else image.transpose(turned)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        stored.save(path, exif=exif, quality=95)
+
+
+def test_photographs(megloc: Any, finished: Path, scene: Path, tmp_path: Path) -> None:
+    query = KaptureFolder(scene / "query")
+    first = query.image_path("0004.jpg")
+    truth = KaptureFolder(scene / "query_gt").read().poses()["0004.jpg"]
+    place = tmp_path / "photos"
+    for orientation in range(1, 9):
+        name = f"my dir/{orientation}.jpg"
+        focal = 0 if orientation == 1 else 26
+        photograph(first, place / name, orientation=orientation, focal_35mm=focal)
+    content = (place / "my dir" / "1.jpg").read_bytes()
+    (place / "cut.jpg").write_bytes(content[: len(content) // 2])
+    (place / "empty.jpg").touch()
+    (place / "phone.HEIC").write_bytes(b"x")
+    write_image(place / "grey.png", np.full((300, 400), 128, np.uint8))
+    writer = cv2.VideoWriter(
+        str(place / "walk.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, (400, 298)
+    )
+    for name in query.read().image_names():
+        for _ in range(4):
+            writer.write(cv2.resize(cv2.imread(str(query.image_path(name))), (400, 298)))
+    writer.release()
+
+    out = tmp_path / "out"
+    done = megloc("localize", "-i", finished / "map", "--images", place, "--every", "4", "-o", out)
+    assert done.status == 0
+    assert done.out.startswith("12 of 16 queries localized in "), done
+    statuses = read_status(out / "status.csv")
+    reasons = {name: row.reason for name, row in statuses.items() if row.status == "failed"}
+    assert set(reasons) == {"cut.jpg", "empty.jpg", "phone.HEIC", "grey.png"}
+    assert "broken" in reasons["cut.jpg"] and ".HEIC cannot be read" in reasons["phone.HEIC"]
+    assert all(
+        "focal length estimated" in row.remarks for row in statuses.values() if row.num_inliers
+    )
+
+    # what is written is kapture with upright images, and the cameras that the poses go with
+    theirs = kapture_from_dir(str(out))
+    ours = KaptureFolder(out).read()
+    assert len(theirs.records_camera.data_list()) == 14 == len(ours.image_names())
+    poses = ours.poses()
+    for orientation in range(1, 9):
+        name = f"my dir/{orientation}.jpg"
+        assert np.linalg.norm(poses[name].center() - truth.center()) < 0.05
+        camera = ours.camera_of(name)
+        assert camera.params[0] == pytest.approx(300, rel=0.015)
+        assert image_size(KaptureFolder(out).image_path(name)) == (camera.width, camera.height)
+        link = KaptureFolder(out).image_path(name)
+        assert link.is_symlink() == (orientation == 1)
+    # so that it can be localized again, by its own cameras
+    names = [name for name in ours.image_names() if name in poses]
+    again = tmp_path / "again"
+    (place / "cut.jpg").write_bytes(content)
+    assert megloc("localize", "-i", finished / "map", "--query", out, "-o", again).status == 0
+    for name in names:
+        moved = KaptureFolder(again).read().poses()[name].center() - poses[name].center()
+        assert np.linalg.norm(moved) < 0.03
+
+
+def test_a_given_camera(megloc: Any, finished: Path, scene: Path, tmp_path: Path) -> None:
+    place = KaptureFolder(scene / "query").image_path("0004.jpg").parent
+    out = tmp_path / "out"
+    text = "PINHOLE,400,300,300,302,200,150"
+    command = ("localize", "-i", finished / "map", "--images", place, "-o", out)
+    assert megloc(*command, "--camera", text).status == 0
+    assert len(KaptureFolder(out).read().sensors) == 1
+    known = tmp_path / "known"
+    megloc("localize", "-i", finished / "map", "--query", scene / "query", "-o", known)
+    for name in ("status.csv", "clusters.csv"):
+        assert (out / name).read_bytes() == (known / name).read_bytes()
+    assert KaptureFolder(out).read().poses() == KaptureFolder(known).read().poses()
+
+
+def test_refused(megloc: Any, finished: Path, scene: Path, tmp_path: Path) -> None:
+    command = ("localize", "-i", finished / "map", "-o", tmp_path / "out")
+    image = KaptureFolder(scene / "query").image_path("0004.jpg")
+    megloc(*command).refused("either --query, .*, or --images")
+    megloc(*command, "--query", scene / "query", "--images", image).refused("either --query")
+    megloc(*command, "--query", scene / "query", "--every", "2").refused("--every changes nothing")
+    megloc(*command, "--query", scene / "query", "--camera", "x").refused(
+        "--camera changes nothing"
+    )
+    megloc(*command, "--images", image, "--every", "2").refused("there is no video")
+    megloc(*command, "--images", tmp_path / "nowhere").refused("nowhere: no such file or folder")
+    for text in ("PINHOLE,400,300", "PINHOLE", "X,1,2,3", "PINHOLE,4,3,a,b,c,d"):
+        megloc(*command, "--images", image, "--camera", text).refused("give MODEL,WIDTH,HEIGHT")
+    assert not (tmp_path / "out").exists()
+
+
+# ------------------------------------------------------------------ real photographs
+
+
+@pytest.fixture(scope="module", params=["fountain_p11", "herzjesu_p25"])
+def facade(
+    request: pytest.FixtureRequest, shared_data: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, Path]:
+    """A scene with surveyed poses, and a map of it."""
+    from megloc_kapture.cli.main import main
+
+    scene = shared_data / "scenes" / request.param
+    workspace = tmp_path_factory.mktemp("facade") / "workspace"
+    command = ["eval", "kapture", "--root", str(scene), "--workspace", str(workspace)]
+    with pytest.raises(SystemExit):
+        main([*command, "--until", "map_refinement", "--executor", "inline", "-q"])
+    return scene, workspace / "map"
+
+
+# The focal length is 1381 px, 32.4 mm of 35 mm film; the images are without distortion, but their
+# principal point is 11 px off the middle, which nobody tells.
+@pytest.mark.slow
+@pytest.mark.parametrize("focal_35mm", [0, 32, 31, 34, 26, 39, 42, 23])
+def test_real_photographs(
+    megloc: Any, facade: tuple[Path, Path], focal_35mm: int, tmp_path: Path
+) -> None:
+    """EXIF says nothing, the truth, or is wrong by 5, 20 and 30 %."""
+    scene, kapture_map = facade
+    for path in (scene / "query").rglob("*.jpg"):
+        photograph(path, tmp_path / "photos" / path.name, focal_35mm=focal_35mm)
+    out = tmp_path / "out"
+    done = megloc("localize", "-i", kapture_map, "--images", tmp_path / "photos", "-o", out)
+    assert done.status == 0
+    data = KaptureFolder(out).read()
+    assert data.poses().keys() == set(data.image_names())
+    for name in data.image_names():
+        assert data.camera_of(name).params[0] == pytest.approx(1381, rel=0.015)
+    row = evaluate(out, scene / "query_gt").row()
+    assert row.median_position_m is not None and row.median_angle_deg is not None
+    assert row.median_position_m < 0.07 and row.median_angle_deg < 0.15
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("share", [-0.3, -0.2, -0.05, -0.03, 0.03, 0.05, 0.2, 0.3])
+def test_a_wrong_camera_that_is_given_is_said_not_to_fit(
+    megloc: Any, facade: tuple[Path, Path], share: float, tmp_path: Path
+) -> None:
+    scene, kapture_map = facade
+    camera = next(iter(KaptureFolder(scene / "query").read().sensors.values())).camera()
+    wrong = [value * (1 + share) for value in camera.params[:2]] + list(camera.params[2:])
+    text = ",".join(map(str, (camera.model, camera.width, camera.height, *wrong)))
+    place = scene / "query" / "sensors" / "records_data"
+    out = tmp_path / "out"
+    megloc("localize", "-i", kapture_map, "--images", place, "--camera", text, "-o", out)
+    for row in read_status(out / "status.csv").values():
+        assert row.status == "failed" or "does not fit" in row.remarks

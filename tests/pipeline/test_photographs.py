@@ -1,0 +1,108 @@
+"""Plain photographs and videos as queries: names, cameras, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.io.images import image_size, read_image_rgb
+from megloc_kapture.pipeline.photographs import Photographs
+from megloc_kapture.values import Camera
+
+
+def write(path: Path, *, width: int = 64, height: int = 48, focal_35mm: int = 0) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    exif = Image.Exif()
+    if focal_35mm:
+        exif.get_ifd(0x8769)[0xA405] = focal_35mm
+    Image.new("RGB", (width, height), (90, 40, 200)).save(path, exif=exif)
+    return path
+
+
+def write_video(path: Path, frames: int) -> Path:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
+    for number in range(frames):
+        writer.write(np.full((48, 64, 3), 5 * number, np.uint8))
+    writer.release()
+    return path
+
+
+def test_names_are_paths_below_what_was_given(tmp_path: Path) -> None:
+    for name in ("b.jpg", "a dir/c.PNG", ".hidden/d.jpg", "._b.jpg", "raw.NEF"):
+        write(tmp_path / "in" / name) if name != "raw.NEF" else (tmp_path / "in" / name).touch()
+    (tmp_path / "in" / "notes.txt").write_text("no image")
+    other = write(tmp_path / "e.jpg")
+    photos = Photographs([tmp_path / "in", other])
+    assert photos.names == ["a dir/c.PNG", "b.jpg", "e.jpg"]
+    assert list(photos.unreadable) == ["raw.NEF"]
+    assert ".nef cannot be read" in photos.unreadable["raw.NEF"].lower()
+
+
+def test_images_of_one_size_and_focal_length_share_a_camera(tmp_path: Path) -> None:
+    write(tmp_path / "1.jpg", focal_35mm=28)
+    write(tmp_path / "2.jpg", focal_35mm=28)
+    write(tmp_path / "3.jpg", focal_35mm=50)
+    write(tmp_path / "4.jpg", width=48, height=64, focal_35mm=28)
+    data = Photographs([tmp_path]).data()
+    sensors = [data.record_of(f"{n}.jpg")[1] for n in (1, 2, 3, 4)]
+    assert sensors[0] == sensors[1] and len(set(sensors)) == 3
+
+
+def test_a_given_camera_is_of_the_stored_pixels(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x112] = 6
+    Image.new("RGB", (64, 48)).save(tmp_path / "1.jpg", exif=exif)
+    write(tmp_path / "2.jpg", width=32)
+    camera = Camera.pinhole(64, 48, 50)
+    photos = Photographs([tmp_path], camera)
+    assert photos.names == ["1.jpg"]
+    assert photos.query("1.jpg").read_image().shape == (48, 64, 3)
+    assert photos.unreadable == {"2.jpg": "the image is 32x48, its camera says 64x48"}
+    # without one it is turned, and what is written is
+    photos = Photographs([tmp_path])
+    assert photos.query("1.jpg").read_image().shape == (64, 48, 3)
+    photos.write_images(tmp_path / "out")
+    place = tmp_path / "out" / "sensors" / "records_data"
+    assert image_size(place / "1.jpg") == (48, 64) and not (place / "1.jpg").is_symlink()
+    assert (place / "2.jpg").readlink() == tmp_path / "2.jpg"
+
+
+def test_frames_of_a_video(tmp_path: Path) -> None:
+    write_video(tmp_path / "walk.avi", 25)
+    (tmp_path / "broken.mp4").write_bytes(b"no video")
+    photos = Photographs([tmp_path], every=10)
+    assert photos.names == [f"walk.avi/{n:06}.jpg" for n in (0, 10, 20)]
+    assert list(photos.unreadable) == ["broken.mp4"]
+    photos.write_images(tmp_path / "out")
+    for number in (0, 10, 20):
+        name = f"walk.avi/{number:06}.jpg"
+        stored = read_image_rgb(tmp_path / "out" / "sensors" / "records_data" / name)
+        assert (stored == photos.query(name).read_image()).all()
+        assert abs(int(stored.mean()) - 5 * number) <= 2
+
+
+def test_refused(tmp_path: Path) -> None:
+    one, two = write(tmp_path / "a" / "x.jpg"), write(tmp_path / "b" / "x.jpg")
+    with pytest.raises(DataError, match="same name"):
+        Photographs([one, two])
+    with pytest.raises(DataError, match="no such file"):
+        Photographs([tmp_path / "nowhere"])
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(DataError, match="no image or video"):
+        Photographs([tmp_path / "empty"])
+    with pytest.raises(OptionError, match="no video"):
+        Photographs([one], every=3)
+    with pytest.raises(OptionError, match="give 1 or more"):
+        Photographs([one], every=0)
+    for name in ("Paris, Texas.jpg", " x.jpg", "#1.jpg", "a\tb.jpg", "a\\b.jpg"):
+        with pytest.raises(DataError, match="rename the file"):
+            Photographs([write(tmp_path / "c" / name)])
+    (tmp_path / "k" / "sensors").mkdir(parents=True)
+    (tmp_path / "k" / "sensors" / "sensors.txt").touch()
+    with pytest.raises(DataError, match="--query"):
+        Photographs([tmp_path / "k"])
