@@ -40,6 +40,7 @@ from megloc_kapture.stages.pose_refinement import MapRefiners
 from megloc_kapture.stages.query_poses import localize_unit, localize_views
 from megloc_kapture.stages.ranking_scene import KaptureScene
 from megloc_kapture.stages.reranking import counted, rerank
+from megloc_kapture.stages.unreadable import unreadable_image
 from megloc_kapture.stages.work import ordered_map
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
@@ -231,7 +232,7 @@ class Localizer:
         except DataError as error:
             if error.path is None or error.path not in [query.image for query, _ in unit]:
                 raise
-            return [Failure(error.message, name=query.name) for query, _ in unit]
+            return [unreadable_image(query.name, error.message) for query, _ in unit]
 
     def _localize_unit(self, unit: Unit) -> list[Pose | Failure]:
         with single_threaded():

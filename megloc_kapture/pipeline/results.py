@@ -17,6 +17,7 @@ from megloc_kapture.pipeline.photographs import Photographs
 from megloc_kapture.pipeline.queries import KaptureQueries
 from megloc_kapture.stages.layout import LOCALIZED
 from megloc_kapture.stages.localized_folder import query_status, write_localized
+from megloc_kapture.stages.unreadable import unreadable_image
 from megloc_kapture.stages.work import Track, untracked
 from megloc_kapture.values import Failure, Pose, RigidTransform
 
@@ -75,7 +76,7 @@ class Results(Mapping[str, Pose | Failure]):
             name: None for unit in self._units for name in unit
         }
         if broken := self.queries.unreadable:
-            self._found |= {name: Failure(reason) for name, reason in broken.items()}
+            self._found |= {name: unreadable_image(name, reason) for name, reason in broken.items()}
             self._found = dict(sorted(self._found.items()))
         self._stream = self._localized(workers, track)
 

@@ -50,7 +50,12 @@ def set_aside_unreadable(query: Path, tables: Path, work: Work) -> Mapping[str, 
 def unreadable_queries(tables: Path) -> Iterator[tuple[str, Failure]]:
     """The queries that were set aside, as results."""
     for name, reason in read_unreadable(tables).items():
-        yield name, Failure(f"the image cannot be used: {reason}")
+        yield name, unreadable_image(name, reason)
+
+
+def unreadable_image(name: str, reason: str) -> Failure:
+    """The result of a query whose image cannot be used."""
+    return Failure(f"the image cannot be used: {reason}", name=name)
 
 
 def _fault(job: tuple[FolderSpec, str]) -> str:
