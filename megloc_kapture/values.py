@@ -388,7 +388,7 @@ class Failure:
     remarks: tuple[str, ...] = ()
     confidence: float | None = None
     seconds: Mapping[str, float] = field(default_factory=dict, compare=False)
-    name: str = ""
+    name: str = field(default="", compare=False)
 
     def __bool__(self) -> Literal[False]:
         return False
