@@ -19,8 +19,8 @@ BAD_ARGUMENTS = {
     "no command": ([], r"Missing subcommand: Expected one of \{eval, import"),
     "unknown command": (["evil"], r"Unrecognized options: evil; Available subcommands: eval, "),
     "missing flags": (
-        ["localize", "-i", "map"],
-        r"Missing from megloc localize: --query PATH; see megloc localize",
+        ["refine-poses", "-i", "map", "--poses", "p", "-o", "out"],
+        r"Missing from megloc refine-poses: --query PATH; see megloc refine-poses",
     ),
     "unknown flag": (["eval", "kapture", "--roots", "x"], r"Unrecognized options: --roots, x; see"),
     "unknown long flag": (["eval", "--" + 100 * "x"], r"Unrecognized options: --x{100}; see"),
