@@ -84,6 +84,18 @@ class Map:
             self._localizers[refiners] = Localizer(self.kapture_map, options=options)
         return self._localizers[refiners]
 
+    def view(
+        self,
+        path: Path | str,
+        result: Path | str | Results | None = None,
+        truth: Path | str | None = None,
+    ) -> None:
+        """Write a page that shows the map in 3D, and the queries of a result in it; see
+        :func:`megloc_kapture.evaluation.view.write_view`."""
+        from megloc_kapture.evaluation.view import write_view
+
+        write_view(path, self.kapture_map.folder, result, truth)
+
     @overload
     def localize(
         self,

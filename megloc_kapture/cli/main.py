@@ -102,6 +102,11 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "export:Export",
         "Write a map, localized queries or both for COLMAP, nerfstudio, evo and viewers.",
     ),
+    "view": (
+        "view:View",
+        "Write a page that shows a map in 3D, and the queries of a result in it; it needs no "
+        "network.",
+    ),
     "weights": (
         "weights:WeightsCommand",
         "List, fetch, add, convert and check the weights of networks.",

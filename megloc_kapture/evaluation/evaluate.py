@@ -109,10 +109,7 @@ def evaluate_results(
     """
     true_poses = truth if isinstance(truth, Mapping) else KaptureFolder(Path(truth)).read().poses()
     nowhere = () if isinstance(truth, Mapping) else read_nowhere(truth)
-    contexts = [
-        ResultContext() if isinstance(source, Mapping) else context_of(source, mapping=mapping)
-        for source in results
-    ]
+    contexts = [_context(source, mapping) for source in results]
     relative = benchmark.protocol.pose_file == "mlad" and bool(benchmark.pairs)
     references = _references(contexts, benchmark, mapping) if relative else {}
     limits = thresholds or benchmark.thresholds()
@@ -142,7 +139,7 @@ def evaluate_results(
 
 
 def results_without_truth(
-    results: Sequence[Path | str],
+    results: Sequence[Localized],
     benchmark: Benchmark,
     *,
     thresholds: Sequence[Threshold] | None = None,
@@ -156,7 +153,7 @@ def results_without_truth(
 
     Parameters
     ----------
-    results : kapture folders or pose files, one or several.
+    results : kapture folders, pose files or image -> pose, one or several.
     mapping, labels : as in :func:`evaluate_results`.
     map_poses : ``cam_from_world`` of the map's images; by default those of the first result that
         has a map.
@@ -165,13 +162,15 @@ def results_without_truth(
     ------
     DataError : something is missing or broken, or there is no query.
     """
-    contexts = [context_of(source, mapping=mapping) for source in results]
+    contexts = [_context(source, mapping) for source in results]
     if map_poses is None:
         map_poses = next((poses for context in contexts if (poses := context.map_poses())), {})
     known = {image for context in contexts for image in context.query_images()}
     found = [
         replace(
-            read_result(source, benchmark, images=known, references=map_poses, label=label),
+            result_in_memory(source, label=label)
+            if isinstance(source, Mapping)
+            else read_result(source, benchmark, images=known, references=map_poses, label=label),
             context=context,
         )
         for source, label, context in zip(
@@ -191,6 +190,16 @@ def results_without_truth(
         pools=benchmark.protocol.pools,
         map_poses=map_poses,
         statement=benchmark.protocol.truth,
+    )
+
+
+def _context(source: Localized, mapping: Path | str | None) -> ResultContext:
+    if not isinstance(source, Mapping):
+        return context_of(source, mapping=mapping)
+    folder = getattr(source, "folder", None)  # of results that are localized when asked for
+    return ResultContext(
+        queries=folder if isinstance(folder, KaptureFolder) else None,
+        mapping=None if mapping is None else KaptureFolder(mapping),
     )
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from pydantic import BaseModel, Field
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.pose_files import (
@@ -25,6 +28,7 @@ from megloc_kapture.io.dataset_tables import (
     read_groups,
     read_world,
 )
+from megloc_kapture.io.files import read_json_model
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.tables import (
     CLUSTERS_FILE,
@@ -45,6 +49,7 @@ from megloc_kapture.values import Failure, Pose, RefinementRow, RigidTransform
 # parts of a workspace; datasets and the pipeline write them
 # the map's own keypoints are what queries were matched with; before there is one, its images do
 _MAPS = ("map", "preprocessed/mapping", "mapping")
+_MANIFESTS = "stages"
 _QUERY, _QUERY_MATCHES = "query", "matches/query"
 _QUERY_PYRAMID, _MAPPING_PYRAMID = "pyramid/query", "pyramid/mapping"
 _SENSORS = "sensors/sensors.txt"
@@ -65,6 +70,7 @@ class ResultContext:
     refinements : query -> what each step of refining its pose came to.
     consistency : what the map's own images said of it, before poses were refined.
     masked : folders whose images have masks, with the keypoints that were found in them.
+    seconds : stage of the run -> seconds that it took, in their order.
     """
 
     queries: KaptureFolder | None = None
@@ -74,6 +80,7 @@ class ResultContext:
     refinements: Mapping[str, Sequence[RefinementRow]] = field(default_factory=dict)
     consistency: Sequence[ConsistencyRow] = ()
     masked: Sequence[KaptureFolder] = ()
+    seconds: Mapping[str, float] = field(default_factory=dict)
 
     def map_poses(self) -> dict[str, RigidTransform]:
         """``cam_from_world`` of the map's images; empty without a map.
@@ -148,7 +155,37 @@ def context_of(result: Path | str, *, mapping: Path | str | None = None) -> Resu
         refinements=_by_image(read_refinement(refinement)) if refinement.is_file() else {},
         consistency=read_consistency(consistency) if consistency.is_file() else (),
         masked=[] if workspace is None else _masked(workspace),
+        seconds={} if workspace is None else _seconds(workspace / _MANIFESTS),
     )
+
+
+class _Manifest(BaseModel):
+    """What a report shows of a stage's manifest, which holds more."""
+
+    stage: str
+    seconds: float = Field(ge=0, allow_inf_nan=False)
+    started: str
+
+
+def _seconds(folder: Path) -> dict[str, float]:
+    found = []
+    for path in sorted(folder.glob("*.json")):
+        with contextlib.suppress(
+            DataError
+        ):  # a stage without a manifest that can be read runs anew
+            found.append(read_json_model(path, _Manifest))
+    return {one.stage: one.seconds for one in sorted(found, key=lambda one: one.started)}
+
+
+def are_ranked(candidates: Iterable[Sequence[str]]) -> bool:
+    """Whether lists of candidates are rankings: not where all of them stand in the order of names,
+    and there would be a chance of less than 1 % to find them so."""
+    chance = 1.0
+    for images in candidates:
+        if list(images) != sorted(images):
+            return True
+        chance /= math.factorial(min(len(images), 20))
+    return chance > 0.01
 
 
 def _by_image(rows: Iterable[RefinementRow]) -> dict[str, list[RefinementRow]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
@@ -20,7 +21,7 @@ from megloc_kapture.evaluation.metrics import (
     recall_row,
     row_members,
 )
-from megloc_kapture.evaluation.results import Poses, Result, ResultContext
+from megloc_kapture.evaluation.results import Poses, Result, ResultContext, are_ranked
 from megloc_kapture.evaluation.scoring import Outcome, Reported
 from megloc_kapture.geometry.poses import camera_centers, invert_quats, rotate, stack_poses
 from megloc_kapture.io.tables import QueryStatus
@@ -37,7 +38,7 @@ class NearCandidates:
     Parameters
     ----------
     first_m, first_deg : distance to the first candidate's camera centre, and the angle between
-        the two viewing directions.
+        the two viewing directions; NaN where nobody ranked the candidates.
     nearest : the candidate whose centre is nearest.
     nearest_m, nearest_deg : the same for it.
     """
@@ -82,13 +83,14 @@ def near_candidates(
     cosine = np.einsum("ij,ij->i", directions[owner], map_directions[candidates])
     angle_deg = np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0)))
     names = list(map_poses)
+    ranked = are_ranked(status.candidates for status in statuses.values())
     found = {}
     firsts = np.concatenate([[0], np.cumsum(counts)[:-1]]).tolist()
     for image, first, count in zip(known, firsts, counts.tolist(), strict=True):
         nearest = first + int(np.argmin(distance_m[first : first + count]))
         found[image] = NearCandidates(
-            first_m=float(distance_m[first]),
-            first_deg=float(angle_deg[first]),
+            first_m=float(distance_m[first]) if ranked else math.nan,
+            first_deg=float(angle_deg[first]) if ranked else math.nan,
             nearest=names[int(candidates[nearest])],
             nearest_m=float(distance_m[nearest]),
             nearest_deg=float(angle_deg[nearest]),
@@ -131,6 +133,7 @@ class QueryWithoutTruth:
     image, condition, outcome, reason, num_matches, num_inliers, candidates : as in
         :class:`megloc_kapture.evaluation.scoring.QueryResult`.
     near : None without an estimated pose, candidates, or their poses in the map.
+    confidence : probability that the pose is right, as the result says; None where it does not.
     """
 
     image: str
@@ -141,6 +144,7 @@ class QueryWithoutTruth:
     num_inliers: int | None = None
     candidates: tuple[str, ...] = ()
     near: NearCandidates | None = None
+    confidence: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,7 +182,8 @@ class RowWithoutTruth:
     Parameters
     ----------
     inliers_quartiles : 25, 50, 75 % over the localized queries; None where nothing says them.
-    first_candidate, nearest_candidate : agreement with them; None: no map, or no candidates.
+    first_candidate, nearest_candidate : agreement with them; None: no map, or no candidates, or
+        nobody ranked them.
     """
 
     name: str
@@ -342,6 +347,7 @@ def _result(
             has_pose=image in result.poses,
             status=statuses.get(image),
             near=near.get(image),
+            confidence=result.confidences.get(image),
         )
         for image in images
     )
@@ -359,17 +365,28 @@ def _query(
     has_pose: bool,
     status: QueryStatus | None,
     near: NearCandidates | None,
+    confidence: float | None,
 ) -> QueryWithoutTruth:
     if status is None:
         outcome: Outcome = "localized" if has_pose else "missing"
-        return QueryWithoutTruth(image, condition, outcome, "" if has_pose else "no pose")
+        reason = "" if has_pose else "no pose"
+        return QueryWithoutTruth(image, condition, outcome, reason, confidence=confidence)
     outcome, reason = "missing", status.reason
     if has_pose:
         outcome = "localized" if status.fallback == "none" else "fallback"
     elif not reason:
         reason = "status says localized, but the result has no pose"
-    counts = status.num_matches, status.num_inliers
-    return QueryWithoutTruth(image, condition, outcome, reason, *counts, status.candidates, near)
+    return QueryWithoutTruth(
+        image,
+        condition,
+        outcome,
+        reason,
+        status.num_matches,
+        status.num_inliers,
+        status.candidates,
+        near,
+        status.confidence,
+    )
 
 
 def _row(name: str, queries: Sequence[QueryWithoutTruth]) -> RowWithoutTruth:
@@ -387,12 +404,15 @@ def _row(name: str, queries: Sequence[QueryWithoutTruth]) -> RowWithoutTruth:
         num_fallback=sum(query.outcome == "fallback" for query in queries),
         num_missing=sum(query.outcome == "missing" for query in queries),
         inliers_quartiles=quartiles,
-        first_candidate=_prior([(n.first_m, n.first_deg) for n in near]) if near else None,
-        nearest_candidate=_prior([(n.nearest_m, n.nearest_deg) for n in near]) if near else None,
+        first_candidate=_prior([(n.first_m, n.first_deg) for n in near]),
+        nearest_candidate=_prior([(n.nearest_m, n.nearest_deg) for n in near]),
     )
 
 
-def _prior(pairs: Sequence[tuple[float, float]]) -> PriorAgreement:
+def _prior(pairs: Sequence[tuple[float, float]]) -> PriorAgreement | None:
+    pairs = [pair for pair in pairs if not math.isnan(pair[0])]
+    if not pairs:
+        return None
     distance_m, angle_deg = np.array(pairs).T
     return PriorAgreement(
         num_compared=len(pairs),

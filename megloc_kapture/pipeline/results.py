@@ -145,6 +145,13 @@ class Results(Mapping[str, Pose | Failure]):
             rows.append(row)
         return pd.DataFrame(rows).set_index("image")
 
+    def view(self, path: Path | str, truth: Path | str | None = None) -> None:
+        """Write a page that shows the images in the map in 3D; see
+        :func:`megloc_kapture.evaluation.view.write_view`."""
+        from megloc_kapture.evaluation.view import write_view
+
+        write_view(path, self.localizer.map.folder, self, truth)
+
     def _localized(self, workers: int, track: Track) -> Iterator[tuple[str, Pose | Failure]]:
         with ThreadPoolExecutor(workers) as executor:
             units = self.queries.read_units(rigs=self._rigs)

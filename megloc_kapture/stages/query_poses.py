@@ -274,7 +274,7 @@ def localize_from_matches(
     candidates = {name: tuple(images) for name, images in iterate_candidates(pairs)}
     units = query_units(query.read(), rigs=options.rigs)
     with shared_index(
-        {name: index_map(map_folder, _type_in_map(map_folder, name)) for name in local_types},
+        {name: index_map(map_folder, type_in_map(map_folder, name)) for name in local_types},
         scratch,
     ) as indices:
         jobs = []
@@ -299,7 +299,7 @@ def localize_from_matches(
             yield from results
 
 
-def _type_in_map(map_folder: KaptureFolder, local_type: str) -> str:
+def type_in_map(map_folder: KaptureFolder, local_type: str) -> str:
     """The type that a map knows keypoints by; one without any point is known by its keypoints."""
     names = (local_type, base_type(local_type))
     known = (map_folder.observations(), map_folder.types("keypoints"))

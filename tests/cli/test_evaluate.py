@@ -85,6 +85,7 @@ def test_one_result(megloc: Any, runs: Path) -> None:
         "recall.json",
         "recall.txt",
         "report.html",
+        "view.html",
     ]
     # the map of the workspace is on the page
     assert "map cameras" in (out / "report.html").read_text()
@@ -166,7 +167,7 @@ def test_the_map_may_be_given(megloc: Any, runs: Path) -> None:
             for image in IMAGES
         ],
     )
-    assert "no map or no candidates are known" in megloc("evaluate", "-i", alone).out
+    assert "no map or no ranked candidates are known" in megloc("evaluate", "-i", alone).out
     with_map = megloc("evaluate", "-i", alone, "--map", runs / "a/mapping")
     assert "of 40 localized queries with candidates" in " ".join(with_map.out.split())
 

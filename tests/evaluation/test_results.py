@@ -15,6 +15,7 @@ from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.pose_files import write_pose_file
 from megloc_kapture.evaluation.protocols import Benchmark, benchmark_of, protocol_of
 from megloc_kapture.evaluation.results import (
+    are_ranked,
     context_of,
     distinct_labels,
     read_result,
@@ -247,3 +248,12 @@ def test_absent_results_are_named(truth: Path, tmp_path: Path) -> None:
         evaluate(tmp_path / "nowhere", truth)
     with pytest.raises(DataError, match="nowhere"):
         evaluate(truth, tmp_path / "nowhere")
+
+
+def test_lists_in_the_order_of_names_are_no_ranking() -> None:
+    names = [f"map/{k}.jpg" for k in range(6)]
+    assert not are_ranked([names, names[1:]])
+    assert are_ranked([names, names[::-1]])
+    # of few candidates the order may be chance
+    assert are_ranked([names[:2], names[:3]]) and are_ranked([]) and are_ranked([()])
+    assert not are_ranked([names[:2]] * 7)

@@ -250,3 +250,19 @@ def test_as_text() -> None:
 def test_one_run_is_none() -> None:
     with pytest.raises(OptionError, match="at least two"):
         over_seeds([run("a", [0.1])])
+
+
+def test_too_few_queries_say_nothing_of_a_median() -> None:
+    few, more = 5, 6
+    for number in (few, more):
+        first = result("a", [0.1 + 0.001 * k for k in range(number)])
+        second = result("b", [0.5 + 0.001 * k for k in range(number)])
+        comparison = compare([first, second])
+        median = comparison.medians[0]
+        text = " ".join(report_text(comparison).split())
+        if number == few:
+            assert np.isnan(median.low_m) and not median.is_real
+            assert "-0.4000 m; too few queries to tell it from chance." in text
+        else:
+            assert median.is_real and "the difference is real" in text
+        assert f"too few queries ({number}) to compare recall by" in text

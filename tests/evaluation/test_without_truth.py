@@ -183,7 +183,7 @@ def test_one_pose_file_alone(second: Result, page_of: Callable[[str], Any]) -> N
     found = evaluate_without_truth([second])
     text = report_text(found)
     assert "No true poses were given." in text
-    assert "no map or no candidates are known" in text
+    assert "no map or no ranked candidates are known" in text
     assert "agreement of" not in text
     assert "Do they agree" not in page_of(render_report(found)).text
 

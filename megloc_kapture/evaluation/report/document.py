@@ -177,7 +177,47 @@ class Pictures:
     block: ClassVar[str] = "pictures"
 
 
-Block = Paragraph | Items | Table | Heading | Figure | Numbers | Pictures
+@dataclass(frozen=True, slots=True)
+class Card:
+    """A picture of a query among :class:`Cards`.
+
+    Parameters
+    ----------
+    name, facts : of the query; the facts stand on lines of their own.
+    element : an ``<img>`` or ``<svg>``.
+    role : a word above it; may be empty.
+    condition, outcome : that the cards can be filtered by.
+    sort : name of an order -> its value, of those that are known.
+    """
+
+    name: str
+    element: Markup
+    facts: tuple[str, ...]
+    role: str
+    condition: str
+    outcome: str
+    sort: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Cards:
+    """Pictures side by side, which a script can filter and sort; on the page only."""
+
+    cards: tuple[Card, ...]
+    block: ClassVar[str] = "cards"
+
+    def values(self, attribute: Literal["condition", "outcome"]) -> list[str]:
+        """What the cards can be filtered by; empty where all are the same."""
+        found = sorted({getattr(card, attribute) for card in self.cards})
+        return found if len(found) > 1 else []
+
+    def orders(self) -> list[str]:
+        """Names of the orders that at least two cards have a value for."""
+        names = dict.fromkeys(name for card in self.cards for name in card.sort)
+        return [name for name in names if sum(name in card.sort for card in self.cards) > 1]
+
+
+Block = Paragraph | Items | Table | Heading | Figure | Numbers | Pictures | Cards
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,6 +248,7 @@ class Document:
     text, page : its sections in the two forms.
     data : for JSON: mappings, sequences, models and numbers; what is infinite becomes null.
     tables : file name -> column -> values of a CSV table; None and what is infinite are empty.
+    beside : file name -> content of further pages that are written beside this one.
     provenance : plain data, shown at the end of the page with the versions; its ``steps``, each
         with ``name``, ``on`` and ``why``, stand first.
     """
@@ -219,3 +260,4 @@ class Document:
     data: Mapping[str, Any]
     tables: Mapping[str, Mapping[str, Sequence[object]]]
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    beside: Mapping[str, str] = field(default_factory=dict)

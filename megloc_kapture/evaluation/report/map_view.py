@@ -19,6 +19,7 @@ from megloc_kapture.evaluation.report.figures import (
     styled_figure,
     to_svg,
 )
+from megloc_kapture.evaluation.results import are_ranked
 from megloc_kapture.evaluation.scoring import Evaluation
 from megloc_kapture.evaluation.without_truth import ResultWithoutTruth
 from megloc_kapture.geometry.poses import camera_centers, invert_quats, rotate, stack_poses
@@ -141,12 +142,16 @@ def views_without_truth(
     *,
     prefix: str = "above",
 ) -> list[Block]:
-    """The views of a result without truth; lines lead from the first candidate to the pose."""
+    """The views of a result without truth; lines lead from the first candidate to the pose,
+    where candidates were ranked."""
     drawn, of_query = {}, dict(frames or {})
+    ranked = are_ranked(query.candidates for query in result.queries)
     for query in result.queries:
         first = next((c for c in query.candidates if c in map_poses), "")
         drawn[query.image] = DrawnQuery(
-            map_poses.get(first), result.poses.get(query.image), query.outcome == "fallback"
+            map_poses.get(first) if ranked else None,
+            result.poses.get(query.image),
+            query.outcome == "fallback",
         )
         # a pose stands in the frame of the images it was estimated from
         if first in of_query:

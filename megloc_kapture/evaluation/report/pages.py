@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 from markupsafe import Markup
 
-from megloc_kapture.evaluation.metrics import ALL, within
+from megloc_kapture.evaluation.metrics import ALL
 from megloc_kapture.evaluation.report import figures, tables
 from megloc_kapture.evaluation.report.document import (
     Block,
-    Cell,
     Figure,
     Heading,
     Items,
@@ -19,9 +17,8 @@ from megloc_kapture.evaluation.report.document import (
     Paragraph,
     Pictures,
     Section,
-    Table,
-    column,
 )
+from megloc_kapture.evaluation.report.gallery import gallery_blocks, query_table
 from megloc_kapture.evaluation.report.map_view import views_of_evaluation, views_without_truth
 from megloc_kapture.evaluation.report.masks import mask_blocks
 from megloc_kapture.evaluation.report.pictures import AGREES, DISAGREES
@@ -29,12 +26,13 @@ from megloc_kapture.evaluation.report.queries import (
     QueryPictures,
     disputed_queries,
     doubtful_queries,
-    order_of_badness,
     query_pictures,
     worst_queries,
 )
 from megloc_kapture.evaluation.report.refinement import refinement_blocks
+from megloc_kapture.evaluation.report.shown_queries import shown_queries
 from megloc_kapture.evaluation.report.wording import (
+    FEW,
     INTERVALS,
     agreement_sentence,
     comparison_sentences,
@@ -47,7 +45,7 @@ from megloc_kapture.evaluation.report.wording import (
     method_sentence,
     notes,
 )
-from megloc_kapture.evaluation.results import ResultContext
+from megloc_kapture.evaluation.results import ResultContext, are_ranked
 from megloc_kapture.evaluation.scoring import Evaluation
 from megloc_kapture.evaluation.statistics import Comparison, Seeds
 from megloc_kapture.evaluation.without_truth import (
@@ -60,8 +58,6 @@ from megloc_kapture.values import RigidTransform
 
 Poses = Mapping[str, RigidTransform]
 
-# more rows than anybody reads; the CSV beside the report has them all
-_MAX_ROWS = 500
 _BELOW = f"Below each recall: its {INTERVALS.replace('intervals of recall', 'interval')}."
 _FROM_ABOVE = "Camera centres from above, each error a red line from the truth to the estimate."
 
@@ -147,27 +143,30 @@ def evaluation_page(
         sections.append(Section((Figure(Markup(inliers)),), "Error against inliers", beside=beside))
     confidence = evaluation.confidence
     if confidence is not None:
-        worth = (
-            *(
-                Paragraph(f"{sentence[0].upper()}{sentence[1:]}.")
-                for sentence in confidence_sentences(confidence, evaluation.thresholds[-1])
-            ),
-            Paragraph(
-                "Left: poses by their confidence; where it can be trusted, the dots lie on the "
-                "dotted line. Right: poses are accepted from the most confident on."
-            ),
-        )
-        drawn = (
-            (Figure(Markup(figures.confidence_curves(confidence))),) if confidence.num_poses else ()
-        )
-        sections.append(Section((*worth, *drawn), "Does it know when it does not know?"))
+        worth: list[Block] = [
+            Paragraph(f"{sentence[0].upper()}{sentence[1:]}.")
+            for sentence in confidence_sentences(confidence, evaluation.thresholds[-1])
+        ]
+        if confidence.num_poses < FEW:
+            worth.append(Paragraph(f"Too few poses ({confidence.num_poses}) for a diagram."))
+        else:
+            worth += [
+                Paragraph(
+                    "Left: poses by their confidence; where it can be trusted, the dots lie on the "
+                    "dotted line. Right: poses are accepted from the most confident on."
+                ),
+                Figure(Markup(figures.confidence_curves(confidence))),
+            ]
+        sections.append(Section(tuple(worth), "Does it know when it does not know?"))
+    sections += _unless_empty("Queries", gallery_blocks(context, shown_queries(evaluation)))
     sections += _pictured(
-        "The worst queries",
+        "The worst queries, beside what they match",
         "Left the query, right the candidate with most matches. ",
         query_pictures(worst_queries(evaluation), context, map_poses),
     )
     sections += _unless_empty("What refinement changed", refined)
     sections += _unless_empty("What masks hide", mask_blocks(context.masked))
+    sections += _seconds(context)
     table, num_hidden = query_table(evaluation)
     hidden = (
         f" {num_hidden} better ones are left out here; the CSV table beside this report has them "
@@ -226,13 +225,15 @@ def without_truth_page(
     sections = [Section((Paragraph(f"No recall: {found.statement} {CAUTION}", "note"),))]
     for number, (result, context) in enumerate(zip(found.results, contexts, strict=True)):
         views = views_without_truth(result, map_poses, context.frames, prefix=f"above{number}-")
-        said = "Camera centres from above, a grey line from the first candidate to the pose."
+        said = "Camera centres from above"
+        if are_ranked(query.candidates for query in result.queries):
+            said += ", a grey line from the first candidate to the pose"
         blocks: list[Block] = [
             tables.result_table(result),
             Paragraph(_retrieval_note(result), "soft small"),
         ]
         if views:
-            blocks += [Heading("Where they are"), Paragraph(said), *views]
+            blocks += [Heading("Where they are"), Paragraph(f"{said}."), *views]
         sections.append(Section(tuple(blocks), result.label))
     if found.agreement:
         told = (
@@ -251,6 +252,9 @@ def without_truth_page(
             )
         )
     several = list(zip(found.results, contexts, strict=True))
+    if len(several) == 1:
+        gallery = gallery_blocks(contexts[0], shown_queries(found.results[0]))
+        sections += _unless_empty("Queries", gallery)
     for result, context in several:
         sections += _pictured(
             f"{result.label}: localized, but least sure",
@@ -259,75 +263,13 @@ def without_truth_page(
             query_pictures(doubtful_queries(result), context, map_poses),
             "estimated",
         )
+        sections += _seconds(contexts[0])
     for result, context in several:
         blocks_of_result = refinement_blocks(context, result.poses)
         sections += _unless_empty(f"{result.label}: what refinement changed", blocks_of_result)
     for result, context in several:
         sections += _unless_empty(f"{result.label}: what masks hide", mask_blocks(context.masked))
     return tuple(sections)
-
-
-def query_table(evaluation: Evaluation) -> tuple[Table, int]:
-    """The worst 500 queries, those without a pose first, then by falling error, then by name.
-
-    Returns
-    -------
-    The table, and the number of queries that are left out.
-    """
-    by_center = evaluation.by_center
-    met = [within(evaluation.errors, threshold) for threshold in evaluation.thresholds]
-    centers_m = (by_center or evaluation).errors.position_m.tolist()
-    queries = evaluation.queries
-    ranked = sorted(range(len(queries)), key=lambda i: order_of_badness(queries[i]))[:_MAX_ROWS]
-    rows = [queries[i] for i in ranked]
-    outcomes = {"missing": "no pose"}
-
-    def dots(index: int) -> Cell:
-        marks = ("●" if own[index] else Markup("<i>○</i>") for own in met)
-        return Cell("", page=Markup("").join(marks), style="c dots")
-
-    columns = [
-        column("#", range(len(rows)), lambda n: Cell(str(n + 1), style="soft"), kind="count"),
-        column("image", rows, lambda row: Cell(row.image, style="name")),
-        column("condition", rows, lambda row: row.condition),
-        column(
-            "outcome",
-            rows,
-            lambda row: Cell(outcomes.get(row.outcome, row.outcome), style=row.outcome),
-        ),
-        column("met", ranked, dots),
-        column(
-            "position (m)" if by_center is None else "relative (m)",
-            rows,
-            lambda row: _if_finite(row.position_m, format_metres),
-            kind="count",
-        ),
-        column(
-            "centre (m)",
-            ranked,
-            lambda index: _if_finite(centers_m[index], format_metres),
-            kind="count",
-        ),
-        column(
-            "angle (deg)",
-            rows,
-            lambda row: _if_finite(row.angle_deg, format_degrees),
-            kind="count",
-        ),
-        column("inliers", rows, lambda row: _if_known(row.num_inliers), kind="count"),
-        column("matches", rows, lambda row: _if_known(row.num_matches), kind="count"),
-        column("confidence", rows, lambda row: _if_confident(row.confidence), kind="count"),
-        column("reason", rows, lambda row: row.reason),
-    ]
-    empty = set() if any(query.condition for query in queries) else {"condition"}
-    if by_center is None:
-        empty.add("centre (m)")
-    if all(query.num_inliers is None for query in queries):
-        empty |= {"inliers", "matches"}
-    if all(query.confidence is None for query in queries):
-        empty.add("confidence")
-    shown = tuple(own for own in columns if own.heading not in empty)
-    return Table(shown, tall=True), max(len(queries) - _MAX_ROWS, 0)
 
 
 def _several(
@@ -399,6 +341,14 @@ def _pictured(
     return [Section((Paragraph(Markup("{}{}").format(intro, key)), *pictures), heading)]
 
 
+def _seconds(context: ResultContext) -> list[Section]:
+    # a run's own report has none: two runs give the same bytes
+    if not context.seconds:
+        return []
+    told = "Each stage when it last ran. timing.csv of the run has seconds per query and step."
+    return [Section((Paragraph(told), tables.seconds_table(context.seconds)), "How long it took")]
+
+
 def _unless_empty(heading: str, blocks: tuple[Block, ...]) -> list[Section]:
     return [Section(blocks, heading)] if blocks else []
 
@@ -433,22 +383,11 @@ def _retrieval_note(result: ResultWithoutTruth) -> str:
     first = result.rows[-1].first_candidate
     if first is None:
         return (
-            "No map or no candidates are known, so nothing is said about agreement with retrieval."
+            "No map or no ranked candidates are known, so nothing is said about agreement with "
+            "retrieval."
         )
     return (
         f"Of {first.num_compared} localized queries with candidates in the map; in its direction: "
         f"within {PRIOR_ANGLE_DEG:g} degrees of the first candidate's. Fallback poses are in no "
         "figure but their own."
     )
-
-
-def _if_finite(value: float, form: Callable[[float], str]) -> str:
-    return form(value) if math.isfinite(value) else ""
-
-
-def _if_known(count: int | None) -> str:
-    return "" if count is None else str(count)
-
-
-def _if_confident(confidence: float | None) -> str:
-    return "" if confidence is None else f"{confidence:.2f}"

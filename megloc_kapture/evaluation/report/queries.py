@@ -28,7 +28,7 @@ from megloc_kapture.evaluation.report.pictures import (
     side_by_side,
 )
 from megloc_kapture.evaluation.report.wording import counted, format_degrees, format_metres
-from megloc_kapture.evaluation.results import ResultContext
+from megloc_kapture.evaluation.results import ResultContext, are_ranked
 from megloc_kapture.evaluation.scoring import Evaluation, QueryResult
 from megloc_kapture.evaluation.without_truth import QueryWithoutTruth, ResultWithoutTruth
 from megloc_kapture.geometry.poses import camera_centers, invert_quats, rotate, stack_poses
@@ -196,8 +196,9 @@ def _facts_without_truth(query: QueryWithoutTruth) -> tuple[str, ...]:
     if query.num_inliers is not None:
         facts.append(f"{query.num_inliers} inliers of {query.num_matches}")
     if query.near is not None:
-        facts.append(f"{format_metres(query.near.first_m)} m from its first candidate")
-        facts.append(f"{format_metres(query.near.nearest_m)} m from the nearest one")
+        if math.isfinite(query.near.first_m):
+            facts.append(f"{format_metres(query.near.first_m)} m from its first candidate")
+        facts.append(f"{format_metres(query.near.nearest_m)} m from the nearest candidate")
     return tuple(facts)
 
 
@@ -207,8 +208,15 @@ class QueryPictures:
     What is missing or cannot be read is left out: a report without it is better than none.
     """
 
-    def __init__(self, context: ResultContext, map_poses: Mapping[str, RigidTransform]) -> None:
-        self._context = context
+    def __init__(
+        self,
+        context: ResultContext,
+        map_poses: Mapping[str, RigidTransform],
+        *,
+        ranked: bool = True,
+    ) -> None:
+        """``ranked`` : whether the order of a query's candidates means anything."""
+        self._context, self._ranked = context, ranked
         self._map_poses = map_poses
         self._matches = StoredMatches(context)
         quats, translations = stack_poses(map_poses.values())
@@ -228,7 +236,7 @@ class QueryPictures:
             best, nearest = nearest, ""
         shown = [(c, counts.get(c)) for c in candidates if c != best][: _CANDIDATES_SHOWN - 1]
         others = [
-            (image, self._facts(image, chosen, f"candidate {candidates.index(image) + 1}", count))
+            (image, self._facts(image, chosen, self._role(image, candidates), count))
             for image, count in shown
         ]
         if nearest and nearest != best and nearest not in dict(shown):
@@ -311,7 +319,7 @@ class QueryPictures:
             return Picture(image_tag(query, chosen.image))
         role = f"nearest to the {chosen.pose_name} pose"
         if best in chosen.candidates:
-            role = f"candidate {chosen.candidates.index(best) + 1}"
+            role = self._role(best, chosen.candidates)
         lines = self._matches.lines(chosen.image, best)
         facts = list(self._facts(best, chosen, role, None))
         points = (np.zeros((0, 2)), np.zeros((0, 2)))
@@ -340,6 +348,10 @@ class QueryPictures:
         if count is not None:
             facts.append(counted(count, "match", "matches"))
         return tuple(facts)
+
+    def _role(self, image: str, candidates: Sequence[str]) -> str:
+        """A candidate's rank, where candidates were ranked at all."""
+        return f"candidate {candidates.index(image) + 1}" if self._ranked else "candidate"
 
     def _nearest(self, pose: RigidTransform | None) -> str:
         """The map image nearest to a pose, of those that look its way where there are any."""
@@ -375,5 +387,6 @@ def query_pictures(
     chosen: Sequence[Chosen], context: ResultContext, map_poses: Mapping[str, RigidTransform]
 ) -> list[Pictures]:
     """Pictures of all chosen queries of one result."""
-    pictures = QueryPictures(context, map_poses)
+    ranked = are_ranked(one.candidates for one in chosen)
+    pictures = QueryPictures(context, map_poses, ranked=ranked)
     return [pictures.of(one) for one in chosen]

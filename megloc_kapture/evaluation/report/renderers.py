@@ -6,7 +6,7 @@ import json
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import BaseModel
@@ -23,6 +23,9 @@ from megloc_kapture.evaluation.report.document import (
 from megloc_kapture.io.csv_table import write_csv_table
 from megloc_kapture.io.files import write_bytes, write_json
 
+if TYPE_CHECKING:
+    from jinja2 import Template
+
 REPORT_HTML = "report.html"
 _WIDTH = 92
 
@@ -36,13 +39,18 @@ def write_document(folder: Path | str, document: Document) -> dict[str, Path]:
     """
     # whatever is wrong with the page is found before anything is written
     page = render_html(document)
-    names = [f"{document.name}.json", f"{document.name}.txt", *document.tables, REPORT_HTML]
+    names = [
+        *(f"{document.name}.json", f"{document.name}.txt"),
+        *(*document.tables, *document.beside, REPORT_HTML),
+    ]
     paths = {name: Path(folder) / name for name in names}
     write_json(paths[names[0]], plain(document.data))
     write_bytes(paths[names[1]], render_text(document.text).encode("utf-8"))
     for name, columns in document.tables.items():
         rows = zip(*([csv_cell(v) for v in values] for values in columns.values()), strict=True)
         write_csv_table(paths[name], list(columns), list(rows))
+    for name, text in document.beside.items():
+        write_bytes(paths[name], text.encode("utf-8"))
     write_bytes(paths[REPORT_HTML], page.encode("utf-8"))
     return paths
 
@@ -117,11 +125,8 @@ def _wrapped(text: str) -> list[str]:
     return textwrap.wrap(text, width=_WIDTH, break_long_words=False, break_on_hyphens=False)
 
 
-def render_html(document: Document) -> str:
-    """The page of a document; the same document gives the same text.
-
-    It is self-contained: no script, no link to the outside, no date.
-    """
+def template(name: str) -> Template:
+    """A template of pages; what is put in is escaped, and what is forgotten an error."""
     from jinja2 import Environment, PackageLoader, StrictUndefined  # only a page waits for it
 
     environment = Environment(
@@ -132,9 +137,17 @@ def render_html(document: Document) -> str:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
+    return environment.get_template(name)
+
+
+def render_html(document: Document) -> str:
+    """The page of a document; the same document gives the same text.
+
+    It is self-contained: no link to the outside, no date, and no script but the gallery's own.
+    """
     provenance = dict(document.provenance)
     steps = provenance.pop("steps", [])
-    return environment.get_template("report.html").render(
+    return template("report.html").render(
         document=document,
         versions=package_versions(),
         steps=steps,

@@ -7,6 +7,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from markupsafe import Markup
+
 from megloc_kapture.evaluation.metrics import ALL
 from megloc_kapture.evaluation.report import tables
 from megloc_kapture.evaluation.report.document import (
@@ -17,6 +19,7 @@ from megloc_kapture.evaluation.report.document import (
     Section,
 )
 from megloc_kapture.evaluation.report.renderers import render_html, render_text, write_document
+from megloc_kapture.evaluation.report.shown_queries import shown_queries
 from megloc_kapture.evaluation.report.wording import (
     INTERVALS,
     agreement_sentence,
@@ -39,6 +42,7 @@ from megloc_kapture.evaluation.without_truth import (
 from megloc_kapture.values import RigidTransform
 
 RECALL_JSON, RECALL_TEXT = "recall.json", "recall.txt"
+VIEW_HTML = "view.html"
 AGREEMENT_TEXT = "agreement.txt"
 PER_QUERY_CSV, DIFFERENCES_CSV = "per_query.csv", "differences.csv"
 
@@ -57,6 +61,7 @@ def report_of(
     map_poses: Poses | None = None,
     provenance: Mapping[str, Any] | None = None,
     contexts: Sequence[ResultContext] | None = None,
+    view: bool = False,
 ) -> Document:
     """The report of one result, of several, of runs with seeds, or of results without truth.
 
@@ -66,6 +71,7 @@ def report_of(
         of the first context that has a map.
     provenance : options, preset, inputs: plain JSON data, shown at the end with the versions.
     contexts : images, masks and matches of each result, by default those it brings along.
+    view : add the 3D view of a single result, a file beside the page that leads to it.
 
     Raises
     ------
@@ -92,6 +98,9 @@ def report_of(
     else:
         title = " and ".join(labels) or "Without truth"
         page = pages.without_truth_page(reported, map_poses, contexts)
+    beside = _view(results[0], contexts[0], title) if view and len(results) == 1 else {}
+    if beside:
+        page = (*page[:1], _view_section(), *page[1:])
     csv_tables = {PER_QUERY_CSV: reported.per_query()}
     if isinstance(reported, Comparison):
         csv_tables[DIFFERENCES_CSV] = reported.differences()
@@ -103,7 +112,24 @@ def report_of(
         data=report_data(reported),
         tables=csv_tables,
         provenance=provenance or {},
+        beside=beside,
     )
+
+
+def _view(
+    result: Evaluation | ResultWithoutTruth, context: ResultContext, title: str
+) -> dict[str, str]:
+    """The page of the view by its name; none where no camera has a pose."""
+    from megloc_kapture.evaluation.report.scene import render_view, scene_of
+
+    scene = scene_of(title, context, shown_queries(result))
+    return {} if scene is None else {VIEW_HTML: render_view(scene)}
+
+
+def _view_section() -> Section:
+    link = Markup('<a class="view" href="{}">See it in 3D</a>').format(VIEW_HTML)
+    told = " The map's points and cameras, and the queries: coloured by their error or confidence."
+    return Section((Paragraph(link + told),))
 
 
 def write_report(folder: Path | str, reported: AnyReported, **options: Any) -> dict[str, Path]:
@@ -111,6 +137,7 @@ def write_report(folder: Path | str, reported: AnyReported, **options: Any) -> d
 
     With truth these are recall.json, recall.txt, per_query.csv and report.html, of a comparison
     also differences.csv; without truth agreement.json and agreement.txt take the place of recall's.
+    Of a single result the 3D view stands beside them, view.html.
 
     Parameters
     ----------
@@ -121,7 +148,7 @@ def write_report(folder: Path | str, reported: AnyReported, **options: Any) -> d
     DataError : a map is broken.
     OutputError : a file cannot be written.
     """
-    return write_document(folder, report_of(reported, **options))
+    return write_document(folder, report_of(reported, view=True, **options))
 
 
 def render_report(reported: AnyReported, **options: Any) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Protocol, TypeVar
 
@@ -287,6 +287,16 @@ def agreement_table(found: WithoutTruth, rows: Sequence[AgreementRow]) -> Table:
         ),
     )
     return Table(columns, styles=tuple("total" if row.name == ALL else "" for row in rows))
+
+
+def seconds_table(seconds: Mapping[str, float]) -> Table:
+    """Seconds of each stage of a run, and of all."""
+    rows = [*seconds.items(), (ALL, sum(seconds.values()))]
+    columns = (
+        column("stage", rows, lambda row: row[0]),
+        column("seconds", rows, lambda row: f"{row[1]:.1f}", kind="count"),
+    )
+    return Table(columns, styles=_total_last(rows))
 
 
 def _recall_columns(

@@ -27,6 +27,8 @@ from megloc_kapture.evaluation.without_truth import (
 )
 
 INTERVALS = "95 % confidence intervals of recall, queries taken as independent"
+# fewer are an example, not a measurement
+FEW = 10
 _NO_CONDITION = "(no condition)"
 _MAX_NAME_WIDTH = 19
 _NAMES_SHOWN = 5
@@ -117,6 +119,11 @@ def notes(evaluation: Evaluation) -> list[str]:
     """Sentences a reader needs beside the table: fallbacks, images without truth, no overlap."""
     row = evaluation.row()
     said = []
+    if row.num_queries < FEW:
+        said.append(
+            f"too few queries ({row.num_queries}) to compare recall by: the intervals say how "
+            "little they tell"
+        )
     kinds = {query.fallback for query in evaluation.queries} - {"none"}
     if row.num_fallback:
         whose = " or the one ".join(_FALLBACK_POSES[kind] for kind in sorted(kinds))
@@ -178,7 +185,8 @@ def retrieval_note(result: ResultWithoutTruth) -> str:
     first = result.rows[-1].first_candidate
     if first is None:
         return (
-            "no map or no candidates are known, so nothing is said about agreement with retrieval"
+            "no map or no ranked candidates are known, so nothing is said about agreement with "
+            "retrieval"
         )
     return (
         "first, nearest: the candidate map image that is ranked first, or lies nearest to the "
@@ -223,13 +231,15 @@ def median_sentence(difference: MedianDifference, labels: Sequence[str]) -> str:
     if lost:
         return f"Most queries of {' and of '.join(lost)} have no pose, so there is no median."
     apart = medians[0] - medians[1]
+    told = (
+        f"The median position error is {format_metres(medians[0])} m for {pair[0]} and "
+        f"{format_metres(medians[1])} m for {pair[1]}: {_signed(apart)} m"
+    )
+    if math.isnan(difference.low_m):
+        return f"{told}; too few queries to tell it from chance."
     verdict = "the difference is real" if difference.is_real else "the difference could be chance"
     interval = f"{_signed(difference.low_m)} to {_signed(difference.high_m)}"
-    return (
-        f"The median position error is {format_metres(medians[0])} m for {pair[0]} and "
-        f"{format_metres(medians[1])} m for {pair[1]}: {_signed(apart)} m, 95 % interval "
-        f"{interval} m; {verdict}."
-    )
+    return f"{told}, 95 % interval {interval} m; {verdict}."
 
 
 def comparison_sentences(comparison: Comparison) -> list[tuple[str, bool]]:

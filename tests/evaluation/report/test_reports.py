@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from megloc_kapture.errors import OutputError
-from megloc_kapture.evaluation.report.pages import query_table
+from megloc_kapture.evaluation.report.gallery import query_table
 from megloc_kapture.evaluation.report.queries import disputed_queries, worst_queries
 from megloc_kapture.evaluation.report.reports import render_report, report_text, write_report
 from megloc_kapture.evaluation.scoring import Evaluation, evaluate_poses

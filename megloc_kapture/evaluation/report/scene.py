@@ -1,0 +1,259 @@
+"""The 3D view of a map and of queries in it: one self-contained HTML file, drawn by WebGL2.
+
+Everything that is drawn stands in the page as little-endian arrays; coordinates are float32,
+relative to an origin that is given in full, so that a frame far from zero loses nothing. What would
+make the page large is drawn in part, and the page says so.
+"""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+from numpy.typing import NDArray
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.evaluation.report.map_view import top_view
+from megloc_kapture.evaluation.report.renderers import plain, template
+from megloc_kapture.evaluation.report.shown_queries import (
+    ShownQuery,
+    StoredInliers,
+    legend,
+    spread,
+)
+from megloc_kapture.evaluation.results import ResultContext
+from megloc_kapture.geometry.cameras import bearing_rays
+from megloc_kapture.geometry.poses import camera_centers, stack_poses
+from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.values import Camera, RigidTransform
+
+MAX_POINTS, MAX_CAMERAS, MAX_QUERIES = 60_000, 4_000, 2_000
+# points that inliers lead to: of all queries, and of one of them
+_MAX_INLIERS, _MAX_INLIERS_OF_ONE = 40_000, 300
+_SEED = 0
+# rays further from the axis than this (80 degrees) make a frustum that hides everything
+_WIDEST = 5.7
+# the share of points and cameras that the first look takes in
+_SEEN_AT_FIRST = 0.02, 0.98
+_ANY_CAMERA = Camera.pinhole(4, 3, 4)  # stands in for intrinsics that are not known
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What a view shows.
+
+    Attributes
+    ----------
+    title : of the page.
+    origin : float64 (3,), which the coordinates are relative to.
+    up : float64 (3,), unit vector.
+    points : float32 (P, 3), and ``colors`` uint8 (P, 3).
+    cameras : names of map images, and ``camera_frusta`` float32 (C, 5, 3): the centre, then the
+        rays through the image's corners (upper left, upper right, lower right, lower left) at
+        depth 1, as vectors of the world.
+    queries : in the order of the list, worst first.
+    frusta, true_frusta : float32 (Q, 5, 3), of estimates and truths, NaN where there is none.
+    inliers : float32 (K, 3), points of the queries' inliers one query after another, and
+        ``num_inliers`` (Q,) how many each has here.
+    radius : of what there is to see around the origin, unit of the map.
+    notes : sentences on what is left out.
+    """
+
+    title: str
+    origin: NDArray[np.float64]
+    up: NDArray[np.float64]
+    points: NDArray[np.float32]
+    colors: NDArray[np.uint8]
+    cameras: tuple[str, ...]
+    camera_frusta: NDArray[np.float32]
+    queries: tuple[ShownQuery, ...]
+    frusta: NDArray[np.float32]
+    true_frusta: NDArray[np.float32]
+    inliers: NDArray[np.float32]
+    num_inliers: tuple[int, ...]
+    radius: float
+    notes: tuple[str, ...]
+
+
+def scene_of(
+    title: str, context: ResultContext, queries: Sequence[ShownQuery] = ()
+) -> Scene | None:
+    """The scene of a map and of queries in it; None where no camera has a pose.
+
+    Parameters
+    ----------
+    context : where the map, the queries' cameras and their matches are; each may be absent.
+    queries : worst first; what is left out of many are the better ones.
+
+    Raises
+    ------
+    DataError : the map is broken.
+    """
+    notes: list[str] = []
+    rng = np.random.default_rng(_SEED)
+    mapping = context.mapping
+    map_poses = context.map_poses()
+    points = np.zeros((0, 6))
+    if mapping is not None and mapping.has_points():
+        points = mapping.points3d()
+    points = points[np.isfinite(points[:, :3]).all(axis=1)]
+    if len(points) > MAX_POINTS:
+        notes.append(f"{MAX_POINTS} of the map's {len(points)} points are drawn.")
+        points = points[np.sort(rng.choice(len(points), MAX_POINTS, replace=False))]
+    names = list(map_poses)
+    if len(names) > MAX_CAMERAS:
+        notes.append(f"{MAX_CAMERAS} of the map's {len(names)} cameras are drawn.")
+        names = [names[at] for at in spread(len(names), MAX_CAMERAS)]
+    if len(queries) > MAX_QUERIES:
+        notes.append(f"The worst {MAX_QUERIES} of {len(queries)} queries are drawn and listed.")
+        queries = queries[:MAX_QUERIES]
+    poses = [map_poses[name] for name in names]
+    true = [query.truth for query in queries if query.truth is not None]
+    spanning = poses + true or [q.estimated for q in queries if q.estimated is not None]
+    if not spanning:
+        return None
+    quats, translations = stack_poses(spanning)
+    centers = camera_centers(quats, translations)
+    view = top_view(quats, centers)
+    # each by itself: of a thousand points and ten cameras the cameras count too
+    ends = [
+        np.quantile(own, _SEEN_AT_FIRST, axis=0) for own in (centers, points[:, :3]) if len(own)
+    ]
+    low, high = np.min(ends, axis=0)[0], np.max(ends, axis=0)[1]
+    # of few digits, so that the text of the page says exactly what was subtracted
+    origin = np.round((low + high) / 2, 3)
+    rays = _rays(context.queries, [query.image for query in queries])
+    stored = StoredInliers(context) if any(q.num_inliers for q in queries) else None
+    most = min(_MAX_INLIERS // max(len(queries), 1), _MAX_INLIERS_OF_ONE)
+    inliers = [np.zeros((0, 3)) if stored is None else stored.of(query)[1] for query in queries]
+    if any(len(own) > most for own in inliers):
+        notes.append(f"Of a query's inliers at most {most} are drawn.")
+    inliers = [own[spread(len(own), most)] for own in inliers]
+    return Scene(
+        title=title,
+        origin=origin,
+        up=np.cross(view.right, view.up),
+        points=(points[:, :3] - origin).astype(np.float32),
+        colors=_colors(points, np.cross(view.right, view.up)),
+        cameras=tuple(names),
+        camera_frusta=_frusta(poses, _rays(mapping, names), origin),
+        queries=tuple(queries),
+        frusta=_frusta([query.estimated for query in queries], rays, origin),
+        true_frusta=_frusta([query.truth for query in queries], rays, origin),
+        inliers=(np.concatenate([np.zeros((0, 3)), *inliers]) - origin).astype(np.float32),
+        num_inliers=tuple(len(own) for own in inliers),
+        radius=max(float(np.linalg.norm(high - low)) / 2, 1e-3),
+        notes=tuple(notes),
+    )
+
+
+def render_view(scene: Scene) -> str:
+    """The page of a scene; the same scene gives the same text. It loads nothing."""
+    failed = [query for query in scene.queries if query.estimated is None]
+    data = {
+        "origin": scene.origin.tolist(),
+        "up": np.round(scene.up, 9).tolist(),
+        "radius": scene.radius,
+        "points": _encoded(scene.points),
+        "colors": _encoded(scene.colors),
+        "cameras": scene.cameras,
+        "cameraFrusta": _encoded(scene.camera_frusta),
+        "queries": [
+            {
+                "name": query.name,
+                "condition": query.condition,
+                "facts": query.facts(),
+                "color": query.color,
+                "meaning": query.meaning,
+                "error": query.position_m,
+                "confidence": query.confidence,
+                "inliers": query.num_inliers,
+                "drawn": drawn,
+            }
+            for query, drawn in zip(scene.queries, scene.num_inliers, strict=True)
+        ],
+        "frusta": _encoded(scene.frusta),
+        "trueFrusta": _encoded(scene.true_frusta),
+        "inliers": _encoded(scene.inliers),
+    }
+    return template("view.html").render(
+        title=scene.title,
+        data=_script_data(data),
+        legend=legend(list(scene.queries)),
+        counts={
+            "points": len(scene.points),
+            "cameras": len(scene.cameras),
+            "queries": len(scene.queries),
+            "failed": len(failed),
+        },
+        has_truth=bool(np.isfinite(scene.true_frusta).any()),
+        notes=scene.notes,
+    )
+
+
+def corner_rays(camera: Camera) -> NDArray[np.float64]:
+    """Rays (4, 3) at depth 1 through the corners of an image: upper left, upper right, lower right,
+    lower left. Where the lens' model says nothing of a corner, or nothing narrower than 80 degrees,
+    they are those of the nearest pixels towards the middle that it does."""
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (camera.width, camera.height)
+    middle = np.array([camera.width, camera.height]) / 2
+    for share in np.linspace(1.0, 0.1, 10):
+        rays = bearing_rays(camera, middle + share * (corners - middle))
+        if np.isfinite(rays).all() and np.abs(rays).max() < _WIDEST:
+            return rays
+    return bearing_rays(_ANY_CAMERA, np.array([[0.0, 0], [4, 0], [4, 3], [0, 3]]))
+
+
+def _rays(folder: KaptureFolder | None, images: Sequence[str]) -> NDArray[np.float64]:
+    """Corner rays (N, 4, 3) of images; of a camera that is not known those of a usual one."""
+    known: dict[Camera, NDArray[np.float64]] = {}
+    found = []
+    for image in images:
+        camera = _ANY_CAMERA
+        with contextlib.suppress(DataError):
+            if folder is not None:
+                camera = folder.read().camera_of(image)
+        if camera not in known:
+            known[camera] = corner_rays(camera)
+        found.append(known[camera])
+    return np.array(found).reshape(-1, 4, 3)
+
+
+def _frusta(
+    poses: Sequence[RigidTransform | None], rays: NDArray[np.float64], origin: NDArray[np.float64]
+) -> NDArray[np.float32]:
+    """Centres relative to ``origin`` and corner rays in the world, (N, 5, 3)."""
+    found = np.full((len(poses), 5, 3), np.nan, np.float32)
+    for own, pose, of_camera in zip(found, poses, rays, strict=True):
+        if pose is not None:
+            own[0] = pose.center() - origin
+            own[1:] = of_camera @ pose.rotation_matrix()  # R^T x of rows
+    return found
+
+
+def _colors(points: NDArray[np.float64], up: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """The points' own colours; of a map without any, greys that grow lighter upwards."""
+    if points[:, 3:].any():
+        return np.asarray(np.clip(np.round(points[:, 3:]), 0, 255), np.uint8)
+    heights = points[:, :3] @ up
+    low, high = np.quantile(heights, _SEEN_AT_FIRST) if len(heights) else (0.0, 1.0)
+    share = np.clip((heights - low) / max(high - low, 1e-9), 0, 1)[:, None]
+    dark, light = np.array([70, 96, 128]), np.array([226, 230, 222])
+    return np.asarray(np.round(dark + share * (light - dark)), np.uint8)
+
+
+def _encoded(array: NDArray[np.float32] | NDArray[np.uint8]) -> str:
+    little = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
+    return base64.b64encode(little.tobytes()).decode("ascii")
+
+
+def _script_data(data: Mapping[str, Any]) -> Markup:
+    """JSON that can stand in a script element whatever names it holds."""
+    text = json.dumps(plain(data), ensure_ascii=True, allow_nan=False, separators=(",", ":"))
+    return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"))

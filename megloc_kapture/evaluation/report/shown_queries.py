@@ -1,0 +1,204 @@
+"""Queries of a result as the view and the gallery show them: outcome, poses, stored inliers."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.evaluation.metrics import PoseErrors, Threshold, within
+from megloc_kapture.evaluation.report.wording import format_degrees, format_metres
+from megloc_kapture.evaluation.results import ResultContext
+from megloc_kapture.evaluation.scoring import Evaluation, Outcome, QueryResult
+from megloc_kapture.evaluation.without_truth import ResultWithoutTruth
+from megloc_kapture.geometry.cameras import project
+from megloc_kapture.io.kapture import FeatureReader, MatchesReader
+from megloc_kapture.localization.map_index import MapIndex, observed_matches
+from megloc_kapture.values import RigidTransform
+
+# a match is an inlier within so many pixels of its point, as when a pose is estimated
+INLIER_PX = 12.0
+_NOTHING = np.zeros((0, 2)), np.zeros((0, 3))
+# from right to wrong, told apart with any colour vision; then without a pose, and unknown
+_SCALE = ("#4cc3f0", "#7fd17f", "#f4d35e", "#ff9f45", "#ff4d4d")
+NO_POSE_COLOR, UNKNOWN_COLOR = "#9aa5b1", "#c9a7ff"
+# least confidences of the colours
+_SURE = (0.95, 0.8, 0.6)
+
+
+@dataclass(frozen=True)
+class ShownQuery:
+    """A query and what is known of it.
+
+    Attributes
+    ----------
+    name, image : what it is called, and its image.
+    outcome, reason, condition, num_matches, num_inliers, confidence, candidates : as of
+        :class:`megloc_kapture.evaluation.scoring.QueryResult`.
+    position_m, angle_deg : infinite without a pose; None where the truth is not known.
+    estimated, truth : ``cam_from_world``; None where there is none.
+    color, meaning : of its error where the truth is known, else of its confidence.
+    """
+
+    name: str
+    image: str
+    condition: str
+    outcome: Outcome
+    reason: str
+    num_matches: int | None
+    num_inliers: int | None
+    confidence: float | None
+    candidates: tuple[str, ...]
+    position_m: float | None
+    angle_deg: float | None
+    estimated: RigidTransform | None
+    truth: RigidTransform | None
+    color: str
+    meaning: str
+
+    def facts(self) -> list[str]:
+        """Its outcome in words, in order."""
+        said = []
+        if self.estimated is None:
+            said.append(f"no pose ({self.reason})" if self.reason else "no pose")
+        elif self.position_m is not None and self.angle_deg is not None:
+            error = f"{format_metres(self.position_m)} m, {format_degrees(self.angle_deg)} deg"
+            said.append(f"{error} off")
+        if self.outcome == "fallback":
+            said.append(f"fallback pose ({self.reason})")
+        if self.num_inliers is not None:
+            said.append(f"{self.num_inliers} inliers of {self.num_matches}")
+        if self.confidence is not None:
+            said.append(f"confidence {self.confidence:.2f}")
+        return said
+
+    def rank(self) -> tuple[float, float, float, str]:
+        """Sorts the worst first: without a pose, then by falling error, or rising confidence, or
+        rising number of inliers; then by name."""
+        error = math.inf if self.estimated is None else self.position_m or 0.0
+        sure = self.confidence if self.confidence is not None else 1.0
+        return -error, sure, float(self.num_inliers or 0), self.name
+
+
+def shown_queries(result: Evaluation | ResultWithoutTruth) -> list[ShownQuery]:
+    """The queries of a result, the worst first."""
+    evaluation = result if isinstance(result, Evaluation) else None
+    poses = result.estimated if isinstance(result, Evaluation) else result.poses
+    shown = []
+    for query in result.queries:
+        image, position_m, angle_deg, truth = query.image, None, None, None
+        if evaluation is not None and isinstance(query, QueryResult):
+            image, truth = evaluation.image(query.image), evaluation.truth.get(query.image)
+            position_m, angle_deg = query.position_m, query.angle_deg
+        color, meaning = UNKNOWN_COLOR, "pose, confidence not known"
+        if query.image not in poses:
+            color, meaning = NO_POSE_COLOR, "no pose"
+        elif evaluation is not None and isinstance(query, QueryResult):
+            color, meaning = _by_error(query, evaluation.thresholds)
+        elif query.confidence is not None:
+            color, meaning = _by_confidence(query.confidence)
+        shown.append(
+            ShownQuery(
+                name=query.image,
+                image=image,
+                condition=query.condition,
+                outcome=query.outcome,
+                reason=query.reason,
+                num_matches=query.num_matches,
+                num_inliers=query.num_inliers,
+                confidence=query.confidence,
+                candidates=query.candidates,
+                position_m=position_m,
+                angle_deg=angle_deg,
+                estimated=poses.get(query.image),
+                truth=truth,
+                color=color,
+                meaning=meaning,
+            )
+        )
+    return sorted(shown, key=ShownQuery.rank)
+
+
+def legend(queries: list[ShownQuery]) -> list[tuple[str, str]]:
+    """The colours of queries and their meaning, from right to wrong, those in use alone."""
+    used = {query.meaning: query.color for query in queries}
+    order = [*_SCALE, UNKNOWN_COLOR, NO_POSE_COLOR]
+    return [(used[m], m) for m in sorted(used, key=lambda m: order.index(used[m]))]
+
+
+def _by_error(query: QueryResult, thresholds: tuple[Threshold, ...]) -> tuple[str, str]:
+    error = PoseErrors((query.image,), np.array([query.position_m]), np.array([query.angle_deg]))
+    shown = thresholds[: len(_SCALE) - 1]
+    for color, threshold in zip(_SCALE, shown, strict=False):
+        if within(error, threshold)[0]:
+            return color, f"within {threshold}"
+    return _SCALE[-1], f"beyond {shown[-1]}"
+
+
+def _by_confidence(confidence: float) -> tuple[str, str]:
+    for color, least in zip(_SCALE, _SURE, strict=False):
+        if confidence >= least:
+            return color, f"confidence {least:g} or more"
+    return _SCALE[-1], f"confidence below {_SURE[-1]:g}"
+
+
+@dataclass(eq=False)
+class StoredInliers:
+    """The 2D-3D matches of queries that agree with their poses, from what a run left behind.
+
+    A workspace keeps the matches of a query with map images, and the map says which of their
+    keypoints observe a point; those whose point lies within 12 pixels of the keypoint under the
+    query's pose are inliers. Nothing is known where matches, keypoints or points are missing or
+    broken: a picture without some inliers is better than none.
+    """
+
+    context: ResultContext
+    _sources: list[tuple[FeatureReader, MatchesReader, MapIndex]] = field(init=False)
+
+    def __post_init__(self) -> None:
+        # only those who draw inliers wait for what reads maps
+        from megloc_kapture.stages.query_poses import type_in_map
+        from megloc_kapture.stages.shared_index import index_map
+
+        self._sources = []
+        queries, mapping = self.context.queries, self.context.mapping
+        if queries is None or mapping is None or not mapping.has_points():
+            return
+        with contextlib.suppress(DataError):
+            kept = set(queries.types("matches"))
+            # those of a guided pyramid hold the others
+            kept -= {name for name in kept if f"{name}-pyramid" in kept}
+            for name in sorted(kept & set(queries.types("keypoints"))):
+                index = index_map(mapping, type_in_map(mapping, name))
+                self._sources.append((queries.keypoints(name), queries.matches(name), index))
+
+    def of(self, query: ShownQuery) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Pixels (K, 2) of the inliers of a query's pose, and their points (K, 3) in the world."""
+        if query.estimated is None or query.outcome != "localized" or not self._sources:
+            return _NOTHING
+        found = [_NOTHING]
+        with contextlib.suppress(DataError):
+            assert self.context.queries is not None
+            camera = self.context.queries.read().camera_of(query.image)
+            for keypoints, matches, index in self._sources:
+                pairs = [(query.image, image) for image in query.candidates]
+                read = [(pair[1], *matches.read(*pair)) for pair in pairs if pair in matches]
+                if not read or query.image not in keypoints:
+                    continue
+                one = observed_matches(index, read).resolve()
+                pixels = np.asarray(keypoints.read(query.image)[:, :2], np.float64)
+                if len(pixels) <= one.keypoint_ids.max(initial=-1):
+                    continue
+                px, xyz = pixels[one.keypoint_ids], index.xyz[one.point_ids]
+                apart = np.linalg.norm(project(camera, query.estimated, xyz) - px, axis=1)
+                found.append((px[apart <= INLIER_PX], xyz[apart <= INLIER_PX]))
+        return np.concatenate([px for px, _ in found]), np.concatenate([xyz for _, xyz in found])
+
+
+def spread(number: int, most: int) -> NDArray[np.int64]:
+    """At most ``most`` of ``number`` positions, evenly spread; the same each time."""
+    return np.unique(np.linspace(0, number - 1, min(number, most)).round().astype(np.int64))

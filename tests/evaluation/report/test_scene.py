@@ -1,0 +1,260 @@
+"""The 3D view: its data against kapture's own readers, its frusta against COLMAP's cameras."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import kapture
+import numpy as np
+import pycolmap
+import pytest
+from kapture.io.csv import kapture_from_dir
+
+from megloc_kapture.evaluation.report import scene as scenes
+from megloc_kapture.evaluation.report.scene import corner_rays, render_view, scene_of
+from megloc_kapture.evaluation.report.shown_queries import legend, shown_queries
+from megloc_kapture.evaluation.results import ResultContext
+from megloc_kapture.evaluation.scoring import evaluate_poses
+from megloc_kapture.geometry.cameras import project
+from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.kapture.points import write_points3d
+from megloc_kapture.io.tables import QueryStatus
+from megloc_kapture.values import Camera, RigidTransform
+
+EVIL = "</script><script>alert('\"&')</script>\u2028<!--.jpg"
+CAMERAS = (
+    Camera("SIMPLE_PINHOLE", 640, 480, (500.0, 320.0, 240.0)),
+    Camera("PINHOLE", 480, 640, (510.0, 500.0, 230.0, 322.0)),
+    Camera("OPENCV", 800, 600, (600.0, 601.0, 400.0, 300.0, -0.2, 0.05, 1e-3, -1e-3)),
+    Camera("OPENCV_FISHEYE", 800, 800, (600.0, 601.0, 400.0, 401.0, 0.02, -0.01, 0.0, 0.0)),
+)
+
+
+def data_of(page: str) -> dict[str, Any]:
+    """The data of a view, arrays decoded."""
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.DOTALL)
+    assert found is not None
+    data: dict[str, Any] = json.loads(found[1])
+    for name in ("points", "inliers"):
+        data[name] = decoded(data[name], "<f4").reshape(-1, 3)
+    for name in ("cameraFrusta", "frusta", "trueFrusta"):
+        data[name] = decoded(data[name], "<f4").reshape(-1, 5, 3)
+    data["colors"] = decoded(data["colors"], "u1").reshape(-1, 3)
+    return data
+
+
+def decoded(text: str, kind: str) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(text), kind)
+
+
+def check_against_kapture(data: dict[str, Any], theirs: kapture.Kapture) -> None:
+    """Points and camera centres of a view are kapture's, to float32 about the view's origin."""
+    points = np.asarray(theirs.points3d) if theirs.points3d is not None else np.zeros((0, 6))
+    scale = 1 + np.abs(points[:, :3] - data["origin"]).max(initial=0)
+    np.testing.assert_allclose(
+        data["origin"] + data["points"], points[:, :3], rtol=0, atol=1e-7 * scale
+    )
+    names = {
+        name: theirs.trajectories[timestamp, sensor]
+        for timestamp, sensor, name in kapture.flatten(theirs.records_camera)
+        if (timestamp, sensor) in theirs.trajectories
+    }
+    assert list(data["cameras"]) == sorted(names)
+    for name, frustum in zip(data["cameras"], data["cameraFrusta"], strict=True):
+        centre = names[name].inverse().t.ravel()
+        apart = np.abs(centre - data["origin"]).max()
+        np.testing.assert_allclose(data["origin"] + frustum[0], centre, atol=1e-7 * (1 + apart))
+
+
+def check_corners(camera: Camera, pose: RigidTransform, frustum: np.ndarray) -> None:
+    """The corners of a frustum are the image's corners, projected by COLMAP."""
+    in_cam = frustum[1:].astype(np.float64) @ pose.rotation_matrix().T
+    theirs = pycolmap.Camera(
+        model=camera.model, width=camera.width, height=camera.height, params=camera.params
+    )
+    pixels = theirs.img_from_cam(in_cam)
+    w, h = camera.width, camera.height
+    np.testing.assert_allclose(pixels, [[0, 0], [w, 0], [w, h], [0, h]], atol=2e-3)
+
+
+@pytest.fixture
+def make_map(tmp_path: Path, upright: Any, kaptures: Any) -> Callable[..., Path]:
+    def make(names: list[str], camera: Camera, points: np.ndarray, offset: float = 0.0) -> Path:
+        poses = {
+            name: upright(np.array([offset + 3.0 * k, k * 0.5, 1.6]), 0.3 * k)
+            for k, name in enumerate(names)
+        }
+        root: Path = kaptures(tmp_path / "map", names, poses, camera)
+        write_points3d(root, points)
+        (root / "reconstruction" / "observations.txt").write_text("# kapture format: 1.1\n")
+        return root
+
+    return make
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=lambda c: c.model)
+@pytest.mark.parametrize("offset", [0.0, 4.2e6], ids=["near zero", "ECEF"])
+def test_the_page_has_what_kapture_reads(make_map: Any, camera: Camera, offset: float) -> None:
+    rng = np.random.default_rng(0)
+    points = np.column_stack(
+        [rng.normal((offset, 0, 0), 5, (500, 3)), rng.integers(0, 256, (500, 3))]
+    )
+    root = make_map([f"m/{k}.jpg" for k in range(6)], camera, points, offset)
+    scene = scene_of("a map", ResultContext(mapping=KaptureFolder(root)))
+    assert scene is not None
+    data = data_of(render_view(scene))
+    check_against_kapture(data, kapture_from_dir(str(root), skip_list=[kapture.Observations]))
+    np.testing.assert_array_equal(data["colors"], points[:, 3:])
+    poses = KaptureFolder(root).read().poses()
+    for name, frustum in zip(data["cameras"], data["cameraFrusta"], strict=True):
+        check_corners(camera, poses[name], frustum)
+    np.testing.assert_allclose(data["up"], [0, 0, 1], atol=1e-9)
+
+
+def test_a_foreign_map_of_rigs(shared_data: Path) -> None:
+    root = shared_data / "foreign_maps" / "virtual_gallery" / "map"
+    scene = scene_of("gallery", ResultContext(mapping=KaptureFolder(root)))
+    assert scene is not None
+    data = data_of(render_view(scene))
+    check_against_kapture(data, kapture_from_dir(str(root), skip_list=[kapture.Observations]))
+    read = KaptureFolder(root).read()
+    for name, frustum in zip(data["cameras"], data["cameraFrusta"], strict=True):
+        check_corners(read.camera_of(name), read.poses()[name], frustum)
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        # beyond 90 degrees, beyond where the polynomial turns, and not to be inverted at all
+        Camera("OPENCV_FISHEYE", 800, 800, (200.0, 200.0, 400.0, 400.0, 0.0, 0.0, 0.0, 0.0)),
+        Camera("SIMPLE_RADIAL", 2000, 1500, (500.0, 1000.0, 750.0, -0.4)),
+        Camera("FOV", 640, 480, (5.0, 5.0, 320.0, 240.0, 1e-12)),
+    ],
+    ids=lambda c: c.model,
+)
+def test_corners_of_extreme_lenses_stay_finite(camera: Camera) -> None:
+    rays = corner_rays(camera)
+    assert rays.shape == (4, 3) and np.isfinite(rays).all() and np.abs(rays).max() < 10
+    assert (np.sign(rays[:, :2]) == [[-1, -1], [1, -1], [1, 1], [-1, 1]]).all()
+
+
+def test_many_points_and_cameras_are_drawn_in_part(make_map: Any, monkeypatch: Any) -> None:
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.normal(0, 5, (90_000, 3)), rng.integers(0, 256, (90_000, 3))])
+    monkeypatch.setattr(scenes, "MAX_CAMERAS", 10)
+    root = make_map([f"m/{k:03d}.jpg" for k in range(30)], CAMERAS[0], points)
+    scene = scene_of("many", ResultContext(mapping=KaptureFolder(root)))
+    assert scene is not None and len(scene.cameras) == 10
+    assert "60000 of the map's 90000 points" in scene.notes[0]
+    assert "10 of the map's 30 cameras" in scene.notes[1]
+    page = render_view(scene)
+    assert len(page) < 3_000_000
+    again = scene_of("many", ResultContext(mapping=KaptureFolder(root)))
+    assert again is not None and render_view(again) == page
+    known = {tuple(row) for row in np.float32(points[:, :3] - scene.origin).tolist()}
+    assert {tuple(row) for row in scene.points.tolist()} <= known
+
+
+def test_names_cannot_leave_the_data(world: Any, make_map: Any, upright: Any) -> None:
+    root = make_map(["m/0.jpg", "m/1.jpg"], CAMERAS[0], np.zeros((1, 6)))
+    name = f"query/{EVIL}"
+    world.truth[name] = world.estimated[name] = upright(np.zeros(3), 0.0)
+    world.conditions = dict.fromkeys(world.truth, EVIL)
+    world.statuses[name] = QueryStatus(image=name, status="failed", reason=EVIL)
+    evaluation = evaluate_poses(
+        world.estimated, world.truth, conditions=world.conditions, statuses=world.statuses
+    )
+    context = ResultContext(mapping=KaptureFolder(root))
+    scene = scene_of(EVIL, context, shown_queries(evaluation))
+    assert scene is not None
+    page = render_view(replace(scene, cameras=(EVIL, "m/1.jpg")))
+    # two scripts, of data and ours, whatever the names say
+    assert page.count("<script") == page.count("</script>") == 2 and "alert('" not in page[:2000]
+    data = data_of(page)
+    assert data["cameras"][0] == EVIL
+    assert name in [query["name"] for query in data["queries"]]
+    assert {query["condition"] for query in data["queries"]} == {EVIL}
+    assert html.escape(EVIL).replace("&#x27;", "&#39;").replace("&quot;", "&#34;") in page
+    for outside in ("http:", "https:", "src=", "href=", "import ", "fetch(", "url("):
+        assert outside not in page
+
+
+def test_queries_estimates_and_truths(world: Any, make_map: Any) -> None:
+    root = make_map(["m/0.jpg", "m/1.jpg"], CAMERAS[0], np.zeros((1, 6)))
+    evaluation = evaluate_poses(
+        world.estimated, world.truth, conditions=world.conditions, statuses=world.statuses
+    )
+    shown = shown_queries(evaluation)
+    scene = scene_of("queries", ResultContext(mapping=KaptureFolder(root)), shown)
+    assert scene is not None
+    data = data_of(render_view(scene))
+    by_image = {query.image: query for query in evaluation.queries}
+    met = [evaluation.thresholds.index(t) for t in evaluation.thresholds]
+    assert met  # the colours below are those of the thresholds
+    for query, frustum, true in zip(
+        data["queries"], data["frusta"], data["trueFrusta"], strict=True
+    ):
+        name = query["name"]
+        one = by_image[name]
+        np.testing.assert_allclose(data["origin"] + true[0], world.truth[name].center(), atol=1e-5)
+        if one.outcome == "missing":
+            assert np.isnan(frustum).all() and query["meaning"] == "no pose"
+            assert query["error"] is None and one.reason in query["facts"][0]
+            continue
+        np.testing.assert_allclose(
+            data["origin"] + frustum[0], world.estimated[name].center(), atol=1e-5
+        )
+        assert query["error"] == one.position_m
+        within = [
+            t for t in evaluation.thresholds
+            if one.position_m <= t.position_m and one.angle_deg <= (t.angle_deg or np.inf)
+        ]  # fmt: skip
+        expected = f"within {within[0]}" if within else f"beyond {evaluation.thresholds[-1]}"
+        assert query["meaning"] == expected
+    errors = [np.inf if q["error"] is None else q["error"] for q in data["queries"]]
+    assert errors == sorted(errors, reverse=True)
+    used = legend(list(shown))
+    assert [m for _, m in used][-1] == "no pose" and len({c for c, _ in used}) == len(used)
+
+
+def test_of_many_queries_the_worst_are_shown(worlds: Any, make_map: Any) -> None:
+    root = make_map(["m/0.jpg", "m/1.jpg"], CAMERAS[0], np.zeros((1, 6)))
+    world = worlds(num_queries=3000)
+    evaluation = evaluate_poses(world.estimated, world.truth, statuses=world.statuses)
+    context = ResultContext(mapping=KaptureFolder(root))
+    scene = scene_of("many", context, shown_queries(evaluation))
+    assert scene is not None and len(scene.queries) == 2000
+    assert scene.notes == ("The worst 2000 of 3000 queries are drawn and listed.",)
+    assert len(render_view(scene)) < 3_000_000
+
+
+def test_a_map_without_colours_is_shaded_by_height(make_map: Any) -> None:
+    points = np.zeros((50, 6))
+    points[:, 2] = np.arange(50)
+    root = make_map(["m/0.jpg", "m/1.jpg"], CAMERAS[0], points)
+    scene = scene_of("grey", ResultContext(mapping=KaptureFolder(root)))
+    assert scene is not None
+    assert (np.diff(scene.colors.astype(int).sum(axis=1)) >= 0).all() and scene.colors.std() > 20
+
+
+def test_nothing_to_see() -> None:
+    assert scene_of("nothing", ResultContext()) is None
+
+
+def test_projection_agrees_with_the_package(make_map: Any) -> None:
+    """A point on a ray of the frustum is seen at the corner by the package's own projection."""
+    camera = CAMERAS[2]
+    root = make_map(["m/0.jpg", "m/1.jpg"], camera, np.zeros((1, 6)))
+    scene = scene_of("rays", ResultContext(mapping=KaptureFolder(root)))
+    assert scene is not None
+    pose = KaptureFolder(root).read().poses()[scene.cameras[0]]
+    corners = scene.origin + scene.camera_frusta[0, 0] + 7.0 * scene.camera_frusta[0, 1:]
+    pixels = project(camera, pose, corners)
+    np.testing.assert_allclose(pixels, [[0, 0], [800, 0], [800, 600], [0, 600]], atol=1e-2)
