@@ -149,6 +149,7 @@ def browse(page: Path, width: int, height: int, tmp_path: Path, *, script: str =
     shot = tmp_path / f"{page.stem}-{width}.png"
     flags = ["--headless=new", "--no-sandbox", "--hide-scrollbars", "--enable-logging=stderr"]
     flags += ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--v=0"]
+    flags += ["--force-prefers-reduced-motion"]  # flying takes no time
     flags += [f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=3000"]
     done = subprocess.run(
         [
@@ -185,6 +186,28 @@ def test_a_browser_draws_the_view(finished: Path, tmp_path: Path) -> None:
         page, 1000, 700, tmp_path, script="document.querySelector('#list button').click()"
     )
     assert name and (np.abs(np.asarray(flown)[:600, :600] - picture).sum(axis=2) > 60).mean() > 0.01
+
+
+@needs_chromium
+@pytest.mark.slow
+def test_a_tap_chooses_a_query_and_dragging_does_not(finished: Path, tmp_path: Path) -> None:
+    script = """
+        const canvas = document.getElementById('scene'), chosen = document.getElementById('chosen');
+        canvas.setPointerCapture = () => {};  // these pointers are made up
+        const at = (kind, x, y) => canvas.dispatchEvent(new PointerEvent(kind, {
+          clientX: canvas.clientWidth / 2 + x, clientY: canvas.clientHeight / 2 + y,
+          pointerId: 7, pointerType: 'touch', bubbles: true }));
+        document.querySelector('#list button').click();
+        const name = chosen.querySelector('.name').textContent;
+        setTimeout(() => {
+          chosen.textContent = '';
+          at('pointerdown', 0, 0); at('pointermove', 60, 0); at('pointermove', 0, 0);
+          at('pointerup', 0, 0);
+          if (chosen.textContent) console.error('dragging chose', chosen.textContent);
+          at('pointerdown', 0, 0); at('pointerup', 0, 0);
+          if (!chosen.textContent.includes(name)) console.error('no tap', chosen.textContent, name);
+        }, 1500);"""
+    browse(finished / "evaluation/view.html", 1000, 700, tmp_path, script=script)
 
 
 @needs_chromium

@@ -36,6 +36,9 @@ from megloc_kapture.values import Camera, RigidTransform
 MAX_POINTS, MAX_CAMERAS, MAX_QUERIES = 60_000, 4_000, 2_000
 # points that inliers lead to: of all queries, and of one of them
 _MAX_INLIERS, _MAX_INLIERS_OF_ONE = 40_000, 300
+# to find a query's inliers takes 20 ms, of many keypoints more
+_MAX_QUERIES_WITH_INLIERS = 300
+_MAX_FRAMES = 255
 _SEED = 0
 # rays further from the axis than this (80 degrees) make a frustum that hides everything
 _WIDEST = 5.7
@@ -62,6 +65,8 @@ class Scene:
     inliers : float32 (K, 3), points of the queries' inliers one query after another, and
         ``num_inliers`` (Q,) how many each has here.
     radius : of what there is to see around the origin, unit of the map.
+    frames : names of the map's coordinate frames, which share no world and are shown one at a time;
+        ``point_frames``, ``camera_frames``, ``query_frames`` uint8 (P,), (C,), (Q,) say which.
     notes : sentences on what is left out.
     """
 
@@ -78,6 +83,10 @@ class Scene:
     inliers: NDArray[np.float32]
     num_inliers: tuple[int, ...]
     radius: float
+    frames: tuple[str, ...]
+    point_frames: NDArray[np.uint8]
+    camera_frames: NDArray[np.uint8]
+    query_frames: NDArray[np.uint8]
     notes: tuple[str, ...]
 
 
@@ -102,10 +111,14 @@ def scene_of(
     points = np.zeros((0, 6))
     if mapping is not None and mapping.has_points():
         points = mapping.points3d()
-    points = points[np.isfinite(points[:, :3]).all(axis=1)]
-    if len(points) > MAX_POINTS:
-        notes.append(f"{MAX_POINTS} of the map's {len(points)} points are drawn.")
-        points = points[np.sort(rng.choice(len(points), MAX_POINTS, replace=False))]
+    frame_of = {name: context.frames.get(name, "") for name in map_poses}
+    frames = sorted(set(frame_of.values()))[:_MAX_FRAMES] or [""]
+    point_frames = _point_frames(mapping, frame_of, frames, len(points))
+    kept = np.flatnonzero(np.isfinite(points[:, :3]).all(axis=1))
+    if len(kept) > MAX_POINTS:
+        notes.append(f"{MAX_POINTS} of the map's {len(kept)} points are drawn.")
+        kept = np.sort(rng.choice(kept, MAX_POINTS, replace=False))
+    points, point_frames = points[kept], point_frames[kept]
     names = list(map_poses)
     if len(names) > MAX_CAMERAS:
         notes.append(f"{MAX_CAMERAS} of the map's {len(names)} cameras are drawn.")
@@ -130,8 +143,15 @@ def scene_of(
     origin = np.round((low + high) / 2, 3)
     rays = _rays(context.queries, [query.image for query in queries])
     stored = StoredInliers(context) if any(q.num_inliers for q in queries) else None
-    most = min(_MAX_INLIERS // max(len(queries), 1), _MAX_INLIERS_OF_ONE)
-    inliers = [np.zeros((0, 3)) if stored is None else stored.of(query)[1] for query in queries]
+    with_inliers = min(max(len(queries), 1), _MAX_QUERIES_WITH_INLIERS)
+    most = min(_MAX_INLIERS // with_inliers, _MAX_INLIERS_OF_ONE)
+    if stored is not None and stored.known and len(queries) > _MAX_QUERIES_WITH_INLIERS:
+        notes.append(f"Inliers are drawn of the worst {_MAX_QUERIES_WITH_INLIERS} queries.")
+    inliers = [
+        np.zeros((0, 3)) if stored is None else stored.of(query)[1]
+        for query in queries[:_MAX_QUERIES_WITH_INLIERS]
+    ]
+    inliers += [np.zeros((0, 3))] * (len(queries) - len(inliers))
     if any(len(own) > most for own in inliers):
         notes.append(f"Of a query's inliers at most {most} are drawn.")
     inliers = [own[spread(len(own), most)] for own in inliers]
@@ -149,6 +169,10 @@ def scene_of(
         inliers=(np.concatenate([np.zeros((0, 3)), *inliers]) - origin).astype(np.float32),
         num_inliers=tuple(len(own) for own in inliers),
         radius=max(float(np.linalg.norm(high - low)) / 2, 1e-3),
+        frames=tuple(frames),
+        point_frames=point_frames,
+        camera_frames=_positions([frame_of[name] for name in names], frames),
+        query_frames=_positions([_frame_of(q, context, frame_of) for q in queries], frames),
         notes=tuple(notes),
     )
 
@@ -181,6 +205,10 @@ def render_view(scene: Scene) -> str:
         "frusta": _encoded(scene.frusta),
         "trueFrusta": _encoded(scene.true_frusta),
         "inliers": _encoded(scene.inliers),
+        "frames": scene.frames,
+        "pointFrames": _encoded(scene.point_frames),
+        "cameraFrames": _encoded(scene.camera_frames),
+        "queryFrames": _encoded(scene.query_frames),
     }
     return template("view.html").render(
         title=scene.title,
@@ -192,6 +220,7 @@ def render_view(scene: Scene) -> str:
             "queries": len(scene.queries),
             "failed": len(failed),
         },
+        frames=scene.frames,
         has_truth=bool(np.isfinite(scene.true_frusta).any()),
         notes=scene.notes,
     )
@@ -234,6 +263,32 @@ def _frusta(
         if pose is not None:
             own[0] = pose.center() - origin
             own[1:] = of_camera @ pose.rotation_matrix()  # R^T x of rows
+    return found
+
+
+def _frame_of(query: ShownQuery, context: ResultContext, frame_of: Mapping[str, str]) -> str:
+    """The frame of a query's pose: its own, or that of the images it was estimated from."""
+    if query.image in context.frames:
+        return context.frames[query.image]
+    known = (frame_of[image] for image in query.candidates if image in frame_of)
+    return next(known, query.condition)
+
+
+def _positions(frames: Sequence[str], known: Sequence[str]) -> NDArray[np.uint8]:
+    """Positions among the known frames; of one that is not there, the first."""
+    at = {name: position for position, name in enumerate(known)}
+    return np.array([at.get(name, 0) for name in frames], np.uint8)
+
+
+def _point_frames(
+    mapping: KaptureFolder | None, frame_of: Mapping[str, str], frames: Sequence[str], number: int
+) -> NDArray[np.uint8]:
+    """The frame of each point of the map: that of the images that observe it."""
+    found = np.zeros(number, np.uint8)
+    if mapping is not None and number and len(frames) > 1:
+        for seen in mapping.observations().values():
+            of_image = _positions([frame_of.get(name, "") for name in seen.image_names], frames)
+            found[seen.point_ids] = of_image[seen.image_ids]
     return found
 
 

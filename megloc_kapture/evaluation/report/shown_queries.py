@@ -176,6 +176,11 @@ class StoredInliers:
                 index = index_map(mapping, type_in_map(mapping, name))
                 self._sources.append((queries.keypoints(name), queries.matches(name), index))
 
+    @property
+    def known(self) -> bool:
+        """Whether matches and points are there at all."""
+        return bool(self._sources)
+
     def of(self, query: ShownQuery) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Pixels (K, 2) of the inliers of a query's pose, and their points (K, 3) in the world."""
         if query.estimated is None or query.outcome != "localized" or not self._sources:

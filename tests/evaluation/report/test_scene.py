@@ -258,3 +258,29 @@ def test_projection_agrees_with_the_package(make_map: Any) -> None:
     corners = scene.origin + scene.camera_frusta[0, 0] + 7.0 * scene.camera_frusta[0, 1:]
     pixels = project(camera, pose, corners)
     np.testing.assert_allclose(pixels, [[0, 0], [800, 0], [800, 600], [0, 600]], atol=1e-2)
+
+
+def test_coordinate_frames_are_kept_apart(world: Any, make_map: Any) -> None:
+    names = [f"m/{k}.jpg" for k in range(4)]
+    points = np.zeros((3, 6))
+    root = make_map(names, CAMERAS[0], points)
+    (root / "reconstruction" / "observations.txt").write_text(
+        "# kapture format: 1.1\n0, x, m/0.jpg, 0\n1, x, m/3.jpg, 0\n2, x, m/2.jpg, 1, m/3.jpg, 1\n"
+    )
+    evaluation = evaluate_poses(
+        world.estimated, world.truth, conditions=world.conditions, statuses=world.statuses
+    )
+    shown = [
+        replace(q, candidates=("m/2.jpg",) * (k % 2))
+        for k, q in enumerate(shown_queries(evaluation))
+    ]
+    frames = dict.fromkeys(names[:2], "DUC1") | dict.fromkeys(names[2:], "DUC2")
+    context = ResultContext(mapping=KaptureFolder(root), frames=frames)
+    scene = scene_of("frames", context, shown)
+    assert scene is not None and scene.frames == ("DUC1", "DUC2")
+    assert scene.point_frames.tolist() == [0, 1, 1]
+    assert scene.camera_frames.tolist() == [0, 0, 1, 1]
+    assert scene.query_frames.tolist() == [k % 2 for k in range(len(shown))]
+    assert "DUC2</option>" in render_view(scene)
+    one = scene_of("one", ResultContext(mapping=KaptureFolder(root)), shown)
+    assert one is not None and 'id="frame"' not in render_view(one)

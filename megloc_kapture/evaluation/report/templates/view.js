@@ -20,7 +20,9 @@
   const vector = (array, i) => [array[3 * i], array[3 * i + 1], array[3 * i + 2]];
   const centre = (array, i) => vector(array, 5 * i);
   const has = (array, i) => Number.isFinite(array[15 * i]);
-  let first = 0;
+  const pointFrames = bytes(data.pointFrames), cameraFrames = bytes(data.cameraFrames);
+  const queryFrames = bytes(data.queryFrames);
+  let frame = 0, first = 0; // frames share no world, so one of them is drawn at a time
   for (const query of queries) { query.first = first; first += query.drawn; }
 
   // ---- the eye: it turns about a target, up is the map's
@@ -129,18 +131,17 @@
   }
   const size = () => usual * 2 ** Number(at("size").value);
   const white = [1, 1, 1], red = [1, 0.3, 0.3], grey = [0.56, 0.65, 0.75];
-  const dots = gl && cloud(), cameras = gl && new Mesh(gl.LINES), lines = gl && new Mesh(gl.LINES);
-  const faces = gl && new Mesh(gl.TRIANGLES), allInliers = gl && new Mesh(gl.LINES);
-  let own = null; // of the chosen query
+  let dots, cameras, lines, faces, allInliers, own = null; // own: of the chosen query
   function cloud() {
     const mesh = new Mesh(gl.POINTS), colors = bytes(data.colors), n = points.length / 3;
     const rows = new Float32Array(10 * n);
-    for (let i = 0; i < n; i++) {
-      rows.set(points.subarray(3 * i, 3 * i + 3), 10 * i);
-      for (let k = 0; k < 3; k++) rows[10 * i + 6 + k] = colors[3 * i + k] / 255;
-      rows[10 * i + 9] = 1;
+    let at = 0;
+    for (let i = 0; i < n; i++) if (pointFrames[i] === frame) {
+      rows.set(points.subarray(3 * i, 3 * i + 3), at);
+      for (let k = 0; k < 3; k++) rows[at + 6 + k] = colors[3 * i + k] / 255;
+      rows[at + 9] = 1; at += 10;
     }
-    mesh.rows = rows;
+    mesh.rows = rows.subarray(0, at);
     return mesh;
   }
   function inlierLines(mesh, i, alpha) {
@@ -148,9 +149,14 @@
     for (let k = q.first; k < q.first + q.drawn; k++)
       mesh.line(centre(frusta, i), vector(inliers, k), rgb(q.color), alpha);
   }
-  if (gl) {
-    for (let i = 0; i < cameraFrusta.length / 15; i++) cameras.frustum(cameraFrusta, i, grey, 0.7);
+  function build() {
+    dots = cloud(); own = null;
+    [cameras, lines, allInliers] = [0, 1, 2].map(() => new Mesh(gl.LINES));
+    faces = new Mesh(gl.TRIANGLES);
+    for (let i = 0; i < cameraFrusta.length / 15; i++)
+      if (cameraFrames[i] === frame) cameras.frustum(cameraFrusta, i, grey, 0.7);
     queries.forEach((q, i) => {
+      if (queryFrames[i] !== frame) return;
       if (has(trueFrusta, i)) lines.frustum(trueFrusta, i, white, 0.55);
       if (!has(frusta, i)) return;
       lines.frustum(frusta, i, rgb(q.color), 1);
@@ -158,6 +164,12 @@
       if (has(trueFrusta, i)) lines.line(centre(frusta, i), centre(trueFrusta, i), red, 1);
       inlierLines(allInliers, i, 0.12);
     });
+  }
+  if (gl) build();
+  function enter(to) {
+    frame = to;
+    if (gl) build();
+    redraw();
   }
   let asked = false;
   function redraw() { if (!asked) { asked = true; requestAnimationFrame(draw); } }
@@ -205,6 +217,7 @@
   }
   function choose(i) {
     chosen = i;
+    if (queryFrames[i] !== frame) { at("frame").value = queryFrames[i]; enter(queryFrames[i]); }
     const q = queries[i], posed = has(frusta, i), array = posed ? frusta : trueFrusta;
     const said = q.facts.slice();
     if (q.condition) said.unshift(q.condition);
@@ -240,7 +253,7 @@
     const m = matrix(eye, canvas.clientWidth / canvas.clientHeight);
     let best = null, least = reach;
     const look = (array, i, kind) => {
-      if (!has(array, i)) return;
+      if (!has(array, i) || (kind === "query" ? queryFrames : cameraFrames)[i] !== frame) return;
       const c = centre(array, i);
       let ahead = [0, 0, 0];
       for (let k = 1; k < 5; k++) ahead = add(ahead, vector(array, 5 * i + k), 0.25);
@@ -326,6 +339,7 @@
   });
   for (const id of ["show-points", "show-cameras", "show-inliers", "size"])
     if (at(id)) at(id).addEventListener("input", redraw);
+  if (at("frame")) at("frame").addEventListener("change", () => enter(Number(at("frame").value)));
   at("home").addEventListener("click", () => go({ ...home }));
   new ResizeObserver(redraw).observe(canvas);
 
