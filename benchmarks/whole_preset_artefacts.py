@@ -233,5 +233,6 @@ _ARTEFACTS: dict[str, dict[str, Reader]] = {
         "evaluation/recall.txt": _file,
         "evaluation/per_query.csv": _table,
         "evaluation/report.html": _file,
+        "evaluation/view.html": _file,
     },
 }

@@ -231,6 +231,8 @@
       line.className = "soft"; line.textContent = text; return line; }));
     for (const button of at("list").querySelectorAll("button"))
       button.setAttribute("aria-current", String(Number(button.dataset.i) === i));
+    const item = at("list").querySelector("[aria-current=true]");
+    if (item && getComputedStyle(at("list")).overflowY === "auto") item.scrollIntoView({ block: "nearest" });
     if (gl) {
       own = { lines: new Mesh(gl.LINES), inliers: new Mesh(gl.LINES) };
       if (posed) { own.lines.frustum(frusta, i, white, 1); inlierLines(own.inliers, i, 0.3); }
