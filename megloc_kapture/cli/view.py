@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from megloc_kapture.cli.common import Common, Force, Linked, Output
+from megloc_kapture.cli.common import Common, Force, Linked, Output, opened_map
 from megloc_kapture.errors import DataError, OptionError
 
 
@@ -18,7 +18,7 @@ class View(Linked, Common):
     network."""
 
     map: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MAP")]
-    """Kapture folder: a map with points, or images with poses."""
+    """Kapture folder: a map with points, or images with poses; or a COLMAP model."""
     result: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="RESULT")] = None
     """Localized kapture folder, or pose file."""
     gt: Path | None = None
@@ -41,9 +41,8 @@ class View(Linked, Common):
                 raise DataError("no such file or folder", path=path)
         if self.gt is not None and self.result is None:
             raise OptionError("--gt needs a result to compare with it: megloc view MAP RESULT")
-        left_out = write_view(
-            self.output, self.kapture(self.map), self.result, self.gt, force=self.force
-        )
+        folder = self.kapture(opened_map(self.map, console))
+        left_out = write_view(self.output, folder, self.result, self.gt, force=self.force)
         if left_out:
             console.say(left_out)
         console.result(f"view: {self.output}")

@@ -30,6 +30,7 @@ from megloc_kapture.evaluation.report.shown_queries import (
 from megloc_kapture.evaluation.results import ResultContext
 from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.geometry.poses import camera_centers, stack_poses
+from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import Camera, RigidTransform
 
@@ -39,6 +40,7 @@ _MAX_INLIERS, _MAX_INLIERS_OF_ONE = 40_000, 300
 # to find a query's inliers takes 20 ms, of many keypoints more
 _MAX_QUERIES_WITH_INLIERS = 300
 _MAX_FRAMES = 255
+_MAX_COLOR_IMAGES = 150
 _SEED = 0
 # rays further from the axis than this (80 degrees) make a frustum that hides everything
 _WIDEST = 5.7
@@ -160,7 +162,7 @@ def scene_of(
         origin=origin,
         up=np.cross(view.right, view.up),
         points=(points[:, :3] - origin).astype(np.float32),
-        colors=_colors(points, np.cross(view.right, view.up)),
+        colors=_colors(points, np.cross(view.right, view.up), mapping, kept),
         cameras=tuple(names),
         camera_frusta=_frusta(poses, _rays(mapping, names), origin),
         queries=tuple(queries),
@@ -292,15 +294,50 @@ def _point_frames(
     return found
 
 
-def _colors(points: NDArray[np.float64], up: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """The points' own colours; of a map without any, greys that grow lighter upwards."""
+def _colors(
+    points: NDArray[np.float64],
+    up: NDArray[np.float64],
+    mapping: KaptureFolder | None,
+    rows: NDArray[np.int64],
+) -> NDArray[np.uint8]:
+    """The points' own colours (P, 3); of a map without any those of its images, and where no image
+    says one, greys that grow lighter upwards. ``rows`` are the points' in the map."""
     if points[:, 3:].any():
         return np.asarray(np.clip(np.round(points[:, 3:]), 0, 255), np.uint8)
     heights = points[:, :3] @ up
     low, high = np.quantile(heights, _SEEN_AT_FIRST) if len(heights) else (0.0, 1.0)
     share = np.clip((heights - low) / max(high - low, 1e-9), 0, 1)[:, None]
     dark, light = np.array([70, 96, 128]), np.array([226, 230, 222])
-    return np.asarray(np.round(dark + share * (light - dark)), np.uint8)
+    colors = np.asarray(np.round(dark + share * (light - dark)), np.uint8)
+    if mapping is not None and len(points):
+        position = np.full(int(rows.max()) + 1, -1)
+        position[rows] = np.arange(len(rows))
+        # without images, or keypoints, the greys are as good
+        with contextlib.suppress(DataError):
+            _color_from_images(colors, position, mapping)
+    return colors
+
+
+def _color_from_images(
+    colors: NDArray[np.uint8], position: NDArray[np.int64], mapping: KaptureFolder
+) -> None:
+    """Set the colours of points to those of the pixels that observe them."""
+    for name, seen in mapping.observations().items():
+        keypoints = mapping.keypoints(name)
+        order = np.argsort(seen.image_ids, kind="stable")
+        ends = np.searchsorted(seen.image_ids[order], np.arange(len(seen.image_names) + 1))
+        for at in spread(len(seen.image_names), _MAX_COLOR_IMAGES).tolist():
+            rows = order[ends[at] : ends[at + 1]]
+            rows = rows[seen.point_ids[rows] < len(position)]
+            drawn = position[seen.point_ids[rows]]
+            rows, drawn = rows[drawn >= 0], drawn[drawn >= 0]
+            if not len(rows):
+                continue
+            image = seen.image_names[at]
+            pixels = read_image_rgb(mapping.image_path(image))
+            x, y = np.floor(keypoints.read(image)[seen.keypoint_ids[rows], :2]).astype(int).T
+            height, width = pixels.shape[:2]
+            colors[drawn] = pixels[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)]
 
 
 def _encoded(array: NDArray[np.float32] | NDArray[np.uint8]) -> str:

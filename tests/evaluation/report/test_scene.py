@@ -23,7 +23,8 @@ from megloc_kapture.evaluation.report.shown_queries import legend, shown_queries
 from megloc_kapture.evaluation.results import ResultContext
 from megloc_kapture.evaluation.scoring import evaluate_poses
 from megloc_kapture.geometry.cameras import project
-from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.images import write_image
+from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
 from megloc_kapture.io.kapture.points import write_points3d
 from megloc_kapture.io.tables import QueryStatus
 from megloc_kapture.values import Camera, RigidTransform
@@ -284,3 +285,24 @@ def test_coordinate_frames_are_kept_apart(world: Any, make_map: Any) -> None:
     assert "DUC2</option>" in render_view(scene)
     one = scene_of("one", ResultContext(mapping=KaptureFolder(root)), shown)
     assert one is not None and 'id="frame"' not in render_view(one)
+
+
+def test_points_without_colours_have_those_of_the_images(make_map: Any) -> None:
+    names = ["m/0.jpg", "m/1.jpg"]
+    root = make_map(names, CAMERAS[0], np.zeros((4, 6)))
+    (root / "reconstruction" / "observations.txt").write_text(
+        "# kapture format: 1.1\n0, x, m/0.jpg, 0\n1, x, m/0.jpg, 1\n2, x, m/1.jpg, 0\n"
+    )
+    config = FeatureConfig("x", np.dtype("<f4"), 2)
+    with FeatureWriter(root, "keypoints", "x", config) as keypoints:
+        keypoints.write(names[0], np.float32([[100.5, 50.5], [639.9, 479.9]]))
+        keypoints.write(names[1], np.float32([[0.1, 0.1]]))
+    colors = {"m/0.jpg": (200, 30, 40), "m/1.jpg": (10, 150, 60)}
+    for name, color in colors.items():
+        pixels = np.full((480, 640, 3), color, np.uint8)
+        write_image(root / "sensors/records_data" / name, pixels)
+    scene = scene_of("coloured", ResultContext(mapping=KaptureFolder(root)))
+    assert scene is not None
+    expected = np.array([colors["m/0.jpg"], colors["m/0.jpg"], colors["m/1.jpg"]])
+    np.testing.assert_allclose(scene.colors[:3].astype(int), expected, atol=4)  # JPEG
+    assert np.ptp(scene.colors[3].astype(int)) < 70  # a grey: nothing observes it

@@ -187,7 +187,8 @@
     gl.blendFuncSeparate(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA, gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.useProgram(program);
     gl.uniformMatrix4fv(uniform.view, false, matrix(eye, w / h));
-    gl.uniform1f(uniform.dot_px, 0.006 * data.radius * Math.min(w, h));
+    const few = Math.min(Math.max(Math.sqrt(6e4 / points.length), 1), 2); // larger where they are few
+    gl.uniform1f(uniform.dot_px, 0.006 * few * data.radius * Math.min(w, h));
     const ticked = (id) => { const box = at(id); return box && box.checked; };
     if (ticked("show-points")) dots.draw();
     if (ticked("show-cameras")) cameras.draw();
