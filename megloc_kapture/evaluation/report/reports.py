@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 from markupsafe import Markup
 
+from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.metrics import ALL
 from megloc_kapture.evaluation.report import tables
 from megloc_kapture.evaluation.report.document import (
@@ -119,11 +121,15 @@ def report_of(
 def _view(
     result: Evaluation | ResultWithoutTruth, context: ResultContext, title: str
 ) -> dict[str, str]:
-    """The page of the view by its name; none where no camera has a pose."""
+    """The page of the view by its name; none where no camera has a pose, or the map is broken."""
     from megloc_kapture.evaluation.report.scene import render_view, scene_of
 
-    scene = scene_of(title, context, shown_queries(result))
-    return {} if scene is None else {VIEW_HTML: render_view(scene)}
+    # a report without a view is better than none; `megloc view` says what is broken
+    with contextlib.suppress(DataError):
+        scene = scene_of(title, context, shown_queries(result))
+        if scene is not None:
+            return {VIEW_HTML: render_view(scene)}
+    return {}
 
 
 def _view_section() -> Section:
