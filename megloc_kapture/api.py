@@ -94,7 +94,10 @@ class Map:
         :func:`megloc_kapture.evaluation.view.write_view`."""
         from megloc_kapture.evaluation.view import write_view
 
-        write_view(path, self.kapture_map.folder, result, truth)
+        if isinstance(result, Results):
+            result.view(path, truth)
+        else:
+            write_view(path, self.kapture_map.folder, result, truth)
 
     @overload
     def localize(

@@ -196,10 +196,11 @@ def results_without_truth(
 def _context(source: Localized, mapping: Path | str | None) -> ResultContext:
     if not isinstance(source, Mapping):
         return context_of(source, mapping=mapping)
-    folder = getattr(source, "folder", None)  # of results that are localized when asked for
+    poses = {image: found for image, found in source.items() if isinstance(found, Pose)}
     return ResultContext(
-        queries=folder if isinstance(folder, KaptureFolder) else None,
         mapping=None if mapping is None else KaptureFolder(mapping),
+        localized=poses,
+        cameras={image: pose.camera for image, pose in poses.items() if pose.camera is not None},
     )
 
 

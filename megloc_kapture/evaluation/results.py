@@ -44,7 +44,7 @@ from megloc_kapture.io.tables import (
     read_status,
 )
 from megloc_kapture.stages.localized_folder import query_status
-from megloc_kapture.values import Failure, Pose, RefinementRow, RigidTransform
+from megloc_kapture.values import Camera, Failure, Pose, RefinementRow, RigidTransform
 
 # parts of a workspace; datasets and the pipeline write them
 # the map's own keypoints are what queries were matched with; before there is one, its images do
@@ -71,6 +71,8 @@ class ResultContext:
     consistency : what the map's own images said of it, before poses were refined.
     masked : folders whose images have masks, with the keypoints that were found in them.
     seconds : stage of the run -> seconds that it took, in their order.
+    localized : image -> what localizing gave, of results in memory.
+    cameras : image -> its camera, of queries that are in no folder.
     """
 
     queries: KaptureFolder | None = None
@@ -81,6 +83,8 @@ class ResultContext:
     consistency: Sequence[ConsistencyRow] = ()
     masked: Sequence[KaptureFolder] = ()
     seconds: Mapping[str, float] = field(default_factory=dict)
+    localized: Mapping[str, Pose] = field(default_factory=dict)
+    cameras: Mapping[str, Camera] = field(default_factory=dict)
 
     def map_poses(self) -> dict[str, RigidTransform]:
         """``cam_from_world`` of the map's images; empty without a map.

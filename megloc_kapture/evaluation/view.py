@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from megloc_kapture.errors import DataError, OptionError, OutputError
@@ -17,6 +18,7 @@ from megloc_kapture.evaluation.scoring import Evaluation
 from megloc_kapture.evaluation.without_truth import ResultWithoutTruth
 from megloc_kapture.io.files import write_bytes
 from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.values import Camera
 
 _OURS = b'content="megloc view"'
 _HEAD_BYTES = 1000
@@ -28,6 +30,7 @@ def write_view(
     result: Localized | None = None,
     truth: Path | str | Poses | None = None,
     *,
+    cameras: Mapping[str, Camera] | None = None,
     force: bool = False,
 ) -> str:
     """Write a page that shows a map in 3D, and the queries of a result in it.
@@ -40,6 +43,7 @@ def write_view(
     mapping : kapture folder with points, or with the poses of images alone.
     result, truth : as in :func:`megloc_kapture.evaluation.evaluate.evaluate`; queries are coloured
         by their error where the truth is known, else by their confidence.
+    cameras : of the queries of a result in memory, where they are known.
 
     Returns
     -------
@@ -62,6 +66,8 @@ def write_view(
     if result is not None:
         found = _judged(result, truth, folder)
         context, queries = found.context, shown_queries(found)
+        # those that were estimated with the poses come first
+        context = replace(context, cameras={**(cameras or {}), **context.cameras})
         title = found.label or title
     elif truth is not None:
         raise OptionError("a truth needs a result to be compared with")

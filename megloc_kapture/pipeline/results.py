@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -150,7 +151,11 @@ class Results(Mapping[str, Pose | Failure]):
         :func:`megloc_kapture.evaluation.view.write_view`."""
         from megloc_kapture.evaluation.view import write_view
 
-        write_view(path, self.localizer.map.folder, self, truth)
+        data, cameras = self.queries.data(), {}
+        for name in self:
+            with contextlib.suppress(DataError):  # of a photograph perhaps nobody knows it
+                cameras[name] = data.camera_of(name)
+        write_view(path, self.localizer.map.folder, self, truth, cameras=cameras)
 
     def _localized(self, workers: int, track: Track) -> Iterator[tuple[str, Pose | Failure]]:
         with ThreadPoolExecutor(workers) as executor:

@@ -137,6 +137,16 @@ def test_from_python(finished: Path, tmp_path: Path) -> None:
     data = data_of(tmp_path / "results.html")
     assert len(data["queries"]) == len(results)
     assert all(query["error"] is not None for query in data["queries"])
+    # their cameras and inliers are at hand
+    for query in data["queries"]:
+        assert query["drawn"] == min(results[query["name"]].num_inliers, 300)
+    opened.view(tmp_path / "same.html", results, finished / "query_gt")
+    assert (tmp_path / "same.html").read_bytes() == (tmp_path / "results.html").read_bytes()
+    # saved, they are seen from the same places, through the same cameras
+    results.save(tmp_path / "localized")
+    opened.view(tmp_path / "folder.html", tmp_path / "localized", finished / "query_gt")
+    saved = data_of(tmp_path / "folder.html")
+    assert saved["frusta"] == data["frusta"] and saved["trueFrusta"] == data["trueFrusta"]
 
 
 def browse(page: Path, width: int, height: int, tmp_path: Path, *, script: str = "") -> Image.Image:

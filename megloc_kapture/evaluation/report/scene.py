@@ -143,7 +143,7 @@ def scene_of(
     low, high = np.min(ends, axis=0)[0], np.max(ends, axis=0)[1]
     # of few digits, so that the text of the page says exactly what was subtracted
     origin = np.round((low + high) / 2, 3)
-    rays = _rays(context.queries, [query.image for query in queries])
+    rays = _rays(context.queries, [query.image for query in queries], context.cameras)
     stored = StoredInliers(context) if any(q.num_inliers for q in queries) else None
     with_inliers = min(max(len(queries), 1), _MAX_QUERIES_WITH_INLIERS)
     most = min(_MAX_INLIERS // with_inliers, _MAX_INLIERS_OF_ONE)
@@ -164,7 +164,7 @@ def scene_of(
         points=(points[:, :3] - origin).astype(np.float32),
         colors=_colors(points, np.cross(view.right, view.up), mapping, kept),
         cameras=tuple(names),
-        camera_frusta=_frusta(poses, _rays(mapping, names), origin),
+        camera_frusta=_frusta(poses, _rays(mapping, names, {}), origin),
         queries=tuple(queries),
         frusta=_frusta([query.estimated for query in queries], rays, origin),
         true_frusta=_frusta([query.truth for query in queries], rays, origin),
@@ -241,14 +241,16 @@ def corner_rays(camera: Camera) -> NDArray[np.float64]:
     return bearing_rays(_ANY_CAMERA, np.array([[0.0, 0], [4, 0], [4, 3], [0, 3]]))
 
 
-def _rays(folder: KaptureFolder | None, images: Sequence[str]) -> NDArray[np.float64]:
+def _rays(
+    folder: KaptureFolder | None, images: Sequence[str], cameras: Mapping[str, Camera]
+) -> NDArray[np.float64]:
     """Corner rays (N, 4, 3) of images; of a camera that is not known those of a usual one."""
     known: dict[Camera, NDArray[np.float64]] = {}
     found = []
     for image in images:
-        camera = _ANY_CAMERA
+        camera = cameras.get(image, _ANY_CAMERA)
         with contextlib.suppress(DataError):
-            if folder is not None:
+            if folder is not None and image not in cameras:
                 camera = folder.read().camera_of(image)
         if camera not in known:
             known[camera] = corner_rays(camera)

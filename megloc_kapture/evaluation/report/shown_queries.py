@@ -153,7 +153,7 @@ class StoredInliers:
     A workspace keeps the matches of a query with map images, and the map says which of their
     keypoints observe a point; those whose point lies within 12 pixels of the keypoint under the
     query's pose are inliers. Nothing is known where matches, keypoints or points are missing or
-    broken: a picture without some inliers is better than none.
+    broken: a picture without some inliers is better than none. Poses in memory bring their own.
     """
 
     context: ResultContext
@@ -179,10 +179,15 @@ class StoredInliers:
     @property
     def known(self) -> bool:
         """Whether matches and points are there at all."""
-        return bool(self._sources)
+        return bool(self._sources or self.context.localized)
 
     def of(self, query: ShownQuery) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Pixels (K, 2) of the inliers of a query's pose, and their points (K, 3) in the world."""
+        found_here = self.context.localized.get(query.image)
+        if found_here is not None and found_here.inlier_points_world is not None:
+            px = found_here.inlier_points_px
+            xyz = found_here.inlier_points_world
+            return (np.zeros((len(xyz), 2)) if px is None else px), xyz
         if query.estimated is None or query.outcome != "localized" or not self._sources:
             return _NOTHING
         found = [_NOTHING]
