@@ -25,7 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.geometry.cameras import bearing_rays, focal_px, principal_point_px
+from megloc_kapture.evaluation.report.scene import corner_rays
+from megloc_kapture.geometry.cameras import principal_point_px
 from megloc_kapture.io.colmap import MapImage, write_model
 from megloc_kapture.io.files import write_bytes
 from megloc_kapture.io.ply import write_ply
@@ -223,16 +224,10 @@ def export_geojson(scene: Scene, output: Path, origin: GeoOrigin) -> None:
 
 
 def frustum(camera: Camera, cam_from_world: RigidTransform, depth: float) -> NDArray[np.float64]:
-    """Centre and corners (5, 3) of what a camera sees up to a depth, in the world.
-
-    A corner that the distortion cannot be undone at is where it would be without.
-    """
-    width, height = camera.width, camera.height
-    corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float64)
-    rays = bearing_rays(camera, corners)
-    flat = (corners - principal_point_px(camera)) / focal_px(camera)
-    rays = np.where(np.isfinite(rays), rays, np.concatenate([flat, np.ones((4, 1))], axis=1))
-    return cam_from_world.inverse().apply(np.concatenate([np.zeros((1, 3)), depth * rays]))
+    """Centre and corners (5, 3) of what a camera sees up to a depth, in the world; see
+    :func:`~megloc_kapture.evaluation.report.scene.corner_rays`."""
+    rays = np.concatenate([np.zeros((1, 3)), depth * corner_rays(camera)])
+    return cam_from_world.inverse().apply(rays)
 
 
 def _check_names(scene: Scene) -> None:
