@@ -85,6 +85,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "localize:Localize",
         "Localize photographs, or the images of a kapture folder, in a kapture map.",
     ),
+    "serve": (
+        "serve:Serve",
+        "Localize images that come by HTTP in a kapture map; with a page for photographs.",
+    ),
     "submit": (
         "submit:Submit",
         "Write the pose file of a localized kapture folder, and its provenance beside it.",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,8 +29,20 @@ def read_image_rgb(path: Path | str) -> NDArray[np.uint8]:
     ------
     DataError : missing, not an image, or truncated.
     """
-    path = Path(path)
-    content = _content(path)
+    return decode_image_rgb(_content(Path(path)), path)
+
+
+def decode_image_rgb(content: bytes, path: Path | str | None = None) -> NDArray[np.uint8]:
+    """Decode the bytes of an image file; see :func:`read_image_rgb`.
+
+    Parameters
+    ----------
+    path : what an error names; nothing is read there.
+
+    Raises
+    ------
+    DataError : not an image, or truncated.
+    """
     import cv2  # 0.1 s, and most commands that import io never read an image
 
     flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
@@ -142,7 +155,7 @@ def check_image_file(path: Path) -> None:
         raise DataError("not an image but a folder, pipe or device", path=path)
 
 
-def _check_complete(path: Path, content: bytes) -> None:
+def _check_complete(path: Path | str | None, content: bytes) -> None:
     """Refuse a truncated file; OpenCV fills what is missing with grey and says nothing.
 
     The end mark shows completeness without decoding twice; only where it is not found (other
@@ -158,7 +171,7 @@ def _check_complete(path: Path, content: bytes) -> None:
     from PIL import Image
 
     try:
-        with Image.open(path) as image:
+        with Image.open(BytesIO(content)) as image:
             image.load()
     except Exception as error:  # pillow raises many kinds on broken data
         raise DataError(f"not an image, or truncated ({error})", path=path) from error

@@ -173,7 +173,7 @@ def _start_worker() -> None:
     import cv2
     import numpy  # noqa: F401  its thread pool must be there to be limited
 
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    end_with_parent()
     _single_threads.enter()  # for good
     cv2.setNumThreads(1)
 
@@ -213,8 +213,12 @@ def _signals_held() -> Iterator[None]:
             signal.raise_signal(number)
 
 
-def _end_with_parent() -> None:
-    """A worker waits for work forever; when the run was killed, none will come."""
+def end_with_parent() -> None:
+    """End this process when its parent has gone: a worker waits for work that will not come."""
+    threading.Thread(target=_wait_for_parent, daemon=True).start()
+
+
+def _wait_for_parent() -> None:
     parent = multiprocessing.parent_process()
     if parent is not None:
         wait([parent.sentinel])

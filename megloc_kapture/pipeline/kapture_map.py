@@ -131,6 +131,7 @@ class KaptureMap:
         features_dirs: Sequence[Path | str] = (),
         pixel_origin: PixelOriginChoice = "auto",
         allow_links_below: Sequence[Path | str] = (),
+        indices: Mapping[str, MapIndex] | None = None,
     ) -> KaptureMap:
         """Open a kapture map.
 
@@ -140,6 +141,8 @@ class KaptureMap:
         features_dirs : folders with features in the orphan layout beside the map's own.
         pixel_origin : of the map's intrinsics; "auto" finds it out (see ``.pixel_origin``).
         allow_links_below : folders that links in the map may lead to.
+        indices : of its keypoints types, from another process that has opened it; points and
+            observations are not read then.
 
         Raises
         ------
@@ -158,17 +161,8 @@ class KaptureMap:
                 "missing; `megloc triangulate` makes one from images with poses",
                 path=folder.root,
             )
-        present = sorted(t for t, seen in folder.observations().items() if len(seen.point_ids))
-        if not present:
-            raise DataError("the map's points have no observations", path=folder.root)
-        absent = [name for name in keypoints_types if name not in present]
-        if absent:
-            raise OptionError(
-                f"{folder.root}: no points of keypoints type {absent[0]!r}; there are: "
-                f"{', '.join(present)}"
-            )
-        types = sorted(set(keypoints_types)) or present
-        indices = {name: index_map(folder, name) for name in types}
+        if indices is None:
+            indices = _read_indices(folder, keypoints_types)
         origins = _find_origins(folder, indices)
         if pixel_origin != "auto":
             given: Origin = pixel_origin
@@ -176,7 +170,7 @@ class KaptureMap:
                 name: replace(found, intrinsics=given, reason="as asked for")
                 for name, found in origins.items()
             }
-        keypoints = {n: MapKeypoints(folder, n, indices[n], origins[n]) for n in types}
+        keypoints = {n: MapKeypoints(folder, n, indices[n], origins[n]) for n in indices}
         # a workspace's map has its dataset's tables beside it, a foreign map has none
         tables = folder.root.resolve().parent / SIDE_TABLES
         restrictions = UNRESTRICTED
@@ -318,6 +312,19 @@ def _extractor_named(name: str) -> PluginChoice | None:
     if plugin is None or name not in registry():
         return None
     return PluginChoice(name=plugin, options={"weights": name})
+
+
+def _read_indices(folder: KaptureFolder, keypoints_types: Sequence[str]) -> dict[str, MapIndex]:
+    present = sorted(t for t, seen in folder.observations().items() if len(seen.point_ids))
+    if not present:
+        raise DataError("the map's points have no observations", path=folder.root)
+    absent = [name for name in keypoints_types if name not in present]
+    if absent:
+        raise OptionError(
+            f"{folder.root}: no points of keypoints type {absent[0]!r}; there are: "
+            f"{', '.join(present)}"
+        )
+    return {name: index_map(folder, name) for name in sorted(set(keypoints_types)) or present}
 
 
 def _is_ours(folder: KaptureFolder, local_type: str) -> bool:

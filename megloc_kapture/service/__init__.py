@@ -1,0 +1,1 @@
+"""Localization over HTTP: ``megloc serve``; needs the extra ``serve``."""

@@ -1,0 +1,53 @@
+"""A map of the rendered scene, its queries, and the service before it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from serving import Photo, client_of
+from starlette.testclient import TestClient
+
+from megloc_kapture import KaptureMap, Localizer
+from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.pipeline.datasets import choose_dataset
+from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
+from megloc_kapture.pipeline.plan import run_plan
+from megloc_kapture.pipeline.presets import options_of_preset
+from megloc_kapture.pipeline.run import Run
+from megloc_kapture.pipeline.workspace import Workspace
+from megloc_kapture.service.limits import Limits
+
+OPTIONS = options_of_preset(assignments=["local_features.options.max_keypoints=400"])
+
+
+@pytest.fixture(scope="session")
+def served_map(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Our map of the scene; not to be written into."""
+    workspace = Workspace(tmp_path_factory.mktemp("served") / "workspace")
+    with workspace.lock():
+        run = Run(choose_dataset("kapture", scene), "classic", OPTIONS, workspace)
+        run_plan(plan_evaluation(run), workspace, last="map")
+    return workspace.root / "map"
+
+
+@pytest.fixture(scope="session")
+def localizer(served_map: Path) -> Localizer:
+    """What answers are compared with."""
+    return Localizer(KaptureMap.open(served_map), options=OPTIONS)
+
+
+@pytest.fixture(scope="session")
+def photos(scene: Path) -> list[Photo]:
+    """The query images of the scene."""
+    folder = KaptureFolder(scene / "query")
+    data = folder.read()
+    return [Photo(folder.image_path(name), data.camera_of(name)) for name in data.image_names()]
+
+
+@pytest.fixture
+def client(localizer: Localizer) -> Iterator[TestClient]:
+    """A client of a service without token or rate."""
+    with client_of(localizer, Limits(threads=2, requests_per_minute=0)) as found:
+        yield found

@@ -1,0 +1,359 @@
+"""The service: answers are those of ``Localizer``; whatever else comes is refused in one line."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+from urllib.parse import quote
+
+import httpx2
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from PIL import Image
+from prometheus_client.parser import text_string_to_metric_families
+from serving import Photo, client_of
+from starlette.testclient import TestClient
+
+from megloc_kapture import Localizer, Pose
+from megloc_kapture.errors import DataError
+from megloc_kapture.service.limits import Limits
+from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS
+
+# of the machine: no answer has one in it
+PATH = re.compile(r"/(home|root|usr|tmp|work|var|opt)/|\.py\b|Traceback")
+
+
+def refused(answer: httpx2.Response, status: int, *words: str) -> str:
+    assert answer.status_code == status, answer.text
+    assert set(answer.json()) == {"error"}
+    error: str = answer.json()["error"]
+    assert not PATH.search(answer.text)
+    for word in words:
+        assert re.search(word, error), error
+    return error
+
+
+def picture(width: int, height: int, form: str = "PNG") -> bytes:
+    content = io.BytesIO()
+    noise = np.random.default_rng(0).integers(0, 255, (height, width, 3), np.uint8)
+    Image.fromarray(noise).save(content, form)
+    return content.getvalue()
+
+
+def pinhole(width: int, height: int, focal: float = 300.0) -> str:
+    params = [focal, width / 2, height / 2]
+    return json.dumps(
+        {"model": "SIMPLE_PINHOLE", "width": width, "height": height, "params": params}
+    )
+
+
+# ------------------------------------------------------------------------------------- answers
+
+
+def test_answers_are_those_of_the_localizer(
+    client: TestClient, localizer: Localizer, photos: list[Photo]
+) -> None:
+    for photo in photos:
+        answer = client.post("/localize", **photo.form())
+        found = localizer.localize(photo.path, photo.camera)
+        assert answer.status_code == 200 and isinstance(found, Pose)
+        said = answer.json()
+        assert said["localized"] is True and said["reason"] is None
+        assert tuple(said["cam_from_world"]["quat_wxyz"]) == found.cam_from_world.quat_wxyz
+        assert tuple(said["cam_from_world"]["translation"]) == found.cam_from_world.translation
+        assert said["camera_center"] == found.cam_from_world.center().tolist()
+        assert found.covariance is not None and said["covariance"] == found.covariance.tolist()
+        assert said["confidence"] == found.confidence
+        numbers = (said["num_matches"], said["num_inliers"], tuple(said["candidates"]))
+        assert numbers == (found.num_matches, found.num_inliers, found.candidates)
+        camera = said["camera"]
+        assert tuple(camera["params"]) == photo.camera.params and camera["width"] == 400
+        for other in (
+            client.post(
+                "/localize",
+                content=photo.content,
+                params={"camera": photo.camera_json()},
+                headers={"content-type": "image/jpeg"},
+            ),
+            client.post(f"/localize?camera={quote(photo.camera_json())}", content=photo.content),
+        ):
+            assert other.content == answer.content
+
+
+def test_clients_at_once_get_the_same(client: TestClient, photos: list[Photo]) -> None:
+    alone = [client.post("/localize", **photo.form()).content for photo in photos]
+    with ThreadPoolExecutor(8) as pool:
+        sent = [pool.submit(client.post, "/localize", **photo.form()) for photo in photos * 3]
+        assert [one.result().content for one in sent] == alone * 3
+
+
+def test_a_photograph_of_something_else_has_a_reason(client: TestClient) -> None:
+    answer = client.post(
+        "/localize", files={"image": picture(400, 300)}, data={"camera": pinhole(400, 300)}
+    )
+    assert answer.status_code == 200
+    said = answer.json()
+    assert said["localized"] is False and said["cam_from_world"] is None
+    assert re.search("match|agree|confidence", said["reason"])
+
+
+def test_the_answer_is_what_openapi_says(client: TestClient, photos: list[Photo]) -> None:
+    api = client.get("/openapi.json").json()
+    call = api["paths"]["/localize"]["post"]
+    assert set(call["requestBody"]["content"]) == {"multipart/form-data", "image/jpeg", "image/png"}
+    assert {"200", "401", "408", "413", "415", "422", "429", "503", "504"} <= set(call["responses"])
+    said = client.post("/localize", **photos[0].form()).json()
+    model = api["components"]["schemas"]["Answer"]
+    assert set(said) == set(model["properties"]) == set(model["required"])
+    assert set(said["camera"]) == set(api["components"]["schemas"]["CameraModel"]["required"])
+
+
+def test_pages_need_no_network(client: TestClient) -> None:
+    for path in ("/", "/docs"):
+        page = client.get(path)
+        assert page.status_code == 200 and page.headers["content-type"].startswith("text/html")
+        assert not re.search(r"(src|href)=\"?(https?:)?//|@import|url\(", page.text)
+        assert "default-src 'none'" in page.headers["content-security-policy"]
+
+
+def test_the_map_from_above(client: TestClient, localizer: Localizer) -> None:
+    seen = client.get("/map").json()
+    axes = np.array([seen["right"], seen["up"]])
+    np.testing.assert_allclose(axes @ axes.T, np.eye(2), atol=1e-8)
+    centers = np.array([pose.center() for pose in localizer.map.poses.values()])
+    np.testing.assert_allclose(seen["origin"], centers.mean(axis=0))
+    flat = np.reshape(seen["cameras"], (-1, 4))
+    np.testing.assert_allclose(flat[:, :2], (centers - seen["origin"]) @ axes.T, rtol=1e-3)
+    assert seen["images"] == len(flat) == 7 and len(seen["points"]) > 200
+
+
+def test_metrics_are_prometheus(localizer: Localizer, photos: list[Photo]) -> None:
+    with client_of(localizer, Limits(threads=1)) as client:
+        client.post("/localize", **photos[0].form())
+        client.post("/localize", content=b"no image")
+        client.get("/nowhere/at/all")
+        families = text_string_to_metric_families(client.get("/metrics").text)
+        found = {
+            (sample.name, *sample.labels.values()): sample.value
+            for family in families
+            for sample in family.samples
+        }
+    assert found["megloc_images_total", "true"] == 1
+    assert found["megloc_image_seconds_count",] == 1
+    assert found["megloc_requests_total", "/localize", "200"] == 1
+    assert found["megloc_requests_total", "/localize", "415"] == 1
+    assert found["megloc_requests_total", "other", "404"] == 1
+    assert found["process_resident_memory_bytes",] > 1e7
+
+
+# ------------------------------------------------------------------------------------- refusals
+
+
+@pytest.mark.parametrize(
+    "camera, words",
+    [
+        ("", "the camera is missing"),
+        ("{", "camera: Invalid JSON"),
+        ("[" * 1500, "camera: "),
+        ('"PINHOLE"', "camera: "),
+        ("null", "camera: "),
+        ({"model": "FISHEYE"}, "unknown camera model 'FISHEYE'; known: "),
+        ({"model": "RADIAL"}, "RADIAL takes 5 parameters, got 4"),
+        ({"width": 0}, "camera.width"),
+        ({"width": 4000}, "the image is 400x300 as it is stored, its camera says 4000x300"),
+        ({"width": "400"}, "camera.width"),
+        ({"height": 10**30}, "camera.height"),
+        ({"params": [float("nan")] * 4}, "camera"),
+        ({"params": [float("inf"), 1, 1, 1]}, "camera"),
+        ({"params": [1e308, 1e308, 200, 150]}, "no lens"),
+        ({"params": [-300, 300, 200, 150]}, "focal length"),
+        ({"params": [300, 300, 1e9, 150]}, "principal point"),
+        ({"model": "RADIAL", "params": [300, 200, 150, 1e200, 0]}, "distorts"),
+        ({"params": [[300]]}, "camera.params"),
+        ({"params": [0.0] * 1000}, "camera.params"),
+        ({"path": "/etc/passwd"}, "camera.path: Extra inputs"),
+    ],
+)
+def test_impossible_cameras_are_refused(
+    client: TestClient, photos: list[Photo], camera: str | dict[str, Any], words: str
+) -> None:
+    sent = photos[0].camera_json(**camera) if isinstance(camera, dict) else camera
+    refused(client.post("/localize", **photos[0].form(sent)), 422, words)
+
+
+@pytest.mark.parametrize(
+    "content, status, words",
+    [
+        (b"", 415, "neither JPEG nor PNG"),
+        (b"GIF89a" + bytes(1000), 415, "neither"),
+        (b"PK\x03\x04" + bytes(1000), 415, "neither"),
+        (b"<svg xmlns='http://www.w3.org/2000/svg'/>", 415, "neither"),
+        (picture(400, 300)[:-20], 422, "broken"),
+        (picture(400, 300)[:2000], 422, "broken"),
+        (picture(400, 300, "JPEG")[:9000], 422, "broken"),
+        (picture(400, 300).replace(b"IDAT", b"IDXX"), 422, "broken"),
+        (picture(1200, 1000), 413, "1200x1000, which is more than 1 megapixels"),
+    ],
+)
+def test_what_is_no_image_is_refused(
+    localizer: Localizer, content: bytes, status: int, words: str
+) -> None:
+    with client_of(localizer, Limits(threads=1, max_megapixels=1.0)) as client:
+        form = {"files": {"image": content}, "data": {"camera": pinhole(400, 300)}}
+        refused(client.post("/localize", **form), status, words)
+        raw = client.post(f"/localize?camera={quote(pinhole(400, 300))}", content=content)
+        refused(raw, status, words)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 3), (1, 900), (900, 1), (16, 16), (7, 500)])
+def test_tiny_images_are_no_defect(client: TestClient, size: tuple[int, int]) -> None:
+    form = {"files": {"image": picture(*size)}, "data": {"camera": pinhole(*size)}}
+    answer = client.post("/localize", **form)
+    assert answer.status_code in (200, 422), answer.text
+    assert not PATH.search(answer.text)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["../../../../etc/passwd", "/etc/passwd", "C:\\boot.ini", "a\0.jpg", "%2e%2e/x", "x" * 1000],
+)
+def test_names_of_files_mean_nothing(client: TestClient, photos: list[Photo], name: str) -> None:
+    plain = client.post("/localize", **photos[0].form())
+    form = {"files": {"image": (name, photos[0].content)}, "data": photos[0].form()["data"]}
+    assert client.post("/localize", **form).content == plain.content
+
+
+@pytest.mark.parametrize(
+    "body, kind, status",
+    [
+        (b"", "multipart/form-data", 400),
+        (b"--b\r\n", "multipart/form-data; boundary=b", 422),
+        (b"--b--\r\n", "multipart/form-data; boundary=b", 422),
+        (b"nothing", "multipart/form-data; boundary=b", 400),
+        (b"--b\r\nContent-Disposition: form-data\r\n\r\nx\r\n--b--", "", 400),
+        (b'--b\r\nContent-Disposition: form-data; name="x"\r\n\r\ny\r\n--b--\r\n', "", 422),
+        (b'--b\r\nContent-Disposition: form-data; name="image"\r\n\r\ny\r\n--b--\r\n', "", 422),
+        (b'--b\r\nContent-Disposition: form-data; name="a"\r\n\r\ny\r\n' * 9, "", 400),
+        (b"--b\r\n" + b"X-A: b\r\n" * 100_000, "", 400),
+        (b"x", "application/json", 415),
+        (b"x", "text/html", 415),
+    ],
+)
+def test_broken_forms_are_refused(client: TestClient, body: bytes, kind: str, status: int) -> None:
+    kind = kind or "multipart/form-data; boundary=b"
+    answer = client.post("/localize", content=body, headers={"content-type": kind})
+    refused(answer, status)
+
+
+def test_paths_lead_nowhere(client: TestClient) -> None:
+    for path in ("/../etc/passwd", "/%2e%2e/%2e%2e/etc/passwd", "/localize/", "/static/x"):
+        refused(client.get(path), 404)
+    for method in ("GET", "PUT", "DELETE", "PATCH"):
+        refused(client.request(method, "/localize"), 405)
+    refused(client.post("/localize?camera=" + "x" * 3000, content=b"x"), 422)
+
+
+def test_a_body_that_is_too_large_is_refused(localizer: Localizer) -> None:
+    with client_of(localizer, Limits(threads=1, max_mb=0.01)) as client:
+        refused(client.post("/localize", content=bytes(10_001)), 413, "larger than 0.01 MB")
+        chunks = (bytes(1000) for _ in range(11))  # of a length that is not told
+        refused(client.post("/localize", content=chunks), 413, "larger than 0.01 MB")
+        refused(client.post("/localize", content=bytes(9_999)), 415)
+
+
+def test_the_token_is_needed_for_all_that_tells_of_the_map(
+    localizer: Localizer, photos: list[Photo]
+) -> None:
+    token = "correct horse battery"
+    with client_of(localizer, Limits(threads=1), token) as client:
+        wrong = ("", "Bearer", f"Basic {token}", "Bearer correct horse batter", f"Bearer {token}s")
+        for shown in (*wrong, f"bearer {token.upper()}", "Bearer \xff\xfe"):
+            given = {"authorization": shown.encode("latin-1")} if shown else {}
+            for method, path in (("POST", "/localize"), ("GET", "/map"), ("GET", "/metrics")):
+                answer = client.request(method, path, headers=given)
+                error = refused(answer, 401)
+                assert token not in error and answer.headers["www-authenticate"] == "Bearer"
+        for path in ("/", "/docs", "/openapi.json", "/health"):
+            assert client.get(path).status_code == 200
+        right = {"authorization": f"Bearer {token}"}
+        assert client.post("/localize", **photos[0].form(), headers=right).status_code == 200
+        assert client.get("/map", headers=right).status_code == 200
+
+
+def test_too_many_requests_are_told_when_to_come_again(localizer: Localizer) -> None:
+    with client_of(localizer, Limits(threads=1, requests_per_minute=3)) as client:
+        answers = [client.post("/localize", content=b"x") for _ in range(4)]
+        assert [answer.status_code for answer in answers] == [415, 415, 415, 429]
+        refused(answers[-1], 429, "too many requests")
+        assert 1 <= int(answers[-1].headers["retry-after"]) <= 21
+        assert client.get("/health").status_code == 200
+
+
+def test_a_full_line_and_a_long_wait_are_told(
+    localizer: Localizer, photos: list[Photo], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go_on = threading.Event()
+    localize = localizer.localize_query
+
+    def slow(query: Any) -> Any:
+        go_on.wait(30)
+        return localize(query)
+
+    monkeypatch.setattr(localizer, "localize_query", slow)
+    limits = Limits(threads=1, max_waiting=1, time_limit_s=1.5, requests_per_minute=0)
+    with client_of(localizer, limits) as client, ThreadPoolExecutor(8) as pool:
+        sent = [pool.submit(client.post, "/localize", **photos[0].form()) for _ in range(6)]
+        answers = [one.result() for one in sent]
+        go_on.set()
+        statuses = sorted(answer.status_code for answer in answers)
+        assert statuses == [503] * 4 + [504] * 2
+        assert refused(answers[0], answers[0].status_code)
+        full = next(answer for answer in answers if answer.status_code == 503)
+        assert full.headers["retry-after"] == "2"
+        # the thread is free again when what nobody waits for any more is done
+        assert client.post("/localize", **photos[0].form()).status_code in (200, 503)
+
+
+def test_defects_of_the_map_say_nothing_of_the_machine(
+    localizer: Localizer, photos: list[Photo], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    errors = (
+        DataError("cannot read", path="/srv/maps/secret/points3d.txt"),
+        DataError("cannot read /srv/maps/secret/points3d.txt"),
+        ValueError("/srv/maps/secret"),
+    )
+    for error in errors:
+
+        def fail(_: Any, error: Exception = error) -> Any:
+            raise error
+
+        monkeypatch.setattr(localizer, "localize_query", fail)
+        with client_of(localizer, Limits(threads=1)) as client:
+            answer = client.post("/localize", **photos[0].form())
+            assert answer.status_code == 500 and "secret" not in answer.text
+            assert "its log says more" in answer.json()["error"]
+
+
+@given(
+    model=st.sampled_from(sorted(CAMERA_MODEL_NUM_PARAMS)),
+    data=st.data(),
+)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_no_camera_is_a_defect(
+    client: TestClient, photos: list[Photo], model: str, data: st.DataObject
+) -> None:
+    number = st.floats(allow_nan=False) | st.floats(-100, 400) | st.sampled_from([0.0, 150.0, 1e9])
+    count = CAMERA_MODEL_NUM_PARAMS[model]
+    params = data.draw(st.lists(number, min_size=count, max_size=count))
+    if data.draw(st.booleans()):
+        params[0] = params[1] = 300.0
+    sent = photos[0].camera_json(model=model, params=params)
+    answer = client.post("/localize", **photos[0].form(sent))
+    assert answer.status_code in (200, 422), answer.text
+    json.loads(answer.text, parse_constant=lambda text: pytest.fail(text))
