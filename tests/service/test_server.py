@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import signal
@@ -148,6 +149,20 @@ def test_who_leaves_is_not_waited_for(port: int, photos: list[Photo]) -> None:
     url = f"http://127.0.0.1:{port}/localize"
     assert httpx2.post(url, **photos[0].form(), timeout=30).status_code == 200
     assert time.monotonic() - begin < 10
+
+
+def test_the_example_client(port: int, photos: list[Photo], tmp_path: Path) -> None:
+    program = Path(__file__).parents[2] / "examples" / "serve_client.py"
+    camera = photos[0].camera
+    texts = (camera.model, camera.width, camera.height, *camera.params)
+    words = [",".join(map(str, texts)), "--url", f"http://127.0.0.1:{port}/"]
+    command = [sys.executable, str(program)]
+    done = subprocess.run([*command, str(photos[0].path), *words], capture_output=True, text=True)
+    assert done.returncode == 0 and json.loads(done.stdout)["localized"] is True, done.stderr
+    (tmp_path / "no_image.jpg").write_bytes(b"x")
+    other = [*command, str(tmp_path / "no_image.jpg"), *words]
+    done = subprocess.run(other, capture_output=True, text=True)
+    assert done.returncode == 1 and "neither JPEG" in json.loads(done.stdout)["error"]
 
 
 def test_an_address_that_cannot_be_had_is_told() -> None:
