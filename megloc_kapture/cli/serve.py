@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from megloc_kapture.cli.common import Common, Deciding, Force, Reading, existing
+from megloc_kapture.cli.common import Common, Deciding, Force, Reading, existing, opened_map
 from megloc_kapture.errors import DataError, MeglocError, OptionError
 from megloc_kapture.io.files import read_text
 from megloc_kapture.pipeline.executors import available_cores
@@ -32,7 +32,7 @@ class Serve(Reading, Deciding, Common):
     """Localize images that come by HTTP in a kapture map."""
 
     map: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MAP")]
-    """Kapture map: keypoints, points3d and observations. Read only."""
+    """Kapture map: keypoints, points3d and observations; or a COLMAP model. Read only."""
     host: str = "127.0.0.1"
     """Address to listen at; 0.0.0.0: every one of this machine."""
     port: int = 8000
@@ -70,15 +70,15 @@ class Serve(Reading, Deciding, Common):
         options = options_of_preset(
             self.preset or DEFAULT_PRESET, assignments=self.assignments(), used=LOCALIZING
         )
-        served = ServedMap(
-            self.map,
-            options,
-            self.keypoints_type,
-            existing(self.features_dir),
-            self.pixel_origin,
-            existing(self.allow_links_below),
-        )
         with bind(self.host, self.port) as bound:
+            served = ServedMap(
+                opened_map(self.map, console),
+                options,
+                self.keypoints_type,
+                existing(self.features_dir),
+                self.pixel_origin,
+                existing(self.allow_links_below),
+            )
             kapture_map = served.open()
             if not self.force and (fault := kapture_map.fault()):
                 raise DataError(

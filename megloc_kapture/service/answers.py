@@ -71,7 +71,10 @@ class Answer(BaseModel):
     frame: str | None = Field(
         description="the coordinate frame of the pose, where the map has some"
     )
-    camera: CameraModel = Field(description="the camera that was localized with")
+    camera: CameraModel = Field(
+        description="the camera of the pose: that of the request; without one by EXIF, its focal "
+        "length estimated with the pose, of the image the right way up"
+    )
 
 
 class Refused(BaseModel):
@@ -98,6 +101,8 @@ def answer_of(found: Pose | Failure, camera: Camera, frame: str = "") -> dict[st
     frame : of the pose; "" where the map has only one.
     """
     pose = found.cam_from_world if isinstance(found, Pose) else None
+    if isinstance(found, Pose) and found.camera is not None:
+        camera = found.camera
     covariance = found.covariance if isinstance(found, Pose) else None
     return {
         "localized": bool(found),

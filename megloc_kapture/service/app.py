@@ -29,6 +29,7 @@ from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from megloc_kapture.errors import DataError, MeglocError, OptionError
+from megloc_kapture.io.photos import turned_upright
 from megloc_kapture.pipeline.executors import available_cores
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.queries import Query as ImageQuery
@@ -166,9 +167,10 @@ class Service:
         try:
             max_pixels = self.limits.max_megapixels * 1e6
             photograph = Photograph.of(content, max_pixels=max_pixels)
-            chosen = _camera_of(photograph, camera)
+            chosen, orientation = _camera_of(photograph, camera)
+            pixels = turned_upright(photograph.decode(), orientation)
             # a JPEG is pre-processed as a JPEG
-            query = ImageQuery(chosen, photograph.decode(), f"image{photograph.suffix}")
+            query = ImageQuery(chosen, pixels, f"image{photograph.suffix}")
             found = self.localizer.localize_query(query)
         except UnknownFormat as error:
             raise HTTPException(415, str(error)) from error
@@ -417,16 +419,20 @@ async def _disconnected(request: Request) -> None:
         pass
 
 
-def _camera_of(photograph: Photograph, camera: str | None) -> Camera:
+def _camera_of(photograph: Photograph, camera: str | None) -> tuple[Camera, int]:
+    """The camera, and how the pixels are to be turned before (1: not); raises DataError."""
     if not camera:
-        raise DataError(
-            "the camera is missing: send `camera`, JSON with model, width, height and params as "
-            "COLMAP defines them"
-        )
-    found = read_camera(camera)
-    if (found.width, found.height) != (photograph.width, photograph.height):
+        found = photograph.exif()
+        if found is None:
+            raise DataError(
+                "the camera is missing, and the image has no EXIF with a focal length: send "
+                "`camera`, JSON with model, width, height and params as COLMAP defines them"
+            )
+        return found.upright_camera, found.orientation
+    given = read_camera(camera)
+    if (given.width, given.height) != (photograph.width, photograph.height):
         raise DataError(
             f"the image is {photograph.width}x{photograph.height} as it is stored, its camera says "
-            f"{found.width}x{found.height}"
+            f"{given.width}x{given.height}"
         )
-    return found
+    return given, 1

@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 import struct
 from dataclasses import dataclass
+from io import BytesIO
 from typing import Literal
 
 import numpy as np
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, MeglocError
 from megloc_kapture.io.images import decode_image_rgb
+from megloc_kapture.io.photos import GUESS_DEVIATION, Photo, photo_of
 
 _PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 _JPEG = b"\xff\xd8\xff"
@@ -87,6 +89,19 @@ class Photograph:
                 f"says {self.width}x{self.height}"
             )
         return pixels
+
+    def exif(self) -> Photo | None:
+        """Camera and orientation by EXIF; None where it says no focal length, as a PNG's."""
+        if self.suffix != ".jpg":
+            return None
+        from PIL import Image
+
+        try:
+            with Image.open(BytesIO(self.content), formats=["JPEG"]) as image:
+                found = photo_of(image)
+        except Exception as error:  # pillow raises many kinds on broken headers
+            raise DataError("the image is broken: its header cannot be read") from error
+        return found if found.camera.focal_deviation < GUESS_DEVIATION else None
 
 
 def _png_size(content: bytes) -> tuple[int, int]:

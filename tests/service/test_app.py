@@ -7,6 +7,7 @@ import json
 import re
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
@@ -21,6 +22,7 @@ from serving import Photo, client_of
 from starlette.testclient import TestClient
 
 from megloc_kapture import Localizer, Pose
+from megloc_kapture.api import Map
 from megloc_kapture.errors import DataError
 from megloc_kapture.service.limits import Limits
 from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS
@@ -84,6 +86,34 @@ def test_answers_are_those_of_the_localizer(
             client.post(f"/localize?camera={quote(photo.camera_json())}", content=photo.content),
         ):
             assert other.content == answer.content
+
+
+@pytest.mark.parametrize("orientation", [1, 6])
+def test_a_camera_by_exif_is_that_of_the_package(
+    client: TestClient,
+    localizer: Localizer,
+    photos: list[Photo],
+    tmp_path: Path,
+    orientation: int,
+) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    exif.get_ifd(0x8769)[0xA405] = 27  # FocalLengthIn35mmFilm: 300 px of 400
+    stored = Image.open(photos[0].path).rotate(90 if orientation == 6 else 0, expand=True)
+    stored.save(tmp_path / "photo.jpg", quality=95, exif=exif)
+    found = Map(localizer.map, localizer.options).localize(tmp_path / "photo.jpg")
+    content = (tmp_path / "photo.jpg").read_bytes()
+    for answer in (
+        client.post("/localize", content=content),
+        client.post("/localize", files={"image": content}),
+    ):
+        assert isinstance(found, Pose) and found.camera is not None
+        said = answer.json()
+        assert tuple(said["cam_from_world"]["quat_wxyz"]) == found.cam_from_world.quat_wxyz
+        assert tuple(said["cam_from_world"]["translation"]) == found.cam_from_world.translation
+        assert said["camera"]["params"] == list(found.camera.params)
+        assert (said["camera"]["width"], said["camera"]["height"]) == (400, 300)
+        assert said["remarks"] == list(found.remarks)
 
 
 def test_clients_at_once_get_the_same(client: TestClient, photos: list[Photo]) -> None:
