@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -276,3 +277,18 @@ def test_a_worker_that_dies_is_replaced(
             time.sleep(0.1)
         answer = httpx2.post(f"{url}localize", **photos[0].form(), timeout=60)
         assert answer.status_code == 200
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="needs chromium")
+@pytest.mark.parametrize("path, text", [("docs", "<h2>POST /localize</h2>"), ("", "<canvas")])
+def test_pages_run_in_a_browser(port: int, tmp_path: Path, path: str, text: str) -> None:
+    browser = ["chromium", "--headless=new", "--no-sandbox", "--disable-gpu", "--dump-dom"]
+    quiet = ["--enable-logging=stderr", f"--user-data-dir={tmp_path}", "--virtual-time-budget=5000"]
+    done = subprocess.run(
+        [*browser, *quiet, f"http://127.0.0.1:{port}/{path}"],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert text in done.stdout and "CONSOLE" not in done.stderr, done.stderr
