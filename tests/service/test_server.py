@@ -25,6 +25,7 @@ from megloc_kapture.errors import OptionError
 from megloc_kapture.service import server
 from megloc_kapture.service.app import Service, make_app
 from megloc_kapture.service.limits import Limits
+from megloc_kapture.service.overview import map_overview
 from megloc_kapture.service.server import bind
 
 LIMITS = Limits(threads=2, upload_limit_s=1.0, time_limit_s=5.0, requests_per_minute=0)
@@ -38,7 +39,7 @@ def port(localizer: Localizer) -> Iterator[int]:
     """The port of a service in a thread of this process."""
     with pytest.MonkeyPatch.context() as patch, bind("127.0.0.1", 0) as bound:
         patch.setattr(server, "_HEADERS_LIMIT_S", 1.0)
-        app = make_app(Service(localizer, LIMITS), b"{}")
+        app = make_app(Service(localizer, LIMITS), map_overview(localizer.map))
         started = threading.Event()
         running = server._Server(
             server._config(app, limits=LIMITS, proxy="", log_requests=False), started.set
