@@ -24,10 +24,15 @@ from megloc_kapture.io.files import owned_name
 from megloc_kapture.pipeline import executors
 from megloc_kapture.pipeline.executors import available_cores, open_executor, single_threaded
 
+# an OpenMP that an earlier test loaded within a block begins with one thread in every new thread,
+# as the block's docstring says; which there are is known to the fixture below
+_BEGIN_WITH_ONE: set[str] = set()
+
 
 def threads() -> set[int]:
     """Numbers of threads of the loaded libraries that have a pool."""
-    return {pool["num_threads"] for pool in threadpool_info()}
+    pools = [pool for pool in threadpool_info() if pool["filepath"] not in _BEGIN_WITH_ONE]
+    return {pool["num_threads"] for pool in pools}
 
 
 @dataclass(frozen=True)
@@ -213,10 +218,14 @@ def two_threads() -> Iterator[None]:
     import torch
 
     before = torch.get_num_threads()
+    with ThreadPoolExecutor(1) as new:
+        pools = new.submit(threadpool_info).result()
+    _BEGIN_WITH_ONE.update(p["filepath"] for p in pools if p["num_threads"] == 1)
     with threadpool_limits(limits=2):
         torch.set_num_threads(2)
         yield
         torch.set_num_threads(before)
+    _BEGIN_WITH_ONE.clear()
 
 
 def everywhere() -> set[int]:
