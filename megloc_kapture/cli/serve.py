@@ -29,7 +29,7 @@ _MIN_TOKEN_LENGTH = 16
 
 @dataclass(frozen=True, kw_only=True)
 class Serve(Reading, Deciding, Common):
-    """Localize images that come by HTTP in a kapture map."""
+    """Localize images that come by HTTP in a kapture map; with a page for photographs."""
 
     map: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MAP")]
     """Kapture map: keypoints, points3d and observations; or a COLMAP model. Read only."""

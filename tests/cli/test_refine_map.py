@@ -70,7 +70,8 @@ def test_what_cannot_be_refined_is_refused(megloc: Any, gallery: Path, tmp_path:
     query.refused("no map to refine", "points3d.txt")
     unknown = ("--set", "refinement.uncertainty.max_sigma=1")
     megloc("refine-map", "-i", gallery / "map", "-o", out, *unknown).refused(
-        "unknown option refinement.uncertainty.max_sigma; known here: .*keep_quantile"
+        "unknown option refinement.uncertainty.max_sigma; did you mean 'max_robust_sigmas'. known "
+        "here: .*keep_quantile"
     )
     assert not out.exists()
     (gallery / "full").mkdir()

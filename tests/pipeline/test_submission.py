@@ -433,7 +433,7 @@ def test_datasets_that_go_together(asked: str, written: str, tmp_path: Path) -> 
         ("aachen", "kapture", "of dataset kapture"),
         ("kapture", "aachen", "of dataset aachen"),
         ("synthetic", "synthetic-inloc", "of dataset synthetic-inloc"),
-        ("aahcen", "aachen", "unknown dataset 'aahcen'; known: kapture, "),
+        ("aahcen", "aachen", "unknown dataset 'aahcen'; did you mean 'aachen'. known: kapture, "),
     ],
 )
 def test_datasets_that_do_not(asked: str, written: str, words: str, tmp_path: Path) -> None:
