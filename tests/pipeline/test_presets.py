@@ -70,7 +70,7 @@ def test_values(text: str, value: object) -> None:
         ),
         (
             "query_pairs.topk=3",
-            "unknown option query_pairs.topk; did you mean 'top_k'. known here: by, diversity, top_k",
+            "unknown option query_pairs.topk; did you mean 'top_k'. known here: by, ",
         ),
         ("query_pairs.top_k=many", "option query_pairs.top_k: "),
         ("query_pairs.top_k=0", "option query_pairs.top_k: "),
