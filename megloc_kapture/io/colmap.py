@@ -13,7 +13,7 @@ import threading
 import zlib  # noqa: F401  pycolmap 4.1.1 to 4.2.1 corrupt the heap when imported before zlib
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from shutil import disk_usage
@@ -85,8 +85,7 @@ def undistorted_pinhole(camera: Camera, *, blank_pixels: float = 0.0) -> Camera:
     options = pycolmap.UndistortCameraOptions()
     options.blank_pixels = blank_pixels
     found = pycolmap.undistort_camera(options, _colmap_camera(camera))
-    params = tuple(found.params)
-    return Camera(found.model.name, found.width, found.height, params, camera.focal_deviation)
+    return replace(Camera.from_colmap(found), focal_deviation=camera.focal_deviation)
 
 
 def focal_from_exif(jpeg: bytes) -> float | None:
@@ -313,12 +312,7 @@ def _write_database(
         for index, image in enumerate(images):
             if image.camera not in camera_ids:
                 camera_id = camera_ids[image.camera] = len(camera_ids) + 1
-                camera = pycolmap.Camera(
-                    model=image.camera.model,
-                    width=image.camera.width,
-                    height=image.camera.height,
-                    params=list(image.camera.params),
-                )
+                camera = _new_colmap_camera(image.camera)
                 camera.camera_id = camera_id
                 database.write_camera(camera, use_camera_id=True)
                 reconstruction.add_camera_with_trivial_rig(camera)
@@ -411,7 +405,7 @@ def write_model(
     tracks: list[list[Any]] = [[] for _ in xyz]
     for number, (image, (rows, points)) in enumerate(zip(images, observed, strict=True), start=1):
         if image.camera not in camera_ids:
-            camera = pycolmap.Camera(_colmap_camera(image.camera).todict())
+            camera = _new_colmap_camera(image.camera)
             camera.camera_id = camera_ids[image.camera] = len(camera_ids) + 1
             model.add_camera_with_trivial_rig(camera)
         keypoints = np.ascontiguousarray(image.keypoints_px[:, :2], dtype=np.float64)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, OptionError, OutputError, suggestion
 from megloc_kapture.io.files import staged_output
@@ -93,56 +94,27 @@ def _scene(
     if given is not None and not (trajectory and query is not None):
         if isinstance(given, KaptureMap):
             opened = given
+        elif (folder := KaptureFolder(given)).has_points():
+            opened = KaptureMap.open(given)
         else:
-            folder = KaptureFolder(given)
-            opened = KaptureMap.open(given) if folder.has_points() else None
-            if opened is None:
-                images += _of_folder(folder, None, sensor, is_query=False)
+            images += _posed_images(folder, None, sensor, is_query=False)
         if opened is not None:
-            images += _of_map(opened, sensor)
+            images += _posed_images(opened.folder, opened, sensor, is_query=False)
     if query is not None:
-        images += _of_folder(KaptureFolder(query), opened, sensor, is_query=True)
+        images += _posed_images(KaptureFolder(query), opened, sensor, is_query=True)
     points = np.zeros((0, 6)) if opened is None else opened.folder.points3d()
     return Scene(images, points)
 
 
-def _of_map(opened: KaptureMap, sensor: str | None) -> list[PosedImage]:
-    """The images of a map, keypoints of all types one behind the other."""
-    data = opened.folder.read()
-    found = []
-    for image, pose in sorted(data.poses().items()):
-        timestamp, device = data.record_of(image)
-        if sensor not in (None, device):
-            continue
-        keypoints, rows, points = [np.zeros((0, 2))], [_NO_ROWS], [_NO_ROWS]
-        for typed in opened.keypoints.values():
-            if image in typed:
-                before = sum(map(len, keypoints))
-                keypoints.append(typed.keypoints_px(image)[:, :2].astype(np.float64))
-                own_rows, own_points = typed.index.observed(image)
-                rows.append(own_rows.astype(np.int64) + before)
-                points.append(own_points.astype(np.int64))
-        found.append(
-            PosedImage(
-                name=image,
-                path=opened.folder.image_path(image),
-                camera=opened.camera(image),
-                cam_from_world=pose,
-                timestamp=timestamp,
-                sensor=device,
-                is_query=False,
-                keypoints_px=np.concatenate(keypoints),
-                rows=np.concatenate(rows),
-                points=np.concatenate(points),
-            )
-        )
-    return found
-
-
-def _of_folder(
-    folder: KaptureFolder, convention: KaptureMap | None, sensor: str | None, *, is_query: bool
+def _posed_images(
+    folder: KaptureFolder, opened: KaptureMap | None, sensor: str | None, *, is_query: bool
 ) -> list[PosedImage]:
-    """The images of a folder that have a pose, without observations."""
+    """The images of a folder that have a pose; those of the map with their observations.
+
+    Parameters
+    ----------
+    opened : the map, which cameras are described as; None without one.
+    """
     data = folder.read()
     found = []
     for image, pose in sorted(data.poses().items()):
@@ -150,18 +122,37 @@ def _of_folder(
         if sensor not in (None, device):
             continue
         camera = data.camera_of(image)
+        keypoints, rows, points = np.zeros((0, 2)), _NO_ROWS, _NO_ROWS
+        if opened is not None and not is_query:
+            keypoints, rows, points = _observed(opened, image)
         found.append(
             PosedImage(
                 name=image,
                 path=folder.image_path(image),
-                camera=camera if convention is None else convention.to_colmap(camera),
+                camera=camera if opened is None else opened.to_colmap(camera),
                 cam_from_world=pose,
                 timestamp=timestamp,
                 sensor=device,
                 is_query=is_query,
-                keypoints_px=np.zeros((0, 2)),
-                rows=_NO_ROWS,
-                points=_NO_ROWS,
+                keypoints_px=keypoints,
+                rows=rows,
+                points=points,
             )
         )
     return found
+
+
+def _observed(
+    opened: KaptureMap, image: str
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
+    """Keypoints (K, 2) of all types of a map image, one behind the other; rows (M,) of these and
+    of the points that they observe."""
+    keypoints, rows, points = [np.zeros((0, 2))], [_NO_ROWS], [_NO_ROWS]
+    for typed in opened.keypoints.values():
+        if image in typed:
+            before = sum(map(len, keypoints))
+            keypoints.append(typed.keypoints_px(image)[:, :2].astype(np.float64))
+            own_rows, own_points = typed.index.observed(image)
+            rows.append(own_rows.astype(np.int64) + before)
+            points.append(own_points.astype(np.int64))
+    return np.concatenate(keypoints), np.concatenate(rows), np.concatenate(points)

@@ -126,12 +126,13 @@ def export_nerfstudio(scene: Scene, output: Path, *, beside: Path | None = None)
     for image in scene.images:
         if image.path is None or not image.path.is_file():
             raise DataError(f"nerfstudio needs the file of {image.name!r}", path=image.path)
+        world_from_cam = image.cam_from_world.inverse().matrix()
         file = os.path.relpath(image.path.resolve(), (beside or output).resolve())
         frames.append(
             {
                 "file_path": Path(file).as_posix(),
                 **_nerfstudio_camera(image.camera),
-                "transform_matrix": (_matrix(image) @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist(),
+                "transform_matrix": (world_from_cam @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist(),
             }
         )
     content: dict[str, Any] = {"frames": frames}
@@ -166,7 +167,10 @@ def export_tum(scene: Scene, output: Path) -> None:
 def export_kitti(scene: Scene, output: Path) -> None:
     """Write a KITTI trajectory in the order of the names, which ``OUTPUT.names.txt`` has."""
     images = sorted(scene.images, key=lambda image: image.name)
-    lines = [" ".join(_number(v) for v in _matrix(image)[:3].ravel()) for image in images]
+    lines = [
+        " ".join(map(_number, image.cam_from_world.inverse().matrix()[:3].ravel()))
+        for image in images
+    ]
     write_bytes(output, "".join(f"{line}\n" for line in lines).encode())
     names = "".join(f"{image.name}\n" for image in images)
     write_bytes(output.with_name(f"{output.name}.names.txt"), names.encode())
@@ -235,15 +239,6 @@ def _check_names(scene: Scene) -> None:
     if len(set(names)) != len(names):
         twice = min(name for name in names if names.count(name) > 1)
         raise DataError(f"map and queries both have an image {twice!r}; COLMAP knows one")
-
-
-def _matrix(image: PosedImage) -> NDArray[np.float64]:
-    """``world_from_cam`` (4, 4)."""
-    world_from_cam = image.cam_from_world.inverse()
-    matrix = np.eye(4)
-    matrix[:3, :3] = world_from_cam.rotation_matrix()
-    matrix[:3, 3] = world_from_cam.translation
-    return matrix
 
 
 def _nerfstudio_camera(camera: Camera) -> Mapping[str, Any]:
