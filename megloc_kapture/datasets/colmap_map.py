@@ -29,7 +29,13 @@ from megloc_kapture.datasets.formats.colmap_rigs import ColmapRigs, read_colmap_
 from megloc_kapture.datasets.reference_map import write_reference_map
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.files import link_records
-from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
+from megloc_kapture.io.kapture import (
+    KaptureData,
+    KaptureFolder,
+    Sensor,
+    writable_name,
+    write_sensors,
+)
 from megloc_kapture.plugins import LOCAL_FEATURES, load_plugin
 from megloc_kapture.stages.given_map import given_map
 from megloc_kapture.stages.local_features import extract_local_features
@@ -275,11 +281,7 @@ def kapture_names(model: ColmapModel, folder: Path) -> dict[str, str]:
     names: dict[str, str] = {}
     taken: dict[str, str] = {}
     for image in model.images:
-        name = image.name.replace(",", "_")
-        middle = name.strip()
-        left = len(name) - len(name.lstrip())
-        name = "_" * left + middle + "_" * (len(name) - left - len(middle))
-        name = f"_{name[1:]}" if name.startswith("#") else name
+        name = writable_name(image.name)
         if name in taken:
             raise DataError(
                 f"images {taken[name]!r} and {image.name!r} would both be {name!r} in kapture, "

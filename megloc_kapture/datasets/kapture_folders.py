@@ -38,7 +38,7 @@ from megloc_kapture.io.files import link_images, output_error
 from megloc_kapture.io.images import image_size
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
 from megloc_kapture.io.paths import check_relative
-from megloc_kapture.values import RigidTransform
+from megloc_kapture.values import Camera, RigidTransform
 
 MAPPING, QUERY, QUERY_GT = "mapping", "query", "query_gt"
 
@@ -216,7 +216,11 @@ def check_image(folder: KaptureFolder, image: str) -> None:
     ------
     DataError : it is not; names its file.
     """
-    path, camera = folder.image_path(image), folder.read().camera_of(image)
+    check_image_file(folder.image_path(image), folder.read().camera_of(image))
+
+
+def check_image_file(path: Path, camera: Camera) -> None:
+    """As :func:`check_image`, of a file."""
     width, height = image_size(path)
     if (width, height) != (camera.width, camera.height):
         raise DataError(

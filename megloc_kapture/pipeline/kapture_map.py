@@ -23,7 +23,7 @@ from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.plugins import LOCAL_FEATURES, PluginChoice, plugin_names
 from megloc_kapture.stages.map_refinement import REPORT_FILE
 from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
-from megloc_kapture.stages.shared_index import index_map, observed_keypoints
+from megloc_kapture.stages.shared_index import index_map, observed_keypoints, with_noise
 from megloc_kapture.values import Camera, RigidTransform
 
 PixelOriginChoice = Literal["auto", "corner", "centre"]
@@ -267,7 +267,6 @@ class KaptureMap:
             # half a pixel of another origin is far within what a map may err by
             sample = observed_keypoints(
                 self.folder,
-                name,
                 keypoints.index,
                 (images[at] for at in taken if at < len(images)),
             )
@@ -324,7 +323,8 @@ def _read_indices(folder: KaptureFolder, keypoints_types: Sequence[str]) -> dict
             f"{folder.root}: no points of keypoints type {absent[0]!r}; there are: "
             f"{', '.join(present)}"
         )
-    return {name: index_map(folder, name) for name in sorted(set(keypoints_types)) or present}
+    types = sorted(set(keypoints_types)) or present
+    return {name: with_noise(folder, index_map(folder, name)) for name in types}
 
 
 def _is_ours(folder: KaptureFolder, local_type: str) -> bool:
@@ -370,7 +370,7 @@ def _find_origin(folder: KaptureFolder, local_type: str, index: MapIndex) -> Pix
                 path=folder.root / "reconstruction" / "observations.txt",
             )
     step = max(1, len(images) // _SAMPLED_IMAGES)
-    sample = observed_keypoints(folder, local_type, index, images[::step])
+    sample = observed_keypoints(folder, index, images[::step])
     known: Origin | None = "corner" if _is_ours(folder, local_type) else None
     return find_pixel_origin(
         sample,

@@ -7,10 +7,11 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from megloc_kapture.datasets.kapture_folders import check_image_file
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.files import hard_link, link_file, owned_name
-from megloc_kapture.io.images import WRITABLE_SUFFIXES, image_size, read_image_rgb, write_image
-from megloc_kapture.io.kapture import KaptureData, Sensor
+from megloc_kapture.io.images import WRITABLE_SUFFIXES, read_image_rgb, write_image
+from megloc_kapture.io.kapture import KaptureData, Sensor, writable_name
 from megloc_kapture.io.paths import check_relative
 from megloc_kapture.io.photos import UNREAD_SUFFIXES, read_photo, turned_upright
 from megloc_kapture.io.video import VIDEO_SUFFIXES, extract_frames
@@ -144,11 +145,7 @@ class Photographs:
                 path, photo.upright_camera, photo.orientation, photo.make, is_frame
             )
             return
-        size = image_size(path)
-        if size != (camera.width, camera.height):
-            raise DataError(
-                f"the image is {size[0]}x{size[1]}, its camera says {camera.width}x{camera.height}"
-            )
+        check_image_file(path, camera)
         self._images[name] = _Image(path, camera, 1, "", is_frame)
 
     def _add_video(self, name: str, path: Path, camera: Camera | None, every: int) -> None:
@@ -199,7 +196,7 @@ def _check_name(name: str, path: Path) -> None:
         check_relative(name)
     except DataError as error:
         raise DataError(f"{error.message}; rename the file", path=path) from error
-    if "," in name or name != name.strip() or name.startswith("#"):
+    if name != writable_name(name):
         raise DataError(
             f"kapture's tables cannot hold the name {name!r} (a comma, a space at an end, or # at "
             "its beginning); rename the file",

@@ -144,15 +144,16 @@ def write_submission(
     beside = None if tables is None else tables.parent
     rules = Protocol() if tables is None else read_protocol(tables)
     result = _read_result(localized, beside, from_rig=from_rig)
+    unreadable = {} if tables is None else read_unreadable(tables)
     if rules.pose_file == "mlad" and tables is not None:
         content = _mlad(result, tables)
         for name, text in content.files.items():
             write_bytes(safe_join(place, name), text.encode("ascii"))
     else:
-        content = _ltvl(result, tables, rules)
+        content = _ltvl(result, tables, rules, unreadable)
         write_bytes(place, content.files[""].encode("utf-8"))
     counts = {
-        "queries": len(result.data.records_camera) + len(_unreadable(tables)),
+        "queries": len(result.data.records_camera) + len(unreadable),
         "scored": len(content.posed) + len(content.missing),
         "poses": len(content.posed),
         "missing": len(content.missing),
@@ -237,22 +238,20 @@ def _read_result(localized: Path, beside: Path | None, *, from_rig: bool) -> _Re
     return _Result(data, poses | derived, guesses - derived.keys(), from_rigs, confidences)
 
 
-def _ltvl(result: _Result, tables: Path | None, rules: Protocol) -> _Content:
+def _ltvl(
+    result: _Result, tables: Path | None, rules: Protocol, unreadable: Collection[str]
+) -> _Content:
     names = {} if tables is None else read_names(tables)
     world = World() if tables is None else read_world(tables)
     images = list(names)
     if not names:
         groups = {} if tables is None else read_groups(tables)
-        every = sorted({*result.data.image_names(), *_unreadable(tables)})
+        every = sorted({*result.data.image_names(), *unreadable})
         images = [image for image in every if groups.get(image, ImageGroup()).scored]
     posed = [image for image in images if image in result.poses]
     official = {image: world.pose_in_official(result.poses[image]) for image in posed}
     text = format_pose_file(official, names=names or rules.pose_file_names)
     return _Content({"": text}, posed, [image for image in images if image not in result.poses])
-
-
-def _unreadable(tables: Path | None) -> Mapping[str, str]:
-    return {} if tables is None else read_unreadable(tables)
 
 
 def _mlad(result: _Result, tables: Path) -> _Content:

@@ -53,7 +53,7 @@ from megloc_kapture.stages.matches import iterate_candidates
 from megloc_kapture.stages.ranking_scene import KaptureScene
 from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.rigs import Unit, query_units
-from megloc_kapture.stages.shared_index import index_map, open_index, shared_index
+from megloc_kapture.stages.shared_index import index_map, open_index, shared_index, with_noise
 from megloc_kapture.stages.stage import LOCAL_TYPES, PipelineStage, StageWork
 from megloc_kapture.stages.unreadable import unreadable_queries
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
@@ -273,10 +273,9 @@ def localize_from_matches(
     map_spec, query_spec, matches_spec = (FolderSpec(f) for f in (map_folder, query, matches))
     candidates = {name: tuple(images) for name, images in iterate_candidates(pairs)}
     units = query_units(query.read(), rigs=options.rigs)
-    with shared_index(
-        {name: index_map(map_folder, type_in_map(map_folder, name)) for name in local_types},
-        scratch,
-    ) as indices:
+    read = {name: index_map(map_folder, type_in_map(map_folder, name)) for name in local_types}
+    measured = {name: with_noise(map_folder, index) for name, index in read.items()}
+    with shared_index(measured, scratch) as indices:
         jobs = []
         for unit in units:
             own = tuple(candidates.get(image, ()) for image, _ in unit)

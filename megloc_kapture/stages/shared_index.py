@@ -63,15 +63,14 @@ def index_map(folder: KaptureFolder, local_type: str) -> MapIndex:
         observations.point_ids,
         read_point_covariances(folder.root, len(points)),
     )
-    noise_rad, noise_px = _noise(folder, local_type, index)
-    return replace(index, local_type=local_type, noise_rad=noise_rad, noise_px=noise_px)
+    return replace(index, local_type=local_type)
 
 
 def observed_keypoints(
-    folder: KaptureFolder, local_type: str, index: MapIndex, images: Iterable[str]
+    folder: KaptureFolder, index: MapIndex, images: Iterable[str]
 ) -> list[ObservedKeypoints]:
     """Images that have a pose and keypoints, which are as they are stored."""
-    data, keypoints = folder.read(), folder.keypoints(local_type)
+    data, keypoints = folder.read(), folder.keypoints(index.local_type)
     poses = data.poses()
     return [
         ObservedKeypoints(
@@ -85,19 +84,22 @@ def observed_keypoints(
     ]
 
 
-def _noise(folder: KaptureFolder, local_type: str, index: MapIndex) -> tuple[float, float]:
-    """Median angle and distance between observations and their points, of a sample of the images;
-    NaN where there is none."""
-    if not len(index.point_ids) or local_type not in folder.types("keypoints"):
-        return math.nan, math.nan
-    keypoints, poses = folder.keypoints(local_type), folder.read().poses()
+def with_noise(folder: KaptureFolder, index: MapIndex) -> MapIndex:
+    """The index with the median angle and distance between observations and their points.
+
+    Of a sample of the images; it stays as it is where there is none.
+    """
+    if not len(index.point_ids) or index.local_type not in folder.types("keypoints"):
+        return index
+    keypoints, poses = folder.keypoints(index.local_type), folder.read().poses()
     images = [image for image in index.row_of_image if image in keypoints and image in poses]
     sample = images[:: max(1, len(images) // _SAMPLED_IMAGES)]
     errors_rad, errors_px = [np.zeros(0)], [np.zeros(0)]
-    for image in observed_keypoints(folder, local_type, index, sample):
+    for image in observed_keypoints(folder, index, sample):
         errors_px.append(image.errors_px(index.xyz))
         errors_rad.append(errors_px[-1] / focal_px(image.camera))
-    return _finite_median(errors_rad), _finite_median(errors_px)
+    noise_rad, noise_px = _finite_median(errors_rad), _finite_median(errors_px)
+    return replace(index, noise_rad=noise_rad, noise_px=noise_px)
 
 
 def _finite_median(parts: Sequence[NDArray[np.float64]]) -> float:

@@ -263,6 +263,7 @@ def without_truth_page(
             query_pictures(doubtful_queries(result), context, map_poses),
             "estimated",
         )
+    if len(several) == 1:
         sections += _seconds(contexts[0])
     for result, context in several:
         blocks_of_result = refinement_blocks(context, result.poses)

@@ -27,7 +27,8 @@ from megloc_kapture.evaluation.report.pictures import (
     read_small,
     side_by_side,
 )
-from megloc_kapture.evaluation.report.wording import counted, format_degrees, format_metres
+from megloc_kapture.evaluation.report.shown_queries import query_facts
+from megloc_kapture.evaluation.report.wording import counted, format_metres
 from megloc_kapture.evaluation.results import ResultContext, are_ranked
 from megloc_kapture.evaluation.scoring import Evaluation, QueryResult
 from megloc_kapture.evaluation.without_truth import QueryWithoutTruth, ResultWithoutTruth
@@ -91,7 +92,7 @@ def worst_queries(evaluation: Evaluation, number: int = NUM_SHOWN) -> list[Chose
         Chosen(
             name=query.image,
             image=evaluation.image(query.image),
-            facts=("; ".join(_facts(query)),),
+            facts=("; ".join(query_facts(query)),),
             candidates=_candidates(evaluation, query),
             pose=evaluation.truth[query.image],
             pose_name="true",
@@ -124,7 +125,7 @@ def disputed_queries(
         queries = [evaluation.queries[index] for evaluation in evaluations]
         worst = max(range(len(queries)), key=lambda k: (errors[k, index], -k))
         facts = tuple(
-            f"{evaluation.label}: {', '.join(_facts(query))}"
+            f"{evaluation.label}: {', '.join(query_facts(query))}"
             for evaluation, query in zip(evaluations, queries, strict=True)
         )
         of_worst = evaluations[worst]
@@ -173,22 +174,6 @@ def _candidates(evaluation: Evaluation, query: QueryResult) -> tuple[str, ...]:
     if query.candidates or query.image not in evaluation.pairs:
         return query.candidates
     return (evaluation.pairs[query.image].reference,)
-
-
-def _facts(query: QueryResult) -> tuple[str, ...]:
-    facts = []
-    if query.outcome == "missing":
-        facts.append(f"no pose ({query.reason})")
-    else:
-        error = f"{format_metres(query.position_m)} m, {format_degrees(query.angle_deg)} deg"
-        facts.append(f"{error} off")
-        if query.outcome == "fallback":
-            facts.append(f"fallback pose ({query.reason})")
-    if query.num_inliers is not None:
-        facts.append(f"{query.num_inliers} inliers of {query.num_matches}")
-    if query.confidence is not None:
-        facts.append(f"confidence {query.confidence:.2f}")
-    return tuple(facts)
 
 
 def _facts_without_truth(query: QueryWithoutTruth) -> tuple[str, ...]:

@@ -18,6 +18,7 @@ from megloc_kapture.evaluation.without_truth import ResultWithoutTruth
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.io.kapture import FeatureReader, MatchesReader
 from megloc_kapture.localization.map_index import MapIndex, observed_matches
+from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.values import RigidTransform
 
 # a match is an inlier within so many pixels of its point, as when a pose is estimated
@@ -62,19 +63,7 @@ class ShownQuery:
 
     def facts(self) -> list[str]:
         """Its outcome in words, in order."""
-        said = []
-        if self.estimated is None:
-            said.append(f"no pose ({self.reason})" if self.reason else "no pose")
-        elif self.position_m is not None and self.angle_deg is not None:
-            error = f"{format_metres(self.position_m)} m, {format_degrees(self.angle_deg)} deg"
-            said.append(f"{error} off")
-        if self.outcome == "fallback":
-            said.append(f"fallback pose ({self.reason})")
-        if self.num_inliers is not None:
-            said.append(f"{self.num_inliers} inliers of {self.num_matches}")
-        if self.confidence is not None:
-            said.append(f"confidence {self.confidence:.2f}")
-        return said
+        return query_facts(self)
 
     def rank(self) -> tuple[float, float, float, str]:
         """Sorts the worst first: without a pose, then by falling error, or rising confidence, or
@@ -82,6 +71,23 @@ class ShownQuery:
         error = math.inf if self.estimated is None else self.position_m or 0.0
         sure = self.confidence if self.confidence is not None else 1.0
         return -error, sure, float(self.num_inliers or 0), self.name
+
+
+def query_facts(query: ShownQuery | QueryResult) -> list[str]:
+    """The outcome of a query in words, in order."""
+    said = []
+    if query.outcome == "missing":
+        said.append(f"no pose ({query.reason})" if query.reason else "no pose")
+    elif query.position_m is not None and query.angle_deg is not None:
+        error = f"{format_metres(query.position_m)} m, {format_degrees(query.angle_deg)} deg"
+        said.append(f"{error} off")
+    if query.outcome == "fallback":
+        said.append(f"fallback pose ({query.reason})")
+    if query.num_inliers is not None:
+        said.append(f"{query.num_inliers} inliers of {query.num_matches}")
+    if query.confidence is not None:
+        said.append(f"confidence {query.confidence:.2f}")
+    return said
 
 
 def shown_queries(result: Evaluation | ResultWithoutTruth) -> list[ShownQuery]:
@@ -171,7 +177,7 @@ class StoredInliers:
         with contextlib.suppress(DataError):
             kept = set(queries.types("matches"))
             # those of a guided pyramid hold the others
-            kept -= {name for name in kept if f"{name}-pyramid" in kept}
+            kept -= {base_type(name) for name in kept if base_type(name) != name}
             for name in sorted(kept & set(queries.types("keypoints"))):
                 index = index_map(mapping, type_in_map(mapping, name))
                 self._sources.append((queries.keypoints(name), queries.matches(name), index))

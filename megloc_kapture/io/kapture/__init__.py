@@ -28,6 +28,7 @@ from megloc_kapture.io.kapture.points import (
     write_points3d,
 )
 from megloc_kapture.io.kapture.sensors import unit_quaternion, write_sensors
+from megloc_kapture.io.kapture.text import writable_name
 from megloc_kapture.io.kapture.vectors import KaptureVectors
 
 __all__ = [
@@ -53,4 +54,5 @@ __all__ = [
     "write_point_covariances",
     "write_points3d",
     "write_sensors",
+    "writable_name",
 ]

@@ -108,6 +108,16 @@ def named(path: Path, line: int | None = None) -> Iterator[None]:
         raise DataError(error.message, path=path, line=line) from None
 
 
+def writable_name(name: str) -> str:
+    """A name in which ``_`` stands for what :func:`format_table` refuses: a comma, a space at an
+    end, and # at the beginning."""
+    name = name.replace(",", "_")
+    middle = name.strip()
+    left = len(name) - len(name.lstrip())
+    name = "_" * left + middle + "_" * (len(name) - left - len(middle))
+    return f"_{name[1:]}" if name.startswith("#") else name
+
+
 def format_table(header: str, rows: Iterable[Sequence[str]]) -> bytes:
     """A kapture CSV file: the version line, the column header, the rows.
 
