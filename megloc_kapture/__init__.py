@@ -6,9 +6,10 @@
 >>> found.cam_from_world if found else found.reason                         # doctest: +SKIP
 """
 
-# pycolmap 4.1.1 to 4.2.1 corrupt the heap when they are imported before zlib; this import
-# must stay the first of the package (tests/test_import_order.py).
 import sys
+
+# pycolmap 4.1.1 to 4.2.1 corrupt the heap when they are imported before zlib, which must stay the
+# first import of the package that is not there anyway (tests/test_import_order.py)
 import zlib  # noqa: F401
 from importlib import import_module
 from typing import TYPE_CHECKING, Any

@@ -62,7 +62,16 @@ def suggestion(name: str, known: Iterable[str], *, listed: str = "known: ") -> s
 
 
 # packages that an extra brings, and the extra
-_EXTRAS = {"torch": "torch", "kornia": "kornia", "onnx": "convert", "distributed": "cluster"}
+_EXTRAS = {
+    "torch": "torch",
+    "kornia": "kornia",
+    "onnx": "convert",
+    "distributed": "cluster",
+    **dict.fromkeys(
+        ("fastapi", "prometheus_client", "python_multipart", "starlette", "uvicorn"),
+        "serve",
+    ),
+}
 
 
 def missing_extra(error: BaseException) -> str | None:

@@ -8,19 +8,17 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 import megloc_kapture
 from megloc_kapture.cli.main import main
+from megloc_kapture.cli.options import shown
 from megloc_kapture.features.vlad import VladOptions
-from megloc_kapture.plugins import PluginChoice
+from megloc_kapture.pipeline.presets import options_of
 from megloc_kapture.stages.options import PipelineOptions
-from megloc_kapture.values import Options
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 PAGES = sorted([REPOSITORY / "README.md", *(REPOSITORY / "docs").rglob("*.md")])
@@ -113,32 +111,11 @@ def test_commands_have_their_options(capsys: pytest.CaptureFixture[str]) -> None
                     assert re.search(rf"{word}\b", known[name]), f"{page.name}: {name} {word}"
 
 
-def shown(value: Any) -> str:
-    """A default as docs/options.md writes it."""
-    if isinstance(value, PluginChoice):
-        return value.name
-    if isinstance(value, tuple | list):
-        return f"[{', '.join(shown(one) for one in value)}]"
-    if value is None or isinstance(value, bool):
-        return str(value).lower()
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-def defaults(model: type[Options], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Key and default of each option of a model and the models in it."""
-    for name, field in model.model_fields.items():
-        value = field.get_default(call_default_factory=True)
-        if isinstance(value, Options) and not isinstance(value, PluginChoice):
-            yield from defaults(type(value), f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", shown(value)
-
-
 def test_every_option_stands_in_the_table_with_its_default() -> None:
     text = (REPOSITORY / "docs" / "options.md").read_text()
     pipeline, of_plugins = text.split("## Options of plugins")
     assert dict(re.findall(r"^\| `([\w.]+)` \| `(.*?)` \|", pipeline, flags=re.M)) == dict(
-        defaults(PipelineOptions)
+        (option.key, shown(option.value)) for option in options_of(PipelineOptions())
     )
     rows = re.findall(r"^\| `(\w+)`, `(\w+)` \| `(.*?)` \|", of_plugins, flags=re.M)
     assert len(rows) > 5

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from megloc_kapture.cli.console import Console, configure_logging
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.dataset_tables import PROTOCOL_FILE, SIDE_TABLES
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.executors import ExecutorKind, open_executor
+
+if TYPE_CHECKING:
+    from megloc_kapture.pipeline.kapture_map import KaptureMap
+    from megloc_kapture.pipeline.local_types import LocalType
+    from megloc_kapture.stages.options import PipelineOptions
 
 Input = Annotated[Path, tyro.conf.arg(aliases=["-i"])]
 Output = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
@@ -41,6 +46,43 @@ def opened_map(path: Path, console: Console) -> Path:
         folder = kapture_of(path, work=Work(executor, console.track))
     console.say(f"{path}: a COLMAP model, as kapture in {folder}")
     return folder
+
+
+def check_consistent(kapture_map: KaptureMap, path: Path, *, force: bool) -> None:
+    """Raise DataError for a map that contradicts itself, unless it is to be used all the same."""
+    if not force and (fault := kapture_map.fault()):
+        raise DataError(
+            f"{fault}; the poses would be wrong (--force localizes all the same)", path=path
+        )
+
+
+def idle_for_types(
+    typed: Mapping[str, Any], types: Sequence[LocalType], options: PipelineOptions
+) -> dict[str, str]:
+    """Options that change nothing for a map of these keypoints types, and why.
+
+    Parameters
+    ----------
+    typed : nested tables of ``--set``.
+    """
+    idle = {}
+    if "guided_pyramid" in typed and options.matches_again():
+        obstacles = [local.pyramid_obstacle for local in types]
+        if all(obstacles):
+            idle["guided_pyramid"] = obstacles[0]
+    used = {local.choice.name for local in types if local.choice is not None}
+    unused = [one.name for one in options.local_features if one.name not in used]
+    if unused:
+        brought = ", ".join(local.name for local in types)
+        idle["local_features"] = f"the map is of {brought}; nothing in it is of {unused[0]}"
+    return idle
+
+
+def refuse_idle(typed: Mapping[str, Any], idle: Mapping[str, str]) -> None:
+    """Raise OptionError where an option that was typed changes nothing."""
+    for name in typed:
+        if name in idle:
+            raise OptionError(f"--set {name} changes nothing: {idle[name]}")
 
 
 def side_tables_beside(result: Path) -> Path | None:

@@ -18,8 +18,11 @@ from megloc_kapture.cli.common import (
     Input,
     Output,
     Reading,
+    check_consistent,
     existing,
+    idle_for_types,
     opened_map,
+    refuse_idle,
 )
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.files import staged_output
@@ -79,11 +82,7 @@ class Localize(Reading, Deciding, Common):
             pixel_origin=self.pixel_origin,
             allow_links_below=existing(self.allow_links_below),
         )
-        if not self.force and (fault := kapture_map.fault()):
-            raise DataError(
-                f"{fault}; the poses would be wrong (--force localizes all the same)",
-                path=self.input,
-            )
+        check_consistent(kapture_map, self.input, force=self.force)
         options = options_of_preset(
             self.preset or DEFAULT_PRESET, assignments=self.assignments(), used=LOCALIZING
         )
@@ -167,20 +166,13 @@ def check_acted_on(
     ------
     OptionError : names the option, and why it changes nothing.
     """
-    idle: dict[str, str] = {}
+    idle = idle_for_types(typed, localizer.types, localizer.options)
     brought = ", ".join(local.name for local in localizer.types)
     if all(queries.lacking(local.name) is None for local in localizer.types):
         idle |= dict.fromkeys(
             ("preprocessing", "mask_margin_px"),
             f"the queries bring their local features ({brought}), nothing is extracted",
         )
-    if "guided_pyramid" in typed and localizer.options.matches_again():
-        obstacles = [local.pyramid_obstacle for local in localizer.types]
-        if all(obstacles):
-            idle["guided_pyramid"] = obstacles[0]
-    unused = localizer.unused_local_features()
-    if unused:
-        idle["local_features"] = f"the map is of {brought}; nothing in it is of {unused[0]}"
     shared = queries.types_of_all()
     if pairs:
         names = ("query_pairs", "global_features", "fusion")
@@ -193,6 +185,4 @@ def check_acted_on(
             idle["localization"] = "rigs: the queries have none"
         elif localization.get("fallback") == "rig":
             idle["localization"] = "fallback = rig: the queries have none"
-    for name in typed:
-        if name in idle:
-            raise OptionError(f"--set {name} changes nothing: {idle[name]}")
+    refuse_idle(typed, idle)

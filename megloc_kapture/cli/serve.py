@@ -10,8 +10,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from megloc_kapture.cli.common import Common, Deciding, Force, Reading, existing, opened_map
-from megloc_kapture.errors import DataError, MeglocError, OptionError
+from megloc_kapture.cli.common import (
+    Common,
+    Deciding,
+    Force,
+    Reading,
+    check_consistent,
+    existing,
+    idle_for_types,
+    opened_map,
+    refuse_idle,
+)
+from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.files import read_text
 from megloc_kapture.pipeline.executors import available_cores
 from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
@@ -53,13 +63,8 @@ class Serve(Reading, Deciding, Common):
 
     def run(self) -> int:
         """Run it."""
-        try:
-            from megloc_kapture.service.server import ServedMap, bind, serve
-        except ModuleNotFoundError as error:
-            raise MeglocError(
-                f'{error.name} is missing: pip install "megloc-kapture[serve]"'
-            ) from error
         from megloc_kapture.cli.main import INTERRUPTED, TERMINATED, Terminated
+        from megloc_kapture.service.server import ServedMap, bind, serve
 
         console = self.console()
         if self.workers < 1:
@@ -80,11 +85,7 @@ class Serve(Reading, Deciding, Common):
                 existing(self.allow_links_below),
             )
             kapture_map = served.open()
-            if not self.force and (fault := kapture_map.fault()):
-                raise DataError(
-                    f"{fault}; the poses would be wrong (--force localizes all the same)",
-                    path=self.map,
-                )
+            check_consistent(kapture_map, self.map, force=self.force)
             check_acted_on(assigned(self.set), kapture_map, options)
 
             def ready() -> None:
@@ -131,21 +132,10 @@ def check_acted_on(
     ------
     OptionError : names the option, and why it changes nothing.
     """
-    types = local_types_of(kapture_map, options, FeatureCache())
-    idle = {}
-    if options.matches_again() and all(local.pyramid_obstacle for local in types):
-        idle["guided_pyramid"] = types[0].pyramid_obstacle
-    unused = {one.name for one in options.local_features} - {
-        local.choice.name for local in types if local.choice is not None
-    }
-    if unused:
-        brought = ", ".join(local.name for local in types)
-        idle["local_features"] = f"the map is of {brought}; nothing in it is of {min(unused)}"
+    idle = idle_for_types(typed, local_types_of(kapture_map, options, FeatureCache()), options)
     localization = typed.get("localization", {})
     if localization.get("rigs") or localization.get("fallback") == "rig":
         idle["localization"] = "images come one by one, not on a rig"
     if any(one.name == "icp" for one in options.pose_refinement.by):
         idle["pose_refinement"] = "icp needs depth maps, and images come without"
-    for name in typed:
-        if name in idle:
-            raise OptionError(f"--set {name} changes nothing: {idle[name]}")
+    refuse_idle(typed, idle)

@@ -56,7 +56,7 @@ def write_view(
     OutputError : the file cannot be written, or is another one than a view.
     """
     from megloc_kapture.evaluation.report.scene import render_view, scene_of
-    from megloc_kapture.evaluation.report.shown_queries import shown_queries
+    from megloc_kapture.evaluation.report.shown_queries import StoredInliers, shown_queries
 
     path = Path(path)
     _check_output(path, force=force)
@@ -71,7 +71,7 @@ def write_view(
         title = found.label or title
     elif truth is not None:
         raise OptionError("a truth needs a result to be compared with")
-    scene = scene_of(title, context, queries)
+    scene = scene_of(title, StoredInliers(context), queries)
     if scene is None:
         raise DataError("no image has a pose, so there is nothing to see", path=folder.root)
     write_bytes(path, render_view(scene).encode("utf-8"))

@@ -361,11 +361,6 @@ class Localizer:
     def _known_images(self) -> frozenset[str]:
         return frozenset(self.map.folder.read().image_names())
 
-    def unused_local_features(self) -> list[str]:
-        """Names of the options' local features that no type of the map is made of."""
-        used = {local.choice.name for local in self.types if local.choice is not None}
-        return [one.name for one in self.options.local_features if one.name not in used]
-
     def compares_as_asked(self, global_types: Collection[str]) -> bool:
         """Whether queries that bring these global features are compared by the options' own."""
         return self._retrieval.names_one_of(global_types)

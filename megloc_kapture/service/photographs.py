@@ -63,10 +63,11 @@ class Photograph:
         TooManyPixels : more of them than that, or more scans than any camera writes.
         DataError : broken.
         """
-        if content.startswith(_PNG):
-            suffix, (width, height) = ".png", _png_size(content)
+        suffix: Literal[".jpg", ".png"] = ".png" if content.startswith(_PNG) else ".jpg"
+        if suffix == ".png":
+            width, height = _png_size(content)
         elif content.startswith(_JPEG):
-            suffix, (width, height) = ".jpg", _jpeg_size(content)
+            width, height = _jpeg_size(content)
         else:
             raise UnknownFormat("the image is neither JPEG nor PNG")
         if width < 1 or height < 1:
@@ -75,7 +76,7 @@ class Photograph:
             raise TooManyPixels(
                 f"the image is {width}x{height}, which is more than {max_pixels / 1e6:g} megapixels"
             )
-        return cls(content, ".png" if suffix == ".png" else ".jpg", width, height)
+        return cls(content, suffix, width, height)
 
     def decode(self) -> NDArray[np.uint8]:
         """The pixels, uint8 (H, W, 3) RGB, as they are stored; raises DataError."""

@@ -78,7 +78,7 @@ def test_without_the_extra_it_says_what_to_install(
     for name in [name for name in sys.modules if name.startswith("megloc_kapture.service")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "uvicorn", None)
-    line = megloc("serve", finished / "map").refused("uvicorn is missing")
+    line = megloc("serve", finished / "map").refused("uvicorn is not installed")
     assert line.endswith('pip install "megloc-kapture[serve]"')
 
 

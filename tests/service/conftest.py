@@ -9,27 +9,23 @@ import pytest
 from serving import Photo, client_of
 from starlette.testclient import TestClient
 
+import megloc_kapture as megloc
 from megloc_kapture import KaptureMap, Localizer
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.pipeline.datasets import choose_dataset
-from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
-from megloc_kapture.pipeline.plan import run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.run import Run
-from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.service.limits import Limits
 
-OPTIONS = options_of_preset(assignments=["local_features.options.max_keypoints=400"])
+CHANGES = {"local_features.options.max_keypoints": 400}
+OPTIONS = options_of_preset(assignments=CHANGES)
 
 
 @pytest.fixture(scope="session")
 def served_map(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Our map of the scene; not to be written into."""
-    workspace = Workspace(tmp_path_factory.mktemp("served") / "workspace")
-    with workspace.lock():
-        run = Run(choose_dataset("kapture", scene), "classic", OPTIONS, workspace)
-        run_plan(plan_evaluation(run), workspace, last="map")
-    return workspace.root / "map"
+    workspace = tmp_path_factory.mktemp("served") / "workspace"
+    return megloc.build_map(
+        scene / "mapping", set=CHANGES, workspace=workspace
+    ).kapture_map.folder.root
 
 
 @pytest.fixture(scope="session")

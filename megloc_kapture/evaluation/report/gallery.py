@@ -23,7 +23,6 @@ from megloc_kapture.evaluation.report.pictures import dotted, read_small
 from megloc_kapture.evaluation.report.queries import order_of_badness
 from megloc_kapture.evaluation.report.shown_queries import ShownQuery, StoredInliers, spread
 from megloc_kapture.evaluation.report.wording import format_degrees, format_metres
-from megloc_kapture.evaluation.results import ResultContext
 from megloc_kapture.evaluation.scoring import Evaluation
 
 # a picture takes about 10 kB and, of a large photograph, 50 ms
@@ -37,7 +36,7 @@ _MAX_ROWS = 500
 _EACH = 3
 
 
-def gallery_blocks(context: ResultContext, queries: Sequence[ShownQuery]) -> tuple[Block, ...]:
+def gallery_blocks(stored: StoredInliers, queries: Sequence[ShownQuery]) -> tuple[Block, ...]:
     """The pictures of queries; nothing where no image can be shown.
 
     Three of the best, of the typical and of the worst stand first, then the others, the worst
@@ -45,18 +44,19 @@ def gallery_blocks(context: ResultContext, queries: Sequence[ShownQuery]) -> tup
 
     Parameters
     ----------
+    stored : their images and inliers.
     queries : worst first.
     """
-    if context.queries is None or not queries:
+    folder = stored.context.queries
+    if folder is None or not queries:
         return ()
     first, others = _first(queries)
     shown = first + [(query, "") for query in _some(others, MAX_PICTURES - len(first))]
-    stored = StoredInliers(context)
     cards = []
     for query, role in shown:
         picture = None
         with contextlib.suppress(DataError):
-            path = context.queries.image_path(query.image)
+            path = folder.image_path(query.image)
             picture = read_small(path, width=_SIZE[0], height=_SIZE[1])
         if picture is None:
             continue

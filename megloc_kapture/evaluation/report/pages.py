@@ -30,7 +30,7 @@ from megloc_kapture.evaluation.report.queries import (
     worst_queries,
 )
 from megloc_kapture.evaluation.report.refinement import refinement_blocks
-from megloc_kapture.evaluation.report.shown_queries import shown_queries
+from megloc_kapture.evaluation.report.shown_queries import StoredInliers, shown_queries
 from megloc_kapture.evaluation.report.wording import (
     FEW,
     INTERVALS,
@@ -63,15 +63,16 @@ _FROM_ABOVE = "Camera centres from above, each error a red line from the truth t
 
 
 def evaluation_page(
-    evaluation: Evaluation, map_poses: Poses, context: ResultContext
+    evaluation: Evaluation, map_poses: Poses, stored: StoredInliers
 ) -> tuple[Section, ...]:
     """Recall, errors, views and single queries of one result.
 
     Parameters
     ----------
     map_poses : ``cam_from_world`` of the map's images, for the view from above.
-    context : holds images, masks and matches of the queries.
+    stored : the inliers of the queries, and their context: images, masks and matches.
     """
+    context = stored.context
     overall = evaluation.row()
     by_center = evaluation.by_center
     fallbacks = (
@@ -158,7 +159,7 @@ def evaluation_page(
                 Figure(Markup(figures.confidence_curves(confidence))),
             ]
         sections.append(Section(tuple(worth), "Does it know when it does not know?"))
-    sections += _unless_empty("Queries", gallery_blocks(context, shown_queries(evaluation)))
+    sections += _unless_empty("Queries", gallery_blocks(stored, shown_queries(evaluation)))
     sections += _pictured(
         "The worst queries, beside what they match",
         "Left the query, right the candidate with most matches. ",
@@ -219,7 +220,10 @@ def seeds_page(
 
 
 def without_truth_page(
-    found: WithoutTruth, map_poses: Poses, contexts: Sequence[ResultContext]
+    found: WithoutTruth,
+    map_poses: Poses,
+    contexts: Sequence[ResultContext],
+    stored: StoredInliers,
 ) -> tuple[Section, ...]:
     """Localized shares, agreement with retrieval and between results, and doubtful queries."""
     sections = [Section((Paragraph(f"No recall: {found.statement} {CAUTION}", "note"),))]
@@ -253,7 +257,7 @@ def without_truth_page(
         )
     several = list(zip(found.results, contexts, strict=True))
     if len(several) == 1:
-        gallery = gallery_blocks(contexts[0], shown_queries(found.results[0]))
+        gallery = gallery_blocks(stored, shown_queries(found.results[0]))
         sections += _unless_empty("Queries", gallery)
     for result, context in several:
         sections += _pictured(

@@ -21,7 +21,7 @@ from megloc_kapture.evaluation.report.document import (
     Section,
 )
 from megloc_kapture.evaluation.report.renderers import render_html, render_text, write_document
-from megloc_kapture.evaluation.report.shown_queries import shown_queries
+from megloc_kapture.evaluation.report.shown_queries import StoredInliers, shown_queries
 from megloc_kapture.evaluation.report.wording import (
     INTERVALS,
     agreement_sentence,
@@ -88,9 +88,11 @@ def report_of(
         contexts = [result.context for result in results]
     if map_poses is None:
         map_poses = next((poses for context in contexts if (poses := context.map_poses())), {})
+    # the gallery and the view show the same inliers
+    stored = StoredInliers(contexts[0])
     if isinstance(reported, Evaluation):
         title = reported.label or "Evaluation"
-        page = pages.evaluation_page(reported, map_poses, contexts[0])
+        page = pages.evaluation_page(reported, map_poses, stored)
     elif isinstance(reported, Comparison):
         title = " and ".join(labels)
         page = pages.comparison_page(reported, map_poses, contexts)
@@ -99,8 +101,8 @@ def report_of(
         page = pages.seeds_page(reported, map_poses, contexts)
     else:
         title = " and ".join(labels) or "Without truth"
-        page = pages.without_truth_page(reported, map_poses, contexts)
-    beside = _view(results[0], contexts[0], title) if view and len(results) == 1 else {}
+        page = pages.without_truth_page(reported, map_poses, contexts, stored)
+    beside = _view(results[0], stored, title) if view and len(results) == 1 else {}
     if beside:
         page = (*page[:1], _view_section(), *page[1:])
     csv_tables = {PER_QUERY_CSV: reported.per_query()}
@@ -119,14 +121,14 @@ def report_of(
 
 
 def _view(
-    result: Evaluation | ResultWithoutTruth, context: ResultContext, title: str
+    result: Evaluation | ResultWithoutTruth, stored: StoredInliers, title: str
 ) -> dict[str, str]:
     """The page of the view by its name; none where no camera has a pose, or the map is broken."""
     from megloc_kapture.evaluation.report.scene import render_view, scene_of
 
     # a report without a view is better than none; `megloc view` says what is broken
     with contextlib.suppress(DataError):
-        scene = scene_of(title, context, shown_queries(result))
+        scene = scene_of(title, stored, shown_queries(result))
         if scene is not None:
             return {VIEW_HTML: render_view(scene)}
     return {}

@@ -92,21 +92,20 @@ class Scene:
     notes: tuple[str, ...]
 
 
-def scene_of(
-    title: str, context: ResultContext, queries: Sequence[ShownQuery] = ()
-) -> Scene | None:
+def scene_of(title: str, stored: StoredInliers, queries: Sequence[ShownQuery] = ()) -> Scene | None:
     """The scene of a map and of queries in it; None where no camera has a pose.
 
     Parameters
     ----------
-    context : where the map, the queries' cameras and their matches are; each may be absent.
+    stored : the inliers of the queries; its context says where the map and the queries' cameras
+        are, each of which may be absent.
     queries : worst first; what is left out of many are the better ones.
 
     Raises
     ------
     DataError : the map is broken.
     """
-    notes: list[str] = []
+    context, notes = stored.context, list[str]()
     rng = np.random.default_rng(_SEED)
     mapping = context.mapping
     map_poses = context.map_poses()
@@ -144,13 +143,12 @@ def scene_of(
     # of few digits, so that the text of the page says exactly what was subtracted
     origin = np.round((low + high) / 2, 3)
     rays = _rays(context.queries, [query.image for query in queries], context.cameras)
-    stored = StoredInliers(context) if any(q.num_inliers for q in queries) else None
     with_inliers = min(max(len(queries), 1), _MAX_QUERIES_WITH_INLIERS)
     most = min(_MAX_INLIERS // with_inliers, _MAX_INLIERS_OF_ONE)
-    if stored is not None and stored.known and len(queries) > _MAX_QUERIES_WITH_INLIERS:
+    if stored.known and len(queries) > _MAX_QUERIES_WITH_INLIERS:
         notes.append(f"Inliers are drawn of the worst {_MAX_QUERIES_WITH_INLIERS} queries.")
     inliers = [
-        np.zeros((0, 3)) if stored is None else stored.of(query)[1]
+        stored.of(query)[1] if query.num_inliers else np.zeros((0, 3))
         for query in queries[:_MAX_QUERIES_WITH_INLIERS]
     ]
     inliers += [np.zeros((0, 3))] * (len(queries) - len(inliers))

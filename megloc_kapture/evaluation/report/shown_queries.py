@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -163,24 +164,28 @@ class StoredInliers:
     """
 
     context: ResultContext
-    _sources: list[tuple[FeatureReader, MatchesReader, MapIndex]] = field(init=False)
+    _found: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]] = field(
+        init=False, default_factory=dict
+    )
 
-    def __post_init__(self) -> None:
+    @cached_property
+    def _sources(self) -> list[tuple[FeatureReader, MatchesReader, MapIndex]]:
         # only those who draw inliers wait for what reads maps
         from megloc_kapture.stages.query_poses import type_in_map
         from megloc_kapture.stages.shared_index import index_map
 
-        self._sources = []
+        sources: list[tuple[FeatureReader, MatchesReader, MapIndex]] = []
         queries, mapping = self.context.queries, self.context.mapping
         if queries is None or mapping is None or not mapping.has_points():
-            return
+            return sources
         with contextlib.suppress(DataError):
             kept = set(queries.types("matches"))
             # those of a guided pyramid hold the others
             kept -= {base_type(name) for name in kept if base_type(name) != name}
             for name in sorted(kept & set(queries.types("keypoints"))):
                 index = index_map(mapping, type_in_map(mapping, name))
-                self._sources.append((queries.keypoints(name), queries.matches(name), index))
+                sources.append((queries.keypoints(name), queries.matches(name), index))
+        return sources
 
     @property
     def known(self) -> bool:
@@ -189,6 +194,11 @@ class StoredInliers:
 
     def of(self, query: ShownQuery) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Pixels (K, 2) of the inliers of a query's pose, and their points (K, 3) in the world."""
+        if query.image not in self._found:
+            self._found[query.image] = self._read(query)
+        return self._found[query.image]
+
+    def _read(self, query: ShownQuery) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         found_here = self.context.localized.get(query.image)
         if found_here is not None and found_here.inlier_points_world is not None:
             px = found_here.inlier_points_px

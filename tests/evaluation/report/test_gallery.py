@@ -13,7 +13,7 @@ from megloc_kapture.evaluation.report import gallery
 from megloc_kapture.evaluation.report.document import Cards
 from megloc_kapture.evaluation.report.gallery import gallery_blocks
 from megloc_kapture.evaluation.report.reports import render_report
-from megloc_kapture.evaluation.report.shown_queries import shown_queries
+from megloc_kapture.evaluation.report.shown_queries import StoredInliers, shown_queries
 from megloc_kapture.evaluation.results import ResultContext
 from megloc_kapture.evaluation.scoring import Evaluation, evaluate_poses
 from megloc_kapture.io.images import write_image
@@ -34,7 +34,7 @@ def evaluation(world: Any, tmp_path: Path, kaptures: Any) -> Evaluation:
 
 
 def cards_of(evaluation: Evaluation) -> Cards:
-    blocks = gallery_blocks(evaluation.context, shown_queries(evaluation))
+    blocks = gallery_blocks(StoredInliers(evaluation.context), shown_queries(evaluation))
     return next(block for block in blocks if isinstance(block, Cards))
 
 
@@ -90,8 +90,8 @@ def test_of_many_some_are_shown(evaluation: Evaluation, monkeypatch: pytest.Monk
 
 def test_without_images_there_is_none(evaluation: Evaluation) -> None:
     shown = shown_queries(evaluation)
-    assert gallery_blocks(ResultContext(), shown) == ()
+    assert gallery_blocks(StoredInliers(ResultContext()), shown) == ()
     assert evaluation.context.queries is not None
     for path in evaluation.context.queries.root.rglob("*.jpg"):
         path.unlink()
-    assert gallery_blocks(evaluation.context, shown) == ()
+    assert gallery_blocks(StoredInliers(evaluation.context), shown) == ()

@@ -19,7 +19,7 @@ from kapture.io.csv import kapture_from_dir
 
 from megloc_kapture.evaluation.report import scene as scenes
 from megloc_kapture.evaluation.report.scene import corner_rays, render_view, scene_of
-from megloc_kapture.evaluation.report.shown_queries import legend, shown_queries
+from megloc_kapture.evaluation.report.shown_queries import StoredInliers, legend, shown_queries
 from megloc_kapture.evaluation.results import ResultContext
 from megloc_kapture.evaluation.scoring import evaluate_poses
 from megloc_kapture.geometry.cameras import project
@@ -108,7 +108,7 @@ def test_the_page_has_what_kapture_reads(make_map: Any, camera: Camera, offset: 
         [rng.normal((offset, 0, 0), 5, (500, 3)), rng.integers(0, 256, (500, 3))]
     )
     root = make_map([f"m/{k}.jpg" for k in range(6)], camera, points, offset)
-    scene = scene_of("a map", ResultContext(mapping=KaptureFolder(root)))
+    scene = scene_of("a map", StoredInliers(ResultContext(mapping=KaptureFolder(root))))
     assert scene is not None
     data = data_of(render_view(scene))
     check_against_kapture(data, kapture_from_dir(str(root), skip_list=[kapture.Observations]))
@@ -121,7 +121,7 @@ def test_the_page_has_what_kapture_reads(make_map: Any, camera: Camera, offset: 
 
 def test_a_foreign_map_of_rigs(shared_data: Path) -> None:
     root = shared_data / "foreign_maps" / "virtual_gallery" / "map"
-    scene = scene_of("gallery", ResultContext(mapping=KaptureFolder(root)))
+    scene = scene_of("gallery", StoredInliers(ResultContext(mapping=KaptureFolder(root))))
     assert scene is not None
     data = data_of(render_view(scene))
     check_against_kapture(data, kapture_from_dir(str(root), skip_list=[kapture.Observations]))
@@ -151,13 +151,13 @@ def test_many_points_and_cameras_are_drawn_in_part(make_map: Any, monkeypatch: A
     points = np.column_stack([rng.normal(0, 5, (90_000, 3)), rng.integers(0, 256, (90_000, 3))])
     monkeypatch.setattr(scenes, "MAX_CAMERAS", 10)
     root = make_map([f"m/{k:03d}.jpg" for k in range(30)], CAMERAS[0], points)
-    scene = scene_of("many", ResultContext(mapping=KaptureFolder(root)))
+    scene = scene_of("many", StoredInliers(ResultContext(mapping=KaptureFolder(root))))
     assert scene is not None and len(scene.cameras) == 10
     assert "60000 of the map's 90000 points" in scene.notes[0]
     assert "10 of the map's 30 cameras" in scene.notes[1]
     page = render_view(scene)
     assert len(page) < 3_000_000
-    again = scene_of("many", ResultContext(mapping=KaptureFolder(root)))
+    again = scene_of("many", StoredInliers(ResultContext(mapping=KaptureFolder(root))))
     assert again is not None and render_view(again) == page
     known = {tuple(row) for row in np.float32(points[:, :3] - scene.origin).tolist()}
     assert {tuple(row) for row in scene.points.tolist()} <= known
@@ -173,7 +173,7 @@ def test_names_cannot_leave_the_data(world: Any, make_map: Any, upright: Any) ->
         world.estimated, world.truth, conditions=world.conditions, statuses=world.statuses
     )
     context = ResultContext(mapping=KaptureFolder(root))
-    scene = scene_of(EVIL, context, shown_queries(evaluation))
+    scene = scene_of(EVIL, StoredInliers(context), shown_queries(evaluation))
     assert scene is not None
     page = render_view(replace(scene, cameras=(EVIL, "m/1.jpg")))
     # two scripts, of data and ours, whatever the names say
@@ -193,7 +193,7 @@ def test_queries_estimates_and_truths(world: Any, make_map: Any) -> None:
         world.estimated, world.truth, conditions=world.conditions, statuses=world.statuses
     )
     shown = shown_queries(evaluation)
-    scene = scene_of("queries", ResultContext(mapping=KaptureFolder(root)), shown)
+    scene = scene_of("queries", StoredInliers(ResultContext(mapping=KaptureFolder(root))), shown)
     assert scene is not None
     data = data_of(render_view(scene))
     by_image = {query.image: query for query in evaluation.queries}
@@ -230,7 +230,7 @@ def test_of_many_queries_the_worst_are_shown(worlds: Any, make_map: Any) -> None
     world = worlds(num_queries=3000)
     evaluation = evaluate_poses(world.estimated, world.truth, statuses=world.statuses)
     context = ResultContext(mapping=KaptureFolder(root))
-    scene = scene_of("many", context, shown_queries(evaluation))
+    scene = scene_of("many", StoredInliers(context), shown_queries(evaluation))
     assert scene is not None and len(scene.queries) == 2000
     assert scene.notes == ("The worst 2000 of 3000 queries are drawn and listed.",)
     assert len(render_view(scene)) < 3_000_000
@@ -240,20 +240,20 @@ def test_a_map_without_colours_is_shaded_by_height(make_map: Any) -> None:
     points = np.zeros((50, 6))
     points[:, 2] = np.arange(50)
     root = make_map(["m/0.jpg", "m/1.jpg"], CAMERAS[0], points)
-    scene = scene_of("grey", ResultContext(mapping=KaptureFolder(root)))
+    scene = scene_of("grey", StoredInliers(ResultContext(mapping=KaptureFolder(root))))
     assert scene is not None
     assert (np.diff(scene.colors.astype(int).sum(axis=1)) >= 0).all() and scene.colors.std() > 20
 
 
 def test_nothing_to_see() -> None:
-    assert scene_of("nothing", ResultContext()) is None
+    assert scene_of("nothing", StoredInliers(ResultContext())) is None
 
 
 def test_projection_agrees_with_the_package(make_map: Any) -> None:
     """A point on a ray of the frustum is seen at the corner by the package's own projection."""
     camera = CAMERAS[2]
     root = make_map(["m/0.jpg", "m/1.jpg"], camera, np.zeros((1, 6)))
-    scene = scene_of("rays", ResultContext(mapping=KaptureFolder(root)))
+    scene = scene_of("rays", StoredInliers(ResultContext(mapping=KaptureFolder(root))))
     assert scene is not None
     pose = KaptureFolder(root).read().poses()[scene.cameras[0]]
     corners = scene.origin + scene.camera_frusta[0, 0] + 7.0 * scene.camera_frusta[0, 1:]
@@ -277,13 +277,13 @@ def test_coordinate_frames_are_kept_apart(world: Any, make_map: Any) -> None:
     ]
     frames = dict.fromkeys(names[:2], "DUC1") | dict.fromkeys(names[2:], "DUC2")
     context = ResultContext(mapping=KaptureFolder(root), frames=frames)
-    scene = scene_of("frames", context, shown)
+    scene = scene_of("frames", StoredInliers(context), shown)
     assert scene is not None and scene.frames == ("DUC1", "DUC2")
     assert scene.point_frames.tolist() == [0, 1, 1]
     assert scene.camera_frames.tolist() == [0, 0, 1, 1]
     assert scene.query_frames.tolist() == [k % 2 for k in range(len(shown))]
     assert "DUC2</option>" in render_view(scene)
-    one = scene_of("one", ResultContext(mapping=KaptureFolder(root)), shown)
+    one = scene_of("one", StoredInliers(ResultContext(mapping=KaptureFolder(root))), shown)
     assert one is not None and 'id="frame"' not in render_view(one)
 
 
@@ -301,7 +301,7 @@ def test_points_without_colours_have_those_of_the_images(make_map: Any) -> None:
     for name, color in colors.items():
         pixels = np.full((480, 640, 3), color, np.uint8)
         write_image(root / "sensors/records_data" / name, pixels)
-    scene = scene_of("coloured", ResultContext(mapping=KaptureFolder(root)))
+    scene = scene_of("coloured", StoredInliers(ResultContext(mapping=KaptureFolder(root))))
     assert scene is not None
     expected = np.array([colors["m/0.jpg"], colors["m/0.jpg"], colors["m/1.jpg"]])
     np.testing.assert_allclose(scene.colors[:3].astype(int), expected, atol=4)  # JPEG
