@@ -177,15 +177,11 @@ class Localizer:
         executor: Executor | None = None,
         *,
         candidates: Mapping[str, Sequence[str]] | None = None,
-        broken_images_fail: bool = False,
     ) -> Iterator[list[Pose | Failure]]:
         """Localize images, or the cameras of a rig together: one result per camera of each unit.
 
-        A rig that has no pose is tried camera by camera. Parameters as of :meth:`localize_many`.
-
-        Parameters
-        ----------
-        broken_images_fail : an image that cannot be decoded is a Failure, not an error.
+        A rig that has no pose is tried camera by camera, and an image file that cannot be decoded
+        is a Failure of its unit. Parameters as of :meth:`localize_many`.
         """
         if candidates is not None:
             known = candidates
@@ -193,8 +189,7 @@ class Localizer:
                 tuple((replace(q, candidates=tuple(known.get(q.name, ()))), at) for q, at in unit)
                 for unit in units
             )
-        localize = self._localize_readable if broken_images_fail else self._localize_unit
-        return ordered_map(localize, units, executor)
+        return ordered_map(self._localize_readable, units, executor)
 
     def localize_query(self, query: Query) -> Pose | Failure:
         """Localize a query that may bring its features."""

@@ -268,8 +268,9 @@ class KaptureQueries:
 
     Attributes
     ----------
-    names : of the images, sorted; iterating yields the queries in this order.
-    unreadable : none: a broken image ends the run, for somebody listed it.
+    names : of the images that can be used, sorted; iterating yields the queries in this order.
+    unreadable : names of images that are needed and absent, broken or not of their camera's size,
+        to the reason; known after :meth:`check`, so far as headers say it.
     faults : why the features that a query brings cannot be used, known when they have been read;
         such a query has neither features nor candidates.
     """
@@ -313,17 +314,25 @@ class KaptureQueries:
 
         Raises
         ------
-        DataError : there are no images; an image is needed and absent, broken or not of its
-            camera's size; features are not as wide as the map's, or would be taken for those of a
-            map image.
+        DataError : there are no images, or none that can be used; features are not as wide as the
+            map's, or would be taken for those of a map image.
         """
         self._map.folder.check_features_apart(self._folder)
         if not self.names:
             raise DataError("there are no query images", path=self._folder.root)
         self._check_widths()
+        first: DataError | None = None
         for name in self.names:
-            if not any(name in keypoints for keypoints, _ in self._local.values()):
+            if any(name in keypoints for keypoints, _ in self._local.values()):
+                continue
+            try:
                 check_image(self._folder, name)
+            except DataError as error:
+                self.unreadable[name] = error.message
+                first = first or error
+        self.names = [name for name in self.names if name not in self.unreadable]
+        if first is not None and not self.names:
+            raise first
 
     def data(self) -> KaptureData:
         """Sensors, rigs and records."""
@@ -366,12 +375,17 @@ class KaptureQueries:
         ----------
         rigs : whether cameras of one rig and one moment are; else every image by itself.
         """
-        return [tuple(image for image, _ in unit) for unit in query_units(self._data, rigs=rigs)]
+        return [tuple(image for image, _ in unit) for unit in self._units(rigs=rigs)]
 
     def read_units(self, *, rigs: bool) -> Iterator[Unit]:
         """The queries of :meth:`units`, read one after another."""
-        for unit in query_units(self._data, rigs=rigs):
+        for unit in self._units(rigs=rigs):
             yield tuple((self.query(image), cam_from_rig) for image, cam_from_rig in unit)
+
+    def _units(self, *, rigs: bool) -> Iterator[tuple[tuple[str, RigidTransform], ...]]:
+        for unit in query_units(self._data, rigs=rigs):
+            if usable := tuple(one for one in unit if one[0] not in self.unreadable):
+                yield usable
 
     def __iter__(self) -> Iterator[Query]:
         return map(self.query, self.names)

@@ -37,7 +37,7 @@ class Results(Mapping[str, Pose | Failure]):
     Parameters
     ----------
     folder : kapture folder of the queries, and their features where they bring some; or
-        photographs, of which those that cannot be read are failures.
+        photographs. Images that cannot be used are failures.
     workers : threads that localize.
     candidates : query name to the map images it is matched with, instead of retrieval.
     track : shows progress.
@@ -160,12 +160,7 @@ class Results(Mapping[str, Pose | Failure]):
     def _localized(self, workers: int, track: Track) -> Iterator[tuple[str, Pose | Failure]]:
         with ThreadPoolExecutor(workers) as executor:
             units = self.queries.read_units(rigs=self._rigs)
-            results = self.localizer.localize_units(
-                units,
-                executor,
-                candidates=self._candidates,
-                broken_images_fail=isinstance(self.queries, Photographs),
-            )
+            results = self.localizer.localize_units(units, executor, candidates=self._candidates)
             tracked = track(results, len(self._units), "localizing")
             for names, found in zip(self._units, tracked, strict=True):
                 for name, result in zip(names, found, strict=True):
@@ -185,8 +180,6 @@ class Results(Mapping[str, Pose | Failure]):
                 try:
                     ranked: Sequence[str] = self.localizer.ranked(self.queries.query(name))
                 except DataError:
-                    if isinstance(self.queries, KaptureQueries):
-                        raise
                     continue  # it could not be decoded either when it was localized
             else:
                 ranked = self._candidates.get(name, ())

@@ -324,6 +324,31 @@ def test_broken_features_of_a_query_fail_it_and_those_of_the_map_end_the_run(
     done.refused(f"{spoilt}: .*{reason}")
 
 
+def test_images_that_cannot_be_used_fail_their_query_alone(
+    megloc: Any, finished: Path, dataset: Path, tmp_path: Path
+) -> None:
+    images = dataset / "query" / "sensors" / "records_data"
+    names = KaptureFolder(dataset / "query").read().image_names()
+    absent, small, cut, whole = names
+    (images / absent).unlink()
+    write_image(images / small, np.full((9, 16, 3), 90, np.uint8))
+    (images / cut).write_bytes((images / cut).read_bytes()[:-2000])
+    output = tmp_path / "localized"
+    fallback = ("--set", "localization.fallback=retrieval")
+    asked = ("localize", "-i", finished / "map", "--query", dataset / "query", *fallback)
+    done = megloc(*asked, "-o", output)
+    assert done.out.startswith("1 of 4"), done
+    status = read_status(output / "status.csv")
+    assert [status[name].status for name in names] == ["failed"] * 3 + ["localized"]
+    for name, words in ((absent, "no such"), (small, "16x9"), (cut, "broken")):
+        assert status[name].reason.startswith("the image cannot be used: "), name
+        assert words in status[name].reason, status[name].reason
+    # where none is left there is nothing to do
+    (images / whole).unlink()
+    write_image(images / cut, np.full((9, 16, 3), 90, np.uint8))
+    megloc(*asked, "-o", tmp_path / "none").refused(f"{images / absent}: no such")
+
+
 @pytest.fixture
 def namesake(dataset: Path) -> Path:
     """The dataset with a query that has the name of a map image, and shows something else."""
