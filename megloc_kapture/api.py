@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -254,6 +256,14 @@ def open_map(
     return Map(opened, options)
 
 
+def _open(
+    workers: int, scheduler: str | None, root: Path
+) -> AbstractContextManager[Executor | None]:
+    if scheduler is None:
+        return open_executor("processes", workers)
+    return open_executor("dask", None if workers == 1 else workers, scheduler, root)
+
+
 def build_map(
     mapping: Path | str,
     preset: str = "classic",
@@ -261,6 +271,7 @@ def build_map(
     set: Changes | None = None,
     workspace: Path | str | None = None,
     workers: int = 1,
+    scheduler: str | None = None,
 ) -> Map:
     """Build a map of images with poses: features, pairs, matches, points, refinement.
 
@@ -270,6 +281,7 @@ def build_map(
     workspace : where everything is kept, ``runs/MAPPING-PRESET`` unless given; what is done and
         still true is kept, the map is its folder ``map``.
     workers : processes; more than one needs ``if __name__ == "__main__":`` in a script.
+    scheduler : address of a dask scheduler, whose workers do the work instead.
 
     Raises
     ------
@@ -280,7 +292,7 @@ def build_map(
     place = Path(workspace or Path("runs") / f"{source.root.resolve().name}-{preset}")
     stages = plan_map(source, options)
     opened = Workspace(place)
-    with opened.lock(), single_threaded(), open_executor("processes", workers) as executor:
+    with opened.lock(), single_threaded(), _open(workers, scheduler, opened.root) as executor:
         run_plan(stages, opened, Work(executor, num_threads=workers))
     return Map(KaptureMap.open(opened.path(MAP)), options)
 
@@ -338,6 +350,7 @@ def run(
     set: Changes | None = None,
     workspace: Path | str | None = None,
     workers: int = 1,
+    scheduler: str | None = None,
 ) -> FinishedRun:
     """Run a benchmark as ``megloc eval`` does; what is done and still true is kept.
 
@@ -348,6 +361,7 @@ def run(
     set : options, ``{"localization.rank.name": "perceptual"}``.
     workspace : ``runs/DATASET-PRESET`` unless given.
     workers : processes; more than one needs ``if __name__ == "__main__":`` in a script.
+    scheduler : address of a dask scheduler, whose workers do the work instead.
 
     Raises
     ------
@@ -357,7 +371,7 @@ def run(
         dataset, None if root is None else Path(root), preset=preset, assignments=set or {}
     )
     opened = Workspace(Path(workspace or Path("runs") / f"{dataset}-{choice.preset}"))
-    with opened.lock(), single_threaded(), open_executor("processes", workers) as executor:
+    with opened.lock(), single_threaded(), _open(workers, scheduler, opened.root) as executor:
         chosen = choice.run_in(opened)
         run_plan(plan_evaluation(chosen), opened, Work(executor, num_threads=workers))
     return FinishedRun(opened.root, chosen.submission_below(opened.root), choice.options)

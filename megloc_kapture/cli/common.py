@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -115,9 +117,15 @@ class Working:
     """Flags of commands with per-image or per-pair work."""
 
     executor: ExecutorKind = "processes"
-    """Where the work runs: in this process, or in local processes."""
+    """Where the work runs: in this process, in local processes, or on a dask cluster."""
     workers: int | None = None
     """Number of processes; all cores unless given."""
+    scheduler: str | None = None
+    """Address of a running dask scheduler (tcp://HOST:8786); a local cluster unless given."""
+
+    def open_executor(self, output: Path) -> AbstractContextManager[Executor | None]:
+        """The executor that these flags ask for; a cluster must see the output's folder."""
+        return open_executor(self.executor, self.workers, self.scheduler, output)
 
 
 @dataclass(frozen=True, kw_only=True)

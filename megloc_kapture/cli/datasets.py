@@ -131,7 +131,7 @@ class Synth(Working, Common):
         twin = twin_of(self.dataset.removeprefix(TWIN_PREFIX), **changes)
         with (
             staged_output(self.output, kind=DATASET, force=self.force) as out,
-            open_executor(self.executor, self.workers) as executor,
+            self.open_executor(out) as executor,
         ):
             counts = twin.write(out, Work(executor, console.track))
         for what, value in counts.items():

@@ -33,7 +33,7 @@ from megloc_kapture.pipeline.datasets import (
     DatasetChoice,
 )
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
-from megloc_kapture.pipeline.executors import available_cores, open_executor, single_threaded
+from megloc_kapture.pipeline.executors import available_cores, single_threaded
 from megloc_kapture.pipeline.paper_steps import (
     steps_text,
 )
@@ -117,7 +117,7 @@ class Eval(Deciding, Working, Common):
         with (
             workspace.lock(),
             single_threaded(),
-            open_executor(self.executor, self.workers) as executor,
+            self.open_executor(workspace.root) as executor,
         ):
             run = choice.run_in(workspace)
             work = Work(executor, console.track, self.workers or available_cores())

@@ -11,7 +11,7 @@ import tyro
 
 from megloc_kapture.cli.common import Common, Working
 from megloc_kapture.errors import OptionError
-from megloc_kapture.pipeline.executors import available_cores, open_executor, single_threaded
+from megloc_kapture.pipeline.executors import available_cores, single_threaded
 from megloc_kapture.pipeline.plan import describe, run_plan
 from megloc_kapture.pipeline.presets import assigned
 from megloc_kapture.pipeline.workspace import Workspace
@@ -38,7 +38,7 @@ class OutsideStage(Working, Common):
         with (
             workspace.lock(),
             single_threaded(),
-            open_executor(self.executor, self.workers) as executor,
+            self.open_executor(workspace.root) as executor,
         ):
             run_plan(
                 [stage],

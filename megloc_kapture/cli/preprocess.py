@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from megloc_kapture.cli.common import Common, Force, Input, Linked, Output, Working, existing
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.files import first_problem, replace_directory, staged_output
-from megloc_kapture.pipeline.executors import open_executor, single_threaded
+from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.presets import assigned
 from megloc_kapture.stages.preprocessing import (
     REPORT_FILE,
@@ -81,7 +81,7 @@ class Preprocess(Linked, Working, Common):
         with (
             single_threaded(),
             staged_output(self.output, kind=PREPROCESSED, force=self.force) as out,
-            open_executor(self.executor, self.workers) as executor,
+            self.open_executor(out) as executor,
         ):
             preprocess_images(
                 source, out, options, sequences=sequences, work=Work(executor, console.track)

@@ -9,7 +9,7 @@ from megloc_kapture.cli.common import Force, Input, Output, Reading
 from megloc_kapture.cli.stage_command import StageCommand
 from megloc_kapture.cli.stages import MAP
 from megloc_kapture.io.files import read_json_model, staged_output
-from megloc_kapture.pipeline.executors import open_executor, single_threaded
+from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.stages.map_refinement import REPORT_FILE, RefinementReport, refine_map
 from megloc_kapture.stages.work import Work
 
@@ -42,7 +42,7 @@ class RefineMap(Reading, StageCommand):
         with (
             single_threaded(),
             staged_output(self.output, kind=MAP, force=self.force) as out,
-            open_executor(self.executor, self.workers) as executor,
+            self.open_executor(out) as executor,
         ):
             refine_map(source, out, options, work=Work(executor, console.track))
         for row in report_lines(self.output):

@@ -13,7 +13,7 @@ from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.report.refinement import consistency_sentence
 from megloc_kapture.io.files import staged_output
 from megloc_kapture.io.tables import CONSISTENCY_FILE, read_consistency
-from megloc_kapture.pipeline.executors import open_executor, single_threaded
+from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.plugins import POSE_REFINERS, plugin_names
 from megloc_kapture.stages.layout import LOCALIZED
 from megloc_kapture.stages.pose_refinement import refine_poses
@@ -52,7 +52,7 @@ class RefinePoses(Linked, StageCommand):
         with (
             single_threaded(),
             staged_output(self.output, kind=LOCALIZED, force=self.force) as out,
-            open_executor(self.executor, self.workers) as executor,
+            self.open_executor(out) as executor,
         ):
             counts = refine_poses(
                 self.kapture(self.input),

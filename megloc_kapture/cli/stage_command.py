@@ -12,7 +12,7 @@ from megloc_kapture.cli.common import Choosing, Common, Working, side_tables_bes
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.files import staged_output
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.pipeline.executors import open_executor, single_threaded
+from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, options_of_preset
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
@@ -48,7 +48,7 @@ class StageCommand(Choosing, Working, Common):
         with (
             single_threaded(),
             staged_output(output, kind=FEATURES, force=force) as out,
-            open_executor(self.executor, self.workers) as executor,
+            self.open_executor(out) as executor,
         ):
             yield out, Work(executor, self.console().track)
 

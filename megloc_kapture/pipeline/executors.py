@@ -1,4 +1,4 @@
-"""Where per-image and per-pair work runs: here, or in local processes."""
+"""Where per-image and per-pair work runs: here, in local processes, or on a dask cluster."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from typing import Any, Literal
 from megloc_kapture.errors import MeglocError, OptionError
 from megloc_kapture.io.files import clear_leftovers, output_error, owned_name
 
-ExecutorKind = Literal["inline", "processes"]
+ExecutorKind = Literal["inline", "processes", "dask"]
 
 
 def available_cores() -> int:
@@ -161,6 +161,11 @@ def single_threaded() -> Iterator[None]:
         _single_threads.leave()
 
 
+def enter_single_threaded() -> None:
+    """As :func:`single_threaded`, for good."""
+    _single_threads.enter()
+
+
 # ------------------------------------------------------------------------------------ processes
 
 _SEMAPHORES = Path("/dev/shm")  # where Linux keeps those that have a name
@@ -174,12 +179,12 @@ def _start_worker() -> None:
     import numpy  # noqa: F401  its thread pool must be there to be limited
 
     end_with_parent()
-    _single_threads.enter()  # for good
+    enter_single_threaded()
     cv2.setNumThreads(1)
 
 
 @contextmanager
-def _deaf_to(*signals: signal.Signals) -> Iterator[None]:
+def deaf_to(*signals: signal.Signals) -> Iterator[None]:
     """This process ignores signals in the block, and so do for good those that are started in it.
 
     A terminal sends Ctrl-C to every process; the run itself ends its workers.
@@ -242,20 +247,41 @@ def _name_as_ours() -> None:
 
 
 @contextmanager
-def open_executor(kind: ExecutorKind, workers: int | None = None) -> Iterator[Executor | None]:
+def open_executor(
+    kind: ExecutorKind,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    shared: Path | None = None,
+) -> Iterator[Executor | None]:
     """The executor for a run; None stands for inline.
 
     A block that ends in an exception does not wait for what its workers are doing: they are killed.
 
+    Parameters
+    ----------
+    scheduler : of ``dask``: the address of a running one; else a local cluster of so many workers.
+    shared : of ``dask``: a folder that all workers must see; the current one unless given.
+
     Raises
     ------
-    OptionError : no worker at all.
+    OptionError : no worker at all; a scheduler that is not there, or that nothing asks.
     OutputError : no room in the temporary folder, where processes talk to each other.
-    MeglocError : a worker process was killed while the block ran.
+    MeglocError : a worker process was killed while the block ran; see also
+        :func:`~megloc_kapture.pipeline.dask_executor.dask_executor`.
     """
     count = available_cores() if workers is None else workers
     if count < 1:
         raise OptionError(f"{count} workers cannot work; give 1 or more")
+    if kind == "dask":
+        if workers is not None and scheduler is not None:
+            raise OptionError("--workers changes nothing: the scheduler has workers of its own")
+        from megloc_kapture.pipeline.dask_executor import dask_executor
+
+        with dask_executor(count, scheduler, shared or Path.cwd()) as cluster:
+            yield cluster
+        return
+    if scheduler is not None:
+        raise OptionError("--scheduler changes nothing without --executor dask")
     if kind == "inline" or count == 1:
         yield None
         return
@@ -264,7 +290,7 @@ def open_executor(kind: ExecutorKind, workers: int | None = None) -> Iterator[Ex
     context.set_forkserver_preload(["megloc_kapture.stages.query_poses"])
     try:
         _name_as_ours()
-        with _deaf_to(signal.SIGINT):
+        with deaf_to(signal.SIGINT):
             forkserver.ensure_running()
         pool = _WatchedPool(count, mp_context=context, initializer=_start_worker)
     except OSError as error:
@@ -272,7 +298,7 @@ def open_executor(kind: ExecutorKind, workers: int | None = None) -> Iterator[Ex
     try:
         yield pool
     except BaseException as error:
-        with _deaf_to(signal.SIGINT, signal.SIGTERM):
+        with deaf_to(signal.SIGINT, signal.SIGTERM):
             pool.kill()
             pool.shutdown()
         if isinstance(error, BrokenProcessPool):

@@ -27,6 +27,7 @@ from megloc_kapture.stages.shared_index import index_map, observed_keypoints, wi
 from megloc_kapture.values import Camera, RigidTransform
 
 PixelOriginChoice = Literal["auto", "corner", "centre"]
+AS_ASKED = "as asked for"
 
 _SAMPLED_IMAGES = 50
 _NETWORKS = ("aliked", "aslfeat", "r2d2", "superpoint", "xfeat")
@@ -167,7 +168,7 @@ class KaptureMap:
         if pixel_origin != "auto":
             given: Origin = pixel_origin
             origins = {
-                name: replace(found, intrinsics=given, reason="as asked for")
+                name: replace(found, intrinsics=given, reason=AS_ASKED)
                 for name, found in origins.items()
             }
         keypoints = {n: MapKeypoints(folder, n, indices[n], origins[n]) for n in indices}
@@ -177,6 +178,20 @@ class KaptureMap:
         if (tables / PROTOCOL_FILE).is_file():
             restrictions = Restrictions.read(tables)
         return cls(folder, keypoints, restrictions)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickled it is its folders' names; another process opens it again."""
+        asked = self.pixel_origin.intrinsics if self.pixel_origin.reason == AS_ASKED else "auto"
+        folder = self.folder
+        linked = tuple(path.absolute() for path in folder.allow_links_below)
+        features = tuple(path.absolute() for path in folder.features_dirs)
+        return _opened_again, (
+            folder.root.absolute(),
+            tuple(self.keypoints),
+            features,
+            asked,
+            linked,
+        )
 
     @property
     def pixel_origin(self) -> PixelOrigin:
@@ -311,6 +326,22 @@ def _extractor_named(name: str) -> PluginChoice | None:
     if plugin is None or name not in registry():
         return None
     return PluginChoice(name=plugin, options={"weights": name})
+
+
+def _opened_again(
+    root: Path,
+    keypoints_types: tuple[str, ...],
+    features_dirs: tuple[Path, ...],
+    pixel_origin: PixelOriginChoice,
+    allow_links_below: tuple[Path, ...],
+) -> KaptureMap:
+    return KaptureMap.open(
+        root,
+        keypoints_types=keypoints_types,
+        features_dirs=features_dirs,
+        pixel_origin=pixel_origin,
+        allow_links_below=allow_links_below,
+    )
 
 
 def _read_indices(folder: KaptureFolder, keypoints_types: Sequence[str]) -> dict[str, MapIndex]:

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
+from uuid import uuid4
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,6 +98,7 @@ class Localizer:
         options: PipelineOptions | None = None,
     ) -> None:
         self.map = kapture_map
+        self._key = uuid4().hex  # tells it from another of the same name, in processes that live on
         self.options = options or options_of_preset(preset)
         self.options.check()
         self._ranker = self.options.localization.make_ranker()
@@ -108,6 +110,10 @@ class Localizer:
         for local in self.types:
             local.prepare()
         self._retrieval = MapRetrieval(kapture_map, self.options, self.types, self._preprocessor)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickled it is its map's name and its options; another process makes it again, once."""
+        return _made_again, (self._key, *self.map.__reduce__(), self.options.model_dump_json())
 
     # ------------------------------------------------------------------ the public calls
 
@@ -150,6 +156,7 @@ class Localizer:
         Parameters
         ----------
         executor : a thread pool suits: it shares the map, and the work is done outside Python.
+            Processes, of this machine or of a dask cluster, open the map for themselves.
         candidates : query name to the map images it is matched with, instead of retrieval.
         """
         wrapped = (q if isinstance(q, Query) else _query_of(*q) for q in queries)
@@ -380,3 +387,10 @@ class _Matched:
 
 def _query_of(image: Path | str | NDArray[np.uint8], camera: Camera) -> Query:
     return Query(camera, image, str(image) if isinstance(image, str | Path) else "query")
+
+
+@lru_cache(maxsize=2)
+def _made_again(
+    key: str, opened: Callable[..., KaptureMap], of_map: tuple[Any, ...], options: str
+) -> Localizer:
+    return Localizer(opened(*of_map), options=PipelineOptions.model_validate_json(options))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future
@@ -10,13 +9,12 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Protocol, TypeVar
+from uuid import uuid4
 
 from megloc_kapture.io.kapture import KaptureFolder
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-
-_run_ids = itertools.count()
 
 
 class Track(Protocol):
@@ -37,10 +35,14 @@ def ordered_map(
     *,
     window: int = 32,
 ) -> Iterator[Result]:
-    """Like ``map``, on an executor, results in order, at most ``window`` items under way."""
+    """Like ``map``, on an executor, results in order, at most ``window`` items under way.
+
+    An executor with an attribute ``window`` has at least so many, to keep its workers busy.
+    """
     if executor is None:
         yield from map(function, items)
         return
+    window = max(window, getattr(executor, "window", 0))
     waiting: deque[Future[Result]] = deque()
     try:
         for item in items:
@@ -98,7 +100,7 @@ class FolderSpec:
     """A kapture folder as work items name it: cheap to send, opened once per process and run."""
 
     def __init__(self, folder: KaptureFolder) -> None:
-        self.key = (folder.root, folder.features_dirs, folder.allow_links_below, next(_run_ids))
+        self.key = (folder.root, folder.features_dirs, folder.allow_links_below, uuid4().hex)
 
     def open(self) -> KaptureFolder:
         """The folder; the same object for every item of this run in this process."""
@@ -110,6 +112,6 @@ def _open_folder(
     root: Path,
     features_dirs: tuple[Path, ...],
     allow_links_below: tuple[Path, ...],
-    run_id: int,
+    run_id: str,
 ) -> KaptureFolder:
     return KaptureFolder(root, features_dirs=features_dirs, allow_links_below=allow_links_below)

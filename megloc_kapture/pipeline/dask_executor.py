@@ -1,0 +1,224 @@
+"""Work on a cluster of dask.distributed: one that runs already, or one of local processes.
+
+Items of work are paths and numbers, and workers read what these name; so the workspace, the data
+and this process's current folder must be at the same paths on every machine. Each worker, also one
+that joins later, is asked for that and for equal packages and weights before it gets work.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import platform
+import shutil
+import sys
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import CancelledError, Executor, Future
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from signal import SIGINT
+from typing import Any
+
+from distributed import Client, KilledWorker, LocalCluster, Worker, WorkerPlugin
+from distributed.comm.core import CommClosedError
+
+from megloc_kapture.errors import MeglocError, OptionError
+from megloc_kapture.io.files import clear_leftovers, owned_name
+from megloc_kapture.io.weights import describe, files_of, sha256_of
+from megloc_kapture.io.weights.registry import registry
+from megloc_kapture.pipeline.executors import deaf_to, enter_single_threaded
+
+# the last bits of a result depend on these
+_PACKAGES = (
+    *("megloc-kapture", "numpy", "scipy", "numba", "opencv-python-headless", "pillow"),
+    *("pycolmap", "poselib", "kapture", "torch", "kornia", "small-gicp"),
+)
+_CONNECT_S = 10.0
+# a worker that died is no fault of the item it was at; one that kills ten is
+_ALLOWED_FAILURES = 10
+_ITEMS_PER_WORKER = 4
+
+
+@contextmanager
+def dask_executor(workers: int, scheduler: str | None, shared: Path) -> Iterator[_ClusterExecutor]:
+    """An executor whose items run on dask workers.
+
+    Parameters
+    ----------
+    workers : processes of a local cluster; with a scheduler it says nothing.
+    scheduler : address of a running one, as ``tcp://10.0.0.1:8786``; None: a local cluster.
+    shared : folder that all workers must see as this process does; made where it is absent.
+
+    Raises
+    ------
+    OptionError : there is no scheduler at the address, or it has no workers.
+    MeglocError : a worker differs, is named with the difference; or the scheduler went away.
+    """
+    with _client(workers, scheduler) as client:
+        if not client.scheduler_info(n_workers=-1)["workers"]:
+            raise OptionError(f"the scheduler {scheduler} has no workers: start some (dask worker)")
+        plugin = _Preparation.of_this_process(shared, elsewhere=scheduler is not None)
+        try:
+            client.register_plugin(plugin, name="megloc")
+            yield _ClusterExecutor(client)
+        except (CancelledError, CommClosedError) as error:
+            raise MeglocError(
+                f"the scheduler {scheduler or 'of the local cluster'} has gone; what is finished "
+                "is kept, run the same again to go on"
+            ) from error
+        except KilledWorker as error:
+            raise MeglocError(
+                f"an item of work killed {_ALLOWED_FAILURES} workers, perhaps for want of memory; "
+                "try fewer workers on a machine"
+            ) from error
+        except ModuleNotFoundError as error:
+            if error.name != "megloc_kapture":
+                raise
+            raise MeglocError("the workers have no megloc_kapture: install it there") from error
+        finally:
+            plugin.token.unlink(missing_ok=True)
+            with suppress(CommClosedError, OSError, TimeoutError):
+                client.unregister_worker_plugin("megloc")
+
+
+@contextmanager
+def _client(workers: int, scheduler: str | None) -> Iterator[Client]:
+    import dask
+
+    for name in ("distributed", "tornado"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    settings = {
+        "distributed.scheduler.allowed-failures": _ALLOWED_FAILURES,
+        "distributed.comm.timeouts.connect": f"{_CONNECT_S} s",
+        "distributed.worker.profile.enabled": False,
+    }
+    with dask.config.set(settings):
+        if scheduler is not None:
+            try:
+                client = Client(scheduler, timeout=_CONNECT_S, set_as_default=False)
+            except (OSError, ValueError, TypeError) as error:
+                raise OptionError(f"there is no dask scheduler at {scheduler}") from error
+            with client:
+                yield client
+            return
+        clear_leftovers(Path(tempfile.gettempdir()))
+        folder = tempfile.mkdtemp(prefix=owned_name())
+        try:
+            with deaf_to(SIGINT):
+                cluster = LocalCluster(
+                    n_workers=workers,
+                    threads_per_worker=1,
+                    dashboard_address="127.0.0.1:0",
+                    local_directory=folder,
+                    memory_limit=0,  # memory is the system's to give, as to other processes
+                    silence_logs=logging.CRITICAL,
+                )
+            with cluster, Client(cluster, set_as_default=False) as client:
+                yield client
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+class _ClusterExecutor(Executor):
+    """A client's executor, for functions that may give something else each time they are called.
+
+    Attributes
+    ----------
+    window : items that keep all workers busy.
+    """
+
+    def __init__(self, client: Client) -> None:
+        self._executor = client.get_executor(pure=False)
+        threads = sum(one["nthreads"] for one in client.scheduler_info(-1)["workers"].values())
+        self.window = _ITEMS_PER_WORKER * max(threads, 1)
+
+    def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """A future of the result, which a worker computes with one thread per matrix product."""
+        found: Future[Any] = self._executor.submit(_single_threaded, function, *args, **kwargs)
+        return found
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Wait for what is under way, or cancel it."""
+        self._executor.shutdown(wait=wait and not cancel_futures)
+
+
+_prepared = threading.local()
+
+
+def _single_threaded(function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Any:
+    if not getattr(_prepared, "done", False):
+        enter_single_threaded()  # for good
+        _prepared.done = True
+    return function(*args, **kwargs)
+
+
+@dataclass
+class _Preparation(WorkerPlugin):
+    """Makes a worker like the process that has the run, or refuses it.
+
+    Attributes
+    ----------
+    packages : versions, of Python too.
+    weights : sha256 of the files of networks that this process has.
+    folder : current folder, which relative paths start from.
+    token : file in the shared folder.
+    """
+
+    packages: dict[str, str]
+    weights: dict[str, str]
+    folder: Path
+    token: Path
+    name = "megloc"
+
+    @classmethod
+    def of_this_process(cls, shared: Path, *, elsewhere: bool) -> _Preparation:
+        shared.mkdir(parents=True, exist_ok=True)
+        handle, token = tempfile.mkstemp(prefix=f".{owned_name()}", dir=shared.resolve())
+        os.close(handle)
+        return cls(_packages(), _weights() if elsewhere else {}, Path.cwd(), Path(token))
+
+    def setup(self, worker: Worker) -> None:
+        """Raise MeglocError where the worker differs."""
+        import cv2
+
+        where = f"worker {worker.address}"
+        for name, version in _packages().items():
+            if version != self.packages.get(name):
+                here = self.packages.get(name, "none")
+                raise MeglocError(f"{where} has {name} {version}, this process {here}")
+        try:
+            os.chdir(self.folder)
+            self.token.stat()
+        except OSError as error:
+            raise MeglocError(
+                f"{where} does not see {error.filename}: a cluster needs a file system that all "
+                "machines share, at the same path"
+            ) from error
+        own = _weights() if self.weights else {}
+        for name, sha256 in self.weights.items():
+            if own.get(name) != sha256:
+                there = "other weights" if name in own else "no weights"
+                raise MeglocError(f"{where} has {there} of {name} (megloc weights list)")
+        cv2.setNumThreads(1)
+
+
+def _packages() -> dict[str, str]:
+    """Versions of what computes; empty for one that is not there."""
+    found = {"Python": platform.python_version(), "machine": f"{sys.platform} {platform.machine()}"}
+    for name in _PACKAGES:
+        with suppress(metadata.PackageNotFoundError):
+            found[name] = metadata.version(name)
+    return {name: found.get(name, "none") for name in ("Python", "machine", *_PACKAGES)}
+
+
+def _weights() -> dict[str, str]:
+    found = {}
+    for weights in registry().values():
+        path = next(files_of(weights), None)
+        if path is not None:
+            found[weights.name] = sha256_of(describe(weights.name, path))
+    return found
