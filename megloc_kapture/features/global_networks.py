@@ -84,12 +84,20 @@ class GlobalNetwork(ABC):
         """
         return self.describe_many([image])[0]
 
-    @abstractmethod
     def describe_many(self, images: Images) -> NDArray[np.float32]:
-        """The vectors of images of one size, float32 (B, D), as one by one but for rounding.
+        """The vectors of images of one size, float32 (B, D), in their order.
 
-        Raises as :meth:`describe`.
+        On a GPU they are one batch, and as one by one but for rounding. On a processor, where a
+        batch gains nothing, each runs alone, and has to the last bit what it has without the
+        others. Raises as :meth:`describe`.
         """
+        if pick_device(self._device_name).type == "cuda":
+            return self._vectors(images)
+        return np.concatenate([self._vectors([image]) for image in images])
+
+    @abstractmethod
+    def _vectors(self, images: Images) -> NDArray[np.float32]:
+        """The vectors of images of one size, float32 (B, D), of one batch."""
 
     def _network(self, load: Callable[..., nn.Module], *arguments: Any) -> tuple[Any, torch.device]:
         """The network that ``load`` makes of the checkpoint, and the device it is on."""
@@ -126,7 +134,7 @@ class NetVlad(GlobalNetwork):
         self.options = options or NetVladOptions()
         super().__init__(self.options)
 
-    def describe_many(self, images: Images) -> NDArray[np.float32]:
+    def _vectors(self, images: Images) -> NDArray[np.float32]:
         network, device = self._network(netvlad)
         planes = [sized_tensor(image, self.options.max_size_px, device) for image in images]
         return netvlad_vectors(network, planes, self.options.half_precision)
@@ -184,7 +192,7 @@ class OpenIbl(GlobalNetwork):
         self.options = options or OpenIblOptions()
         super().__init__(self.options)
 
-    def describe_many(self, images: Images) -> NDArray[np.float32]:
+    def _vectors(self, images: Images) -> NDArray[np.float32]:
         network, device = self._network(openibl)
         planes = [self._resized(image, device) for image in images]
         return netvlad_vectors(network, planes, self.options.half_precision)
@@ -244,7 +252,7 @@ class ApGem(GlobalNetwork):
         if self.options.whitening:
             self.name += f"-{self.options.whitening}-{self.options.whitening_power:g}"
 
-    def describe_many(self, images: Images) -> NDArray[np.float32]:
+    def _vectors(self, images: Images) -> NDArray[np.float32]:
         options = self.options
         (net, *whitening), device = self._network(
             _apgem_with_whitening, options.whitening, options.whitening_power
@@ -296,7 +304,7 @@ class Delg(GlobalNetwork):
         self.options = options or DelgOptions()
         super().__init__(self.options)
 
-    def describe_many(self, images: Images) -> NDArray[np.float32]:
+    def _vectors(self, images: Images) -> NDArray[np.float32]:
         options = self.options
         net, device = self._network(delg_from)
         sized = np.stack([_with_longer_side(image, options.max_size_px) for image in images])
@@ -341,7 +349,7 @@ class EigenPlaces(GlobalNetwork):
         self.options = options or EigenPlacesOptions()
         super().__init__(self.options)
 
-    def describe_many(self, images: Images) -> NDArray[np.float32]:
+    def _vectors(self, images: Images) -> NDArray[np.float32]:
         options = self.options
         network, device = self._network(_eigenplaces_channels_last)
         batch = torch.cat([sized_tensor(image, options.max_size_px, device) for image in images])
@@ -382,7 +390,7 @@ class MegaLoc(GlobalNetwork):
         if self.options.size_px != _MEGALOC_SIZE_PX:
             self.name += f"-{self.options.size_px}px"
 
-    def describe_many(self, images: Images) -> NDArray[np.float32]:
+    def _vectors(self, images: Images) -> NDArray[np.float32]:
         options = self.options
         network, device = self._network(megaloc_from)
         with inference(device):
