@@ -9,6 +9,8 @@ import re
 import sys
 from collections.abc import Iterator, Sequence
 
+from megloc_kapture.cli.examples import examples_text
+
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 _RULE = re.compile(r"[─-]{3,}")
 # what the box says besides: where help is found, and the help itself
@@ -34,6 +36,8 @@ def one_line_errors(arguments: Sequence[str]) -> Iterator[None]:
     except SystemExit as end:
         if end.code:
             print(f"megloc: {summary(drawn.getvalue())}", file=sys.stderr)
+        elif asks_help:
+            print(examples_text(arguments))
         raise
     print(drawn.getvalue(), end="", file=sys.stderr)
 

@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Iterable, Iterator
 from datetime import timedelta
-from typing import TypeVar
+from typing import Any, TypeVar
 
 Item = TypeVar("Item")
 
@@ -36,15 +36,16 @@ class Console:
             yield from items
         elif self.terminal:
             from rich.console import Console as RichConsole
-            from rich.progress import track
+            from rich.progress import Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-            yield from track(
-                items,
-                description=f"  {label}",
-                total=total,
-                console=RichConsole(stderr=True),
-                transient=True,
-            )
+            class Rate(TaskProgressColumn):
+                def render(self, task: Any) -> Any:
+                    return self.render_speed(task.finished_speed or task.speed)
+
+            bar, of = Progress.get_default_columns()[1], TextColumn("{task.completed}/{task.total}")
+            columns = (TextColumn("{task.description}"), bar, of, Rate(), TimeRemainingColumn())
+            with Progress(*columns, console=RichConsole(stderr=True), transient=True) as progress:
+                yield from progress.track(items, total=total, description=f"  {label}")
         else:
             started = shown = time.monotonic()
             for number, item in enumerate(items, start=1):
@@ -52,8 +53,9 @@ class Console:
                 now = time.monotonic()
                 if now - shown > _LINE_EVERY_S and number < total:
                     shown = now
-                    left = timedelta(seconds=round((now - started) / number * (total - number)))
-                    self.say(f"  {label}: {number} of {total}, {left} left")
+                    rate = number / (now - started)
+                    left = timedelta(seconds=round((total - number) / rate))
+                    self.say(f"  {label}: {number} of {total}, {rate:.2g}/s, {left} left")
 
 
 def configure_logging(level: str) -> None:

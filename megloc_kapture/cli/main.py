@@ -148,12 +148,13 @@ def _parser(given: Sequence[str]) -> Any:
 
     stages = [name.replace("_", "-") for name in plugin_names(STAGES)]
     annotated: Any = Annotated  # of types that are values here, which mypy does not follow
+    completes = given[:1] and given[0].startswith("--tyro-")  # then all that there is
     texts = {name: f"Run the stage {name}, of another package." for name in stages}
     texts |= {name: text for name, (_, text) in COMMANDS.items()}
     entries = []
     for name in [*COMMANDS, *(name for name in stages if name not in COMMANDS)]:
         # a stage that cannot be loaded must not take the other commands with it
-        asked = name in given[:1]
+        asked = name in given[:1] or (completes and name in COMMANDS)
         kind = command_class(name) if asked else make_dataclass(name.replace("-", "_"), [])
         text = kind.__doc__ if asked and name not in COMMANDS else texts[name]
         entries.append(annotated[kind, tyro.conf.subcommand(name, description=text)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from importlib.metadata import EntryPoints
@@ -13,6 +14,7 @@ import pytest
 
 from megloc_kapture import plugins
 from megloc_kapture.cli.arguments import summary
+from megloc_kapture.cli.console import Console
 from megloc_kapture.cli.main import COMMANDS, command_class
 
 BAD_ARGUMENTS = {
@@ -160,3 +162,15 @@ def test_doctor_finds_no_problem_here(megloc: Any) -> None:
     done = megloc("doctor")
     assert (done.status, done.err) == (0, "")
     assert "pycolmap" in done.out and done.out.endswith("no problem found\n")
+
+
+def test_progress_says_how_many_how_fast_and_how_long(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("megloc_kapture.cli.console._LINE_EVERY_S", 0.0)
+    assert list(Console().track("abc", 3, "features, 4 of 7 kept")) == ["a", "b", "c"]
+    lines = capsys.readouterr().err.splitlines()
+    for number, line in enumerate(lines, start=1):
+        start = f"  features, 4 of 7 kept: {number} of 3, "
+        assert re.fullmatch(re.escape(start) + r"[0-9.e+]+/s, 0:00:00 left", line)
+    assert len(lines) == 2
