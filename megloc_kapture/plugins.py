@@ -9,8 +9,12 @@ must be picklable.
 
 from __future__ import annotations
 
+import hashlib
+import sys
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -428,6 +432,32 @@ def plugin_class(group: str, name: str) -> Any:
             f"plugin {name!r} ({found[0].value}) does not fulfil {protocol.__name__}: it {what}"
         )
     return kind
+
+
+@cache
+def code_of(kind: type) -> str:
+    """Version of the package that registers a class, and hash of the code that defines it.
+
+    Of our own classes that is their module; of others all modules of their package.
+    """
+    module = sys.modules.get(kind.__module__)
+    source = getattr(module, "__file__", None)
+    files = [] if source is None else [Path(source)]
+    top = getattr(sys.modules.get(kind.__module__.partition(".")[0]), "__file__", None) or ""
+    if files and not is_ours(kind) and Path(top).name == "__init__.py":
+        files = sorted({*files, *Path(top).parent.rglob("*.py")})
+    digest = hashlib.sha256()
+    for file in files:
+        with suppress(OSError):
+            digest.update(file.read_bytes())
+    value = f"{kind.__module__}:{kind.__qualname__}"
+    registered = [entry.dist for entry in entry_points().select(value=value) if entry.dist]
+    return f"{registered[0].version if registered else ''} {digest.hexdigest()}".strip()
+
+
+def is_ours(kind: type) -> bool:
+    """Whether a class is of this package."""
+    return kind.__module__.partition(".")[0] == __name__.partition(".")[0]
 
 
 def weights_of(plugin: object) -> dict[str, str]:

@@ -87,7 +87,8 @@ def test_it_is_part_of_the_plan_with_manifest_and_progress(scene: Path, tmp_path
     assert workspace.path("counts.csv").read_text().splitlines() == expected_counts(workspace)
     manifest = json.loads(workspace.manifest_path("count_keypoints").read_text())
     assert manifest["options"] == {"least": 0} and manifest["counts"] == {"images": len(images)}
-    assert set(manifest["inputs"]) == {"import", "local_features"}
+    code = "code of keypoint_counts.CountKeypoints"
+    assert set(manifest["inputs"]) == {"import", "local_features", code}
     assert all_kept(run_plan(stages, workspace, last="count_keypoints"))
     # another option, and it alone runs again
     again = run_plan(
@@ -111,7 +112,9 @@ def test_it_has_a_command_of_its_own(
         return end.value.code, printed.out + printed.err
 
     assert "count-keypoints" in megloc("--help")[1]
-    assert "Count the keypoints of every map image." in megloc("count-keypoints", "--help")[1]
+    text = megloc("count-keypoints", "--help")[1]
+    assert "Count the keypoints of every map image." in text
+    assert text.endswith("examples:\n  megloc count-keypoints -w runs/kapture-classic\n")
     command = ("count-keypoints", "-w", str(workspace.root), "--executor", "inline")
     assert megloc(*command) == (2, f"megloc: {workspace.root} is no workspace of megloc eval\n")
     run_plan(planned(scene, workspace, {}), workspace, last="import")

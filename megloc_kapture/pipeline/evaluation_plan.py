@@ -182,6 +182,10 @@ class Import(_RunStage):
         protocol = wanted and wanted.model_dump(mode="json")
         return {**self._run.source.settings(), "protocol": protocol}
 
+    def plugins(self) -> Sequence[object]:
+        adapter = self._run.source.adapter
+        return () if adapter is None else (adapter,)
+
     def external(self, hashes: Hashes) -> Mapping[str, str]:
         source = self._run.source
         if source.root is None:

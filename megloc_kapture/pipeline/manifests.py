@@ -1,8 +1,9 @@
 """Manifests: what a stage did, and whether it must run again.
 
-A stage's fingerprint is a hash of its name, its version, its options and the fingerprints of what
-it reads. What comes from outside the workspace is hashed by content; so a stage runs again exactly
-when something that could change its output has changed.
+A stage's fingerprint is a hash of its name, its version, its options, the code of its plugins and
+the fingerprints of what it reads: hashes of content, whether from outside the workspace or of what
+another stage wrote. So a stage runs again exactly when something that could change its output has
+changed.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from typing import Any
 from pydantic import Field
 
 from megloc_kapture.errors import DataError
+from megloc_kapture.io.file_states import FileState
 from megloc_kapture.io.files import read_json_model
 from megloc_kapture.values import Options
 
@@ -32,11 +34,17 @@ class Manifest(Options):
     options: dict[str, Any]
     inputs: dict[str, str] = Field(description="what was read: name to fingerprint")
     fingerprint: str
+    content: str = Field(default="", description="hash of the outputs; none where they are links")
     outputs: tuple[str, ...]
     counts: dict[str, float] = Field(default_factory=dict)
     seconds: float
     started: str
     versions: dict[str, str]
+
+    @property
+    def output(self) -> str:
+        """The fingerprint of the outputs, by which those that read them know them again."""
+        return self.content or self.fingerprint
 
 
 def fingerprint(
@@ -70,8 +78,9 @@ class FileHashes:
     those of last time has last time's hash.
     """
 
-    def __init__(self, path: Path) -> None:
-        """``path`` is where they are remembered."""
+    def __init__(self, path: Path, written: Mapping[str, FileState] | None = None) -> None:
+        """``path`` is where they are remembered; ``written`` are files whose state is known."""
+        self._written = written or {}
         self._known: dict[str, list[Any]] = {}
         self._seen: dict[str, list[Any]] = {}
         if path.is_file():
@@ -88,6 +97,9 @@ class FileHashes:
             if not S_ISREG(stat.st_mode):
                 raise DataError("not a plain file", path=path)
             key = str(path)
+            written = self._written.get(key)
+            if written is not None and written[:2] == (stat.st_size, stat.st_mtime_ns):
+                return written.sha256
             state = [stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino]
             known = self._known.get(key)
             if isinstance(known, list) and known[:4] == state and len(known) == 5:

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import cache
+from pathlib import Path
 from typing import Any, Literal
 
 from megloc_kapture.errors import OptionError, suggestion
 from megloc_kapture.evaluation.provenance import package_versions
-from megloc_kapture.io.files import write_bytes, write_json_model
+from megloc_kapture.io.files import hard_link, write_bytes, write_json_model
 from megloc_kapture.pipeline.manifests import FileHashes, Manifest, fingerprint, read_manifest
-from megloc_kapture.pipeline.workspace import HASHES, Workspace
-from megloc_kapture.pipeline.written_files import changed_file, remember_files
-from megloc_kapture.stages.stage import Stage, StageWork, is_below
+from megloc_kapture.pipeline.workspace import HASHES, JOURNAL, Workspace
+from megloc_kapture.pipeline.written_files import changed_file, remember_files, written_files
+from megloc_kapture.stages.kept_items import Digest, KeptItems
+from megloc_kapture.stages.stage import CODE_OF, Stage, StageWork, is_below
 from megloc_kapture.stages.work import HERE, Work
 
 State = Literal["run", "kept", "pending", "skipped"]
@@ -30,6 +34,8 @@ class StageReport:
     seconds: float
     counts: Mapping[str, float]
     why: str
+    kept_items: str = ""
+    """How many of its items were taken over from runs before."""
 
 
 _NOT_DONE = "not done yet"
@@ -82,21 +88,23 @@ def run_plan(
         # whatever stops this run, the next one has to do what was asked for
         for name in asked:
             workspace.manifest_path(name).unlink(missing_ok=True)
+            workspace.forget_items(name)
     for number, stage in enumerate(stages[:stop]):
         inputs = {name: fingerprints[name] for name in _before(stages, stage)}
-        inputs |= _there(stages, stage, workspace) | external[stage.name]
-        settings = stage.settings()
+        settings, code = stage.settings(), stage.code()
+        inputs |= _there(stages, stage, workspace) | external[stage.name] | code
         mark = fingerprint(stage.name, stage.version, settings, inputs)
         manifest = read_manifest(workspace.manifest_path(stage.name))
         if number < start and manifest is not None:
             why = changed_file(workspace.files_path(stage.name), workspace.root, verify=verify)
             # what follows is made of something else than the stage wrote, and has to know that
-            fingerprints[stage.name] = f"{manifest.fingerprint}{', changed' if why else ''}"
+            fingerprints[stage.name] = f"{manifest.output}{', changed' if why else ''}"
             report = StageReport(stage.name, "skipped", manifest.seconds, manifest.counts, why)
             reports.append(report)
             on_report(report)
             continue
-        fingerprints[stage.name] = mark
+        same = manifest is not None and manifest.fingerprint == mark
+        fingerprints[stage.name] = manifest.output if manifest is not None and same else mark
         why = asked.get(stage.name) or _why(stage, manifest, mark, settings, inputs, workspace)
         why = why or changed_file(workspace.files_path(stage.name), workspace.root, verify=verify)
         if not why and manifest is not None:
@@ -107,7 +115,11 @@ def run_plan(
             said = "starting" if why == _NOT_DONE else why
             on_start(f"{stage.name}, stage {number + 1} of {stop}: {said}")
             former = [] if manifest is None else _former_outputs(stage, manifest)
-            report = _run(stage, workspace, work, mark, settings, inputs, why, former)
+            own = fingerprint(stage.name, stage.version, settings, code)
+            report, made = _run(
+                stage, workspace, work, mark, own, settings, inputs, why, former, verify=verify
+            )
+            fingerprints[stage.name] = made.output
         reports.append(report)
         on_report(report)
     return reports
@@ -137,7 +149,7 @@ def _there(stages: Sequence[Stage], stage: Stage, workspace: Workspace) -> dict[
             raise OptionError(
                 f"stage {stage.name} reads {path}, which no stage has written in {workspace.root}"
             )
-        found.update({manifest.stage: manifest.fingerprint for manifest in made})
+        found.update({manifest.stage: manifest.output for manifest in made})
     return found
 
 
@@ -188,13 +200,13 @@ def _why(
         return ""
     if manifest.version != stage.version:
         return "a newer version of the stage"
-    changed = sorted(
-        name for name, value in inputs.items() if manifest.inputs.get(name) != value
-    ) or sorted(set(manifest.inputs) - set(inputs))
-    if changed:
-        return f"{changed[0]} changed"
-    options = json.loads(json.dumps(settings))  # a manifest knows no tuples
-    return f"options changed: {', '.join(_differences(manifest.options, options)[:3])}"
+    changed = _differences(manifest.inputs, inputs)
+    # another plugin has another code; that it was chosen tells more
+    read = [name for name in changed if not name.startswith(CODE_OF)]
+    options = _differences(manifest.options, json.loads(json.dumps(settings)))  # knows no tuples
+    if options and not read:
+        return f"options changed: {', '.join(options[:3])}"
+    return f"{(read or changed)[0]} changed"
 
 
 def _former_outputs(stage: Stage, manifest: Manifest) -> list[str]:
@@ -226,23 +238,35 @@ def _run(
     workspace: Workspace,
     work: Work,
     mark: str,
+    own: str,  # what of the mark is not read
     settings: Mapping[str, Any],
     inputs: Mapping[str, str],
     why: str,
     former_outputs: Sequence[str],
-) -> StageReport:
+    *,
+    verify: bool,
+) -> tuple[StageReport, Manifest]:
     started = datetime.now(UTC).isoformat(timespec="seconds")
     clock = time.perf_counter()
     with workspace.staging(stage.name) as folder:
-        counts = dict(stage.run(StageWork(**vars(work), root=workspace.root, out=folder)))
+        journal, sources = folder / JOURNAL, workspace.item_sources(stage.name)
+        kept = KeptItems(own, folder, journal, sources, _digest(workspace), verify=verify)
+        settled = replace(work, kept=kept)
+        counts = dict(stage.run(StageWork(**vars(settled), root=workspace.root, out=folder)))
         # without its manifest a stage counts as not done: killed between here and the end, it
         # runs again whatever of its output has moved by then
         workspace.manifest_path(stage.name).unlink(missing_ok=True)
         _take_over(stage, workspace)
         written = tuple(o for o in stage.writes if (folder / o).exists())
+        # before its files have moved: whichever of them have, the journal knows them
+        if kept.states:
+            hard_link(journal, workspace.items_path(stage.name))
+        else:
+            workspace.items_path(stage.name).unlink(missing_ok=True)
         workspace.publish(folder, tuple(stage.writes))
         workspace.remove(former_outputs)
-    remember_files(workspace.files_path(stage.name), workspace.root, written)
+    files = workspace.files_path(stage.name)
+    content = remember_files(files, workspace.root, written, kept.states)
     seconds = time.perf_counter() - clock
     manifest = Manifest(
         stage=stage.name,
@@ -250,6 +274,7 @@ def _run(
         options=dict(settings),
         inputs=dict(inputs),
         fingerprint=mark,
+        content=content,
         outputs=written,
         counts=counts,
         seconds=round(seconds, 3),
@@ -257,7 +282,21 @@ def _run(
         versions=package_versions(),
     )
     write_json_model(workspace.manifest_path(stage.name), manifest)
-    return StageReport(stage.name, "run", seconds, counts, why)
+    taken = f"{kept.num_kept} of {kept.num_items} kept" if kept.num_kept else ""
+    return StageReport(stage.name, "run", seconds, counts, why, taken), manifest
+
+
+def _digest(workspace: Workspace) -> Digest:
+    """Hashes of files: of what stages wrote and what was imported they are remembered."""
+    root = os.path.realpath(workspace.root)
+
+    @cache
+    def hashes() -> FileHashes:
+        records = [written_files(path) for path in (workspace.root / "stages").glob("*.files")]
+        written = {f"{root}/{path}": state for files in records for path, state in files.items()}
+        return FileHashes(workspace.path(HASHES), written)
+
+    return lambda path: hashes().of_file(Path(os.path.realpath(path)))
 
 
 def all_kept(reports: Iterable[StageReport]) -> bool:
@@ -276,4 +315,5 @@ def describe(report: StageReport) -> str:
     counts = ", ".join(
         f"{value:g} {name.replace('_', ' ')}" for name, value in report.counts.items()
     )
-    return f"{report.name}: {counts}; {report.seconds:.1f} s"
+    kept = f"; {report.kept_items}" if report.kept_items else ""
+    return f"{report.name}: {counts}{kept}; {report.seconds:.1f} s"

@@ -298,7 +298,7 @@ def workspace_provenance(localized: Path) -> dict[str, Any]:
     if made is None or localized.resolve().name not in made.outputs:
         return {}
     found: dict[str, Any] = {"localization_fingerprint": made.fingerprint}
-    if handed_in is not None and handed_in.inputs.get("localization") == made.fingerprint:
+    if handed_in is not None and handed_in.inputs.get("localization") == made.output:
         options = handed_in.options
         found |= {key: options[key] for key in ("preset", "options") if key in options}
     return found

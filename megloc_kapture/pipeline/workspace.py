@@ -23,6 +23,7 @@ from megloc_kapture.io.kapture import KaptureFolder
 PARTIAL = ".partial"
 LOCK = ".lock"
 HASHES = "stages/.hashes.json"
+JOURNAL = ".items"  # of a stage's items that are done, in the folder that it writes into
 
 
 class Workspace:
@@ -53,6 +54,25 @@ class Workspace:
         """Where the files that a stage wrote are listed."""
         return self.root / "stages" / f"{stage}.files"
 
+    def items_path(self, stage: str) -> Path:
+        """Where the items that a stage's output consists of are listed."""
+        return self.root / "stages" / f"{stage}.items"
+
+    def item_sources(self, stage: str) -> list[tuple[Path, Path]]:
+        """Folders that have items of a stage, stopped runs' before its output; their journals."""
+        left = sorted(self._stopped(stage), reverse=True)
+        return [*((path, path / JOURNAL) for path in left), (self.root, self.items_path(stage))]
+
+    def forget_items(self, stage: str) -> None:
+        """Let nothing be taken over that a stage did before."""
+        for path in (*self._stopped(stage), self.root / PARTIAL / stage, self.items_path(stage)):
+            with contextlib.suppress(OSError):
+                remove(path)
+
+    def _stopped(self, stage: str) -> Iterator[Path]:
+        """What runs of a stage left that were stopped: a number stands behind its name."""
+        return (self.root / PARTIAL).glob(f"{stage}~*")
+
     def manifest_paths(self) -> list[Path]:
         """The manifests that there are."""
         folder = self.root / "stages"
@@ -66,8 +86,9 @@ class Workspace:
     def lock(self) -> Iterator[None]:
         """Hold the workspace against a second run; the system lets go when the process dies.
 
-        What killed runs have left is cleared. A workspace that no stage has been run in by the end
-        of the block is taken away again: a refused run, or a dry run, leaves nothing behind.
+        What killed runs have left is cleared, but for items that are done. A workspace that no
+        stage has been run in by the end of the block is taken away again: a refused run, or a dry
+        run, leaves nothing behind.
         """
         path = self.root / LOCK
         try:
@@ -102,14 +123,16 @@ class Workspace:
 
     def _clear_partial(self) -> None:
         for left in (self.root / PARTIAL).glob("*"):
-            with contextlib.suppress(OSError):
-                remove(left)
+            if not (left / JOURNAL).is_file():
+                with contextlib.suppress(OSError):
+                    remove(left)
 
     def _release_if_unused(self) -> None:
         stages = self.root / "stages"
         with contextlib.suppress(OSError):
             gone = not (self.root / LOCK).exists()  # what is there has come after the deletion
-            if not gone and (self._published or self.manifest_paths()):
+            kept = self._published or self.manifest_paths() or any((self.root / PARTIAL).glob("*"))
+            if not gone and kept:
                 return
             for path in (self.path(HASHES), self.root / LOCK):
                 path.unlink(missing_ok=True)
@@ -122,24 +145,33 @@ class Workspace:
     def staging(self, stage: str) -> Iterator[Path]:
         """A fresh folder to write a stage's output into; removed when the block ends.
 
+        One that has items stays when the block raises, for the next run to take over.
+
         Raises
         ------
         OutputError : it cannot be made.
         """
         place = self.root / PARTIAL / stage
         try:
-            if place.exists():
+            if (place / JOURNAL).is_file():
+                numbers = [int(path.name.rpartition("~")[2]) for path in self._stopped(stage)]
+                place.rename(f"{place}~{max(numbers, default=0) + 1}")
+            elif place.exists():
                 shutil.rmtree(place)
             place.mkdir(parents=True)
             self._staged = os.open(place, os.O_RDONLY)
         except OSError as error:
             raise output_error(place, error) from error
+        done = False
         try:
             yield place
+            done = True
         finally:
             os.close(self._staged)
             self._staged = None
-            shutil.rmtree(place, ignore_errors=True)
+            if done or not (place / JOURNAL).is_file():
+                for path in (place, *(self._stopped(stage) if done else ())):
+                    shutil.rmtree(path, ignore_errors=True)
 
     def publish(self, staging: Path, outputs: tuple[str, ...]) -> None:
         """Move what a stage wrote to its places; outputs it did not write are taken away.

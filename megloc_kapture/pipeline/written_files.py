@@ -5,66 +5,76 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 from megloc_kapture.errors import DataError
+from megloc_kapture.io.file_states import FileState, state_if_unchanged, state_of
 from megloc_kapture.io.files import output_error, read_content, write_bytes
 
-# by path in the workspace: size, modification time in ns, SHA-256; of a link 0, 0, what it says
-Files = dict[str, tuple[int, int, str]]
+Files = dict[str, FileState]  # by path in the workspace
 
 
-def remember_files(record: Path, root: Path, outputs: Iterable[str]) -> None:
+def remember_files(
+    record: Path, root: Path, outputs: Iterable[str], known: Mapping[str, FileState]
+) -> str:
     """Write down the files below a stage's outputs, with their hashes.
+
+    Parameters
+    ----------
+    known : states of files that were hashed when they were written.
+
+    Returns
+    -------
+    One hash of their names and contents; none where there are links, which do not say what is at
+    their ends.
 
     Raises
     ------
     OutputError : cannot be written, or one of them is gone already.
     """
+    files: Files = {}
+    digest, has_links = hashlib.sha256(), False
     try:
-        files = {path: _state(root / path) for path in sorted(_below(root, outputs))}
+        for path in sorted(_below(root, outputs)):
+            before, place = known.get(path), root / path
+            state = None if before is None else state_if_unchanged(place, before)
+            files[path] = state = state or state_of(place)
+            digest.update(f"{path}\0{state.sha256}\0".encode())
+            has_links = has_links or place.is_symlink()
     except OSError as error:
         raise output_error(root, error) from error
     _write(record, files)
+    return "" if has_links else digest.hexdigest()
 
 
 def changed_file(record: Path, root: Path, *, verify: bool = False) -> str:
     """The first file that is not as it was written, and what became of it; empty if all are.
 
-    A file of the same size and modification time counts as the same. One of another time is
-    hashed: a workspace may be copied.
-
     Parameters
     ----------
-    verify : hash all of them.
+    verify : hash all of them, see :func:`~megloc_kapture.io.file_states.state_if_unchanged`.
     """
-    try:
-        files: Files = json.loads(read_content(record))
-        touched = False
-        for path, (size, time_ns, digest) in files.items():
-            there = root / path
-            try:
-                found = there.lstat()
-                if there.is_symlink():
-                    same = os.readlink(there) == digest
-                elif found.st_size != size:
-                    same = False
-                elif found.st_mtime_ns == time_ns and not verify:
-                    continue
-                else:
-                    state = _state(there)
-                    same, touched = state[2] == digest, touched or state[1] != time_ns
-                    files[path] = state
-            except OSError:
-                return f"{path} is gone"
-            if not same:
-                return f"{path} was changed since it was written"
-    except (DataError, ValueError, TypeError, AttributeError):
-        return ""  # written before there were records, or spoilt: nothing is known
+    files = written_files(record)
+    touched = False
+    for path, known in files.items():
+        state = state_if_unchanged(root / path, known, verify=verify)
+        if state is None:
+            there = os.path.lexists(root / path)
+            return f"{path} {'was changed since it was written' if there else 'is gone'}"
+        files[path], touched = state, touched or state != known
     if touched:
         _write(record, files)
     return ""
+
+
+def written_files(record: Path) -> Files:
+    """The files that a record lists; none where it is of another time, or spoilt."""
+    try:
+        content = json.loads(read_content(record))
+        return {path: FileState(*state) for path, state in content.items()}
+    except (DataError, ValueError, TypeError, AttributeError):
+        return {}
 
 
 def _write(record: Path, files: Files) -> None:
@@ -82,11 +92,3 @@ def _below(root: Path, outputs: Iterable[str]) -> Iterator[str]:
             here = os.path.relpath(folder, root)
             links = (name for name in names if os.path.islink(os.path.join(folder, name)))
             yield from (f"{here}/{name}" for name in (*files, *links))
-
-
-def _state(path: Path) -> tuple[int, int, str]:
-    if path.is_symlink():
-        return 0, 0, os.readlink(path)
-    with open(path, "rb") as file:
-        found = os.fstat(file.fileno())
-        return found.st_size, found.st_mtime_ns, hashlib.file_digest(file, "sha256").hexdigest()

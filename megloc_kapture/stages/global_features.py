@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -27,7 +27,7 @@ from megloc_kapture.plugins import (
 )
 from megloc_kapture.stages.global_vlad import extract_vlad, vlad_type
 from megloc_kapture.stages.layout import FEATURES, GLOBAL_FEATURES, LOCAL_FEATURES
-from megloc_kapture.stages.local_features import read_image_of
+from megloc_kapture.stages.local_features import image_inputs, read_image_of
 from megloc_kapture.stages.map_points import described_images
 from megloc_kapture.stages.stage import LOCAL_TYPES, PipelineStage, StageWork
 from megloc_kapture.stages.work import HERE, Work
@@ -122,10 +122,17 @@ def extract_global_features(
         image of the same name; there are no images.
     PluginError : the extractor breaks its protocol.
     """
-    jobs = _jobs(folders, extractor)
+    folder_of = _images(folders)
+    items = work.items(
+        extractor.name,
+        list(folder_of),
+        lambda image, digest: image_inputs(folder_of[image], image, digest)[:3],
+    )
+    todo = [image for image in folder_of if image not in items.done]
+    jobs = _jobs(folder_of, todo, extractor)
     writer: FeatureWriter | None = None
-    results = work.map(_describe, jobs, extractor.name)
-    count, size = 0, 0
+    results = work.map(_describe, jobs, items.label(extractor.name))
+    size = 0
     for job, vectors in zip(jobs, results, strict=True):
         if writer is None:
             size = vectors.shape[1]
@@ -137,9 +144,8 @@ def extract_global_features(
                 f"values, {size} of the images before"
             )
         for (image, _, _), vector in zip(job.images, vectors, strict=True):
-            writer.write(image, vector)
-        count += len(job.images)
-    return {"images": count}
+            items.add(image, writer.write(image, vector))
+    return {"images": len(items.done)}
 
 
 def describe_images(
@@ -187,18 +193,30 @@ def _checked(
     return vectors
 
 
-def _jobs(folders: Sequence[KaptureFolder], extractor: GlobalFeatureExtractor) -> list[_Job]:
-    """Images in order of their names, neighbours of one size together."""
+def _images(folders: Sequence[KaptureFolder]) -> dict[str, KaptureFolder]:
+    """All images in order of their names, with their folders."""
     named = sorted(
-        (image, folder.image_path(image), folder.read().camera_of(image))
-        for folder in folders
-        for image in folder.read().image_names()
+        ((image, folder) for folder in folders for image in folder.read().image_names()),
+        key=lambda item: item[0],
     )
     for before, after in zip(named, named[1:], strict=False):
         if before[0] == after[0]:
             raise DataError(f"image {before[0]} stands in two kapture folders at once")
     if not named:
         raise DataError("there are no images to describe")
+    return dict(named)
+
+
+def _jobs(
+    folder_of: Mapping[str, KaptureFolder],
+    images: Iterable[str],
+    extractor: GlobalFeatureExtractor,
+) -> list[_Job]:
+    """Images in their order, neighbours of one size together."""
+    named = [
+        (image, folder_of[image].image_path(image), folder_of[image].read().camera_of(image))
+        for image in images
+    ]
     batch = BATCH if hasattr(extractor, "describe_many") else 1
     jobs = []
     for _, group in groupby(named, key=lambda item: (item[2].width, item[2].height)):

@@ -23,6 +23,7 @@ from megloc_kapture.io.tables import write_mask_counts
 from megloc_kapture.plugins import LocalFeatureExtractor
 from megloc_kapture.preprocessing.masks import with_margin
 from megloc_kapture.stages.given_map import has_descriptors
+from megloc_kapture.stages.kept_items import Digest
 from megloc_kapture.stages.layout import LOCAL_FEATURES, REFERENCE
 from megloc_kapture.stages.map_points import check_given_type
 from megloc_kapture.stages.stage import LOCAL_TYPES, PipelineStage, StageWork
@@ -74,25 +75,29 @@ def extract_local_features(
         raise DataError(f"image {duplicates[0]} stands in two kapture folders at once")
     if not jobs:
         raise DataError("there are no images to extract features from")
-    total = 0
-    masked: dict[str, int] = {}
-    keypoint_writer: FeatureWriter | None = None
-    descriptor_writer: FeatureWriter | None = None
-    results = work.map(_extract, jobs, f"{extractor.name} features")
-    for job, features in zip(jobs, results, strict=True):
-        if keypoint_writer is None or descriptor_writer is None:
-            keypoint_writer, descriptor_writer = _writers(output, extractor, features)
-        keypoint_writer.write(job.image, features.keypoints_px)
-        descriptor_writer.write(job.image, features.descriptors)
-        total += len(features.keypoints_px)
-        if job.has_mask:
-            masked[job.image] = features.num_masked
-    counts = {"images": len(jobs), "keypoints": total}
+    folder_of = {job.image: job.folder for job in jobs}
+
+    def inputs(image: str, digest: Digest) -> object:
+        return [*image_inputs(folder_of[image].open(), image, digest), mask_margin_px]
+
+    items = work.items(extractor.name, list(folder_of), inputs)
+    todo = [job for job in jobs if job.image not in items.done]
+    writers: tuple[FeatureWriter, FeatureWriter] | None = None
+    results = work.map(_extract, todo, items.label(f"{extractor.name} features"))
+    for job, features in zip(todo, results, strict=True):
+        writers = writers or _writers(output, extractor, features)
+        files = (
+            *writers[0].write(job.image, features.keypoints_px),
+            *writers[1].write(job.image, features.descriptors),
+        )
+        items.add(job.image, files, [len(features.keypoints_px), features.num_masked])
+    counts = {"images": len(jobs), "keypoints": sum(count for count, _ in items.done.values())}
     bound = max_megapixels_of(extractor)
     cameras = (job.folder.open().read().camera_of(job.image) for job in jobs)
     sizes = ((camera.width, camera.height) for camera in cameras)
     if reduced := sum(bounded_size(*size, bound) != size for size in sizes):
         counts["images_reduced"] = reduced
+    masked = {job.image: items.done[job.image][1] for job in jobs if job.has_mask}
     if masked:
         write_mask_counts(output, extractor.name, masked)
         counts |= {"images_with_mask": len(masked), "keypoints_masked": sum(masked.values())}
@@ -134,6 +139,18 @@ def _writers(
 def _extract(job: _Job) -> LocalFeatures:
     frame = read_frame(job.folder.open(), job.image, margin_px=job.mask_margin_px)
     return extract_checked(job.extractor, *frame, job.image)
+
+
+def image_inputs(folder: KaptureFolder, image: str, digest: Digest) -> list[object]:
+    """What features of an image are made of: its file, its camera's size, its mask if it has one.
+
+    Raises
+    ------
+    DataError : a file cannot be read.
+    """
+    camera, mask = folder.read().camera_of(image), mask_path(folder, image)
+    masked = digest(mask) if mask.is_file() else None
+    return [digest(folder.image_path(image)), camera.width, camera.height, masked]
 
 
 def mask_path(folder: KaptureFolder, image: str) -> Path:

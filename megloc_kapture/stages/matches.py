@@ -5,11 +5,12 @@ Mapping pairs are verified with their known poses, query pairs by a two-view mod
 
 from __future__ import annotations
 
+import hashlib
 import threading
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import astuple, dataclass
+from functools import cache, cached_property
 from itertools import groupby, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
@@ -29,6 +30,7 @@ from megloc_kapture.matching.verification import (
     verify_with_poses,
 )
 from megloc_kapture.plugins import Matcher
+from megloc_kapture.stages.kept_items import Digest
 from megloc_kapture.stages.layout import (
     FEATURES,
     LOCAL_FEATURES,
@@ -146,21 +148,48 @@ def match_pairs(
             for pair in pairs
         }
     )
-    for image, group in groupby(ordered, key=lambda pair: pair[0]):
+    named = {f"{image}\0{other}": (image, other) for image, other in ordered}
+
+    @cache
+    def side(number: int, image: str, digest: Digest) -> object:
+        posed = isinstance(verification, KnownPoseOptions)
+        return _image_inputs((first, second)[number], local_type, image, digest, posed=posed)
+
+    items = work.items(
+        local_type,
+        list(named),
+        lambda name, digest: [side(k, image, digest) for k, image in enumerate(named[name])],
+    )
+    todo = [pair for name, pair in named.items() if name not in items.done]
+    for image, group in groupby(todo, key=lambda pair: pair[0]):
         others = tuple(other for _, other in group)
         jobs.append(_Job(specs[0], specs[1], local_type, matcher, verification, image, others))
     writer = MatchesWriter(output, local_type, orphan=True)
-    counts: list[PairCount] = []
-    for job, found in zip(jobs, work.map(_match, jobs, "matching"), strict=True):
+    for job, found in zip(jobs, work.map(_match, jobs, items.label("matching")), strict=True):
         for other, pair in zip(job.others, found, strict=True):
-            writer.write(job.image, other, pair.matches, pair.scores)
-            counts.append(PairCount(job.image, other, pair.num_found, len(pair.matches)))
+            file = writer.write(job.image, other, pair.matches, pair.scores)
+            items.add(f"{job.image}\0{other}", [file], [pair.num_found, len(pair.matches)])
+    counts = [PairCount(*pair, *items.done[name]) for name, pair in named.items()]
     write_match_counts(output, local_type, counts)
     return {
         "pairs": len(ordered),
         "pairs_with_matches": sum(count.verified > 0 for count in counts),
         "matches": sum(count.verified for count in counts),
     }
+
+
+def _image_inputs(
+    folder: KaptureFolder, local_type: str, image: str, digest: Digest, *, posed: bool
+) -> object:
+    """What matches of an image are made of: its features and its camera, with poses its pose."""
+    found: list[object] = [astuple(folder.read().camera_of(image))]
+    for reader in (folder.keypoints(local_type), folder.descriptors(local_type)):
+        file = Path(reader.where(image))
+        in_tar = not file.is_file()
+        content = hashlib.sha256(reader.read(image).data).hexdigest() if in_tar else digest(file)
+        found.append([reader.config.dtype.name, reader.config.dsize, content])
+    pose = folder.read().cam_from_world(image) if posed else None
+    return [*found, pose and astuple(pose)]
 
 
 def _match(job: _Job) -> list[VerifiedMatches]:

@@ -105,6 +105,10 @@ class PerceptualRanker:
         choice = self.options.distance
         self._distance: ImageDistance = load_plugin(IMAGE_DISTANCES, choice.name, choice.options)
 
+    def plugins(self) -> tuple[object, ...]:
+        """Those it is made of."""
+        return (self._distance,)
+
     def weights(self) -> dict[str, str]:
         """Those of the image distance."""
         return weights_of(self._distance)

@@ -374,6 +374,10 @@ class PyramidMapping(PipelineStage):
     def is_wanted(cls, options: PipelineOptions) -> bool:
         return options.matches_again() and options.triangulates()
 
+    def plugins(self) -> Sequence[object]:
+        extractors = self.options.make_extractors()
+        return [*extractors, *(self.options.make_matcher(one.name) for one in extractors)]
+
     def run(self, work: StageWork) -> Mapping[str, float]:
         counts: dict[str, float] = {}
         for extractor in self.options.make_extractors():

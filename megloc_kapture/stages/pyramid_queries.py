@@ -236,6 +236,10 @@ class PyramidQueries(PipelineStage):
     def is_wanted(cls, options: PipelineOptions) -> bool:
         return options.matches_again()
 
+    def plugins(self) -> Sequence[object]:
+        extractors = self.options.query_extractors()
+        return [*extractors, *(self.options.make_matcher(one.name) for one in extractors)]
+
     def run(self, work: StageWork) -> Mapping[str, float]:
         counts: dict[str, float] = {}
         pairs = read_pairs(work.path(QUERY_PAIRS))

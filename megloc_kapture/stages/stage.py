@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, cast
 
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.plugins import weights_of
+from megloc_kapture.plugins import code_of, is_ours, weights_of
 from megloc_kapture.stages.layout import Layout
 from megloc_kapture.stages.restrictions import Restrictions
 from megloc_kapture.stages.work import Work
@@ -67,6 +67,9 @@ class StageWork(Work):
         return Restrictions.read(self.path(SIDE_TABLES))
 
 
+CODE_OF = "code of "
+
+
 def is_below(path: str, folder: str) -> bool:
     """Whether a path in the workspace is that of a folder, or of something in it."""
     return path == folder or path.startswith(f"{folder}/")
@@ -98,6 +101,20 @@ class Stage(ABC):
     def external(self, hashes: Hashes) -> Mapping[str, str]:
         """Fingerprints of what is read from outside the workspace, by what they are of."""
         return {}
+
+    def plugins(self) -> Sequence[object]:
+        """The plugins at work, whose code and weights determine the output."""
+        return ()
+
+    def code(self) -> dict[str, str]:
+        """Versions of the plugins' code, and of a stage's of another package; see `code_of`."""
+        found = [*self.plugins(), *(() if is_ours(type(self)) else (self,))]
+        for plugin in self.plugins():
+            found += getattr(plugin, "plugins", tuple)()  # what it is made of
+        kinds = {type(plugin) for plugin in found}
+        names = {f"{CODE_OF}{kind.__module__}.{kind.__qualname__}": kind for kind in kinds}
+        # mypy does not take a class for something that can be hashed
+        return {name: code_of(kind) for name, kind in names.items()}  # type: ignore[arg-type]
 
     @abstractmethod
     def run(self, work: StageWork) -> Mapping[str, float]:
@@ -136,10 +153,6 @@ class PipelineStage(Stage):
     def is_wanted(cls, options: PipelineOptions) -> bool:
         """Whether the options ask for what the stage does."""
         return True
-
-    def plugins(self) -> Sequence[object]:
-        """The plugins at work, whose weights determine the output."""
-        return ()
 
     def settings(self) -> dict[str, Any]:
         dump = self._all.model_dump(mode="json")

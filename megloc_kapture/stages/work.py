@@ -12,6 +12,7 @@ from typing import Protocol, TypeVar
 from uuid import uuid4
 
 from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.stages.kept_items import Inputs, Items, KeptItems
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -66,11 +67,13 @@ class Work:
     ----------
     executor : None stands for this process.
     num_threads : for what has threads of its own, as COLMAP's triangulation.
+    kept : what runs before have done of it; None where nothing is kept.
     """
 
     executor: Executor | None = None
     track: Track = untracked
     num_threads: int = 1
+    kept: KeptItems | None = None
 
     def map(
         self,
@@ -91,6 +94,17 @@ class Work:
             items = items if isinstance(items, Sequence) else list(items)
             total = len(items)
         return self.track(ordered_map(function, items, self.executor), total, label)
+
+    def items(self, kind: str, names: Sequence[str], inputs: Inputs) -> Items:
+        """Items that do not depend on each other: those that are done, and what notes new ones.
+
+        Parameters
+        ----------
+        kind : of the items, where a stage has several.
+        inputs : what an item is made of beside the stage's settings and its own name; asked for
+            only where something may be kept.
+        """
+        return Items.of(self.kept, kind, names, inputs)
 
 
 HERE = Work()

@@ -166,7 +166,8 @@ def test_a_manifest_says_what_was_done(finished: Path) -> None:
         {"name": "rootsift", "options": {"max_keypoints": 800}}
     ]
     assert manifest["counts"]["images"] == 11
-    assert set(manifest["inputs"]) == {"import"}
+    code = "code of megloc_kapture.features.rootsift.RootSift"
+    assert set(manifest["inputs"]) == {"import", code}
     assert manifest["seconds"] > 0 and manifest["versions"]["pycolmap"]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -28,10 +29,13 @@ def _obey_interrupts() -> None:
 
 
 def left_behind(workspace: Path, *pids: int) -> list[Path]:
-    """What runs have left: temporary files in the workspace and elsewhere, semaphores."""
+    """What runs have left: temporary files in the workspace and elsewhere, semaphores.
+
+    Items that are done stay, for the next run.
+    """
     temporary = list(Path(os.environ["TMPDIR"]).iterdir())
     hidden = [path for path in workspace.rglob(".*") if path.name.startswith(".megloc-")]
-    staged = list((workspace / ".partial").glob("*"))
+    staged = [p for p in workspace.glob(".partial/*") if not (p / ".items").is_file()]
     named = [Path("/dev/shm").glob(f"sem.megloc-*.{pid}-*") for pid in pids]
     return [*temporary, *hidden, *staged, *(path for found in named for path in found)]
 
@@ -115,7 +119,7 @@ def test_workers_end_with_a_killed_run(scene: Path, tmp_path: Path) -> None:
 def test_a_run_ended_at_the_keyboard_says_how_to_go_on(scene: Path, tmp_path: Path) -> None:
     run = start(scene, tmp_path / "run")
     wait_for(run, "local_features, stage 2 of 12: starting")
-    while not any((tmp_path / "run" / ".partial").rglob("*.desc")):
+    while not num_lines(tmp_path / "run" / ".partial" / "local_features" / ".items"):
         time.sleep(0.01)
         assert run.poll() is None
     # a terminal sends it to every process of the group
@@ -126,6 +130,10 @@ def test_a_run_ended_at_the_keyboard_says_how_to_go_on(scene: Path, tmp_path: Pa
     assert run.wait() == 130
     assert not (tmp_path / "run" / "local_features").exists()
     assert left_behind(tmp_path / "run", run.pid) == []
+    again = start(scene, tmp_path / "run")
+    wait_for(again, "of 11 kept")
+    os.killpg(again.pid, signal.SIGKILL)
+    again.communicate()
 
 
 @pytest.mark.parametrize("stage", ["local_features", "mapping_matches", "localization"])
@@ -161,6 +169,41 @@ def test_ctrl_c_twice_ends_a_run_in_one_line_from_its_first_moment_on(
     assert left_behind(tmp_path / "run", run.pid) == []
 
 
+@pytest.mark.parametrize(
+    "counts",
+    [[2, 5], pytest.param([1, 2, 3, 4, 5, 6], marks=pytest.mark.slow)],
+    ids=["4 kills", "12 kills"],
+)
+def test_items_that_are_done_when_a_run_is_killed_are_not_done_again(
+    scene: Path, finished: Path, tmp_path: Path, contents: Contents, counts: list[int]
+) -> None:
+    workspace = tmp_path / "run"
+    for kind in ("local_features", "mapping_matches"):
+        for count in counts:
+            run = start(scene, workspace)
+            wait_for(run, f"{kind}, stage")
+            journal = workspace / ".partial" / kind / ".items"
+            while num_lines(journal) < count:
+                time.sleep(0.002)
+            os.killpg(run.pid, signal.SIGKILL)
+            run.communicate()
+    last = start(scene, workspace)
+    _, told = last.communicate()
+    assert last.returncode == 0, told
+    kept = [int(n) for n in re.findall(r"mapping_matches: .* ([0-9]+) of 21 kept", told)]
+    assert len(kept) == 1 and kept[0] >= max(counts)
+    assert left_behind(workspace, last.pid) == [] and not any(workspace.glob(".partial/*"))
+    assert undated(contents(workspace)) == undated(contents(finished))
+
+
+def num_lines(path: Path) -> int:
+    return path.read_bytes().count(b"\n") if path.is_file() else 0
+
+
+def undated(found: dict[str, bytes]) -> dict[str, bytes]:
+    return {name: content for name, content in found.items() if not name.startswith(DATED)}
+
+
 @pytest.mark.parametrize("kills", [1, pytest.param(6, marks=pytest.mark.slow)])
 def test_runs_killed_at_random_moments_end_in_the_same_bytes(
     scene: Path, finished: Path, tmp_path: Path, contents: Contents, kills: int
@@ -185,9 +228,6 @@ def test_runs_killed_at_random_moments_end_in_the_same_bytes(
     _, told = last.communicate()
     assert last.returncode == 0, told
     assert left_behind(workspace, last.pid, *pids) == []
-    expected, found = contents(finished), contents(workspace)
-    for dated in DATED:
-        expected = {n: c for n, c in expected.items() if not n.startswith(dated)}
-        found = {n: c for n, c in found.items() if not n.startswith(dated)}
-    assert found == expected
+    found = undated(contents(workspace))
+    assert found == undated(contents(finished))
     assert any(name.startswith("submissions/") for name in found)

@@ -129,7 +129,8 @@ def test_a_changed_input_from_outside(kitchen: Kitchen) -> None:
     assert kitchen.cook()[0].why == "flour changed"
     kitchen.external = {}
     assert kitchen.cook()[0].why == "flour changed"
-    assert kitchen.log == ["a", "b", "c"]
+    # what follows is kept: it reads the same bytes as before
+    assert kitchen.log == ["a"]
 
 
 def test_a_newer_version(kitchen: Kitchen) -> None:

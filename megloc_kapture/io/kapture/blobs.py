@@ -171,8 +171,11 @@ class FolderBlobWriter:
         except OSError:
             return False  # too long a name, or a folder closed to us: writing will say so
 
-    def write(self, name: str, content: bytes) -> None:
-        write_bytes(safe_join(self._folder, name), content)
+    def write(self, name: str, content: bytes) -> Path:
+        """Write one; returns its file."""
+        path = safe_join(self._folder, name)
+        write_bytes(path, content)
+        return path
 
     def close(self) -> None:
         pass

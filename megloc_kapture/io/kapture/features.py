@@ -356,7 +356,7 @@ class FeatureWriter(AbstractContextManager["FeatureWriter"]):
         self.config = config
         folder = feature_folder(Path(root), kind, type_name, orphan=orphan)
         check_output(Path(root), folder)
-        path = folder / f"{kind}.txt"
+        self._path = path = folder / f"{kind}.txt"
         content = format_config(kind, config)
         if path.exists():
             if format_config(kind, read_config(path, kind)) != content:
@@ -369,8 +369,12 @@ class FeatureWriter(AbstractContextManager["FeatureWriter"]):
     def __contains__(self, image: str) -> bool:
         return image + SUFFIX[self.kind] in self._blobs
 
-    def write(self, image: str, array: ArrayLike) -> None:
+    def write(self, image: str, array: ArrayLike) -> tuple[Path, Path]:
         """Write one image's array, (N, dsize), or (dsize,) for global features.
+
+        Returns
+        -------
+        The files that say what it is and hold it.
 
         Raises
         ------
@@ -389,7 +393,7 @@ class FeatureWriter(AbstractContextManager["FeatureWriter"]):
         if not np.can_cast(given.dtype, self.config.dtype, casting="same_kind"):
             raise ValueError(f"cannot store {given.dtype} as {self.config.dtype.name}")
         content = np.ascontiguousarray(given, dtype=self.config.dtype).tobytes()
-        self._blobs.write(check_field(image) + SUFFIX[self.kind], content)
+        return self._path, self._blobs.write(check_field(image) + SUFFIX[self.kind], content)
 
     def close(self) -> None:
         """Finish the tar; the writer is of no use afterwards."""

@@ -151,8 +151,12 @@ class MatchesWriter(AbstractContextManager["MatchesWriter"]):
     def __contains__(self, pair: tuple[str, str]) -> bool:
         return _name(min(pair), max(pair)) in self._blobs
 
-    def write(self, a: str, b: str, indices: ArrayLike, scores: ArrayLike) -> None:
+    def write(self, a: str, b: str, indices: ArrayLike, scores: ArrayLike) -> Path:
         """Write one pair: integer indices (M, 2) in the order ``a``, ``b``, and scores (M,).
+
+        Returns
+        -------
+        The file that holds it.
 
         Raises
         ------
@@ -175,7 +179,8 @@ class MatchesWriter(AbstractContextManager["MatchesWriter"]):
         rows = np.empty((len(pairs), 3), dtype="<f8")
         rows[:, :2] = pairs if a < b else pairs[:, ::-1]
         rows[:, 2] = values
-        self._blobs.write(_name(check_field(min(a, b)), check_field(max(a, b))), rows.tobytes())
+        name = _name(check_field(min(a, b)), check_field(max(a, b)))
+        return self._blobs.write(name, rows.tobytes())
 
     def close(self) -> None:
         """Finish the tar; the writer is of no use afterwards."""

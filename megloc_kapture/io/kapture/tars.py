@@ -234,7 +234,8 @@ class TarBlobWriter:
     def __contains__(self, name: str) -> bool:
         return name in self._index
 
-    def write(self, name: str, content: bytes) -> None:
+    def write(self, name: str, content: bytes) -> Path:
+        """Append one; returns the tar's file."""
         if not self._open:
             raise ValueError(f"{self._path}: is closed")
         member = tarfile.TarInfo(check_relative(name))
@@ -251,6 +252,7 @@ class TarBlobWriter:
             raise output_error(self._path, error) from error
         self._index[name] = (self._end + len(header), len(content))
         self._end += len(header) + len(content) + len(padding)
+        return self._path
 
     def close(self) -> None:
         if not self._open:
