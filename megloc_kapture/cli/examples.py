@@ -9,7 +9,7 @@ megloc localize -i my_map --images IMG_0001.jpg holiday/ walk.mp4 -o localized
 megloc localize -i my_map --query my_scene/query -o localized
 megloc eval kapture --root my_scene
 megloc eval kapture --root my_scene --set localization.pose.max_error_px=8 --dry-run
-megloc eval aachen --root /data/Aachen-Day-Night --preset megloc
+megloc eval aachen --root /data/Aachen-Day-Night --executor dask --scheduler tcp://host:8786
 megloc import aachen /data/Aachen-Day-Night -o aachen
 megloc import colmap sparse/0 --images photos --database features.db -o my_map
 megloc synth -o my_scene
