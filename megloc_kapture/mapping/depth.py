@@ -75,7 +75,7 @@ def lift_keypoints(
     settled = np.zeros(len(rays), bool)
     for _ in range(1 if same_centre else _ROUNDS):
         in_depth = depth_from_image.apply(rays * z[:, None])
-        depth = _sample(depth_m, px_from_cam(depth_camera, in_depth), options.max_jump)
+        depth = sample_depth(depth_m, px_from_cam(depth_camera, in_depth), options.max_jump)
         with np.errstate(invalid="ignore", divide="ignore"):
             lifted = image_from_depth.apply(in_depth * (depth / in_depth[:, 2])[:, None])
             change = np.abs(lifted[:, 2] - z)
@@ -87,8 +87,19 @@ def lift_keypoints(
     return points, settled
 
 
-def _sample(depth_m: NDArray[np.float32], pixels: Floats, max_jump: float) -> Floats:
-    """Depth at pixels (N, 2), float64 (N,); NaN where it is unknown or jumps."""
+def sample_depth(depth_m: NDArray[np.float32], pixels: Floats, max_jump: float) -> Floats:
+    """Depth at pixels of a depth map, interpolated as :func:`lift_keypoints` does.
+
+    Parameters
+    ----------
+    depth_m : float32 (H, W), 0 or less where unknown.
+    pixels : float64 (N, 2) of the depth map, COLMAP's pixel origin; may be NaN.
+    max_jump : see :class:`LiftingOptions`.
+
+    Returns
+    -------
+    float64 (N,); NaN outside, where the depth is unknown, and where it jumps.
+    """
     height, width = depth_m.shape
     result = np.full(len(pixels), np.nan)
     inside = np.isfinite(pixels).all(axis=1)

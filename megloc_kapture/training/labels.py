@@ -1,0 +1,241 @@
+"""Labels of a pair's keypoints: the partner in the other image, that there is none, or unknown.
+
+Depth and poses, or a homography, bring each keypoint into the other image. The rules are those of
+the open trainings of matchers (glue-factory's ``gt_generation``): two keypoints are partners that
+are each other's nearest and near in both images, where neither is hidden; a keypoint is unmatched
+that is far from all of the other image. What lies between is ignored.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from megloc_kapture.geometry.cameras import bearing_rays, px_from_cam
+from megloc_kapture.mapping.depth import LiftingOptions, lift_keypoints, sample_depth
+from megloc_kapture.matching.verification import ray_slopes, sampson_error_px
+from megloc_kapture.plugins import DepthView
+from megloc_kapture.values import Camera, Options, RigidTransform
+
+UNMATCHED, IGNORED = -1, -2
+# pixels across and down that overlap is measured at
+_GRID = (24, 18)
+_LIFTING = LiftingOptions()
+
+Floats = NDArray[np.float64]
+
+
+class LabelOptions(Options):
+    """Options of labels; the distances are glue-factory's, in the images that are trained on."""
+
+    positive_px: float = Field(default=3.0, gt=0, description="partners are nearer, in both images")
+    negative_px: float = Field(
+        default=5.0, gt=0, description="an unmatched keypoint is farther from all of the other's"
+    )
+    max_depth_error: float = Field(
+        default=0.03,
+        gt=0,
+        description="a point is hidden in an image whose depth differs by more than this share",
+    )
+
+    @model_validator(mode="after")
+    def _ordered(self) -> LabelOptions:
+        if self.negative_px < self.positive_px:
+            raise ValueError("negative_px is smaller than positive_px")
+        return self
+
+
+@dataclass(frozen=True, eq=False)
+class PosedView:
+    """An image whose depth and pose are known.
+
+    Attributes
+    ----------
+    camera, cam_from_world : of the image, in the resolution that keypoints are given in.
+    depth : the depth map of its moment, in its own resolution.
+    """
+
+    camera: Camera
+    cam_from_world: RigidTransform
+    depth: DepthView
+
+
+@dataclass(frozen=True, eq=False)
+class Labels:
+    """Labels of the N and M keypoints of two images.
+
+    Attributes
+    ----------
+    partner_a : int64 (N,): the row in b, UNMATCHED or IGNORED.
+    partner_b : int64 (M,): the row in a, UNMATCHED or IGNORED.
+    """
+
+    partner_a: NDArray[np.int64]
+    partner_b: NDArray[np.int64]
+
+    def matches(self) -> NDArray[np.int64]:
+        """The partners, int64 (K, 2), sorted by the row in a."""
+        rows = np.flatnonzero(self.partner_a >= 0)
+        return np.stack([rows, self.partner_a[rows]], axis=1)
+
+
+def labels_of_views(
+    px_a: NDArray[np.floating[Any]],
+    px_b: NDArray[np.floating[Any]],
+    a: PosedView,
+    b: PosedView,
+    options: LabelOptions | None = None,
+) -> Labels:
+    """Labels by depth and poses, of any of COLMAP's camera models.
+
+    A keypoint without depth is unmatched where it is farther than ``negative_px`` (Sampson
+    distance) from the epipolar curves of all keypoints that have no partner; otherwise it is
+    ignored.
+
+    Parameters
+    ----------
+    px_a, px_b : (N, 2) and (M, 2), COLMAP's pixel origin.
+    """
+    options = options or LabelOptions()
+    a_in_b, known_a, visible_a = reproject(px_a, a, b, options)
+    b_in_a, known_b, visible_b = reproject(px_b, b, a, options)
+    labels = _labels(
+        (px_a, a_in_b, known_a, visible_a), (px_b, b_in_a, known_b, visible_b), options
+    )
+    open_a, open_b = labels.partner_a == IGNORED, labels.partner_b == IGNORED
+    lost_a, lost_b = open_a & ~known_a, open_b & ~known_b
+    if lost_a.any() or lost_b.any():
+        error = _epipolar_error_px(px_a[open_a], px_b[open_b], a, b)
+        far_a, far_b = open_a.copy(), open_b.copy()
+        far_a[open_a] = error.min(axis=1, initial=np.inf) > options.negative_px
+        far_b[open_b] = error.min(axis=0, initial=np.inf) > options.negative_px
+        labels.partner_a[lost_a & far_a] = UNMATCHED
+        labels.partner_b[lost_b & far_b] = UNMATCHED
+    return labels
+
+
+def labels_of_homography(
+    px_a: NDArray[np.floating[Any]],
+    px_b: NDArray[np.floating[Any]],
+    b_from_a: Floats,
+    size_a: tuple[int, int],
+    size_b: tuple[int, int],
+    options: LabelOptions | None = None,
+) -> Labels:
+    """Labels by a homography between the pixels of two images.
+
+    Parameters
+    ----------
+    px_a, px_b : (N, 2) and (M, 2), COLMAP's pixel origin.
+    b_from_a : float64 (3, 3), of such pixels.
+    size_a, size_b : width and height of the images.
+    """
+
+    def side(px: NDArray[np.floating[Any]], matrix: Floats, size: tuple[int, int]) -> _Side:
+        moved = np.column_stack([px, np.ones(len(px))]) @ matrix.T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            there = np.where(moved[:, 2:] > 0, moved[:, :2] / moved[:, 2:], np.nan)
+        return px, there, np.ones(len(px), bool), _inside(there, *size)
+
+    a_from_b = np.asarray(np.linalg.inv(b_from_a), np.float64)
+    a, b = side(px_a, b_from_a, size_b), side(px_b, a_from_b, size_a)
+    return _labels(a, b, options or LabelOptions())
+
+
+def reproject(
+    px: NDArray[np.floating[Any]], a: PosedView, b: PosedView, options: LabelOptions | None = None
+) -> tuple[Floats, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Where b has the points that a sees at pixels.
+
+    Returns
+    -------
+    px : float64 (N, 2) in b; NaN behind it and without depth.
+    known : bool (N,), where a has depth.
+    visible : bool (N,), where b shows the point: inside the image, and of the depth that b has.
+    """
+    options = options or LabelOptions()
+    points, known = lift_keypoints(
+        px, a.depth.depth_m, a.camera, a.depth.camera, a.depth.image_from_depth, _LIFTING
+    )
+    in_b = (b.cam_from_world @ a.cam_from_world.inverse()).apply(points)
+    there = px_from_cam(b.camera, in_b)
+    in_depth = b.depth.image_from_depth.inverse().apply(in_b)
+    measured = sample_depth(
+        b.depth.depth_m, px_from_cam(b.depth.camera, in_depth), _LIFTING.max_jump
+    )
+    with np.errstate(invalid="ignore"):
+        seen = np.abs(measured - in_depth[:, 2]) <= options.max_depth_error * in_depth[:, 2]
+    return there, known, known & seen & _inside(there, b.camera.width, b.camera.height)
+
+
+def overlap(a: PosedView, b: PosedView, options: LabelOptions | None = None) -> float:
+    """Share of the pixels with depth that the other image shows: the smaller of both ways."""
+    shares = []
+    for one, other in ((a, b), (b, a)):
+        size = one.camera.width, one.camera.height
+        x, y = np.meshgrid(
+            *((np.arange(n) + 0.5) * side / n for n, side in zip(_GRID, size, strict=True))
+        )
+        grid = np.stack([x.ravel(), y.ravel()], axis=1)
+        _, known, visible = reproject(grid, one, other, options)
+        shares.append(visible.sum() / known.sum() if known.any() else 0.0)
+    return float(min(shares))
+
+
+_Side = tuple[NDArray[np.floating[Any]], Floats, NDArray[np.bool_], NDArray[np.bool_]]
+
+
+def _labels(a: _Side, b: _Side, options: LabelOptions) -> Labels:
+    """Labels of sides (pixels, where the other image has them, known, visible)."""
+    px_a, a_in_b, known_a, visible_a = a
+    px_b, b_in_a, known_b, visible_b = b
+    if not len(px_a) or not len(px_b):
+        return Labels(np.full(len(px_a), IGNORED), np.full(len(px_b), IGNORED))
+    in_b, in_a = _distances(a_in_b, px_b), _distances(b_in_a, px_a).T
+    both = np.where(visible_a[:, None] & visible_b, np.maximum(in_a, in_b), np.inf)
+    nearest_a, nearest_b = both.argmin(axis=1), both.argmin(axis=0)
+    rows = np.arange(len(px_a))
+    pairs = (nearest_b[nearest_a] == rows) & (both[rows, nearest_a] < options.positive_px)
+    partner_a = np.where(pairs, nearest_a, IGNORED)
+    partner_b = np.full(len(px_b), IGNORED)
+    partner_b[nearest_a[pairs]] = rows[pairs]
+    partner_a[known_a & (in_b.min(axis=1) > options.negative_px)] = UNMATCHED
+    partner_b[known_b & (in_a.min(axis=0) > options.negative_px)] = UNMATCHED
+    return Labels(partner_a, partner_b)
+
+
+def _distances(
+    first: NDArray[np.floating[Any]], second: NDArray[np.floating[Any]]
+) -> NDArray[np.float64]:
+    """(N, M) pixels; infinite where the first is not known."""
+    found = np.linalg.norm(first[:, None].astype(np.float64) - second[None], axis=2)
+    return np.where(np.isfinite(found), found, np.inf)
+
+
+def _inside(px: Floats, width: int, height: int) -> NDArray[np.bool_]:
+    with np.errstate(invalid="ignore"):
+        return np.asarray(((px >= 0) & (px <= (width, height))).all(axis=1))
+
+
+def _epipolar_error_px(
+    px_a: NDArray[np.floating[Any]], px_b: NDArray[np.floating[Any]], a: PosedView, b: PosedView
+) -> Floats:
+    """(N, M) pixels; 0 where the geometry does not tell: views of one centre, undefined rays."""
+    rays = [bearing_rays(view.camera, px) for view, px in ((a, px_a), (b, px_b))]
+    slopes = [
+        ray_slopes(view.camera, px, ray)
+        for view, px, ray in ((a, px_a, rays[0]), (b, px_b, rays[1]))
+    ]
+    first, second = (grid.ravel() for grid in np.indices((len(px_a), len(px_b))))
+    error = sampson_error_px(
+        rays[0][first],
+        slopes[0][first],
+        rays[1][second],
+        slopes[1][second],
+        b.cam_from_world @ a.cam_from_world.inverse(),
+    )
+    return np.where(np.isfinite(error), error, 0.0).reshape(len(px_a), len(px_b))

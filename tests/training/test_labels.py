@@ -1,0 +1,260 @@
+"""Labels against definitions written out, on a rendered world whose depth is exact."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from corner import CAMERA, depth_m, pose_at
+from megloc_twins.options import SyntheticWorldOptions
+from megloc_twins.render import PlaceRenderer
+from megloc_twins.synthetic_kapture import build_world
+from numpy.typing import NDArray
+
+from megloc_kapture.geometry.cameras import bearing_rays, project
+from megloc_kapture.plugins import DepthView
+from megloc_kapture.training.labels import (
+    IGNORED,
+    UNMATCHED,
+    LabelOptions,
+    PosedView,
+    labels_of_homography,
+    labels_of_views,
+    overlap,
+    reproject,
+)
+from megloc_kapture.values import Camera, RigidTransform
+
+IDENTITY = RigidTransform.identity()
+DISTORTED = Camera("OPENCV", 400, 300, (300.0, 302.0, 198.0, 151.0, -0.12, 0.03, 1e-3, -2e-3))
+
+
+def corner_view(pose: RigidTransform) -> PosedView:
+    return PosedView(CAMERA, pose, DepthView(CAMERA, depth_m(pose), IDENTITY))
+
+
+@pytest.fixture(scope="module")
+def twin() -> tuple[PosedView, PosedView]:
+    """Two images of a rendered square, with cars and people that moved; the second is distorted."""
+    options = SyntheticWorldOptions(
+        seed=11, num_places=1, stations_per_place=3, day_queries=4, night_queries=0, width=320,
+        height=240, supersampling=1,
+    )  # fmt: skip
+    world = build_world(options)
+    renderer = PlaceRenderer(world.places[0], seed=11, supersampling=1)
+
+    def view(frame):  # type: ignore[no-untyped-def]
+        depth = renderer.render(frame, depth=True).depth_m
+        return PosedView(
+            frame.camera, frame.cam_from_world, DepthView(frame.camera, depth, IDENTITY)
+        )
+
+    views = {frame.name: view(frame) for frame in world.frames()}
+    query = next(name for name in views if name.startswith("query"))
+    other = max(
+        (name for name in views if name.startswith("db")),
+        key=lambda name: overlap(views[query], views[name]),
+    )
+    assert overlap(views[query], views[other]) > 0.2
+    assert views[query].camera.model == "SIMPLE_RADIAL" != views[other].camera.model
+    return views[other], views[query]
+
+
+def surface(view: PosedView, px: NDArray[np.float64]) -> NDArray[np.float64]:
+    """World points at pixels: depth of the four around, or of the nearest that has some."""
+    points, depth_m = np.full((len(px), 3), np.nan), view.depth.depth_m.astype(np.float64)
+    height, width = depth_m.shape
+    for row, (x, y) in enumerate(px):
+        if not (0 <= x <= width and 0 <= y <= height):
+            continue
+        left, top = int(np.floor(x - 0.5)), int(np.floor(y - 0.5))
+        u, v = x - 0.5 - left, y - 0.5 - top
+        corners = []
+        for i, j, weight in (
+            (top, left, (1 - u) * (1 - v)),
+            (top, left + 1, u * (1 - v)),
+            (top + 1, left, (1 - u) * v),
+            (top + 1, left + 1, u * v),
+        ):
+            z = depth_m[min(max(i, 0), height - 1), min(max(j, 0), width - 1)]
+            corners.append((z if z > 0 else np.nan, weight))
+        known = [(weight, z) for z, weight in corners if z > 0]
+        depths = [z for _, z in known]
+        if not known or max(depths) - min(depths) > 0.1 * min(depths):
+            continue
+        z = sum(w * z for w, z in known) if len(known) == 4 else max(known)[1]
+        ray = bearing_rays(view.camera, px[row : row + 1])[0]
+        points[row] = view.cam_from_world.inverse().apply((ray * z)[None])[0]
+    return points
+
+
+def brute_force(
+    px_a: NDArray[np.float64], px_b: NDArray[np.float64], a: PosedView, b: PosedView
+) -> list[int]:
+    """Labels of a's keypoints with depth, one by one; None's stand-in is -3 (without depth)."""
+    options = LabelOptions()
+
+    def there(px: NDArray[np.float64], one: PosedView, other: PosedView):  # type: ignore[no-untyped-def]
+        points = surface(one, px)
+        seen = project(other.camera, other.cam_from_world, points)
+        z = other.cam_from_world.apply(points)[:, 2]
+        behind = surface(other, np.nan_to_num(seen, nan=-9.0))
+        measured = other.cam_from_world.apply(behind)[:, 2]
+        inside = ((seen >= 0) & (seen <= (other.camera.width, other.camera.height))).all(axis=1)
+        return points, seen, inside & (np.abs(measured - z) <= options.max_depth_error * z)
+
+    points_a, a_in_b, visible_a = there(px_a, a, b)
+    _, b_in_a, visible_b = there(px_b, b, a)
+    distance = np.full((len(px_a), len(px_b)), np.inf)
+    for i in range(len(px_a)):
+        for j in range(len(px_b)):
+            if visible_a[i] and visible_b[j]:
+                distance[i, j] = max(
+                    np.hypot(*(a_in_b[i] - px_b[j])), np.hypot(*(b_in_a[j] - px_a[i]))
+                )
+    found = []
+    for i in range(len(px_a)):
+        if np.isnan(points_a[i]).any():
+            found.append(-3)
+            continue
+        j = int(distance[i].argmin())
+        mutual = int(distance[:, j].argmin()) == i
+        away = np.nan_to_num(np.hypot(*(a_in_b[i] - px_b).T), nan=np.inf).min()
+        if mutual and distance[i, j] < options.positive_px:
+            found.append(j)
+        else:
+            found.append(UNMATCHED if away > options.negative_px else IGNORED)
+    return found
+
+
+def keypoints(a: PosedView, b: PosedView) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Random ones, and in b some that are those of a, more or less."""
+    rng = np.random.default_rng(0)
+    px_a = rng.uniform(0, (a.camera.width, a.camera.height), (300, 2))
+    moved, _, visible = reproject(px_a, a, b)
+    near = moved[visible] + rng.normal(0, 2.0, (visible.sum(), 2))
+    far = rng.uniform(0, (b.camera.width, b.camera.height), (150, 2))
+    inside = ((near > 1) & (near < (b.camera.width - 1, b.camera.height - 1))).all(axis=1)
+    return px_a, np.concatenate([near[inside], far])
+
+
+def test_labels_are_those_of_brute_force_on_an_exact_twin(
+    twin: tuple[PosedView, PosedView],
+) -> None:
+    a, b = twin
+    px_a, px_b = keypoints(a, b)
+    found = labels_of_views(px_a, px_b, a, b)
+    for px, other_px, view, other, partner in (
+        (px_a, px_b, a, b, found.partner_a),
+        (px_b, px_a, b, a, found.partner_b),
+    ):
+        expected = np.array(brute_force(px, other_px, view, other))
+        told = expected != -3
+        assert told.sum() > 150
+        np.testing.assert_array_equal(partner[told], expected[told])
+        assert (expected >= 0).sum() > 40
+        assert min((expected == UNMATCHED).sum(), (expected == IGNORED).sum()) > 5
+    matches = found.matches()
+    np.testing.assert_array_equal(found.partner_b[matches[:, 1]], matches[:, 0])
+
+
+def test_what_is_hidden_is_no_partner() -> None:
+    a, b = corner_view(pose_at((-1.5, 0, 0), -4, 0)), corner_view(pose_at((1.0, 0, 0), 3, 0))
+    px_a = np.random.default_rng(1).uniform((50, 50), (350, 250), (200, 2))
+    there, known, visible = reproject(px_a, a, b)
+    assert known.all() and visible.sum() > 80
+    exact = labels_of_views(px_a, there[visible], a, b)
+    assert (exact.partner_a[visible] == np.arange(visible.sum())).all()
+    # something stands before the second camera
+    blocked = np.where(np.arange(400) < 200, 1.0, b.depth.depth_m).astype(np.float32)
+    hidden = PosedView(b.camera, b.cam_from_world, DepthView(CAMERA, blocked, IDENTITY))
+    behind = there[visible, 0] < 198
+    labels = labels_of_views(px_a, there[visible], a, hidden)
+    assert behind.sum() > 20
+    assert (labels.partner_a[visible][behind] == IGNORED).all()
+    clear = there[visible, 0] > 202
+    assert (labels.partner_a[visible][clear] >= 0).all()
+
+
+def test_without_depth_the_epipolar_line_tells() -> None:
+    a, b = corner_view(pose_at((-0.5, 0, 0), 0, 0)), corner_view(pose_at((0.5, 0, 0), 0, 0))
+    nothing = DepthView(CAMERA, np.zeros((300, 400), np.float32), IDENTITY)
+    blind = [PosedView(CAMERA, view.cam_from_world, nothing) for view in (a, b)]
+    # the cameras stand side by side: epipolar lines are rows
+    px_a = np.array([[100.0, 80.0], [100.0, 200.0]])
+    px_b = np.array([[300.0, 80.0 + 3.0], [20.0, 150.0]])
+    labels = labels_of_views(px_a, px_b, *blind)
+    assert labels.partner_a.tolist() == [IGNORED, UNMATCHED]
+    assert labels.partner_b.tolist() == [IGNORED, UNMATCHED]
+    # of one centre there are no such lines
+    same = [PosedView(CAMERA, a.cam_from_world, nothing)] * 2
+    assert (labels_of_views(px_a, px_b, *same).partner_a == IGNORED).all()
+
+
+def test_depth_beside_the_camera_and_distortion() -> None:
+    pose_a, pose_b = pose_at((-0.6, 0, 0), -2, 0), pose_at((0.3, 0.1, 0.2), 1, 1)
+    image_from_depth = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.05, -0.02, 0.01))
+    views = []
+    for pose in (pose_a, pose_b):
+        depth = depth_m(image_from_depth.inverse() @ pose)
+        views.append(PosedView(DISTORTED, pose, DepthView(CAMERA, depth, image_from_depth)))
+    a, b = views
+    px_a = np.random.default_rng(2).uniform((60, 60), (340, 240), (150, 2))
+    rays = bearing_rays(DISTORTED, px_a)
+    # the wall before both cameras is the plane z = 6 of the room
+    in_room = pose_a.inverse()
+    origin, along = (
+        in_room.center() * 0 + np.array(in_room.translation),
+        rays @ in_room.rotation_matrix().T,
+    )
+    points = origin + along * ((6.0 - origin[2]) / along[:, 2])[:, None]
+    on_wall = points[:, 0] < 1.5
+    expected = project(DISTORTED, pose_b, points)
+    there, _, visible = reproject(px_a, a, b)
+    assert (on_wall & visible).sum() > 60
+    np.testing.assert_allclose(there[on_wall & visible], expected[on_wall & visible], atol=0.05)
+
+
+def test_a_homography_is_a_plane() -> None:
+    """The wall of the corner, once by its depth and once by the homography between its images."""
+    a, b = corner_view(pose_at((-2.5, 0, 0), -8, 2)), corner_view(pose_at((-2.0, 0.2, 0.3), -6, 0))
+    grid = np.stack(np.meshgrid(np.arange(20.5, 380, 20), np.arange(20.5, 280, 20)), -1).reshape(
+        -1, 2
+    )
+    there, _, visible = reproject(grid, a, b)
+    grid, there = grid[visible], there[visible]
+    rows = np.zeros((2 * len(grid), 9))
+    ones = np.column_stack([grid, np.ones(len(grid))])
+    rows[::2, :3], rows[::2, 6:] = ones, -there[:, :1] * ones
+    rows[1::2, 3:6], rows[1::2, 6:] = ones, -there[:, 1:] * ones
+    b_from_a = np.linalg.svd(rows)[2][-1].reshape(3, 3)
+    b_from_a /= b_from_a[2, 2]
+    rng = np.random.default_rng(3)
+    px_b = np.concatenate([there + rng.normal(0, 2.5, there.shape), rng.uniform(0, 300, (40, 2))])
+    by_depth = labels_of_views(grid, px_b, a, b)
+    by_plane = labels_of_homography(grid, px_b, b_from_a, (400, 300), (400, 300))
+    np.testing.assert_array_equal(by_depth.partner_a, by_plane.partner_a)
+    assert len(by_plane.matches()) > 50 and (by_plane.partner_a == IGNORED).any()
+
+
+def test_no_keypoints_no_labels() -> None:
+    view = corner_view(pose_at((0, 0, 0), 0, 0))
+    none, some = np.zeros((0, 2)), np.array([[10.0, 10.0]])
+    for px_a, px_b in ((none, some), (some, none), (none, none)):
+        labels = labels_of_views(px_a, px_b, view, view)
+        assert labels.partner_a.tolist() == [IGNORED] * len(px_a)
+        assert len(labels.matches()) == 0
+
+
+def test_overlap_is_of_the_view_that_shows_more() -> None:
+    near, far = corner_view(pose_at((-2, 0, 2.5), 0, 0)), corner_view(pose_at((-2, 0, 0), 0, 0))
+    assert overlap(near, near) == 1.0
+    assert overlap(near, far) == overlap(far, near)
+    # all of the near one stands in the far one, of which it shows (3.5 / 6)^2
+    assert overlap(near, far) == pytest.approx((3.5 / 6) ** 2, abs=0.04)
+    away = corner_view(pose_at((-2, 0, 0), 120, 0))
+    assert overlap(far, away) == 0.0
+
+
+def test_options_are_ordered() -> None:
+    with pytest.raises(ValueError, match="smaller than positive_px"):
+        LabelOptions(positive_px=6.0)

@@ -1,0 +1,121 @@
+"""Pairs of a rendered kapture and of photographs, and what there is to train on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from corner import depth_m, pose_at, render, write_kapture
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.images import write_image
+from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.training.pairs import PairOptions, Photographs, PosedPairs, sha256_of_files
+
+STEPS = np.arange(5)
+POSES = {f"{k}.png": pose_at((-2.4 + 0.8 * k, 0, 0), 24.0 - 12.0 * k, 0) for k in STEPS}
+SMALL = PairOptions(max_size_px=200)
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("walk")
+    write_kapture(root, POSES, with_poses=True, with_depth=True)
+    return root
+
+
+def test_pairs_overlap_as_asked_for(walk: Path) -> None:
+    source = PosedPairs(KaptureFolder(walk), SMALL)
+    assert source.counts()["images"] == 5 and source.counts()["pairs"] > 4
+    baselines = {}
+    for low, high in ((0.3, 0.5), (0.5, 0.7)):
+        options = SMALL.model_copy(update={"overlap_bins": (low, high)})
+        narrow = PosedPairs(KaptureFolder(walk), options)
+        moved = []
+        for seed in range(8):
+            b_from_a = narrow.draw(np.random.default_rng(seed)).b_from_a
+            assert b_from_a is not None
+            moved.append(np.linalg.norm(b_from_a.center()))
+        baselines[low] = np.mean(moved)
+    assert baselines[0.3] > baselines[0.5] + 0.4
+
+
+def test_a_pair_is_its_images_reduced_and_its_geometry(walk: Path) -> None:
+    source = PosedPairs(KaptureFolder(walk), SMALL)
+    pair, again = (source.draw(np.random.default_rng(3)) for _ in range(2))
+    assert pair.keys == again.keys and pair.keys is not None and pair.views is not None
+    names = [Path(key).name for key in pair.keys]
+    assert names[0] != names[1]
+    for name, image, view in zip(names, pair.images, pair.views, strict=True):
+        assert image.shape == (150, 200, 3)
+        assert (view.camera.width, view.camera.height) == (200, 150)
+        assert view.camera.params[0] == pytest.approx(150.0)
+        whole = render(POSES[name]).astype(np.float64)
+        halved = whole.reshape(150, 2, 200, 2, 3).mean(axis=(1, 3))
+        assert np.abs(image - halved).max() <= 1
+        np.testing.assert_array_equal(view.depth.depth_m, depth_m(POSES[name]))
+    # a point of the wall is where both cameras see it
+    a, b = (POSES[name] for name in names)
+    point = np.array([[-1.5, 0.3, 6.0]])
+    px = []
+    for pose in (a, b):
+        x, y, z = pose.apply(point)[0]
+        px.append(np.array([[150 * x / z + 100, 151 * y / z + 75]]))
+    assert pair.label(px[0], px[1]).partner_a.tolist() == [0]
+    assert pair.label(px[0], px[1] + 10).partner_a.tolist() == [-1]
+    assert {tuple(source.draw(np.random.default_rng(k)).keys or ()) for k in range(30)} >= {
+        pair.keys,
+        (pair.keys[1], pair.keys[0]),
+    }
+
+
+def test_what_cannot_be_trained_on_is_said(walk: Path, tmp_path: Path) -> None:
+    write_kapture(tmp_path / "flat", POSES, with_poses=True)
+    with pytest.raises(DataError, match=r"flat: no two images have a pose and a depth map"):
+        PosedPairs(KaptureFolder(tmp_path / "flat"), SMALL)
+    apart = SMALL.model_copy(update={"overlap_bins": (0.98, 0.99)})
+    with pytest.raises(
+        DataError, match=r"no pair of images overlaps by 0\.98 to 0\.99; the 10 that"
+    ):
+        PosedPairs(KaptureFolder(walk), apart)
+    with pytest.raises(DataError, match="no such folder"):
+        Photographs(tmp_path / "nowhere", SMALL)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(DataError, match="no image"):
+        Photographs(tmp_path / "empty", SMALL)
+    with pytest.raises(ValueError, match="each larger than the one before"):
+        PairOptions(overlap_bins=(0.5, 0.3))
+
+
+def test_views_of_one_photograph(tmp_path: Path) -> None:
+    write_image(tmp_path / "sub" / "photo.jpg", render(POSES["2.png"]))
+    (tmp_path / "notes.txt").write_text("no image")
+    source = Photographs(tmp_path, SMALL)
+    assert source.counts() == {"images": 1}
+    pair, again = (source.draw(np.random.default_rng(0)) for _ in range(2))
+    assert pair.images[0].shape == (150, 200, 3) and pair.keys is None and pair.views is None
+    assert pair.images[0].tobytes() == again.images[0].tobytes() != pair.images[1].tobytes()
+    grid = np.stack(np.meshgrid(np.arange(0.5, 200, 4), np.arange(0.5, 150, 4)), -1).reshape(-1, 2)
+    matches = pair.label(grid, grid).matches()
+    assert len(matches) > 50
+    # partners of a grid under a homography are near one, fitted to them
+    a, b = (np.column_stack([grid[rows], np.ones(len(rows))]) for rows in matches.T)
+    rows = np.zeros((2 * len(a), 9))
+    rows[::2, :3], rows[::2, 6:] = a, -b[:, :1] * a
+    rows[1::2, 3:6], rows[1::2, 6:] = a, -b[:, 1:2] * a
+    fitted = np.linalg.svd(rows)[2][-1].reshape(3, 3)
+    there = a @ fitted.T
+    assert np.linalg.norm(there[:, :2] / there[:, 2:] - b[:, :2], axis=1).mean() < 3
+
+
+def test_a_checksum_of_names_and_contents(tmp_path: Path) -> None:
+    for name, content in (("a.jpg", "1"), ("b.jpg", "2")):
+        (tmp_path / name).write_text(content)
+    paths = [tmp_path / "a.jpg", tmp_path / "b.jpg"]
+    first = sha256_of_files(tmp_path, paths)
+    assert len(first) == 64 and sha256_of_files(tmp_path, paths[:1]) != first
+    (tmp_path / "b.jpg").write_text("3")
+    assert sha256_of_files(tmp_path, paths) != first
+    (tmp_path / "b.jpg").write_text("2")
+    assert sha256_of_files(tmp_path, paths) == first
