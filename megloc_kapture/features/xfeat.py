@@ -18,6 +18,7 @@ from megloc_kapture.nets.xfeat import (
     DESCRIPTOR_SIZE,
     STRIDE,
     XFeatNetwork,
+    descriptors_at,
     keypoint_scores,
     load_xfeat,
     sample_at_pixels,
@@ -29,13 +30,19 @@ class XFeatOptions(NetworkOptions, BoundedOptions):
     """Options of XFeat."""
 
     weights: str = Field(default="xfeat", description="name in the registry, or a file")
+    descriptor_weights: str | None = Field(
+        default=None, description="file of another XFeat network, whose descriptors are taken"
+    )
     max_keypoints: int = Field(default=1500, gt=0, description="best kept; the authors keep 4096")
     threshold: float = Field(default=0.05, ge=0, lt=1, description="probability of a keypoint")
     nms_radius_px: int = Field(default=2, ge=0, description="2: a window of 5 by 5 pixels")
 
 
 class XFeat:
-    """The extractor ``xfeat``: keypoints (N, 3) = x, y, score; descriptors float32 (N, 64)."""
+    """The extractor ``xfeat``: keypoints (N, 3) = x, y, score; descriptors float32 (N, 64).
+
+    With other descriptors than its own it is another type of features, named after their file.
+    """
 
     name = "xfeat"
     descriptor_size = DESCRIPTOR_SIZE
@@ -46,10 +53,16 @@ class XFeat:
     def __init__(self, options: XFeatOptions | None = None) -> None:
         self.options = options or XFeatOptions()
         self._file = find_weights(self.options.weights)
+        self._descriptor_file: WeightsFile | None = None
+        if self.options.descriptor_weights is not None:
+            self._descriptor_file = find_weights(self.options.descriptor_weights)
+            # descriptors of different networks do not match
+            self.name = f"xfeat-{self._descriptor_file.path.stem}"
 
     def weights(self) -> dict[str, str]:
-        """sha256 of the checkpoint by its file name."""
-        return {self._file.path.name: sha256_of(self._file)}
+        """sha256 of each checkpoint by its file name."""
+        files = [file for file in (self._file, self._descriptor_file) if file is not None]
+        return {file.path.name: sha256_of(file) for file in files}
 
     def extract(
         self, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
@@ -69,7 +82,7 @@ class XFeat:
         network = _network(self._file, device)
         height, width = image.shape[:2]
         with inference(device, options.half_precision):
-            resized = _resized(image_tensor(image, device))
+            resized = network_image(image, device)
             size = resized.shape[-2], resized.shape[-1]
             features, logits, reliability = network(resized)
             peaks = keypoint_scores(logits)
@@ -88,11 +101,10 @@ class XFeat:
                 mask=mask,
                 max_keypoints=options.max_keypoints,
             )
-            normalised = functional.normalize(features.float(), dim=1)
+            if self._descriptor_file is not None:
+                features = _network(self._descriptor_file, device)(resized)[0]
             chosen = pixels[torch.from_numpy(rows).to(device)]
-            descriptors = functional.normalize(
-                sample_at_pixels(normalised, chosen, size, mode="bicubic"), dim=1
-            )
+            descriptors = descriptors_at(features, chosen, size)
         return LocalFeatures(
             np.column_stack([xy_px[rows], scores[rows]]),
             scores[rows],
@@ -108,9 +120,10 @@ def _network(file: WeightsFile, device: torch.device) -> XFeatNetwork:
     return network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
 
 
-def _resized(image: torch.Tensor) -> torch.Tensor:
-    """An image (1, 3, H, W) with both sides floored to multiples of 32, at least 32."""
-    size = [max(STRIDE, side // STRIDE * STRIDE) for side in image.shape[-2:]]
-    if size == list(image.shape[-2:]):
-        return image
-    return functional.interpolate(image, size, mode="bilinear", align_corners=False)
+def network_image(image: NDArray[np.uint8], device: torch.device) -> torch.Tensor:
+    """An RGB image as the network takes it, (1, 3, h, w): sides floored to multiples of 32."""
+    tensor = image_tensor(image, device)
+    size = [max(STRIDE, side // STRIDE * STRIDE) for side in tensor.shape[-2:]]
+    if size == list(tensor.shape[-2:]):
+        return tensor
+    return functional.interpolate(tensor, size, mode="bilinear", align_corners=False)

@@ -79,8 +79,10 @@ class SuperGlue:
             (np.zeros((0, 2), np.int64), np.zeros(0, np.float32)) for _ in others
         ]
         with inference(device, options.half_precision):
-            side = self._keypoints(a, net, device)
-            sides = [self._keypoints(b, net, device) for b in others]
+            side, *sides = (
+                network_input(image, net.descriptor_size, self._weights.name, device)
+                for image in (a, *others)
+            )
             usable = [k for k, b in enumerate(sides) if len(side.scores) and len(b.scores)]
             at_once = _PAIRS_AT_ONCE[device.type]
             for start in range(0, len(usable), at_once):
@@ -91,35 +93,44 @@ class SuperGlue:
                     found[k] = matches.cpu().numpy(), scores.cpu().numpy()
         return found
 
-    def _keypoints(
-        self, image: ImageFeatures, net: SuperGlueNet, device: torch.device
-    ) -> ImageKeypoints:
-        table = np.asarray(image.keypoints_px, dtype=np.float32)
-        descriptors = np.asarray(image.descriptors, dtype=np.float32)
-        if table.ndim != 2 or table.shape[1] < 3:
-            raise DataError(
-                f"SuperGlue takes keypoints of x, y, score; these have the shape {table.shape}"
-            )
-        scores = table[:, 2]
-        if not ((scores > 0) & (scores <= 1)).all():
-            worst = scores[~((scores > 0) & (scores <= 1))][0]
-            raise DataError(
-                "SuperGlue takes the detector's score as third column of the keypoints, above 0 "
-                f"and up to 1; this one has {worst:g}"
-            )
-        if len(table) and descriptors.shape != (len(table), net.descriptor_size):
-            raise DataError(
-                f"{self._weights.name} takes descriptors of {net.descriptor_size} dimensions, one "
-                f"for each of {len(table)} keypoints; these have the shape {descriptors.shape}"
-            )
-        xy = torch.from_numpy(table[:, :2] - np.float32(0.5)).to(
-            device
-        )  # its first pixel is (0, 0)
-        return ImageKeypoints(
-            normalise_keypoints(xy, image.width, image.height),
-            torch.from_numpy(scores.copy()).to(device),
-            torch.from_numpy(np.array(descriptors, order="C")).to(device),
+
+def network_input(
+    image: ImageFeatures, descriptor_size: int, where: str, device: torch.device
+) -> ImageKeypoints:
+    """Keypoints of an image as the network takes them.
+
+    Parameters
+    ----------
+    where : the weights, for messages.
+
+    Raises
+    ------
+    DataError : keypoints without scores in (0, 1], or descriptors of another size.
+    """
+    table = np.asarray(image.keypoints_px, dtype=np.float32)
+    descriptors = np.asarray(image.descriptors, dtype=np.float32)
+    if table.ndim != 2 or table.shape[1] < 3:
+        raise DataError(
+            f"SuperGlue takes keypoints of x, y, score; these have the shape {table.shape}"
         )
+    scores = table[:, 2]
+    if not ((scores > 0) & (scores <= 1)).all():
+        worst = scores[~((scores > 0) & (scores <= 1))][0]
+        raise DataError(
+            "SuperGlue takes the detector's score as third column of the keypoints, above 0 "
+            f"and up to 1; this one has {worst:g}"
+        )
+    if len(table) and descriptors.shape != (len(table), descriptor_size):
+        raise DataError(
+            f"{where} takes descriptors of {descriptor_size} dimensions, one "
+            f"for each of {len(table)} keypoints; these have the shape {descriptors.shape}"
+        )
+    xy = torch.from_numpy(table[:, :2] - np.float32(0.5)).to(device)  # its first pixel is (0, 0)
+    return ImageKeypoints(
+        normalise_keypoints(xy, image.width, image.height),
+        torch.from_numpy(scores.copy()).to(device),
+        torch.from_numpy(np.array(descriptors, order="C")).to(device),
+    )
 
 
 @lru_cache(maxsize=2)

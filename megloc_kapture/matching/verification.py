@@ -256,7 +256,7 @@ def two_view_of_variants(
             return found
         sets = [pairs, *((one.keypoints_px, other_px[one.other_rows]) for one in found)]
         richest = max(range(len(sets)), key=lambda at: len(sets[at][0]))  # of equals the first
-        other_from_image = _relative_pose(
+        other_from_image = relative_pose(
             bearing_rays(camera, sets[richest][0][:, :2]),
             bearing_rays(other_camera, sets[richest][1][:, :2]),
             0.5 * (focal + other_focal),
@@ -311,13 +311,23 @@ def known_pose_of_variants(
     return PairVerifier(verify)
 
 
-def _relative_pose(
+def relative_pose(
     rays: NDArray[np.float64],
     other_rays: NDArray[np.float64],
     focal: float,
     options: TwoViewOptions,
 ) -> RigidTransform | None:
-    """``other_from_image`` of verified matches, None where there is no model."""
+    """``other_from_image`` of matched rays, with a translation of length 1, by RANSAC.
+
+    Parameters
+    ----------
+    rays, other_rays : float64 (N, 3), homogeneous, last component 1.
+    focal : pixels, at which an error counts.
+
+    Returns
+    -------
+    None where no model has ``min_matches`` inliers.
+    """
     import poselib
 
     if len(rays) < options.min_matches:

@@ -18,7 +18,7 @@ product overflows, and what is left out of a sum is less than 1e-7 of it.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -82,6 +82,15 @@ class SuperGlueNet(nn.Module):
         -------
         For each pair of N and M keypoints float32 (N + 1, M + 1), the dustbins last.
         """
+        return self.assignments(pairs, iterations, [len(self.gnn.layers)])[0]
+
+    def assignments(
+        self,
+        pairs: Sequence[tuple[ImageKeypoints, ImageKeypoints]],
+        iterations: int,
+        after: Collection[int],
+    ) -> list[list[torch.Tensor]]:
+        """As :meth:`forward`, after each of several numbers of layers, ascending."""
         images = [image for pair in pairs for image in pair]
         lengths = [len(image.scores) for image in images]
         device = self.bin_score.device.type
@@ -90,9 +99,17 @@ class SuperGlueNet(nn.Module):
             scores = torch.cat([image.scores for image in images])
             located = torch.column_stack([torch.cat([image.xy for image in images]), scores])
             tokens = torch.cat([image.descriptors for image in images]) + self.kenc.encoder(located)
-        for index, layer in enumerate(self.gnn.layers):
-            tokens = tokens + layer(tokens, lengths, cross=index % 2 == 1)
-        with torch.autocast(device, enabled=False):
+        found = [self._assigned(tokens, lengths, iterations)] if 0 in after else []
+        for number, layer in enumerate(self.gnn.layers, start=1):
+            tokens = tokens + layer(tokens, lengths, cross=number % 2 == 0)
+            if number in after:
+                found.append(self._assigned(tokens, lengths, iterations))
+        return found
+
+    def _assigned(
+        self, tokens: torch.Tensor, lengths: list[int], iterations: int
+    ) -> list[torch.Tensor]:
+        with torch.autocast(tokens.device.type, enabled=False):
             sides = torch.split(self.final_proj(tokens), lengths)
             products = [
                 a @ b.T / self.descriptor_size**0.5

@@ -144,5 +144,11 @@ def sample_at_pixels(
     return found[0, :, 0].T
 
 
+def descriptors_at(features: torch.Tensor, xy: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
+    """Descriptors (N, 64) of unit length at pixels; see :func:`sample_at_pixels`."""
+    normalised = functional.normalize(features.float(), dim=1)
+    return functional.normalize(sample_at_pixels(normalised, xy, size, mode="bicubic"), dim=1)
+
+
 def _enlarged(values: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
     return functional.interpolate(values, like.shape[-2:], mode="bilinear", align_corners=False)

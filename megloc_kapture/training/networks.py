@@ -1,0 +1,252 @@
+"""What is trained: SuperGlue on frozen features, or a descriptor network under a frozen detector.
+
+The split is MegLoc's (section on local features): the detector is frozen, a second network of the
+same kind describes its keypoints, and the gradient comes through SuperGlue, which is trained with
+it, or through the optimal transport of the descriptors' own products.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from megloc_kapture.errors import OptionError
+from megloc_kapture.features.superpoint import SuperPoint, gray_tensor
+from megloc_kapture.features.xfeat import XFeat, network_image
+from megloc_kapture.io.weights import find_weights, read_weights
+from megloc_kapture.matching.superglue import network_input
+from megloc_kapture.nets.runtime import load_strictly
+from megloc_kapture.nets.superglue import (
+    ImageKeypoints,
+    SuperGlueNet,
+    log_optimal_transport,
+    mutual_matches,
+)
+from megloc_kapture.nets.superpoint import SuperPointNet, sample_descriptors
+from megloc_kapture.nets.xfeat import descriptors_at, load_xfeat
+from megloc_kapture.plugins import LocalFeatureExtractor
+from megloc_kapture.training.labels import Labels
+from megloc_kapture.training.loss import transport_loss
+from megloc_kapture.training.pairs import TrainingPair
+from megloc_kapture.values import ImageFeatures
+
+_FEATURES_KEPT = 1024  # images
+_FIRST_SCALE = 10.0  # of products of descriptors; SuperGlue's final projection learns its own
+_FIRST_DUSTBIN = 0.7  # cosine at which a product is as good as nothing
+_CONFIDENT = 0.2  # the matcher's own threshold
+
+Image = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedPair:
+    """A pair with its frozen features and their labels."""
+
+    pair: TrainingPair
+    features: tuple[ImageFeatures, ImageFeatures]
+    labels: Labels
+
+    @property
+    def usable(self) -> bool:
+        """Whether there are keypoints in both images."""
+        return all(len(one.keypoints_px) > 0 for one in self.features)
+
+
+class FrozenFeatures:
+    """Features of an extractor, the best of each image; those of images that come again are kept.
+
+    Parameters
+    ----------
+    extractor : its keypoints carry a score as third column.
+    max_keypoints : best kept of each image.
+    """
+
+    def __init__(self, extractor: LocalFeatureExtractor, max_keypoints: int) -> None:
+        self.extractor, self._max_keypoints = extractor, max_keypoints
+        self._kept: dict[str, ImageFeatures] = {}
+
+    def prepare(self, pair: TrainingPair) -> PreparedPair:
+        """Features and labels of a pair; raises DataError."""
+        keys = pair.keys or (None, None)
+        a, b = (self._of(image, key) for image, key in zip(pair.images, keys, strict=True))
+        labels = pair.label(a.keypoints_px[:, :2], b.keypoints_px[:, :2])
+        return PreparedPair(pair, (a, b), labels)
+
+    def _of(self, image: Image, key: str | None) -> ImageFeatures:
+        if key is not None and key in self._kept:
+            return self._kept[key]
+        found, best = self.extractor.extract(image), slice(self._max_keypoints)
+        height, width = image.shape[:2]
+        features = ImageFeatures(found.keypoints_px[best], found.descriptors[best], width, height)
+        if key is not None and len(self._kept) < _FEATURES_KEPT:
+            self._kept[key] = features
+        return features
+
+
+class SuperPointDescriber(nn.Module):
+    """SuperPoint's backbone and descriptor head; its file is an option ``descriptor_weights``.
+
+    Raises
+    ------
+    DataError : the extractor's weights do not fit.
+    """
+
+    descriptor_size = SuperPoint.descriptor_size
+
+    def __init__(self, extractor: SuperPoint) -> None:
+        super().__init__()
+        self.options = options = extractor.options
+        tensors = read_weights(find_weights(options.weights))
+        if options.descriptor_weights is not None:
+            tensors |= read_weights(find_weights(options.descriptor_weights))
+        self.net = SuperPointNet(detector=False)
+        described = {key: value for key, value in tensors.items() if not key.startswith("convP")}
+        load_strictly(self.net, described, options.weights)
+
+    def forward(self, image: Image, xy_px: torch.Tensor) -> torch.Tensor:
+        dense = self.net.describe(self.net.encode(gray_tensor(image, xy_px.device)))
+        return sample_descriptors(dense[0], xy_px - 0.5, self.options.descriptor_sampling)
+
+
+class XFeatDescriber(nn.Module):
+    """XFeat's backbone; its file, which has all of XFeat's keys, is an option
+    ``descriptor_weights``.
+
+    Its normalisation keeps the statistics it has: pairs of one step are few.
+    """
+
+    descriptor_size = XFeat.descriptor_size
+
+    def __init__(self, extractor: XFeat) -> None:
+        super().__init__()
+        name = extractor.options.descriptor_weights or extractor.options.weights
+        self.net = load_xfeat(read_weights(find_weights(name)), name)
+        for head in (self.net.heatmap_head, self.net.keypoint_head):
+            head.requires_grad_(False)
+
+    def train(self, mode: bool = True) -> XFeatDescriber:
+        super().train(False)
+        return self
+
+    def forward(self, image: Image, xy_px: torch.Tensor) -> torch.Tensor:
+        tensor = network_image(image, xy_px.device)
+        size = tensor.shape[-2], tensor.shape[-1]
+        ratio = xy_px.new_tensor([size[1] / image.shape[1], size[0] / image.shape[0]])
+        return descriptors_at(self.net(tensor)[0], xy_px * ratio - 0.5, size)
+
+
+def describer_of(extractor: LocalFeatureExtractor) -> SuperPointDescriber | XFeatDescriber:
+    """The descriptor network of an extractor, as it begins; raises OptionError, DataError."""
+    if isinstance(extractor, SuperPoint):
+        return SuperPointDescriber(extractor)
+    if isinstance(extractor, XFeat):
+        return XFeatDescriber(extractor)
+    raise OptionError(
+        f"descriptors of superpoint and xfeat can be trained, not those of {extractor.name}"
+    )
+
+
+class ProductHead(nn.Module):
+    """Matching by the descriptors' products alone, as nearest neighbours do.
+
+    Their optimal transport with a scale and a dustbin that are learned, and not used afterwards.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.scale = nn.Parameter(torch.tensor(_FIRST_SCALE))
+        self.dustbin = nn.Parameter(torch.tensor(_FIRST_DUSTBIN))
+
+    def forward(
+        self, pairs: Sequence[tuple[ImageKeypoints, ImageKeypoints]], iterations: int
+    ) -> list[torch.Tensor]:
+        """As :class:`SuperGlueNet`."""
+        cosines = (a.descriptors.float() @ b.descriptors.float().T for a, b in pairs)
+        products = [self.scale * cosine for cosine in cosines]
+        return log_optimal_transport(products, self.scale * self.dustbin, iterations)
+
+
+def encoder_sizes(descriptor_size: int) -> tuple[int, ...]:
+    """Of SuperGlue's keypoint encoder, in the proportions of the official network.
+
+    Raises
+    ------
+    OptionError : the size is not one that four heads share.
+    """
+    if descriptor_size % 8:
+        raise OptionError(
+            f"SuperGlue takes descriptors of a multiple of 8 dimensions, not {descriptor_size}"
+        )
+    return tuple(descriptor_size // part for part in (8, 4, 2, 1, 1))
+
+
+class PairModel(nn.Module):
+    """A matcher, and what describes the keypoints, as one module that is trained.
+
+    Parameters
+    ----------
+    head : the matcher.
+    describer : None: the frozen features' own descriptors.
+    iterations : of the optimal transport.
+    deep_supervision : the loss is the mean over the head's cross-attention layers.
+    """
+
+    def __init__(
+        self,
+        head: SuperGlueNet | ProductHead,
+        describer: SuperPointDescriber | XFeatDescriber | None,
+        *,
+        iterations: int,
+        deep_supervision: bool = False,
+    ) -> None:
+        super().__init__()
+        self.head, self.describer = head, describer
+        self._iterations, self._after = iterations, [0]
+        if isinstance(head, SuperGlueNet):
+            layers = len(head.gnn.layers)
+            self._after = list(range(2, layers, 2)) if deep_supervision else []
+            self._after.append(layers)
+
+    def forward(self, pairs: Sequence[PreparedPair]) -> torch.Tensor:
+        """Mean loss (); 0 where no pair has keypoints in both images."""
+        usable = [one for one in pairs if one.usable]
+        losses = [
+            transport_loss(assignment, one.labels)
+            for depth in self._assignments(usable)
+            for one, assignment in zip(usable, depth, strict=True)
+        ]
+        if not losses:
+            return 0.0 * next(self.head.parameters()).sum()
+        return torch.stack(losses).sum() / (len(self._after) * len(pairs))
+
+    @torch.no_grad()
+    def match(self, pair: PreparedPair) -> tuple[NDArray[np.int64], float]:
+        """Matches (K, 2) and the loss of a pair; by products mutual nearest neighbours."""
+        if not pair.usable:
+            return np.zeros((0, 2), np.int64), 0.0
+        assignment = self._assignments([pair])[-1][0]
+        threshold = _CONFIDENT if isinstance(self.head, SuperGlueNet) else 0.0
+        matches, _ = mutual_matches(assignment, threshold)
+        return matches.cpu().numpy(), float(transport_loss(assignment, pair.labels))
+
+    def _assignments(self, pairs: Sequence[PreparedPair]) -> list[list[torch.Tensor]]:
+        sides = [(self._side(one, 0), self._side(one, 1)) for one in pairs]
+        if not sides:
+            return []
+        if isinstance(self.head, SuperGlueNet):
+            return self.head.assignments(sides, self._iterations, self._after)
+        return [self.head(sides, self._iterations)]
+
+    def _side(self, prepared: PreparedPair, side: int) -> ImageKeypoints:
+        features = prepared.features[side]
+        device = next(self.head.parameters()).device
+        found = network_input(features, features.descriptors.shape[1], "SuperGlue", device)
+        if self.describer is None:
+            return found
+        xy_px = torch.from_numpy(features.keypoints_px[:, :2].copy()).to(device)
+        return replace(found, descriptors=self.describer(prepared.pair.images[side], xy_px))

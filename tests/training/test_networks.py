@@ -1,0 +1,203 @@
+"""The networks in training: what they describe is what the extractors extract."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from safetensors.torch import save_file
+from torch import nn
+
+from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.features.rootsift import RootSift
+from megloc_kapture.features.superpoint import SuperPoint, SuperPointOptions
+from megloc_kapture.features.xfeat import XFeat, XFeatOptions
+from megloc_kapture.nets.superglue import ImageKeypoints, SuperGlueNet
+from megloc_kapture.nets.superpoint import SuperPointNet
+from megloc_kapture.nets.xfeat import XFeatNetwork
+from megloc_kapture.training.labels import Labels
+from megloc_kapture.training.networks import (
+    FrozenFeatures,
+    PairModel,
+    ProductHead,
+    XFeatDescriber,
+    describer_of,
+    encoder_sizes,
+)
+from megloc_kapture.training.pairs import TrainingPair
+
+NOTHING = Labels(np.zeros(0, np.int64), np.zeros(0, np.int64))
+
+
+def texture(height: int, width: int, seed: int = 0) -> NDArray[np.uint8]:
+    noise = np.random.default_rng(seed).uniform(0, 255, (height, width, 3)).astype(np.float32)
+    return cv2.normalize(
+        cv2.GaussianBlur(noise, (0, 0), 1.5), None, 0, 255, cv2.NORM_MINMAX
+    ).astype(np.uint8)
+
+
+def random_file(path: Path, net: nn.Module, seed: int) -> str:
+    torch.manual_seed(seed)
+    for name, value in net.named_parameters():
+        if name.endswith("weight"):
+            nn.init.kaiming_normal_(value)
+    save_file({key: value.contiguous() for key, value in net.state_dict().items()}, path)
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    folder = tmp_path_factory.mktemp("weights")
+    return {
+        "superpoint": random_file(folder / "superpoint_v1.safetensors", SuperPointNet(), 0),
+        "xfeat": random_file(folder / "xfeat.safetensors", XFeatNetwork(), 1),
+        "other": random_file(folder / "other.safetensors", XFeatNetwork(), 2),
+    }
+
+
+def extractors(files: dict[str, str]) -> list[SuperPoint | XFeat]:
+    return [
+        SuperPoint(SuperPointOptions(weights=files["superpoint"], device="cpu")),
+        XFeat(XFeatOptions(weights=files["xfeat"], device="cpu", threshold=0.0)),
+    ]
+
+
+def test_a_describer_begins_as_its_extractor(files: dict[str, str]) -> None:
+    # no multiple of 32: XFeat resizes it
+    image = texture(116, 150)
+    for extractor in extractors(files):
+        found = extractor.extract(image)
+        assert len(found.scores) > 30
+        xy_px = torch.from_numpy(found.keypoints_px[:, :2].copy())
+        described = describer_of(extractor).train()(image, xy_px)
+        assert described.requires_grad
+        np.testing.assert_allclose(described.detach().numpy(), found.descriptors, atol=2e-5)
+
+
+def test_what_is_trained_is_read_as_descriptor_weights(
+    files: dict[str, str], tmp_path: Path
+) -> None:
+    image = texture(96, 128)
+    for extractor in extractors(files):
+        before = extractor.extract(image)
+        describer = describer_of(extractor)
+        with torch.no_grad():
+            for parameter in describer.parameters():
+                if parameter.requires_grad and parameter.ndim == 4:
+                    parameter += 0.03 * torch.randn_like(parameter)
+        path = tmp_path / f"night_{extractor.name}.safetensors"
+        save_file({k: v.contiguous() for k, v in describer.net.state_dict().items()}, path)
+        options = extractor.options.model_copy(update={"descriptor_weights": str(path)})
+        split = type(extractor)(options)  # type: ignore[arg-type]
+        assert split.name == f"{extractor.name}-{path.stem}" != extractor.name
+        assert path.name in split.weights() and len(split.weights()) == 2
+        after = split.extract(image)
+        # the detector is frozen
+        np.testing.assert_array_equal(after.keypoints_px, before.keypoints_px)
+        xy_px = torch.from_numpy(after.keypoints_px[:, :2].copy())
+        np.testing.assert_allclose(
+            after.descriptors, describer(image, xy_px).detach().numpy(), atol=2e-5
+        )
+        cosine = (after.descriptors * before.descriptors).sum(axis=1)
+        assert cosine.max() < 0.9999
+        # and training goes on from there
+        again = describer_of(split)(image, xy_px).detach().numpy()
+        np.testing.assert_allclose(again, after.descriptors, atol=2e-5)
+
+
+def test_xfeat_keeps_its_statistics(files: dict[str, str]) -> None:
+    describer = describer_of(extractors(files)[1]).train()
+    assert isinstance(describer, XFeatDescriber)
+    before = {key: value.clone() for key, value in describer.net.named_buffers()}
+    describer(texture(96, 128), torch.tensor([[30.0, 40.0]])).sum().backward()
+    for key, value in describer.net.named_buffers():
+        assert torch.equal(value, before[key]), key
+    trained = {name for name, p in describer.net.named_parameters() if p.grad is not None}
+    assert any(name.startswith("block5") for name in trained)
+    assert not any(name.startswith(("heatmap", "keypoint")) for name in trained)
+
+
+def test_frozen_features_are_the_best_and_kept(files: dict[str, str]) -> None:
+    extractor = extractors(files)[0]
+    frozen = FrozenFeatures(extractor, 20)
+    images = texture(96, 128), texture(80, 96, 1)
+    labelled: list[tuple[int, int]] = []
+
+    def label(px_a: NDArray[np.float64], px_b: NDArray[np.float64]) -> Labels:
+        labelled.append((len(px_a), len(px_b)))
+        return NOTHING
+
+    first = frozen.prepare(TrainingPair(images, ("a", "b"), label))
+    assert labelled == [(20, 20)]
+    a, b = first.features
+    assert (a.width, a.height, b.width, b.height) == (128, 96, 96, 80)
+    found = extractor.extract(images[0])
+    np.testing.assert_array_equal(a.keypoints_px, found.keypoints_px[:20])
+    again = frozen.prepare(TrainingPair(images, ("b", "c"), label))
+    assert again.features[0] is b and again.features[1] is not b
+    assert frozen.prepare(TrainingPair(images, None, label)).features[0] is not a
+
+
+def test_products_match_as_nearest_neighbours() -> None:
+    generator = torch.Generator().manual_seed(0)
+    a, b = (
+        ImageKeypoints(
+            torch.zeros(n, 2),
+            torch.ones(n),
+            nn.functional.normalize(torch.randn(n, 16, generator=generator), dim=1),
+        )
+        for n in (30, 25)
+    )
+    log = ProductHead()([(a, b)], 50)[0]
+    assert log.shape == (31, 26)
+    torch.testing.assert_close(log.exp()[:, :-1].sum(0), torch.ones(25))
+    cosine = a.descriptors @ b.descriptors.T
+    rows = torch.arange(30)
+    mutual = cosine.argmax(0)[cosine.argmax(1)] == rows
+    inner = log[:-1, :-1]
+    assert ((inner.argmax(0)[inner.argmax(1)] == rows) & mutual).sum() > 0.7 * mutual.sum() > 5
+
+
+def test_deep_supervision_is_the_mean_over_cross_attention(files: dict[str, str]) -> None:
+    extractor = extractors(files)[0]
+    images = texture(96, 128), texture(96, 128, 1)
+    labels = Labels(np.arange(10), np.arange(10))
+    pair = FrozenFeatures(extractor, 10).prepare(TrainingPair(images, None, lambda a, b: labels))
+    torch.manual_seed(0)
+    head = SuperGlueNet(encoder_sizes(256), num_layers=6).eval()
+    deep = PairModel(head, None, iterations=10, deep_supervision=True).eval()
+    losses = []
+    for layers in (2, 4, 6):
+        shallow = SuperGlueNet(encoder_sizes(256), num_layers=layers).eval()
+        kept = {k: v for k, v in head.state_dict().items() if k in shallow.state_dict()}
+        shallow.load_state_dict(kept)
+        losses.append(PairModel(shallow, None, iterations=10).eval()([pair]))
+    torch.testing.assert_close(deep([pair]), torch.stack(losses).mean())
+    assert deep.match(pair)[1] == pytest.approx(losses[-1].item(), rel=1e-5)
+
+
+def test_a_pair_without_keypoints_costs_nothing(files: dict[str, str]) -> None:
+    blank = np.zeros((64, 64, 3), np.uint8)
+    frozen = FrozenFeatures(
+        SuperPoint(SuperPointOptions(weights=files["superpoint"], device="cpu", threshold=0.9)), 10
+    )
+    pair = frozen.prepare(TrainingPair((blank, blank), None, lambda a, b: NOTHING))
+    model = PairModel(SuperGlueNet(encoder_sizes(256), 2), None, iterations=5)
+    loss = model([pair])
+    loss.backward()
+    assert loss.item() == 0 and len(model.match(pair)[0]) == 0
+
+
+def test_what_cannot_be_trained_is_refused(files: dict[str, str], tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="superpoint and xfeat can be trained, not those of root"):
+        describer_of(RootSift())
+    assert encoder_sizes(256) == (32, 64, 128, 256, 256)
+    with pytest.raises(OptionError, match="multiple of 8 dimensions, not 100"):
+        encoder_sizes(100)
+    options = SuperPointOptions(weights=files["xfeat"], device="cpu")
+    with pytest.raises(DataError, match="does not fit SuperPointNet"):
+        describer_of(SuperPoint(options))
