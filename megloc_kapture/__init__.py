@@ -24,7 +24,16 @@ if sys.platform == "win32":
 
 if TYPE_CHECKING:
     __version__: str
-    from megloc_kapture.api import Map, build_map, extract, match, open_map, run, solve_pose
+    from megloc_kapture.api import (
+        Map,
+        build_map,
+        extract,
+        match,
+        open_map,
+        run,
+        solve_pose,
+        train,
+    )
     from megloc_kapture.evaluation.evaluate import evaluate
     from megloc_kapture.pipeline.export import export
     from megloc_kapture.pipeline.kapture_map import KaptureMap
@@ -58,6 +67,7 @@ __all__ = [
     "open_map",
     "run",
     "solve_pose",
+    "train",
 ]
 
 # loaded when asked for: an error must not cost the import of numpy, a value that of the solvers
@@ -78,6 +88,7 @@ _LAZY = {
     "open_map": "megloc_kapture.api",
     "run": "megloc_kapture.api",
     "solve_pose": "megloc_kapture.api",
+    "train": "megloc_kapture.api",
 }
 
 

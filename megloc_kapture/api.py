@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import DataError, OptionError, suggestion
 from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.report.renderers import REPORT_HTML
 from megloc_kapture.evaluation.report.reports import RECALL_JSON
@@ -37,7 +37,7 @@ from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
 from megloc_kapture.pipeline.localizer import LOCALIZING, Localizer
 from megloc_kapture.pipeline.photographs import Photographs
 from megloc_kapture.pipeline.plan import run_plan
-from megloc_kapture.pipeline.presets import options_of_preset
+from megloc_kapture.pipeline.presets import options_of_preset, options_with
 from megloc_kapture.pipeline.queries import Query
 from megloc_kapture.pipeline.results import Results
 from megloc_kapture.pipeline.run import choose_run
@@ -432,3 +432,52 @@ def solve_pose(
     """
     options = AbsolutePoseOptions(max_error_px=max_error_px, min_inliers=min_inliers, seed=seed)
     return absolute_pose(points_px, np.asarray(points_world, np.float64), camera, options)
+
+
+def train(
+    task: str,
+    output: Path | str,
+    *,
+    kaptures: Sequence[Path | str] = (),
+    photographs: Sequence[Path | str] = (),
+    held_out: Sequence[Path | str] = (),
+    features: str = "superpoint",
+    set: Changes | None = None,
+    licences: Mapping[str, str] | None = None,
+    threads: int = 1,
+    force: bool = False,
+) -> dict[str, float]:
+    """Train SuperGlue or descriptors as ``megloc train`` does; goes on where it was interrupted.
+
+    Parameters
+    ----------
+    task : "matcher" or "descriptor".
+    output : the file to write, ``X.safetensors``; others beside it, see
+        :func:`megloc_kapture.training.train.train`.
+    kaptures, held_out : kapture folders with poses and depth, to train on and to evaluate on.
+    photographs : folders of images, trained on under random homographies.
+    features : the extractor whose features are matched, or whose detector is frozen.
+    set : options, ``{"steps": 20000}``.
+    licences : of the folders, by their paths as they are given; for the manifest.
+
+    Returns
+    -------
+    The last row of the curves by column.
+
+    Raises
+    ------
+    MeglocError : options, data, weights or the output cannot be used.
+    """
+    from megloc_kapture.training.train import TASKS, TrainingData
+    from megloc_kapture.training.train import train as run_training
+
+    if task not in TASKS:
+        raise OptionError(f"unknown task {task!r}; {suggestion(task, TASKS)}")
+    options = options_with(TASKS[task], set or {}, {"features.name": features})
+    data = TrainingData(
+        [KaptureFolder(path) for path in kaptures],
+        [Path(path) for path in photographs],
+        [KaptureFolder(path) for path in held_out],
+        {Path(path): licence for path, licence in (licences or {}).items()},
+    )
+    return run_training(options, data, Path(output), force=force, threads=threads)

@@ -111,6 +111,11 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "Write a page that shows a map in 3D, and the queries of a result in it; it needs no "
         "network.",
     ),
+    "train": (
+        "train:Train",
+        "Train SuperGlue, or a detector's descriptors, on kapture folders with depth and on "
+        "photographs.",
+    ),
     "weights": (
         "weights:WeightsCommand",
         "List, fetch, add, convert and check the weights of networks.",

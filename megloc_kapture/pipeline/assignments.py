@@ -6,12 +6,11 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 from megloc_kapture.errors import OptionError
-from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.values import Options
 
 
 def check_assigned(
-    options: PipelineOptions,
+    options: Options,
     assigned: Mapping[str, Any],
     *,
     used: Collection[str] | None = None,

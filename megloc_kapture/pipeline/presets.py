@@ -6,7 +6,7 @@ import re
 import tomllib
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
@@ -23,6 +23,8 @@ from megloc_kapture.stages.options import LocalFeaturesChoice, PipelineOptions
 from megloc_kapture.stages.preprocessing import PreprocessingOptions
 from megloc_kapture.stages.reranking import RerankingOptions
 from megloc_kapture.values import Options
+
+OptionsT = TypeVar("OptionsT", bound=Options)
 
 # every step of the paper that needs nothing of the dataset; what hangs on it (masks, co-visibility,
 # sequences, weights for rooms) stands in benchmarks/*.toml, and docs/paper.md has all of them
@@ -102,16 +104,40 @@ def options_of_preset(
         _merge(tree, change)
     typed = assigned(assignments)
     _merge(tree, typed)
+    options = _validated(PipelineOptions, tree)
+    check_assigned(options, typed, used=used)
+    return options
+
+
+def options_with(
+    model: type[OptionsT],
+    assignments: Sequence[str] | Mapping[str, Any],
+    changes: Mapping[str, Any] | None = None,
+) -> OptionsT:
+    """A model's defaults with changes by ``key.key``, then with what a user typed.
+
+    Raises
+    ------
+    OptionError : see :func:`options_of_preset`.
+    """
+    tree = model().model_dump()
+    typed = assigned(assignments)
+    _merge(tree, assigned(changes or {}))
+    _merge(tree, typed)
+    options = _validated(model, tree)
+    check_assigned(options, typed)
+    return options
+
+
+def _validated(model: type[OptionsT], tree: Mapping[str, Any]) -> OptionsT:
     try:
-        options = PipelineOptions.model_validate(tree)
+        return model.model_validate(tree)
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
-            raise OptionError(f"unknown option {where}; {_known(where)}") from error
+            raise OptionError(f"unknown option {where}; {_known(where, model)}") from error
         raise OptionError(f"option {where}: {first['msg']}") from error
-    check_assigned(options, typed, used=used)
-    return options
 
 
 def assigned(assignments: Sequence[str] | Mapping[str, Any]) -> dict[str, Any]:
@@ -141,9 +167,9 @@ def _typed(assignments: Sequence[str] | Mapping[str, Any]) -> Iterator[tuple[str
         yield key.strip(), _value(text.strip())
 
 
-def _known(path: str) -> str:
+def _known(path: str, root: type[Options]) -> str:
     """A like option to one that does not exist, and those beside it."""
-    model: Any = PipelineOptions
+    model: Any = root
     *parents, name = path.split(".")
     for part in parents:
         annotation = model.model_fields[part].annotation if part in model.model_fields else None
@@ -151,7 +177,7 @@ def _known(path: str) -> str:
             break
         model = annotation
     known = sorted(model.model_fields)
-    elsewhere = [one.key for one in options_of(PipelineOptions()) if one.key.endswith(f".{name}")]
+    elsewhere = [one.key for one in options_of(root()) if one.key.endswith(f".{name}")]
     if elsewhere:
         return f"did you mean {' or '.join(elsewhere)}? known here: {', '.join(known)}"
     return suggestion(name, known, listed="known here: ")

@@ -17,8 +17,6 @@ from megloc_kapture.features.rootsift import RootSift
 from megloc_kapture.features.superpoint import SuperPoint, SuperPointOptions
 from megloc_kapture.features.xfeat import XFeat, XFeatOptions
 from megloc_kapture.nets.superglue import ImageKeypoints, SuperGlueNet
-from megloc_kapture.nets.superpoint import SuperPointNet
-from megloc_kapture.nets.xfeat import XFeatNetwork
 from megloc_kapture.training.labels import Labels
 from megloc_kapture.training.networks import (
     FrozenFeatures,
@@ -38,25 +36,6 @@ def texture(height: int, width: int, seed: int = 0) -> NDArray[np.uint8]:
     return cv2.normalize(
         cv2.GaussianBlur(noise, (0, 0), 1.5), None, 0, 255, cv2.NORM_MINMAX
     ).astype(np.uint8)
-
-
-def random_file(path: Path, net: nn.Module, seed: int) -> str:
-    torch.manual_seed(seed)
-    for name, value in net.named_parameters():
-        if name.endswith("weight"):
-            nn.init.kaiming_normal_(value)
-    save_file({key: value.contiguous() for key, value in net.state_dict().items()}, path)
-    return str(path)
-
-
-@pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    folder = tmp_path_factory.mktemp("weights")
-    return {
-        "superpoint": random_file(folder / "superpoint_v1.safetensors", SuperPointNet(), 0),
-        "xfeat": random_file(folder / "xfeat.safetensors", XFeatNetwork(), 1),
-        "other": random_file(folder / "other.safetensors", XFeatNetwork(), 2),
-    }
 
 
 def extractors(files: dict[str, str]) -> list[SuperPoint | XFeat]:

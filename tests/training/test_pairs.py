@@ -13,16 +13,8 @@ from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.training.pairs import PairOptions, Photographs, PosedPairs, sha256_of_files
 
-STEPS = np.arange(5)
-POSES = {f"{k}.png": pose_at((-2.4 + 0.8 * k, 0, 0), 24.0 - 12.0 * k, 0) for k in STEPS}
+POSES = {f"{k}.png": pose_at((-2.4 + 0.8 * k, 0, 0), 24.0 - 12.0 * k, 0) for k in range(5)}
 SMALL = PairOptions(max_size_px=200)
-
-
-@pytest.fixture(scope="module")
-def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("walk")
-    write_kapture(root, POSES, with_poses=True, with_depth=True)
-    return root
 
 
 def test_pairs_overlap_as_asked_for(walk: Path) -> None:

@@ -1,0 +1,363 @@
+"""The training loop: seeded, interrupted and resumed without a trace, on one or several devices.
+
+The pairs of a step and all that is random in them depend on the seed and the step alone, so the
+state is the networks, the optimizer and the number of the step. On a processor the files of a
+training that was interrupted are, byte for byte, those of one that was not.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from datetime import timedelta
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from pydantic import Field
+from torch import distributed
+
+from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.io.files import read_content
+from megloc_kapture.io.weights import find_weights, read_weights
+from megloc_kapture.nets.runtime import NetworkOptions, pick_device
+from megloc_kapture.nets.superglue import SuperGlueNet, superglue
+from megloc_kapture.plugins import LOCAL_FEATURES, PluginChoice, load_plugin
+from megloc_kapture.stages.work import HERE, Work, ordered_map
+from megloc_kapture.training.held_out import AUC_DEG, HeldOutResult, held_out_result
+from megloc_kapture.training.networks import (
+    FrozenFeatures,
+    PairModel,
+    PreparedPair,
+    ProductHead,
+    describer_of,
+    encoder_sizes,
+)
+from megloc_kapture.training.pairs import PairOptions, PairSource
+
+COLUMNS = (
+    *("step", "learning_rate", "loss", "held_out_loss", "precision", "recall"),
+    *(f"auc_{bound}" for bound in AUC_DEG),
+)
+_LAST_RATE = 0.01  # of the first
+_MAX_GRADIENT = 1.0  # norm; a single pair may have one that is far off
+_PATIENCE = timedelta(hours=2)  # of processes for the first, which reads the data
+
+
+class TrainingOptions(NetworkOptions):
+    """Options of training SuperGlue on the features of a frozen extractor."""
+
+    half_precision: bool = Field(
+        default=False, description="bfloat16 but for keypoints, transport and loss"
+    )
+    features: PluginChoice = PluginChoice(name="superpoint")
+    max_keypoints: int = Field(default=512, gt=0, description="best kept of each image")
+    pairs: PairOptions = PairOptions()
+    steps: int = Field(default=100_000, gt=0)
+    pairs_per_step: int = Field(default=16, gt=0, description="of all devices together")
+    learning_rate: float = Field(
+        default=1e-4, gt=0, description="Adam's, for half of the steps; then down to 1 % of it"
+    )
+    layers: int = Field(
+        default=18, gt=0, multiple_of=2, description="of attention, self and cross in turn"
+    )
+    deep_supervision: bool = Field(
+        default=False, description="the loss is the mean over all layers of cross attention"
+    )
+    sinkhorn_iterations: int = Field(default=50, gt=0, description="in training and evaluation")
+    matcher_weights: str | None = Field(
+        default=None, description="SuperGlue to begin with; none: random weights"
+    )
+    check_every: int = Field(
+        default=1000, gt=0, description="steps between evaluations, which are kept on disk"
+    )
+    held_out_pairs: int = Field(default=100, gt=0, description="of each held-out kapture")
+    seed: int = Field(default=0, ge=0)
+
+    def idle(self) -> dict[str, str]:
+        if self.matcher_weights is None:
+            return {}
+        return {"layers": "it is that of matcher_weights"}
+
+
+class DescriptorOptions(TrainingOptions):
+    """Options of training the descriptors of a frozen detector's keypoints."""
+
+    through: Literal["superglue", "products"] = Field(
+        default="superglue",
+        description="superglue: trained with it, as MegLoc; products: for nearest neighbours",
+    )
+
+    def idle(self) -> dict[str, str]:
+        if self.through == "superglue":
+            return super().idle()
+        reason = "through=products trains no SuperGlue"
+        return dict.fromkeys(("layers", "deep_supervision", "matcher_weights"), reason)
+
+
+@dataclass
+class TrainingState:
+    """How far a training is.
+
+    Attributes
+    ----------
+    rows : of the curves so far, COLUMNS; NaN where there is nothing held out.
+    """
+
+    step: int
+    rows: list[list[float]]
+
+    def tensors(self, model: PairModel, optimizer: torch.optim.Optimizer) -> bytes:
+        """The state with networks and optimizer, as a file."""
+        stream = io.BytesIO()
+        content = {
+            "step": self.step,
+            "rows": self.rows,
+            "model": model.state_dict(),
+            "optimizer": optimizer.state_dict(),
+        }
+        torch.save(content, stream)
+        return stream.getvalue()
+
+    @classmethod
+    def resume(
+        cls, path: Path, model: PairModel, optimizer: torch.optim.Optimizer
+    ) -> TrainingState:
+        """Where a training was left, from its file; the beginning where there is none.
+
+        Raises
+        ------
+        DataError : the file is damaged.
+        """
+        if not path.is_file():
+            return cls(0, [])
+        try:
+            content = torch.load(
+                io.BytesIO(read_content(path)), map_location="cpu", weights_only=True
+            )
+            model.load_state_dict(content["model"])
+            optimizer.load_state_dict(content["optimizer"])
+            return cls(int(content["step"]), [list(map(float, row)) for row in content["rows"]])
+        except DataError:
+            raise
+        except Exception as error:  # torch raises many kinds on damaged files
+            raise DataError(
+                "not the state of this training, or damaged; -f begins again", path=path
+            ) from error
+
+
+@dataclass(frozen=True)
+class ProcessGroup:
+    """The processes that train together, one for each device; started by torchrun."""
+
+    rank: int = 0
+    size: int = 1
+
+    @classmethod
+    @contextmanager
+    def join(cls, device: torch.device) -> Iterator[ProcessGroup]:
+        """Of torchrun's environment; alone without it."""
+        size = int(os.environ.get("WORLD_SIZE", "1"))
+        if size == 1:
+            yield cls()
+            return
+        if device.type == "cuda":
+            torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
+        backend = "nccl" if device.type == "cuda" else "gloo"
+        distributed.init_process_group(backend, timeout=_PATIENCE)
+        try:
+            yield cls(distributed.get_rank(), distributed.get_world_size())
+        finally:
+            distributed.destroy_process_group()
+
+    def wait(self) -> None:
+        """Until all are here."""
+        if self.size > 1:
+            distributed.barrier()
+
+    def average(self, model: PairModel) -> None:
+        """Make the gradients of all processes their mean."""
+        if self.size == 1:
+            return
+        for parameter in model.parameters():
+            if parameter.requires_grad:
+                if parameter.grad is None:
+                    parameter.grad = torch.zeros_like(parameter)
+                distributed.all_reduce(parameter.grad)
+                parameter.grad /= self.size
+
+
+def model_of(options: TrainingOptions, frozen: FrozenFeatures, size: int) -> PairModel:
+    """The networks as training begins.
+
+    Parameters
+    ----------
+    size : of the extractor's descriptors.
+
+    Raises
+    ------
+    OptionError, DataError : the extractor or the weights cannot be trained.
+    """
+    describes = isinstance(options, DescriptorOptions)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(options.seed)
+        head: SuperGlueNet | ProductHead
+        if isinstance(options, DescriptorOptions) and options.through == "products":
+            head = ProductHead()
+        elif options.matcher_weights is not None:
+            file = find_weights(options.matcher_weights)
+            head = superglue(read_weights(file), str(file.path))
+        else:
+            head = SuperGlueNet(encoder_sizes(size), options.layers)
+        if isinstance(head, SuperGlueNet) and head.descriptor_size != size:
+            raise OptionError(
+                f"matcher_weights={options.matcher_weights} are for descriptors of "
+                f"{head.descriptor_size} dimensions; {options.features.name} has {size}"
+            )
+        return PairModel(
+            head,
+            describer_of(frozen.extractor) if describes else None,
+            iterations=options.sinkhorn_iterations,
+            deep_supervision=options.deep_supervision,
+        )
+
+
+class Trainer:
+    """A model, its data and how far it is.
+
+    Parameters
+    ----------
+    sources : where pairs are drawn from, from each alike.
+    held_out : sources of the evaluation, by the name of their results.
+
+    Raises
+    ------
+    MeglocError : the options, weights or data cannot be used.
+    """
+
+    def __init__(
+        self,
+        options: TrainingOptions,
+        sources: Sequence[PairSource],
+        held_out: Mapping[str, PairSource],
+    ) -> None:
+        self.options, self._sources = options, sources
+        choice = options.features
+        self.extractor = load_plugin(LOCAL_FEATURES, choice.name, choice.options)
+        self._frozen = FrozenFeatures(self.extractor, options.max_keypoints)
+        self._device = pick_device(options.device)
+        size = self._descriptor_size()
+        self.model = model_of(options, self._frozen, size).to(self._device)
+        trained = [p for p in self.model.parameters() if p.requires_grad]
+        self.optimizer = torch.optim.Adam(trained, lr=options.learning_rate)
+        self._held_out_sources = held_out
+        self._held_out: dict[str, list[PreparedPair]] = {}
+        self.results: dict[str, HeldOutResult] = {}
+
+    def train(
+        self,
+        state: TrainingState,
+        group: ProcessGroup,
+        work: Work = HERE,
+        *,
+        threads: int = 1,
+    ) -> Iterator[TrainingState]:
+        """Train to the last step; the state at each evaluation, in the process of rank 0.
+
+        Parameters
+        ----------
+        threads : that prepare pairs; one: those of a step are prepared when it comes.
+
+        Raises
+        ------
+        OptionError : the loss is not finite any more.
+        DataError : an image or depth map is broken.
+        """
+        options, losses = self.options, []
+        steps = range(state.step, options.steps)
+        label = f"training {options.steps} steps"
+        with ThreadPoolExecutor(threads) if threads > 1 else nullcontext() as pool:
+            prepared = ordered_map(
+                lambda step: self._pairs(step, group), steps, pool, window=2 * threads
+            )
+            batches = work.track(prepared, len(steps), label) if group.rank == 0 else prepared
+            for step, batch in zip(steps, batches, strict=True):
+                losses.append(self._step(step, batch, group))
+                if (step + 1) % options.check_every and step + 1 < options.steps:
+                    continue
+                if group.rank == 0:
+                    row = [
+                        float(step + 1),
+                        self._rate(step),
+                        float(np.mean(losses)),
+                        *self.evaluate(),
+                    ]
+                    state = TrainingState(step + 1, [*state.rows, row])
+                    yield state
+                losses = []
+                group.wait()
+
+    def evaluate(self) -> list[float]:
+        """Means over the held-out sources, COLUMNS from the fourth on; NaN without any."""
+        if not self._held_out:
+            self._held_out = {
+                name: [
+                    self._frozen.prepare(source.draw(np.random.default_rng([0, number])))
+                    for number in range(self.options.held_out_pairs)
+                ]
+                for name, source in self._held_out_sources.items()
+            }
+        self.model.eval()
+        self.results = {
+            name: held_out_result(self.model, pairs) for name, pairs in self._held_out.items()
+        }
+        if not self.results:
+            return [float("nan")] * (len(COLUMNS) - 3)
+        rows = [(one.loss, one.precision, one.recall, *one.auc) for one in self.results.values()]
+        return [float(value) for value in np.mean(rows, axis=0)]
+
+    def _step(self, step: int, batch: Sequence[PreparedPair], group: ProcessGroup) -> float:
+        options = self.options
+        for parameters in self.optimizer.param_groups:
+            parameters["lr"] = self._rate(step)
+        self.model.train()
+        self.optimizer.zero_grad(set_to_none=True)
+        with torch.autocast(
+            self._device.type, dtype=torch.bfloat16, enabled=options.half_precision
+        ):
+            loss = self.model(batch)
+        value = float(loss.detach())
+        if not np.isfinite(value):
+            raise OptionError(
+                f"the loss of step {step + 1} is {value}; begin again with a smaller learning_rate"
+            )
+        loss.backward()
+        group.average(self.model)
+        torch.nn.utils.clip_grad_norm_(self.model.parameters(), _MAX_GRADIENT)
+        self.optimizer.step()
+        return value
+
+    def _rate(self, step: int) -> float:
+        half = self.options.steps / 2
+        return self.options.learning_rate * _LAST_RATE ** max(0.0, (step - half) / half)
+
+    def _pairs(self, step: int, group: ProcessGroup) -> list[PreparedPair]:
+        found = []
+        for number in range(group.rank, self.options.pairs_per_step, group.size):
+            rng = np.random.default_rng([self.options.seed, step, number])
+            source = self._sources[int(rng.integers(len(self._sources)))]
+            found.append(self._frozen.prepare(source.draw(rng)))
+        return found
+
+    def _descriptor_size(self) -> int:
+        """Of the extractor, which need not say it: that of the first image with keypoints."""
+        size: Any = getattr(self.extractor, "descriptor_size", None)
+        if size is None:
+            pair = self._frozen.prepare(self._sources[0].draw(np.random.default_rng(0)))
+            size = pair.features[0].descriptors.shape[1]
+        return int(size)

@@ -1,0 +1,301 @@
+"""The trainer on small images and random features: it learns, and resumes to the same bytes."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+import megloc_kapture as megloc
+from megloc_kapture.errors import DataError, OptionError, OutputError
+from megloc_kapture.features.superpoint import SuperPoint, SuperPointOptions
+from megloc_kapture.io.images import read_image_rgb
+from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.matching.superglue import SuperGlue, SuperGlueOptions
+from megloc_kapture.stages.work import Work
+from megloc_kapture.training.pairs import PairOptions, PosedPairs, TrainingPair
+from megloc_kapture.training.train import TrainingData, train
+from megloc_kapture.training.trainer import (
+    DescriptorOptions,
+    ProcessGroup,
+    Trainer,
+    TrainingOptions,
+    TrainingState,
+)
+from megloc_kapture.values import ImageFeatures
+
+PAIRS = {"max_size_px": 200}
+
+
+def options(files: dict[str, str], kind: type[TrainingOptions] = TrainingOptions, **changes: Any):  # type: ignore[no-untyped-def]
+    chosen = {"weights": files["xfeat"], "threshold": 0.0, "device": "cpu"}
+    return kind.model_validate(
+        {
+            "features": {"name": "xfeat", "options": chosen},
+            **{"device": "cpu", "pairs": PAIRS, "max_keypoints": 64, "layers": 4},
+            **{"pairs_per_step": 2, "sinkhorn_iterations": 10, "held_out_pairs": 3},
+            **{"steps": 6, "check_every": 2, **changes},
+        }
+    )
+
+
+class Few:
+    """Always the same pairs: drawn from all, or one after the other to be evaluated on."""
+
+    def __init__(self, pairs: Sequence[TrainingPair], *, in_turn: bool = False) -> None:
+        self.folder, self._pairs, self._in_turn, self._next = Path(), pairs, in_turn, 0
+
+    def draw(self, rng: np.random.Generator) -> TrainingPair:
+        self._next += 1
+        number = self._next if self._in_turn else int(rng.integers(len(self._pairs)))
+        return self._pairs[number % len(self._pairs)]
+
+    def files(self) -> Iterable[Path]:
+        return ()
+
+    def counts(self) -> dict[str, int]:
+        return {}
+
+
+def overfitted(chosen: TrainingOptions, walk: Path) -> list[list[float]]:
+    source = PosedPairs(KaptureFolder(walk), PairOptions.model_validate(PAIRS))
+    pairs = [source.draw(np.random.default_rng(seed)) for seed in range(8)]
+    assert len({pair.keys for pair in pairs}) > 4
+    trainer = Trainer(chosen, [Few(pairs)], {"same": Few(pairs, in_turn=True)})
+    before = trainer.evaluate()
+    (state,) = trainer.train(TrainingState(0, []), ProcessGroup())
+    return [before, state.rows[-1][3:]]
+
+
+def test_a_matcher_learns_eight_pairs_by_heart(files: dict[str, str], walk: Path) -> None:
+    chosen = options(
+        files, steps=300, check_every=300, pairs_per_step=4, learning_rate=1e-3, held_out_pairs=8
+    )
+    (loss, *_), (last, precision, recall, *_) = overfitted(chosen, walk)
+    assert last < loss / 10
+    assert precision == 1.0 and recall > 0.99
+
+
+@pytest.mark.slow
+def test_descriptors_learn_eight_pairs_by_heart(files: dict[str, str], walk: Path) -> None:
+    chosen = options(
+        files,
+        DescriptorOptions,
+        **{"through": "products", "steps": 200, "check_every": 200, "pairs_per_step": 2},
+        **{"learning_rate": 1e-3, "held_out_pairs": 8},
+    )
+    (loss, precision, *_), (last, better, recall, *_) = overfitted(chosen, walk)
+    assert last < loss / 10
+    # nearest neighbours reject nothing that is mutual
+    assert better > 2 * precision and recall > 0.95
+
+
+def interrupted_after(step: int) -> Work:
+    def track(items: Iterable[Any], total: int, label: str) -> Iterator[Any]:
+        for number, item in enumerate(items):
+            if label.startswith("training") and number == step:
+                raise KeyboardInterrupt
+            yield item
+
+    return Work(track=track)
+
+
+@pytest.mark.parametrize("task", ["matcher", "descriptor"])
+def test_interrupted_and_resumed_is_uninterrupted(
+    task: str, files: dict[str, str], walk: Path, photographs: Path, tmp_path: Path
+) -> None:
+    kind = {"matcher": TrainingOptions, "descriptor": DescriptorOptions}[task]
+    chosen = options(files, kind, deep_supervision=True)
+    data = TrainingData(
+        [KaptureFolder(walk)], [photographs], licences={walk: "CC0", photographs: "MIT"}
+    )
+    whole, parts = tmp_path / "whole" / "x.safetensors", tmp_path / "parts" / "x.safetensors"
+    last = train(chosen, data, whole)
+    assert last["step"] == 6 and "held_out_loss" in last
+    # in the middle between two that are kept, and at one
+    for step in (3, 2):
+        with pytest.raises(KeyboardInterrupt):
+            train(chosen, data, parts, work=interrupted_after(step))
+    state = torch.load(parts.with_suffix(".state.pt"), weights_only=True)
+    assert state["step"] == 4
+    # threads change nothing
+    assert str(train(chosen, data, parts, threads=3)) == str(last)
+    names = ["x.csv", "x.json", "x.safetensors", "x.state.pt"]
+    names += ["x-superglue.safetensors"] if task == "descriptor" else []
+    assert sorted(path.name for path in parts.parent.iterdir()) == sorted(names)
+    for name in set(names) - {"x.state.pt"}:
+        assert (parts.parent / name).read_bytes() == (whole.parent / name).read_bytes(), name
+    # what is done is done
+    before = parts.stat().st_mtime_ns
+    assert str(train(chosen, data, parts)) == str(last)
+    assert parts.stat().st_mtime_ns == before
+    manifest = json.loads(parts.with_suffix(".json").read_text())
+    record = manifest["training"]
+    assert [(one["licence"], one["images"]) for one in record["data"]] == [("CC0", 5), ("MIT", 1)]
+    assert record["weights"][0]["licence"] == "unknown" and record["task"] == task
+    lines = parts.with_suffix(".csv").read_text().splitlines()
+    assert lines[0].startswith("step,learning_rate,loss,") and len(lines) == 4
+
+
+def test_the_seed_and_the_start_matter(files: dict[str, str], walk: Path, tmp_path: Path) -> None:
+    data = TrainingData([KaptureFolder(walk)], held_out=[])
+    first = tmp_path / "first.safetensors"
+    train(options(files, steps=2), data, first)
+    train(options(files, steps=2, seed=1), data, tmp_path / "second.safetensors")
+    assert first.read_bytes() != (tmp_path / "second.safetensors").read_bytes()
+    # on from there, with small steps, is near there
+    third = tmp_path / "third.safetensors"
+    more = options(files, steps=2, matcher_weights=str(first), learning_rate=1e-7)
+    train(more, data, third)
+    names = {
+        one["file"]
+        for one in json.loads(third.with_suffix(".json").read_text())["training"]["weights"]
+    }
+    assert names == {"first.safetensors", "xfeat.safetensors"}
+    for key, value in load_file(first).items():
+        if value.ndim == 3:
+            torch.testing.assert_close(load_file(third)[key], value, rtol=0, atol=1e-5)
+
+
+def test_a_trained_matcher_is_read_by_the_matcher(
+    files: dict[str, str], walk: Path, tmp_path: Path
+) -> None:
+    output = tmp_path / "small.safetensors"
+    chosen = {"weights": files["xfeat"], "threshold": 0.0}
+    last = megloc.train(
+        "matcher",
+        output,
+        kaptures=[walk],
+        features="xfeat",
+        set={"features.options": chosen, "steps": 2, "layers": 2, "pairs.max_size_px": 200,
+             "pairs_per_step": 1, "max_keypoints": 50, "device": "cpu"},
+    )  # fmt: skip
+    assert last["step"] == 2 and np.isfinite(last["loss"])
+    matcher = SuperGlue(SuperGlueOptions(weights=str(output), device="cpu"))
+    sides = []
+    for name in ("1.png", "2.png"):
+        image = read_image_rgb(walk / "sensors" / "records_data" / name)
+        sides.append(megloc.api.extract("xfeat", image, **chosen, max_keypoints=50))  # type: ignore[attr-defined]
+    matches, scores = matcher.match(*sides)
+    assert matches.shape[1] == 2 and len(matches) == len(scores)
+
+
+def test_a_split_superpoint_is_trained_and_read(
+    files: dict[str, str], walk: Path, tmp_path: Path
+) -> None:
+    """Random weights: detector frozen, gradients through SuperGlue into the descriptors."""
+    frozen = {"weights": files["superpoint"], "device": "cpu", "threshold": 0.0}
+    chosen = options(
+        files,
+        DescriptorOptions,
+        **{"features": {"name": "superpoint", "options": frozen}, "steps": 2, "layers": 2},
+        **{"pairs_per_step": 1, "learning_rate": 1e-3, "max_keypoints": 60},
+    )
+    output = tmp_path / "night.safetensors"
+    train(chosen, TrainingData([KaptureFolder(walk)]), output)
+    before, after = load_file(files["superpoint"]), load_file(output)
+    assert set(after) == {key for key in before if not key.startswith("convP")}
+    assert all(not torch.equal(after[key], before[key]) for key in after)
+    image = read_image_rgb(walk / "sensors" / "records_data" / "1.png")
+    frozen["max_keypoints"] = 60
+    plain = SuperPoint(SuperPointOptions(**frozen)).extract(image)
+    split = SuperPoint(SuperPointOptions(**frozen, descriptor_weights=str(output))).extract(image)
+    np.testing.assert_array_equal(split.keypoints_px, plain.keypoints_px)
+    assert np.abs(split.descriptors - plain.descriptors).max() > 1e-3
+    matcher = SuperGlue(
+        SuperGlueOptions(weights=str(tmp_path / "night-superglue.safetensors"), device="cpu")
+    )
+    side = ImageFeatures(split.keypoints_px, split.descriptors, 400, 300)
+    assert len(matcher.match(side, side)[0]) <= 60
+
+
+def test_half_precision_trains(files: dict[str, str], walk: Path, tmp_path: Path) -> None:
+    data = TrainingData([KaptureFolder(walk)])
+    losses = [
+        train(options(files, steps=2, half_precision=half), data, tmp_path / f"{half}.safetensors")
+        for half in (False, True)
+    ]
+    assert losses[0]["loss"] != losses[1]["loss"]
+    assert losses[0]["loss"] == pytest.approx(losses[1]["loss"], rel=0.05)
+
+
+def test_what_cannot_be_trained_is_refused(
+    files: dict[str, str], walk: Path, photographs: Path, tmp_path: Path
+) -> None:
+    data = TrainingData([KaptureFolder(walk)])
+    output = tmp_path / "x.safetensors"
+    chosen = options(files, steps=2)
+    for wrong, message in (
+        (TrainingData(), "nothing to train on"),
+        (TrainingData([KaptureFolder(walk)], held_out=[KaptureFolder(walk)]), "and held out"),
+        (TrainingData([KaptureFolder(walk)], licences={tmp_path: "MIT"}), "is no folder of this"),
+    ):
+        with pytest.raises(OptionError, match=message):
+            train(chosen, wrong, output)
+    views = {**PAIRS, "homographies": {"light": 0.5}}
+    with pytest.raises(OptionError, match="there are no photographs"):
+        train(options(files, pairs=views), data, output)
+    with pytest.raises(OptionError, match="end in .safetensors"):
+        train(chosen, data, tmp_path / "x.pth")
+    with pytest.raises(OptionError, match="smaller learning_rate"):
+        train(options(files, learning_rate=1e30), data, output)
+    assert not output.exists()
+    train(chosen, data, output)
+    with pytest.raises(OutputError, match=r"x\.json: is of another training \(options\); -f"):
+        train(options(files, steps=4), data, output)
+    output.with_suffix(".state.pt").write_bytes(b"PK damaged")
+    with pytest.raises(DataError, match=r"x\.state\.pt: not the state of this training"):
+        train(chosen, data, output)
+    assert train(options(files, steps=4), data, output, force=True)["step"] == 4
+    mine = tmp_path / "mine.safetensors"
+    mine.write_bytes(b"of somebody else")
+    with pytest.raises(OutputError, match="is of no training"):
+        train(chosen, data, mine)
+    assert mine.read_bytes() == b"of somebody else"
+    with pytest.raises(OptionError, match=r"256 dimensions; xfeat has 64"):
+        official = tmp_path / "official.safetensors"
+        from safetensors.torch import save_file
+
+        from megloc_kapture.nets.superglue import SuperGlueNet
+
+        save_file(SuperGlueNet(num_layers=2).state_dict(), official)
+        train(options(files, matcher_weights=str(official)), data, tmp_path / "y.safetensors")
+
+
+@pytest.mark.slow
+def test_two_processes_train_together(files: dict[str, str], walk: Path, tmp_path: Path) -> None:
+    """On processors by gloo: the gradient is the mean of both, so the step is that of one."""
+    script = tmp_path / "script.py"
+    script.write_text(f"""
+import sys
+from pathlib import Path
+from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.training.train import TrainingData, train
+from megloc_kapture.training.trainer import DescriptorOptions
+options = DescriptorOptions.model_validate_json(sys.argv[1])
+train(options, TrainingData([KaptureFolder({str(walk)!r})]), Path(sys.argv[2]))
+""")
+    # no normalisation over the pairs of a step, which two processes would do apart
+    chosen = options(files, DescriptorOptions, through="products", steps=3, check_every=3)
+    one, two = tmp_path / "one.safetensors", tmp_path / "two.safetensors"
+    train(chosen, TrainingData([KaptureFolder(walk)]), one)
+    torchrun = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node=2"]
+    done = subprocess.run(
+        [*torchrun, "--master-port=29511", script, chosen.model_dump_json(), two],
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    for key, value in load_file(one).items():
+        torch.testing.assert_close(load_file(two)[key], value, rtol=0, atol=2e-5)
