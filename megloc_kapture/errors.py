@@ -67,6 +67,7 @@ _EXTRAS = {
     "kornia": "kornia",
     "onnx": "convert",
     "distributed": "cluster",
+    "h5py": "megadepth",
     **dict.fromkeys(
         ("fastapi", "prometheus_client", "python_multipart", "starlette", "uvicorn"),
         "serve",

@@ -11,6 +11,7 @@ from megloc_kapture.cli.common import Common, Force, Output, Working
 from megloc_kapture.cli.console import Console
 from megloc_kapture.datasets.colmap_map import find_colmap
 from megloc_kapture.datasets.kapture_folders import QUERY
+from megloc_kapture.datasets.megadepth import MegaDepthOptions, import_megadepth
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.files import staged_output
@@ -24,12 +25,12 @@ from megloc_kapture.pipeline.datasets import (
     twin_of,
 )
 from megloc_kapture.pipeline.executors import open_executor
-from megloc_kapture.pipeline.presets import assigned
+from megloc_kapture.pipeline.presets import assigned, options_with
 from megloc_kapture.stages.layout import MAP
 from megloc_kapture.stages.unreadable import set_aside_unreadable
 from megloc_kapture.stages.work import Work
 
-DATASET, COLMAP = "dataset", "colmap"
+DATASET, COLMAP, MEGADEPTH = "dataset", "colmap", "megadepth"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +40,8 @@ class Import(Common):
     Images are linked, not copied."""
 
     dataset: tyro.conf.Positional[str]
-    """aachen, robotcar, 4seasons, inloc, kapture: any pair of kapture folders; colmap: a model."""
+    """aachen, robotcar, 4seasons, inloc, kapture: any pair of kapture folders; colmap: a model;
+    megadepth: to train on, DIR/SCENE each."""
     root: tyro.conf.Positional[Path]
     """Folder of the dataset, laid out as it is published; of colmap the model (sparse/0), or the
     workspace around it."""
@@ -64,6 +66,8 @@ class Import(Common):
         name = self.dataset.removeprefix(TWIN_PREFIX)
         if name == COLMAP:
             return self._import_colmap(console)
+        if name == MEGADEPTH:
+            return self._import_megadepth(console)
         if self.images or self.database:
             raise OptionError(f"--images and --database are of colmap, not of {self.dataset}")
         choice = choose_dataset(
@@ -89,13 +93,7 @@ class Import(Common):
         return 0
 
     def _import_colmap(self, console: Console) -> int:
-        unused = {
-            "--set": self.set,
-            "--query-prefix": self.query_prefix,
-            "--allow-missing": self.allow_missing,
-        }
-        if given := [flag for flag, value in unused.items() if value]:
-            raise OptionError(f"{given[0]} changes nothing of a COLMAP model")
+        self._refuse_unused("a COLMAP model", {"--set": self.set})
         source = find_colmap(self.root, images=self.images, database=self.database)
         with (
             staged_output(self.output, kind=MAP, force=self.force) as out,
@@ -107,6 +105,24 @@ class Import(Common):
         for what, value in counts.items():
             console.result(f"{what.replace('_', ' '):44s}{value:>8g}")
         return 0
+
+    def _import_megadepth(self, console: Console) -> int:
+        self._refuse_unused("MegaDepth", {"--images": self.images, "--database": self.database})
+        options = options_with(MegaDepthOptions, self.set)
+        with staged_output(self.output, kind=MEGADEPTH, force=self.force) as out:
+            work = Work(track=console.track)
+            counts = import_megadepth(self.root, out, options, work=work)
+        for what, value in counts.items():
+            console.result(f"{what.replace('_', ' '):44s}{value:>8g}")
+        return 0
+
+    def _refuse_unused(self, what: str, flags: dict[str, object]) -> None:
+        of_datasets = {
+            "--query-prefix": self.query_prefix,
+            "--allow-missing": self.allow_missing,
+        }
+        if given := [flag for flag, value in (flags | of_datasets).items() if value]:
+            raise OptionError(f"{given[0]} changes nothing of {what}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,195 @@
+"""MegaDepth as kapture folders with depth, one for each scene, to train on.
+
+The layout is that of the published archives and of what the open trainings make of them (D2-Net's
+``megadepth_utils``)::
+
+    phoenix/S6/zl548/MegaDepth_v1/SCENE/dense0/depths/NAME.h5    depth of the undistorted images
+    Undistorted_SfM/SCENE/{images,sparse or sparse-txt}          COLMAP's image_undistorter
+    scene_info/SCENE.npz                                         paths, intrinsics, poses
+
+Cameras and poses are those of the undistorted model; without one, those of ``scene_info``, whose
+arrays of Python objects are pickles and are not read: docs/training.md has the lines that make
+plain arrays of them.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from megloc_kapture.datasets.formats.colmap_reading import read_colmap_model
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.files import link_records
+from megloc_kapture.io.images import image_size, write_depth_map
+from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
+from megloc_kapture.io.paths import check_component, safe_join
+from megloc_kapture.preprocessing.resampling import scaled_camera
+from megloc_kapture.stages.work import HERE, Work
+from megloc_kapture.values import Camera, Options, RigidTransform
+
+_DEPTH = Path("phoenix") / "S6" / "zl548" / "MegaDepth_v1"
+_UNDISTORTED, _SCENE_INFO = "Undistorted_SfM", "scene_info"
+_MODELS = ("sparse", "sparse-txt", "sparse/0")
+_ARRAYS = ("image_paths", "depth_paths", "intrinsics", "poses")
+_MAX_DEPTH_PIXELS = 1 << 28
+_IDENTITY = RigidTransform.identity()
+
+
+class MegaDepthOptions(Options):
+    """Options of importing MegaDepth."""
+
+    scenes: tuple[str, ...] = Field(default=(), description="by their numbers; none: all there are")
+
+
+@dataclass(frozen=True)
+class _Image:
+    """An undistorted image: its file, its depth map's, camera and pose."""
+
+    path: Path
+    depth: Path
+    camera: Camera
+    cam_from_world: RigidTransform
+
+
+def import_megadepth(
+    root: Path, output: Path, options: MegaDepthOptions | None = None, *, work: Work = HERE
+) -> dict[str, int]:
+    """Write ``output/SCENE`` of each scene: links to its images, poses, and depth maps.
+
+    Images without metric depth are left out; a depth map takes four bytes for each pixel.
+
+    Raises
+    ------
+    DataError : no scene, or a file of one is missing or broken; names it.
+    """
+    options = options or MegaDepthOptions()
+    scenes = [check_component(name) for name in options.scenes] or _scenes(root)
+    if not scenes:
+        raise DataError(f"neither {_UNDISTORTED}/SCENE nor {_SCENE_INFO}/SCENE.npz", path=root)
+    counts = {"scenes": 0, "images": 0, "without_depth": 0}
+    for scene in scenes:
+        images = list(_images(root, scene))
+        written = _write_scene(output / scene, work.track(images, len(images), scene))
+        counts["scenes"] += 1
+        counts["images"] += written
+        counts["without_depth"] += len(images) - written
+    return counts
+
+
+def read_megadepth_depth(path: Path) -> NDArray[np.float32] | None:
+    """A depth map (H, W), 0 where unknown; None of an image that has only an order of depths.
+
+    Raises
+    ------
+    DataError : no HDF5 file with an array ``depth`` of its own; names it.
+    """
+    import h5py
+
+    try:
+        with h5py.File(path, "r") as file:
+            link, found = file.get("depth", getlink=True), file.get("depth")
+            if not isinstance(link, h5py.HardLink) or not isinstance(found, h5py.Dataset):
+                raise DataError("no array 'depth'", path=path)
+            if found.is_virtual or found.external:
+                raise DataError("its array 'depth' lies in another file", path=path)
+            if found.ndim != 2 or found.dtype.kind != "f" or not 0 < found.size < _MAX_DEPTH_PIXELS:
+                raise DataError(
+                    f"depth is {found.dtype} {found.shape}, not a float image", path=path
+                )
+            depth_m = np.asarray(found[...], np.float32)
+    except (OSError, RuntimeError, KeyError) as error:
+        raise DataError(f"cannot read as HDF5: {error}", path=path) from error
+    # relative depth has signs for labels: nearer, farther
+    if (depth_m < 0).any():
+        return None
+    depth_m[~np.isfinite(depth_m)] = 0.0
+    return depth_m if depth_m.any() else None
+
+
+def _scenes(root: Path) -> list[str]:
+    models = {path.name for path in (root / _UNDISTORTED).glob("*") if path.is_dir()}
+    return sorted(models | {path.stem for path in (root / _SCENE_INFO).glob("*.npz")})
+
+
+def _images(root: Path, scene: str) -> Iterator[_Image]:
+    """The images of a scene that are there, sorted by name."""
+    folder = root / _UNDISTORTED / scene
+    model = next((folder / name for name in _MODELS if (folder / name).is_dir()), None)
+    table = root / _SCENE_INFO / f"{scene}.npz"
+    if model is not None:
+        yield from _of_model(root, scene, model, folder / "images")
+    elif table.is_file():
+        yield from _of_table(root, table)
+    else:
+        raise DataError(f"neither {folder} nor {table} is there", path=root)
+
+
+def _of_model(root: Path, scene: str, model: Path, folder: Path) -> Iterator[_Image]:
+    found = read_colmap_model(model, with_points=False)
+    depths = root / _DEPTH / scene / "dense0" / "depths"
+    for image in sorted(found.images, key=lambda one: one.name):
+        path = safe_join(folder, image.name)
+        depth = safe_join(depths, str(PurePosixPath(image.name).with_suffix(".h5")))
+        if path.is_file() and depth.is_file():
+            yield _Image(path, depth, found.cameras[image.camera_id], image.cam_from_world)
+
+
+def _of_table(root: Path, table: Path) -> Iterator[_Image]:
+    try:
+        with np.load(table, allow_pickle=False) as file:
+            images, depths, intrinsics, poses = (file[name] for name in _ARRAYS)
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise DataError(
+            "its arrays are Python objects or broken, and pickles are not read; docs/training.md "
+            f"has the lines that make plain arrays of them ({error})",
+            path=table,
+        ) from error
+    _check_table(table, images, depths, intrinsics, poses)
+    for row in np.argsort(images):
+        path, depth = (safe_join(root, str(names[row])) for names in (images, depths))
+        if not (path.is_file() and depth.is_file()):
+            continue
+        k = intrinsics[row]
+        camera = Camera("PINHOLE", *image_size(path), (k[0, 0], k[1, 1], k[0, 2], k[1, 2]))
+        pose = poses[row]
+        yield _Image(path, depth, camera, RigidTransform.from_matrix(pose[:3, :3], pose[:3, 3]))
+
+
+def _check_table(table: Path, *arrays: NDArray[Any]) -> None:
+    shapes = [(len(arrays[0]), *shape) for shape in ((), (), (3, 3), (4, 4))]
+    for name, array, shape in zip(_ARRAYS, arrays, shapes, strict=True):
+        text = name.endswith("paths")
+        if array.shape != shape or array.dtype.kind not in ("U" if text else "fiu"):
+            raise DataError(f"{name} is {array.dtype} {array.shape}, expected {shape}", path=table)
+
+
+def _write_scene(output: Path, images: Sequence[_Image] | Iterator[_Image]) -> int:
+    data, links = KaptureData(), {}
+    for number, image in enumerate(images):
+        depth_m = read_megadepth_depth(image.depth)
+        if depth_m is None:
+            continue
+        name = f"images/{image.path.name}"
+        if name in links:
+            raise DataError("the scene has two images of this name", path=image.path)
+        links[name] = image.path
+        sensor, depth_sensor, rig = f"{number}", f"{number}_depth", f"{number}_rig"
+        depth_camera = scaled_camera(image.camera, depth_m.shape[1], depth_m.shape[0])
+        data.sensors[sensor] = Sensor.from_camera(image.camera)
+        data.sensors[depth_sensor] = Sensor.from_camera(depth_camera, sensor_type="depth")
+        data.rigs[rig] = {sensor: _IDENTITY, depth_sensor: _IDENTITY}
+        data.trajectories[number, rig] = image.cam_from_world
+        data.records_camera[number, sensor] = name
+        record = f"depth/{image.path.stem}.depth"
+        data.records_depth[number, depth_sensor] = record
+        write_depth_map(output / "sensors" / "records_data" / record, depth_m)
+    write_sensors(output, data)
+    link_records(output, links)
+    return len(links)
