@@ -66,12 +66,12 @@ def lift_keypoints(
     options = options or LiftingOptions()
     rays = bearing_rays(image_camera, np.asarray(keypoints_px, np.float64)[:, :2])
     depth_from_image = image_from_depth.inverse()
-    known = depth_m[depth_m > 0]
     points = np.full(rays.shape, np.nan)
-    if not len(known) or not len(rays):
+    if not len(rays) or not (depth_m > 0).any():
         return points, np.zeros(len(rays), bool)
     same_centre = bool(np.linalg.norm(image_from_depth.translation) < _SAME_CENTRE_M)
-    z = np.full(len(rays), float(np.median(known)))
+    # of one centre, all points of a ray are seen at one pixel
+    z = np.full(len(rays), 1.0 if same_centre else float(np.median(depth_m[depth_m > 0])))
     settled = np.zeros(len(rays), bool)
     for _ in range(1 if same_centre else _ROUNDS):
         in_depth = depth_from_image.apply(rays * z[:, None])

@@ -127,6 +127,16 @@ def _superglue(options: PipelineOptions) -> str:
     return f"non-maximum suppression within {radius} px, {weights}"
 
 
+def _trained_anew(options: PipelineOptions) -> bool:
+    return any(one.options.get("descriptor_weights") for one in options.local_features)
+
+
+def _not_public(options: PipelineOptions, facts: DatasetFacts) -> str:
+    if _trained_anew(options):
+        return ""
+    return "the paper's weights are not public; megloc train descriptor makes such"
+
+
 def _pairs_by(method: PairingMethod) -> Callable[[PipelineOptions], bool]:
     return lambda options: method in options.mapping_pairs.by
 
@@ -200,6 +210,7 @@ _STEPS = (
         figures=_superglue,
     ),
     _Step("ASLFeat", "local_features", _uses("aslfeat")),
+    _Step("descriptors and matcher trained anew", "local_features", _trained_anew, _not_public),
     _Step(
         "four global features fused",
         "global_features",
@@ -264,5 +275,4 @@ _STEPS = (
 _MISSING = (
     "depth of map images by multi-view stereo",
     "rendering by a neural field (NeRF-W)",
-    "descriptors and matcher trained anew",
 )

@@ -22,8 +22,13 @@ from megloc_kapture.io.weights.registry import by_sha256
 from megloc_kapture.nets.runtime import pick_device
 from megloc_kapture.nets.superglue import SuperGlueNet
 from megloc_kapture.stages.work import HERE, Work
-from megloc_kapture.training.homographies import HomographyOptions
-from megloc_kapture.training.pairs import PairSource, Photographs, PosedPairs, sha256_of_files
+from megloc_kapture.training.pairs import (
+    PairOptions,
+    PairSource,
+    Photographs,
+    PosedPairs,
+    sha256_of_files,
+)
 from megloc_kapture.training.trainer import (
     COLUMNS,
     DescriptorOptions,
@@ -69,8 +74,21 @@ class TrainingData:
         for path in self.licences:
             if path not in known:
                 raise OptionError(f"a licence of {path}, which is no folder of this training")
-        if not self.photographs and options.pairs.homographies != HomographyOptions():
-            raise OptionError("pairs.homographies changes nothing: there are no photographs")
+        if len({folder.root.name for folder in self.held_out}) < len(self.held_out):
+            raise OptionError("held-out folders need different names")
+        pairs, usual = options.pairs, PairOptions()
+        unused = []
+        if not self.photographs and pairs.homographies != usual.homographies:
+            unused.append(("pairs.homographies", "photographs"))
+        if not (self.kaptures or self.held_out):
+            if pairs.overlap_bins != usual.overlap_bins:
+                unused.append(("pairs.overlap_bins", "kapture folders"))
+            if pairs.labels.max_depth_error != usual.labels.max_depth_error:
+                unused.append(("pairs.labels.max_depth_error", "kapture folders"))
+        if not self.held_out and options.held_out_pairs != TrainingOptions().held_out_pairs:
+            unused.append(("held_out_pairs", "held-out folders"))
+        for name, absent in unused:
+            raise OptionError(f"{name} changes nothing: there are no {absent}")
 
 
 def train(
@@ -86,7 +104,7 @@ def train(
 
     Written at each evaluation, beside each other: ``output``, of descriptors that are trained
     through SuperGlue also ``X-superglue.safetensors``, the manifest ``X.json``, the curves
-    ``X.csv`` and ``X.state.pt``, from which the same call goes on.
+    ``X.csv`` and ``X.state.pt``, from which the same call goes on; before, ``X.overlaps``.
 
     Parameters
     ----------
@@ -107,24 +125,30 @@ def train(
         raise OptionError(f"{output}: the file to write must end in .safetensors")
     data.check(options)
     files = _Files(output)
-    sources: list[PairSource] = [
-        *(PosedPairs(folder, options.pairs, work) for folder in data.kaptures),
-        *(Photographs(folder, options.pairs) for folder in data.photographs),
-    ]
-    held_out = {
-        folder.root.name: PosedPairs(folder, options.pairs, work) for folder in data.held_out
-    }
-    if len(held_out) < len(data.held_out):
-        raise OptionError("held-out folders need different names")
     with ProcessGroup.join(pick_device(options.device)) as group:
-        trainer = Trainer(options, sources, held_out)
+        trainer = Trainer(options)
+        if group.rank:
+            group.wait()  # for the first one's measurements
+        else:
+            files.begin(force=force)
+        posed = [
+            PosedPairs(folder, options.pairs, work, files.overlaps / f"{number:03d}.txt")
+            for number, folder in enumerate([*data.kaptures, *data.held_out])
+        ]
+        if not group.rank:
+            group.wait()
+        sources: list[PairSource] = [*posed[: len(data.kaptures)]]
+        sources += [Photographs(folder, options.pairs) for folder in data.photographs]
+        held_out = {source.folder.name: source for source in posed[len(data.kaptures) :]}
         record = {}
         if group.rank == 0:
             record = _record(options, trainer, sources, held_out, data.licences)
             files.claim(record, force=force)
         group.wait()
         state = TrainingState.resume(files.state, trainer.model, trainer.optimizer)
-        for reached in trainer.train(state, group, work, threads=threads):
+        if group.rank == 0 and state.step < options.steps:
+            trainer.hold_out(held_out)
+        for reached in trainer.train(sources, state, group, work, threads=threads):
             state = reached
             files.write(trainer, state, record)
     return dict(zip(COLUMNS, state.rows[-1], strict=True)) if state.rows else {}
@@ -145,16 +169,23 @@ class _Files:
         return self.output.with_suffix(".json")
 
     @property
+    def overlaps(self) -> Path:
+        """Folder of the measured overlaps of pairs."""
+        return self.output.with_suffix(".overlaps")
+
+    @property
     def matcher(self) -> Path:
         return self.output.with_name(f"{self.output.stem}-superglue.safetensors")
 
+    def begin(self, *, force: bool) -> None:
+        """Remove what training would go on from, where none was begun, or it begins again."""
+        if force or not (self.output.exists() or self.manifest.exists()):
+            remove(self.state)
+            remove(self.overlaps)
+
     def claim(self, record: Mapping[str, Any], *, force: bool) -> None:
-        """Refuse what is not this training's, or remove its state."""
-        if force:
-            remove(self.state)
-            return
-        if not self.output.exists() and not self.manifest.exists():
-            remove(self.state)
+        """Refuse what is not this training's."""
+        if force or not (self.output.exists() or self.manifest.exists()):
             return
         try:
             known = json.loads(read_content(self.manifest)).get("training")

@@ -15,7 +15,7 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -27,7 +27,12 @@ from megloc_kapture.io.files import read_content
 from megloc_kapture.io.weights import find_weights, read_weights
 from megloc_kapture.nets.runtime import NetworkOptions, pick_device
 from megloc_kapture.nets.superglue import SuperGlueNet, superglue
-from megloc_kapture.plugins import LOCAL_FEATURES, PluginChoice, load_plugin
+from megloc_kapture.plugins import (
+    LOCAL_FEATURES,
+    LocalFeatureExtractor,
+    PluginChoice,
+    load_plugin,
+)
 from megloc_kapture.stages.work import HERE, Work, ordered_map
 from megloc_kapture.training.held_out import AUC_DEG, HeldOutResult, held_out_result
 from megloc_kapture.training.networks import (
@@ -192,18 +197,17 @@ class ProcessGroup:
                 parameter.grad /= self.size
 
 
-def model_of(options: TrainingOptions, frozen: FrozenFeatures, size: int) -> PairModel:
+def model_of(options: TrainingOptions, extractor: LocalFeatureExtractor) -> PairModel:
     """The networks as training begins.
-
-    Parameters
-    ----------
-    size : of the extractor's descriptors.
 
     Raises
     ------
     OptionError, DataError : the extractor or the weights cannot be trained.
     """
     describes = isinstance(options, DescriptorOptions)
+    # plugins need not say it
+    noise = np.random.default_rng(0).integers(0, 256, (128, 128, 3), np.uint8)
+    size = extractor.extract(noise).descriptors.shape[1]
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(options.seed)
         head: SuperGlueNet | ProductHead
@@ -221,46 +225,39 @@ def model_of(options: TrainingOptions, frozen: FrozenFeatures, size: int) -> Pai
             )
         return PairModel(
             head,
-            describer_of(frozen.extractor) if describes else None,
+            describer_of(extractor) if describes else None,
             iterations=options.sinkhorn_iterations,
             deep_supervision=options.deep_supervision,
         )
 
 
 class Trainer:
-    """A model, its data and how far it is.
+    """A model and its optimizer.
 
-    Parameters
+    Attributes
     ----------
-    sources : where pairs are drawn from, from each alike.
-    held_out : sources of the evaluation, by the name of their results.
+    results : of the last evaluation, by the name of the held-out source.
 
     Raises
     ------
-    MeglocError : the options, weights or data cannot be used.
+    MeglocError : the options or weights cannot be used.
     """
 
-    def __init__(
-        self,
-        options: TrainingOptions,
-        sources: Sequence[PairSource],
-        held_out: Mapping[str, PairSource],
-    ) -> None:
-        self.options, self._sources = options, sources
+    def __init__(self, options: TrainingOptions) -> None:
+        self.options = options
         choice = options.features
         self.extractor = load_plugin(LOCAL_FEATURES, choice.name, choice.options)
         self._frozen = FrozenFeatures(self.extractor, options.max_keypoints)
         self._device = pick_device(options.device)
-        size = self._descriptor_size()
-        self.model = model_of(options, self._frozen, size).to(self._device)
+        self.model = model_of(options, self.extractor).to(self._device)
         trained = [p for p in self.model.parameters() if p.requires_grad]
         self.optimizer = torch.optim.Adam(trained, lr=options.learning_rate)
-        self._held_out_sources = held_out
         self._held_out: dict[str, list[PreparedPair]] = {}
         self.results: dict[str, HeldOutResult] = {}
 
     def train(
         self,
+        sources: Sequence[PairSource],
         state: TrainingState,
         group: ProcessGroup,
         work: Work = HERE,
@@ -271,6 +268,7 @@ class Trainer:
 
         Parameters
         ----------
+        sources : where pairs are drawn from, from each alike.
         threads : that prepare pairs; one: those of a step are prepared when it comes.
 
         Raises
@@ -283,7 +281,7 @@ class Trainer:
         label = f"training {options.steps} steps"
         with ThreadPoolExecutor(threads) if threads > 1 else nullcontext() as pool:
             prepared = ordered_map(
-                lambda step: self._pairs(step, group), steps, pool, window=2 * threads
+                lambda step: self._pairs(sources, step, group), steps, pool, window=2 * threads
             )
             batches = work.track(prepared, len(steps), label) if group.rank == 0 else prepared
             for step, batch in zip(steps, batches, strict=True):
@@ -302,16 +300,18 @@ class Trainer:
                 losses = []
                 group.wait()
 
+    def hold_out(self, sources: Mapping[str, PairSource]) -> None:
+        """Draw the pairs that are evaluated on, by the names of their sources."""
+        self._held_out = {
+            name: [
+                self._frozen.prepare(source.draw(np.random.default_rng([0, number])))
+                for number in range(self.options.held_out_pairs)
+            ]
+            for name, source in sources.items()
+        }
+
     def evaluate(self) -> list[float]:
         """Means over the held-out sources, COLUMNS from the fourth on; NaN without any."""
-        if not self._held_out:
-            self._held_out = {
-                name: [
-                    self._frozen.prepare(source.draw(np.random.default_rng([0, number])))
-                    for number in range(self.options.held_out_pairs)
-                ]
-                for name, source in self._held_out_sources.items()
-            }
         self.model.eval()
         self.results = {
             name: held_out_result(self.model, pairs) for name, pairs in self._held_out.items()
@@ -346,18 +346,12 @@ class Trainer:
         half = self.options.steps / 2
         return self.options.learning_rate * _LAST_RATE ** max(0.0, (step - half) / half)
 
-    def _pairs(self, step: int, group: ProcessGroup) -> list[PreparedPair]:
+    def _pairs(
+        self, sources: Sequence[PairSource], step: int, group: ProcessGroup
+    ) -> list[PreparedPair]:
         found = []
         for number in range(group.rank, self.options.pairs_per_step, group.size):
             rng = np.random.default_rng([self.options.seed, step, number])
-            source = self._sources[int(rng.integers(len(self._sources)))]
+            source = sources[int(rng.integers(len(sources)))]
             found.append(self._frozen.prepare(source.draw(rng)))
         return found
-
-    def _descriptor_size(self) -> int:
-        """Of the extractor, which need not say it: that of the first image with keypoints."""
-        size: Any = getattr(self.extractor, "descriptor_size", None)
-        if size is None:
-            pair = self._frozen.prepare(self._sources[0].draw(np.random.default_rng(0)))
-            size = pair.features[0].descriptors.shape[1]
-        return int(size)

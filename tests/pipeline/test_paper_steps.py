@@ -27,10 +27,12 @@ FACTS = {
     "inloc": DatasetFacts(map_depth=True, query_depth=False, model=False),
     "kapture": DatasetFacts(map_depth=True, query_depth=True, model=False),
 }
+TRAINED = "descriptors and matcher trained anew"
+# by anybody, or with public weights
 NOT_YET = {
     "depth of map images by multi-view stereo",
     "rendering by a neural field (NeRF-W)",
-    "descriptors and matcher trained anew",
+    TRAINED,
 }
 WITHOUT_DEPTH = {
     "points verified by depth",
@@ -131,6 +133,13 @@ def test_who_turned_a_step_on_is_said() -> None:
     assert steps["ASLFeat"].why == "preset megloc"
     masked = steps["people and vehicles masked"]
     assert masked.why == "the dataset's file (preprocessing.masks.segmenter); deeplabv3plus"
+
+
+def test_weights_of_ones_own_training_are_said() -> None:
+    assert "megloc train descriptor makes such" in steps_of("aachen", "megloc")[TRAINED].why
+    own = "local_features.superpoint.options.descriptor_weights=night.safetensors"
+    step = steps_of("aachen", "megloc", own)[TRAINED]
+    assert step == PaperStep(TRAINED, True, "an option of this run (local_features)")
 
 
 def test_a_step_without_its_data_is_off_whoever_asks_for_it() -> None:

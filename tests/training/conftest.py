@@ -26,6 +26,14 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def other_walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The last three of them, as another scene."""
+    root = tmp_path_factory.mktemp("other_walk")
+    write_kapture(root, dict(list(POSES.items())[2:]), with_poses=True, with_depth=True)
+    return root
+
+
+@pytest.fixture(scope="session")
 def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with one image."""
     root = tmp_path_factory.mktemp("photographs")

@@ -42,7 +42,7 @@ def options(files: dict[str, str], kind: type[TrainingOptions] = TrainingOptions
         {
             "features": {"name": "xfeat", "options": chosen},
             **{"device": "cpu", "pairs": PAIRS, "max_keypoints": 64, "layers": 4},
-            **{"pairs_per_step": 2, "sinkhorn_iterations": 10, "held_out_pairs": 3},
+            **{"pairs_per_step": 2, "sinkhorn_iterations": 10},
             **{"steps": 6, "check_every": 2, **changes},
         }
     )
@@ -70,9 +70,10 @@ def overfitted(chosen: TrainingOptions, walk: Path) -> list[list[float]]:
     source = PosedPairs(KaptureFolder(walk), PairOptions.model_validate(PAIRS))
     pairs = [source.draw(np.random.default_rng(seed)) for seed in range(8)]
     assert len({pair.keys for pair in pairs}) > 4
-    trainer = Trainer(chosen, [Few(pairs)], {"same": Few(pairs, in_turn=True)})
+    trainer = Trainer(chosen)
+    trainer.hold_out({"same": Few(pairs, in_turn=True)})
     before = trainer.evaluate()
-    (state,) = trainer.train(TrainingState(0, []), ProcessGroup())
+    (state,) = trainer.train([Few(pairs)], TrainingState(0, []), ProcessGroup())
     return [before, state.rows[-1][3:]]
 
 
@@ -111,16 +112,24 @@ def interrupted_after(step: int) -> Work:
 
 @pytest.mark.parametrize("task", ["matcher", "descriptor"])
 def test_interrupted_and_resumed_is_uninterrupted(
-    task: str, files: dict[str, str], walk: Path, photographs: Path, tmp_path: Path
+    task: str,
+    files: dict[str, str],
+    walk: Path,
+    other_walk: Path,
+    photographs: Path,
+    tmp_path: Path,
 ) -> None:
     kind = {"matcher": TrainingOptions, "descriptor": DescriptorOptions}[task]
-    chosen = options(files, kind, deep_supervision=True)
+    chosen = options(files, kind, deep_supervision=True, held_out_pairs=3)
     data = TrainingData(
-        [KaptureFolder(walk)], [photographs], licences={walk: "CC0", photographs: "MIT"}
+        [KaptureFolder(walk)],
+        [photographs],
+        [KaptureFolder(other_walk)],
+        {walk: "CC0", photographs: "MIT"},
     )
     whole, parts = tmp_path / "whole" / "x.safetensors", tmp_path / "parts" / "x.safetensors"
     last = train(chosen, data, whole)
-    assert last["step"] == 6 and "held_out_loss" in last
+    assert last["step"] == 6 and np.isfinite(list(last.values())).all()
     # in the middle between two that are kept, and at one
     for step in (3, 2):
         with pytest.raises(KeyboardInterrupt):
@@ -129,11 +138,12 @@ def test_interrupted_and_resumed_is_uninterrupted(
     assert state["step"] == 4
     # threads change nothing
     assert str(train(chosen, data, parts, threads=3)) == str(last)
-    names = ["x.csv", "x.json", "x.safetensors", "x.state.pt"]
+    names = ["x.csv", "x.json", "x.safetensors", "x.state.pt", "x.overlaps"]
     names += ["x-superglue.safetensors"] if task == "descriptor" else []
     assert sorted(path.name for path in parts.parent.iterdir()) == sorted(names)
-    for name in set(names) - {"x.state.pt"}:
+    for name in set(names) - {"x.state.pt", "x.overlaps"}:
         assert (parts.parent / name).read_bytes() == (whole.parent / name).read_bytes(), name
+    assert len(list((parts.parent / "x.overlaps").iterdir())) == 2
     # what is done is done
     before = parts.stat().st_mtime_ns
     assert str(train(chosen, data, parts)) == str(last)
@@ -241,9 +251,15 @@ def test_what_cannot_be_trained_is_refused(
     ):
         with pytest.raises(OptionError, match=message):
             train(chosen, wrong, output)
-    views = {**PAIRS, "homographies": {"light": 0.5}}
-    with pytest.raises(OptionError, match="there are no photographs"):
-        train(options(files, pairs=views), data, output)
+    pictures = TrainingData(photographs=[photographs])
+    for given, changes, message in (
+        (data, {"pairs": {"homographies": {"light": 0.5}}}, "homographies .* no photographs"),
+        (pictures, {"pairs": {"overlap_bins": (0.1, 0.9)}}, "overlap_bins .* no kapture folders"),
+        (pictures, {"pairs": {"labels": {"max_depth_error": 0.1}}}, "max_depth_error changes"),
+        (data, {"held_out_pairs": 7}, "held_out_pairs .* no held-out folders"),
+    ):
+        with pytest.raises(OptionError, match=message):
+            train(options(files, **changes), given, output)
     with pytest.raises(OptionError, match="end in .safetensors"):
         train(chosen, data, tmp_path / "x.pth")
     with pytest.raises(OptionError, match="smaller learning_rate"):

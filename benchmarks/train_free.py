@@ -1,0 +1,157 @@
+"""A night descriptor for XFeat's detector, and a small SuperGlue for it, from free data alone.
+
+    .venv/bin/python benchmarks/train_free.py worlds       # rendered squares by day and at night
+    .venv/bin/python benchmarks/train_free.py descriptor   # hours; the same command goes on
+    .venv/bin/python benchmarks/train_free.py matcher      # on the descriptors so trained
+    .venv/bin/python benchmarks/train_free.py evaluate     # recall on worlds of other seeds
+
+XFeat's weights are Apache-2.0 and the rendered worlds are this project's own, so what comes out may
+be published under a free licence; the manifests beside the files say what went in. Other data with
+their licences: ``--also FOLDER=LICENCE`` (kapture with depth), ``--photographs FOLDER=LICENCE``.
+Everything lies below ``runs/train_free``. The worlds are photograph albums as those of Aachen's
+twin, of seeds from 1000 on, those held out from 2000 on; no test, no other benchmark draws these.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from megloc_twins.aachen import AachenTwin, AachenTwinOptions, build_aachen_frames
+from megloc_twins.frames import Frame
+from megloc_twins.render import RenderedFrame, render_frames
+
+import megloc_kapture as megloc
+from megloc_kapture.io.images import write_depth_map, write_image
+from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
+from megloc_kapture.pipeline.executors import open_executor
+from megloc_kapture.stages.work import HERE, Work
+from megloc_kapture.values import RigidTransform
+
+RENDERED_LICENCE = "BSD-3-Clause"
+TRAINING_SEED, HELD_OUT_SEED = 1000, 2000
+ALBUM = {"stations_per_place": 6, "day_queries": 16, "night_queries": 24}
+PAIRS = {"pairs.max_size_px": 640, "max_keypoints": 512, "check_every": 250}
+DESCRIPTOR = {"through": "products", "pairs_per_step": 4, "learning_rate": 2e-4, "steps": 20_000}
+MATCHER = {"layers": 12, "pairs_per_step": 8, "learning_rate": 5e-4, "steps": 100_000}
+
+
+def write_album(root: Path, seed: int, work: Work = HERE) -> None:
+    """A world's photographs by day and at night as kapture, all with their depth."""
+    options = AachenTwinOptions.model_validate({"seed": seed, **ALBUM})
+    frames = build_aachen_frames(options)
+    images = [*frames.mapping(), *frames.queries()]
+    names = [frame.name for frame in images]
+    records = root / "sensors" / "records_data"
+    render_frames(options.world(), images, partial(_write, records), with_depth=names, work=work)
+    data = KaptureData()
+    still = RigidTransform.identity()
+    for number, frame in enumerate(sorted(images, key=lambda one: one.name)):
+        camera, depth = f"{number}", f"{number}_depth"
+        data.sensors[camera] = Sensor.from_camera(frame.camera)
+        data.sensors[depth] = Sensor.from_camera(frame.camera, sensor_type="depth")
+        data.rigs[f"{number}_rig"] = {camera: still, depth: still}
+        data.trajectories[number, camera] = frame.cam_from_world
+        data.records_camera[number, camera] = frame.name
+        data.records_depth[number, depth] = f"{frame.name}.depth"
+    write_sensors(root, data)
+
+
+def _write(records: Path, frame: Frame, view: RenderedFrame) -> None:
+    write_image(records / frame.name, view.image)
+    assert view.depth_m is not None  # it was asked for
+    write_depth_map(records / f"{frame.name}.depth", view.depth_m)
+
+
+def worlds(root: Path, seeds: Sequence[int], workers: int) -> None:
+    """Render the worlds that are not there."""
+    with open_executor("processes", workers) as executor:
+        for seed in seeds:
+            folder = root / "worlds" / str(seed)
+            if not (folder / "sensors" / "sensors.txt").is_file():
+                write_album(folder, seed, Work(executor))
+                print(f"world {seed}", flush=True)
+
+
+def train(task: str, root: Path, arguments: argparse.Namespace) -> None:
+    """Train, or go on."""
+    rendered = [folder for folder in sorted((root / "worlds").iterdir()) if folder.is_dir()]
+    held_out = [folder for folder in rendered if int(folder.name) >= HELD_OUT_SEED]
+    also, photographs = (
+        dict(text.rsplit("=", 1) for text in given or ())
+        for given in (arguments.also, arguments.photographs)
+    )
+    kaptures = [*(folder for folder in rendered if folder not in held_out), *also]
+    chosen = {**PAIRS, **(DESCRIPTOR if task == "descriptor" else MATCHER)}
+    if task == "matcher":
+        chosen["features.options.descriptor_weights"] = str(root / "xfeat-night.safetensors")
+    name = {"descriptor": "xfeat-night", "matcher": "xfeat-night-superglue"}[task]
+    last = megloc.train(
+        task,
+        root / f"{name}.safetensors",
+        kaptures=kaptures,
+        photographs=list(photographs),
+        held_out=held_out,
+        features="xfeat",
+        set={**chosen, **dict(text.split("=", 1) for text in arguments.set or ())},
+        licences={**dict.fromkeys(map(str, rendered), RENDERED_LICENCE), **also, **photographs},
+    )
+    print({key: round(value, 5) for key, value in last.items()})
+
+
+def evaluate(root: Path, seeds: Sequence[int], workers: int) -> None:
+    """Night and day recall on Aachen's twin with XFeat's own descriptors and with these."""
+    gains = []
+    for seed in seeds:
+        twin = root / "twins" / str(seed)
+        if not twin.is_dir():
+            AachenTwin(AachenTwinOptions(seed=seed)).write(twin)
+        recalls = []
+        for name, options in (
+            ("own", {}),
+            ("night", {"descriptor_weights": str(root / "xfeat-night.safetensors")}),
+        ):
+            features = {"name": "xfeat", "options": {"max_keypoints": 2048, **options}}
+            run = megloc.run(
+                "aachen",
+                twin,
+                preset="classic",
+                set={"local_features": [features], "matching.options.max_ratio": 1.0},
+                workspace=root / "runs" / f"{seed}-{name}",
+                workers=workers,
+            )
+            recalls.append(run.recall)
+            print(f"seed {seed}, {name} descriptors\n{run.recall.round(3)}", flush=True)
+        gains.append(recalls[1].to_numpy() - recalls[0].to_numpy())
+    print("mean gain (rows and columns as above)")
+    print(np.round(np.mean(gains, axis=0), 3))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("task", choices=("worlds", "descriptor", "matcher", "evaluate"))
+    parser.add_argument("--root", type=Path, default=Path("runs") / "train_free")
+    parser.add_argument("--worlds", type=int, default=24, help="to train on")
+    parser.add_argument("--held-out", type=int, default=2, help="worlds")
+    parser.add_argument("--seeds", type=int, nargs="+", default=list(range(5)), help="evaluated")
+    parser.add_argument("--also", action="append", metavar="KAPTURE=LICENCE")
+    parser.add_argument("--photographs", action="append", metavar="FOLDER=LICENCE")
+    parser.add_argument("--set", action="append", metavar="KEY=VALUE", help="of megloc train")
+    parser.add_argument("--workers", type=int, default=1)
+    arguments = parser.parse_args()
+    root = arguments.root
+    if arguments.task == "worlds":
+        seeds = [TRAINING_SEED + k for k in range(arguments.worlds)]
+        seeds += [HELD_OUT_SEED + k for k in range(arguments.held_out)]
+        worlds(root, seeds, arguments.workers)
+    elif arguments.task == "evaluate":
+        evaluate(root, arguments.seeds, arguments.workers)
+    else:
+        train(arguments.task, root, arguments)
+
+
+if __name__ == "__main__":
+    main()
