@@ -19,6 +19,7 @@ from megloc_kapture.cli.options import shown
 from megloc_kapture.features.vlad import VladOptions
 from megloc_kapture.pipeline.presets import options_of
 from megloc_kapture.stages.options import PipelineOptions
+from megloc_kapture.training.trainer import DescriptorOptions
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 PAGES = sorted([REPOSITORY / "README.md", *(REPOSITORY / "docs").rglob("*.md")])
@@ -123,6 +124,14 @@ def test_every_option_stands_in_the_table_with_its_default() -> None:
         found = [one for one in entry_points(name=plugin) if one.group.startswith("megloc_kapture")]
         model = VladOptions if plugin == "vlad" else found[0].load().Options
         assert shown(model.model_fields[option].default) == default, (plugin, option)
+
+
+def test_every_option_of_training_stands_in_its_table() -> None:
+    text = (REPOSITORY / "docs" / "training.md").read_text()
+    expected = {one.key: shown(one.value) for one in options_of(DescriptorOptions())}
+    choice = expected.pop("features")
+    expected |= {"features.name": choice, "features.options": "{}"}
+    assert dict(re.findall(r"^\| `([\w.]+)` \| `(.*?)` \|", text, flags=re.M)) == expected
 
 
 @pytest.mark.slow
