@@ -4,6 +4,7 @@ The layout is that of the published archives and of what the open trainings make
 ``megadepth_utils``)::
 
     phoenix/S6/zl548/MegaDepth_v1/SCENE/dense0/depths/NAME.h5    depth of the undistorted images
+    depth_undistorted/SCENE/NAME.h5                              the same, where glue-factory has it
     Undistorted_SfM/SCENE/{images,sparse or sparse-txt}          COLMAP's image_undistorter
     scene_info/SCENE.npz                                         paths, intrinsics, poses
 
@@ -18,7 +19,6 @@ import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,10 +34,10 @@ from megloc_kapture.preprocessing.resampling import scaled_camera
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, Options, RigidTransform
 
-_DEPTH = Path("phoenix") / "S6" / "zl548" / "MegaDepth_v1"
+_DEPTHS = ("phoenix/S6/zl548/MegaDepth_v1/{}/dense0/depths", "depth_undistorted/{}")
 _UNDISTORTED, _SCENE_INFO = "Undistorted_SfM", "scene_info"
 _MODELS = ("sparse", "sparse-txt", "sparse/0")
-_ARRAYS = ("image_paths", "depth_paths", "intrinsics", "poses")
+_ARRAYS = ("image_paths", "intrinsics", "poses")
 _MAX_DEPTH_PIXELS = 1 << 28
 _IDENTITY = RigidTransform.identity()
 
@@ -77,6 +77,8 @@ def import_megadepth(
     for scene in scenes:
         images = list(_images(root, scene))
         written = _write_scene(output / scene, work.track(images, len(images), scene))
+        if not written:
+            raise DataError(f"scene {scene} has no image that is there with its depth", path=root)
         counts["scenes"] += 1
         counts["images"] += written
         counts["without_depth"] += len(images) - written
@@ -126,48 +128,49 @@ def _images(root: Path, scene: str) -> Iterator[_Image]:
     if model is not None:
         yield from _of_model(root, scene, model, folder / "images")
     elif table.is_file():
-        yield from _of_table(root, table)
+        yield from _of_table(root, scene, table)
     else:
         raise DataError(f"neither {folder} nor {table} is there", path=root)
 
 
 def _of_model(root: Path, scene: str, model: Path, folder: Path) -> Iterator[_Image]:
     found = read_colmap_model(model, with_points=False)
-    depths = root / _DEPTH / scene / "dense0" / "depths"
     for image in sorted(found.images, key=lambda one: one.name):
         path = safe_join(folder, image.name)
-        depth = safe_join(depths, str(PurePosixPath(image.name).with_suffix(".h5")))
-        if path.is_file() and depth.is_file():
+        depth = _depth_of(root, scene, image.name)
+        if path.is_file() and depth is not None:
             yield _Image(path, depth, found.cameras[image.camera_id], image.cam_from_world)
 
 
-def _of_table(root: Path, table: Path) -> Iterator[_Image]:
+def _depth_of(root: Path, scene: str, image: str) -> Path | None:
+    name = str(PurePosixPath(image).with_suffix(".h5"))
+    places = (safe_join(root / folder.format(scene), name) for folder in _DEPTHS)
+    return next((path for path in places if path.is_file()), None)
+
+
+def _of_table(root: Path, scene: str, table: Path) -> Iterator[_Image]:
     try:
         with np.load(table, allow_pickle=False) as file:
-            images, depths, intrinsics, poses = (file[name] for name in _ARRAYS)
+            images, intrinsics, poses = (file[name] for name in _ARRAYS)
     except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
         raise DataError(
             "its arrays are Python objects or broken, and pickles are not read; docs/training.md "
             f"has the lines that make plain arrays of them ({error})",
             path=table,
         ) from error
-    _check_table(table, images, depths, intrinsics, poses)
+    shapes = [(len(images), *shape) for shape in ((), (3, 3), (4, 4))]
+    for name, array, shape in zip(_ARRAYS, (images, intrinsics, poses), shapes, strict=True):
+        if array.shape != shape or array.dtype.kind not in ("U" if array is images else "fiu"):
+            raise DataError(f"{name} is {array.dtype} {array.shape}, expected {shape}", path=table)
     for row in np.argsort(images):
-        path, depth = (safe_join(root, str(names[row])) for names in (images, depths))
-        if not (path.is_file() and depth.is_file()):
+        path = safe_join(root, str(images[row]))
+        depth = _depth_of(root, scene, path.name)
+        if not path.is_file() or depth is None:
             continue
         k = intrinsics[row]
         camera = Camera("PINHOLE", *image_size(path), (k[0, 0], k[1, 1], k[0, 2], k[1, 2]))
         pose = poses[row]
         yield _Image(path, depth, camera, RigidTransform.from_matrix(pose[:3, :3], pose[:3, 3]))
-
-
-def _check_table(table: Path, *arrays: NDArray[Any]) -> None:
-    shapes = [(len(arrays[0]), *shape) for shape in ((), (), (3, 3), (4, 4))]
-    for name, array, shape in zip(_ARRAYS, arrays, shapes, strict=True):
-        text = name.endswith("paths")
-        if array.shape != shape or array.dtype.kind not in ("U" if text else "fiu"):
-            raise DataError(f"{name} is {array.dtype} {array.shape}, expected {shape}", path=table)
 
 
 def _write_scene(output: Path, images: Sequence[_Image] | Iterator[_Image]) -> int:

@@ -61,10 +61,13 @@ def write_sample(root: Path, scene: str, *, model: bool) -> None:
         return
     (root / "scene_info").mkdir()
     names = list(everything)
-    where = DEPTHS / scene / "dense0" / "depths"
+    # of glue-factory's archives
+    moved = root / "depth_undistorted" / scene
+    moved.parent.mkdir()
+    depths.rename(moved)
     arrays = {
         "image_paths": [f"Undistorted_SfM/{scene}/images/{name}" for name in names],
-        "depth_paths": [f"{where.as_posix()}/{Path(name).stem}.h5" for name in names],
+        "depth_paths": [f"elsewhere/{Path(name).stem}.h5" for name in names],
         "intrinsics": [np.array([[FX, 0, CX], [0, FY, CY], [0, 0, 1]]) for _ in names],
         "poses": [everything[name].matrix() for name in names],
     }
@@ -139,11 +142,15 @@ def test_a_scene_by_its_table(tmp_path: Path) -> None:
 def test_depth_that_is_none_of_its_own(tmp_path: Path) -> None:
     path = tmp_path / "a.h5"
     write_depth(tmp_path / "other.h5", np.ones((3, 4), np.float32))
-    for message in ("no array 'depth'", "lies in another file", r"depth is int64 \(3,\)", "HDF5"):
+    elsewhere = [(str(tmp_path / "raw"), 0, h5py.h5f.UNLIMITED)]
+    in_others = "lies in another file"
+    for message in ("no array 'depth'", in_others, f"'depth' {in_others}", "int64", "HDF5"):
         with h5py.File(path, "w") as file:
             if message.startswith("no array"):
                 file["depth"] = h5py.ExternalLink("other.h5", "depth")
-            elif message.startswith("lies"):
+            elif message.startswith("'depth'"):
+                file.create_dataset("depth", (3, 4), np.float32, external=elsewhere)
+            elif message == in_others:
                 layout = h5py.VirtualLayout((3, 4), np.float32)
                 layout[...] = h5py.VirtualSource(tmp_path / "other.h5", "depth", (3, 4))
                 file.create_virtual_dataset("depth", layout)
@@ -165,6 +172,11 @@ def test_what_is_missing_is_named(tmp_path: Path, capsys: Any) -> None:
         import_megadepth(tmp_path, tmp_path / "out")
     with pytest.raises(DataError, match=r"neither .*0001 nor .*0001\.npz is there"):
         import_megadepth(tmp_path, tmp_path / "out", MegaDepthOptions(scenes=("0001",)))
+    (tmp_path / "empty" / "scene_info").mkdir(parents=True)
+    arrays = {"intrinsics": np.eye(3)[None], "poses": np.eye(4)[None]}
+    np.savez(tmp_path / "empty" / "scene_info" / "7.npz", image_paths=["x.jpg"], **arrays)
+    with pytest.raises(DataError, match="scene 7 has no image that is there with its depth"):
+        import_megadepth(tmp_path / "empty", tmp_path / "out")
     with pytest.raises(DataError, match="'..'"):
         import_megadepth(tmp_path, tmp_path / "out", MegaDepthOptions(scenes=("..",)))
     with pytest.raises(SystemExit) as end:
