@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-import numpy as np
+import pandas as pd
 from megloc_twins.aachen import AachenTwin, AachenTwinOptions, build_aachen_frames
 from megloc_twins.frames import Frame
 from megloc_twins.render import RenderedFrame, render_frames
@@ -102,13 +102,14 @@ def train(task: str, root: Path, arguments: argparse.Namespace) -> None:
     print({key: round(value, 5) for key, value in last.items()})
 
 
-def evaluate(root: Path, seeds: Sequence[int], workers: int) -> None:
-    """Night and day recall on Aachen's twin with XFeat's own descriptors and with these."""
-    gains = []
-    for seed in seeds:
-        twin = root / "twins" / str(seed)
+def evaluate(root: Path, seeds: Sequence[int], scenes: Sequence[Path], workers: int) -> None:
+    """Recall with XFeat's own descriptors and with these, on Aachen's twins and on scenes."""
+    places = [("aachen", root / "twins" / str(seed)) for seed in seeds]
+    for seed, (_, twin) in zip(seeds, places, strict=True):
         if not twin.is_dir():
             AachenTwin(AachenTwinOptions(seed=seed)).write(twin)
+    gains: dict[str, list[pd.DataFrame]] = {}
+    for dataset, folder in [*places, *(("kapture", scene) for scene in scenes)]:
         recalls = []
         for name, options in (
             ("own", {}),
@@ -116,18 +117,19 @@ def evaluate(root: Path, seeds: Sequence[int], workers: int) -> None:
         ):
             features = {"name": "xfeat", "options": {"max_keypoints": 2048, **options}}
             run = megloc.run(
-                "aachen",
-                twin,
+                dataset,
+                folder,
                 preset="classic",
                 set={"local_features": [features], "matching.options.max_ratio": 1.0},
-                workspace=root / "runs" / f"{seed}-{name}",
+                workspace=root / "runs" / f"{folder.name}-{name}",
                 workers=workers,
             )
             recalls.append(run.recall)
-            print(f"seed {seed}, {name} descriptors\n{run.recall.round(3)}", flush=True)
-        gains.append(recalls[1].to_numpy() - recalls[0].to_numpy())
-    print("mean gain (rows and columns as above)")
-    print(np.round(np.mean(gains, axis=0), 3))
+            print(f"{folder.name}, {name} descriptors\n{run.recall.round(3)}", flush=True)
+        kind = "twins" if dataset == "aachen" else folder.name
+        gains.setdefault(kind, []).append(recalls[1] - recalls[0])
+    for kind, found in gains.items():
+        print(f"mean gain, {kind}\n{(sum(found[1:], found[0]) / len(found)).round(3)}")
 
 
 def main() -> None:
@@ -137,6 +139,7 @@ def main() -> None:
     parser.add_argument("--worlds", type=int, default=24, help="to train on")
     parser.add_argument("--held-out", type=int, default=2, help="worlds")
     parser.add_argument("--seeds", type=int, nargs="+", default=list(range(5)), help="evaluated")
+    parser.add_argument("--scene", type=Path, nargs="+", default=[], help="evaluated beside them")
     parser.add_argument("--also", action="append", metavar="KAPTURE=LICENCE")
     parser.add_argument("--photographs", action="append", metavar="FOLDER=LICENCE")
     parser.add_argument("--set", action="append", metavar="KEY=VALUE", help="of megloc train")
@@ -148,7 +151,7 @@ def main() -> None:
         seeds += [HELD_OUT_SEED + k for k in range(arguments.held_out)]
         worlds(root, seeds, arguments.workers)
     elif arguments.task == "evaluate":
-        evaluate(root, arguments.seeds, arguments.workers)
+        evaluate(root, arguments.seeds, arguments.scene, arguments.workers)
     else:
         train(arguments.task, root, arguments)
 

@@ -17,7 +17,7 @@ from megloc_kapture.stages.work import Work
 @dataclass(frozen=True, kw_only=True)
 class Train(Linked, Common):
     """Train SuperGlue, or a detector's descriptors, on kapture folders with depth and on
-    photographs; goes on where it was interrupted."""
+    photographs. It goes on where it was interrupted."""
 
     task: Annotated[
         tyro.conf.Positional[Literal["matcher", "descriptor"]], tyro.conf.arg(metavar="TASK")
