@@ -28,6 +28,8 @@ megloc match -i my_scene/mapping --query my_scene/query --features-dir features 
 megloc triangulate -i my_scene/mapping --features-dir features --features-dir matches -o map
 megloc refine-map -i map -o map_refined --set refinement.uncertainty.max_robust_sigmas=2.5
 megloc refine-poses -i map --query my_scene/query --poses localized -o refined --by icp
+megloc train matcher -i my_scene/mapping --held-out other_scene/mapping -o matcher.safetensors
+megloc train descriptor -i my_scene/mapping --features xfeat -o descriptor.safetensors
 megloc serve my_map
 megloc serve my_map --host 0.0.0.0 --token-file token.txt --workers 2
 megloc submit aachen -i runs/aachen-megloc/localized -o poses.txt
