@@ -11,7 +11,7 @@ import signal
 import tempfile
 import threading
 import zlib  # noqa: F401  pycolmap 4.1.1 to 4.2.1 corrupt the heap when imported before zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -32,7 +32,8 @@ if TYPE_CHECKING:
 
 
 @lru_cache(maxsize=1)
-def _pycolmap() -> Any:
+def load_pycolmap() -> Any:
+    """pycolmap, imported when it is first needed; for the modules of ``io`` alone."""
     before = signal.getsignal(signal.SIGTERM)
     import pycolmap
 
@@ -44,7 +45,7 @@ def _pycolmap() -> Any:
 
 
 def _new_colmap_camera(camera: Camera) -> Any:
-    return _pycolmap().Camera(
+    return load_pycolmap().Camera(
         model=camera.model,
         width=camera.width,
         height=camera.height,
@@ -81,7 +82,7 @@ def undistorted_pinhole(camera: Camera, *, blank_pixels: float = 0.0) -> Camera:
     blank_pixels : 0: no pixel that the distorted image does not show; 1: all that it shows; in
         between, in between. The sides stay between 0.2 and 2 times the old ones.
     """
-    pycolmap = _pycolmap()
+    pycolmap = load_pycolmap()
     options = pycolmap.UndistortCameraOptions()
     options.blank_pixels = blank_pixels
     found = pycolmap.undistort_camera(options, _colmap_camera(camera))
@@ -90,7 +91,7 @@ def undistorted_pinhole(camera: Camera, *, blank_pixels: float = 0.0) -> Camera:
 
 def focal_from_exif(jpeg: bytes) -> float | None:
     """Focal length in pixels that COLMAP finds in the EXIF of a JPEG file; None without one."""
-    pycolmap = _pycolmap()
+    pycolmap = load_pycolmap()
     with tempfile.TemporaryDirectory(prefix=f".{owned_name()}") as folder:
         path = Path(folder) / "blank.jpg"
         path.write_bytes(jpeg)
@@ -118,7 +119,7 @@ def focal_from_matches(
     usable = np.isfinite(points_px).all(axis=1) & np.isfinite(points).all(axis=1)
     if np.count_nonzero(usable) < 4:
         return None
-    pycolmap = _pycolmap()
+    pycolmap = load_pycolmap()
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.estimate_focal_length = True
     options.ransac.max_error = max_error_px
@@ -128,7 +129,7 @@ def focal_from_matches(
     return None if found is None else float(changed.mean_focal_length())
 
 
-_NEVER = 2**31 - 1
+NEVER = 2**31 - 1
 
 
 class TriangulationOptions(Options):
@@ -175,7 +176,7 @@ class TriangulatedPoints:
 
 
 @contextmanager
-def _quiet_stderr() -> Iterator[None]:
+def quiet_stderr() -> Iterator[None]:
     # COLMAP writes progress to the file descriptor whatever its log level says
     if os.environ.get("MEGLOC_COLMAP_LOG"):
         yield
@@ -192,7 +193,7 @@ def _quiet_stderr() -> Iterator[None]:
 
 
 def _rigid3d(transform: RigidTransform) -> Any:
-    pycolmap = _pycolmap()
+    pycolmap = load_pycolmap()
     w, x, y, z = transform.quat_wxyz
     return pycolmap.Rigid3d(
         pycolmap.Rotation3d(np.array([x, y, z, w])), np.array(transform.translation)
@@ -232,21 +233,25 @@ def triangulate(
             raise DataError(
                 f"images {images[i].name} and {images[j].name} are matched twice or are the same"
             )
-        sizes = np.array([len(images[i].keypoints_px), len(images[j].keypoints_px)])
-        if len(pairs) and ((np.asarray(pairs) >= sizes).any() or (np.asarray(pairs) < 0).any()):
+        both = np.array([len(images[i].keypoints_px), len(images[j].keypoints_px)])
+        if len(pairs) and ((np.asarray(pairs) >= both).any() or (np.asarray(pairs) < 0).any()):
             raise DataError(
                 f"matches between {images[i].name} and {images[j].name} refer to keypoints "
-                f"that the images do not have ({sizes[0]} and {sizes[1]})"
+                f"that the images do not have ({both[0]} and {both[1]})"
             )
-    pycolmap = _pycolmap()
+    pycolmap = load_pycolmap()
+    sizes = [len(image.keypoints_px) for image in images]
     offset = np.mean([image.cam_from_world.center() for image in images], axis=0)
-    with _database_folder(scratch, images, matches) as folder, _quiet_stderr():
+    with database_folder(scratch, sizes, matches) as folder, quiet_stderr():
         database_path = Path(folder) / "database.db"
-        reconstruction = _write_database(pycolmap, database_path, images, matches, offset)
+        cameras, camera_ids = _cameras_of(images)
+        named = [(i.name, k, i.keypoints_px) for i, k in zip(images, camera_ids, strict=True)]
+        write_database(database_path, cameras, named, matches)
+        reconstruction = _posed_reconstruction(cameras, camera_ids, images, offset)
         pipeline = pycolmap.IncrementalPipelineOptions()
         pipeline.num_threads = num_threads
         # with many residuals its threads add them up in whatever order they come: other last bits
-        pipeline.ba_min_num_residuals_for_cpu_multi_threading = _NEVER
+        pipeline.ba_min_num_residuals_for_cpu_multi_threading = NEVER
         # drawn from in tracks of many images only, and never seen to change a point
         pipeline.random_seed = pipeline.triangulation.random_seed = 0
         pipeline.triangulation.ignore_two_view_tracks = not options.two_view_tracks
@@ -264,9 +269,9 @@ def triangulate(
 
 
 @contextmanager
-def _database_folder(
+def database_folder(
     scratch: Path | None,
-    images: Sequence[MapImage],
+    num_keypoints: Sequence[int],
     matches: Mapping[tuple[int, int], NDArray[np.integer[Any]]],
 ) -> Iterator[str]:
     """A folder for a database; with too little room COLMAP would end the process, so it is asked.
@@ -277,8 +282,8 @@ def _database_folder(
     """
     place = tempfile.gettempdir() if scratch is None else scratch
     # matches are written twice, keypoints as float32; the rest is what SQLite and its journal take
-    needed = 16 * sum(map(len, matches.values())) + 8 * sum(len(i.keypoints_px) for i in images)
-    needed = 2 * needed + 2048 * (len(images) + len(matches)) + (1 << 20)
+    needed = 16 * sum(map(len, matches.values())) + 8 * sum(num_keypoints)
+    needed = 2 * needed + 2048 * (len(num_keypoints) + len(matches)) + (1 << 20)
     try:
         Path(place).mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(
@@ -296,38 +301,49 @@ def _database_folder(
         raise OutputError(f"{place}: COLMAP cannot work here: {error}") from error
 
 
-def _write_database(
-    pycolmap: Any,
+def _cameras_of(images: Sequence[MapImage]) -> tuple[list[Any], list[int]]:
+    """COLMAP's cameras, equal ones once, and the number of each image's."""
+    numbers: dict[Camera, int] = {}
+    camera_ids = [numbers.setdefault(image.camera, len(numbers) + 1) for image in images]
+    return numbered_cameras(numbers), camera_ids
+
+
+def numbered_cameras(cameras: Iterable[Camera]) -> list[Any]:
+    """COLMAP's cameras, numbered from 1 on."""
+    found = []
+    for camera_id, camera in enumerate(cameras, start=1):
+        found.append(_new_colmap_camera(camera))
+        found[-1].camera_id = camera_id
+    return found
+
+
+def write_database(
     path: Path,
-    images: Sequence[MapImage],
+    cameras: Sequence[Any],
+    images: Sequence[tuple[str, int, NDArray[np.floating[Any]]]],
     matches: Mapping[tuple[int, int], NDArray[np.integer[Any]]],
-    offset: NDArray[np.float64],
-) -> Any:
-    """Write COLMAP's database for the images; returns the reconstruction with fixed poses."""
-    reconstruction = pycolmap.Reconstruction()
+    geometry: Callable[[int, int, NDArray[np.uint32]], Any] | None = None,
+) -> None:
+    """Write COLMAP's database; every camera is a rig of its own.
+
+    Parameters
+    ----------
+    cameras : COLMAP's, with their numbers.
+    images : name, number of the camera and keypoints (N, 2) of each; they are numbered from 1 on.
+    matches : (M, 2) keypoint rows of pairs (i, j) of indices into ``images``.
+    geometry : COLMAP's two-view geometry of a pair; a verified one unless given.
+    """
+    pycolmap = load_pycolmap()
     database = pycolmap.Database.open(str(path))
-    recentre = RigidTransform((1.0, 0.0, 0.0, 0.0), (offset[0], offset[1], offset[2]))
-    camera_ids: dict[Camera, int] = {}
     with pycolmap.DatabaseTransaction(database):
-        for index, image in enumerate(images):
-            if image.camera not in camera_ids:
-                camera_id = camera_ids[image.camera] = len(camera_ids) + 1
-                camera = _new_colmap_camera(image.camera)
-                camera.camera_id = camera_id
-                database.write_camera(camera, use_camera_id=True)
-                reconstruction.add_camera_with_trivial_rig(camera)
-                rig = pycolmap.Rig(rig_id=camera_id)
-                rig.add_ref_sensor(camera.sensor_id)
-                database.write_rig(rig, use_rig_id=True)
-            camera_id = camera_ids[image.camera]
-            image_id = index + 1
-            keypoints = np.ascontiguousarray(image.keypoints_px[:, :2], dtype=np.float64)
-            entry = pycolmap.Image(
-                image_id=image_id,
-                name=image.name,
-                camera_id=camera_id,
-                keypoints=keypoints,
-            )
+        for camera in cameras:
+            database.write_camera(camera, use_camera_id=True)
+            rig = pycolmap.Rig(rig_id=camera.camera_id)
+            rig.add_ref_sensor(camera.sensor_id)
+            database.write_rig(rig, use_rig_id=True)
+        for image_id, (name, camera_id, keypoints_px) in enumerate(images, start=1):
+            keypoints = np.ascontiguousarray(keypoints_px[:, :2], dtype=np.float32)
+            entry = pycolmap.Image(image_id=image_id, name=name, camera_id=camera_id)
             entry.frame_id = image_id
             frame = pycolmap.Frame()
             frame.frame_id = image_id
@@ -335,27 +351,48 @@ def _write_database(
             frame.add_data_id(entry.data_id)
             database.write_frame(frame, use_frame_id=True)
             database.write_image(entry, use_image_id=True)
-            database.write_keypoints(image_id, keypoints.astype(np.float32))
-            reconstruction.add_image_with_trivial_frame(
-                pycolmap.Image(
-                    image_id=image_id,
-                    name=image.name,
-                    camera_id=camera_id,
-                    keypoints=keypoints,
-                ),
-                _rigid3d(image.cam_from_world @ recentre),
-            )
+            database.write_keypoints(image_id, keypoints)
         for (i, j), pairs in matches.items():
             if len(pairs) == 0:
                 continue
             rows = np.ascontiguousarray(pairs, dtype=np.uint32)
-            geometry = pycolmap.TwoViewGeometry()
-            geometry.inlier_matches = rows
-            # left UNDEFINED, pycolmap 4.2 triangulates nothing, silently
-            geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
             database.write_matches(i + 1, j + 1, rows)
-            database.write_two_view_geometry(i + 1, j + 1, geometry)
+            found = _verified_geometry(rows) if geometry is None else geometry(i, j, rows)
+            database.write_two_view_geometry(i + 1, j + 1, found)
     database.close()
+
+
+def _verified_geometry(rows: NDArray[np.uint32]) -> Any:
+    pycolmap = load_pycolmap()
+    geometry = pycolmap.TwoViewGeometry()
+    geometry.inlier_matches = rows
+    # left UNDEFINED, pycolmap 4.2 triangulates nothing, silently
+    geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+    return geometry
+
+
+def _posed_reconstruction(
+    cameras: Sequence[Any],
+    camera_ids: Sequence[int],
+    images: Sequence[MapImage],
+    offset: NDArray[np.float64],
+) -> Any:
+    """The reconstruction of the poses, without points."""
+    pycolmap = load_pycolmap()
+    reconstruction = pycolmap.Reconstruction()
+    recentre = RigidTransform((1.0, 0.0, 0.0, 0.0), (offset[0], offset[1], offset[2]))
+    for camera in cameras:
+        reconstruction.add_camera_with_trivial_rig(camera)
+    for image_id, (image, camera_id) in enumerate(zip(images, camera_ids, strict=True), start=1):
+        entry = pycolmap.Image(
+            image_id=image_id,
+            name=image.name,
+            camera_id=camera_id,
+            keypoints=np.ascontiguousarray(image.keypoints_px[:, :2], dtype=np.float64),
+        )
+        reconstruction.add_image_with_trivial_frame(
+            entry, _rigid3d(image.cam_from_world @ recentre)
+        )
     return reconstruction
 
 
@@ -399,7 +436,7 @@ def write_model(
     ------
     OutputError : the folder cannot be written to.
     """
-    pycolmap = _pycolmap()
+    pycolmap = load_pycolmap()
     model = pycolmap.Reconstruction()
     camera_ids: dict[Camera, int] = {}
     tracks: list[list[Any]] = [[] for _ in xyz]
@@ -448,7 +485,7 @@ def extract_sift(
         orientation in radians.
     descriptors : uint8 (N, 128): 512 times the square roots of the L1-normalised histograms.
     """
-    pycolmap = _pycolmap()
+    pycolmap = load_pycolmap()
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads = 1
     options.sift.max_num_features = max_keypoints
@@ -480,7 +517,7 @@ def write_feature_database(path: Path, images: Iterable[DatabaseFeatures]) -> No
     ------
     OutputError : ``path`` is there already, or cannot be written.
     """
-    pycolmap = _pycolmap()
+    pycolmap = load_pycolmap()
     path = Path(path)
     if path.exists():
         raise OutputError(f"{path}: is there already")

@@ -1,0 +1,197 @@
+"""COLMAP's mappers: poses, cameras and points of photographs from their verified matches.
+
+The incremental mapper is that of Schoenberger and Frahm, Structure-from-Motion Revisited (CVPR
+2016), the global one GLOMAP (Pan et al., ECCV 2024); both are pycolmap's.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.colmap import (
+    NEVER,
+    database_folder,
+    load_pycolmap,
+    numbered_cameras,
+    quiet_stderr,
+    write_database,
+)
+from megloc_kapture.values import Camera, RigidTransform
+
+Mapper = Literal["incremental", "global"]
+MIN_IMAGES = 3
+# fewer are what RANSAC finds in anything
+_MIN_POINTS = 30
+# matches that move less than this in the median are of one image twice
+_SAME_PX = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Photograph:
+    """An image without a pose.
+
+    Attributes
+    ----------
+    sensor : images of one sensor have one camera, which is estimated for all of them.
+    keypoints_px : (N, 2), the first pixel's centre is (0.5, 0.5).
+    """
+
+    name: str
+    sensor: str
+    camera: Camera
+    keypoints_px: NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """What a mapper found of images that hang together, in a world of its own without unit.
+
+    Attributes
+    ----------
+    cameras : of the sensors, refined.
+    poses : ``cam_from_world`` by image.
+    error_px : mean reprojection error of its points.
+    """
+
+    cameras: dict[str, Camera]
+    poses: dict[str, RigidTransform]
+    num_points: int
+    error_px: float
+
+
+def reconstruct(
+    photographs: Sequence[Photograph],
+    matches: Mapping[tuple[int, int], NDArray[np.integer[Any]]],
+    mapper: Mapper = "incremental",
+    *,
+    known_cameras: bool = False,
+    seed: int = 0,
+    scratch: Path | None = None,
+) -> list[Model]:
+    """Find poses and cameras; models that do not hang together are several, the largest first.
+
+    In one thread, so that the same photographs and seed give the same model.
+
+    Parameters
+    ----------
+    matches : (M, 2) keypoint rows for pairs (i, j) of indices into ``photographs``.
+    known_cameras : the cameras stay as they are; else focal length and distortion are estimated.
+    scratch : folder for COLMAP's database meanwhile, the system's unless given.
+
+    Raises
+    ------
+    DataError : there is no model, and what speaks against one.
+    OutputError : no room for the database.
+    """
+    pycolmap = load_pycolmap()
+    sensors = sorted({photograph.sensor for photograph in photographs})
+    of_sensor = {photograph.sensor: photograph.camera for photograph in photographs}
+    cameras = numbered_cameras(of_sensor[sensor] for sensor in sensors)
+    for camera in cameras:
+        camera.has_prior_focal_length = known_cameras
+    images = [(p.name, sensors.index(p.sensor) + 1, p.keypoints_px) for p in photographs]
+    seen: list[tuple[Any, float]] = []
+
+    def geometry(i: int, j: int, rows: NDArray[np.uint32]) -> Any:
+        points = [np.asarray(photographs[at].keypoints_px[:, :2], np.float64) for at in (i, j)]
+        options = pycolmap.TwoViewGeometryOptions()
+        options.ransac.random_seed = seed
+        first, second = (cameras[images[at][1] - 1] for at in (i, j))
+        found = pycolmap.estimate_two_view_geometry(
+            first, points[0], second, points[1], rows, options
+        )
+        if len(inliers := found.inlier_matches):
+            apart = points[0][inliers[:, 0]] - points[1][inliers[:, 1]]
+            seen.append((found.config, float(np.median(np.linalg.norm(apart, axis=1)))))
+        return found
+
+    sizes = [len(photograph.keypoints_px) for photograph in photographs]
+    with database_folder(scratch, sizes, matches) as folder, quiet_stderr():
+        database = Path(folder) / "database.db"
+        write_database(database, cameras, images, matches, geometry)
+        if mapper == "global" and seen and not known_cameras:
+            calibration = pycolmap.ViewGraphCalibrationOptions()
+            calibration.random_seed = seed
+            pycolmap.calibrate_view_graph(str(database), calibration)
+        (Path(folder) / "result").mkdir()
+        run = pycolmap.incremental_mapping if mapper == "incremental" else pycolmap.global_mapping
+        made = _options(mapper, cameras, seed, known_cameras)
+        found = run(str(database), folder, str(Path(folder) / "result"), made) if seen else {}
+    models = [_model(reconstruction, sensors) for _, reconstruction in sorted(found.items())]
+    models = [m for m in models if len(m.poses) >= MIN_IMAGES and m.num_points >= _MIN_POINTS]
+    if not models:
+        raise DataError(_why_none(seen))
+    return sorted(models, key=lambda model: (-len(model.poses), -model.num_points))
+
+
+def _options(mapper: Mapper, cameras: Sequence[Any], seed: int, known_cameras: bool) -> Any:
+    pycolmap = load_pycolmap()
+    if mapper == "global":
+        options = pycolmap.GlobalPipelineOptions()
+        inner, bundle = options.mapper, options.mapper.bundle_adjustment
+        parts = [options, inner, inner.rotation_averaging, inner.global_positioning]
+        parts.append(inner.retriangulation)
+        options.num_threads = inner.num_threads = bundle.ceres.solver_options.num_threads = 1
+        bundle.ceres.min_num_residuals_for_cpu_multi_threading = NEVER
+        bundle.refine_focal_length = bundle.refine_extra_params = not known_cameras
+    else:
+        options = pycolmap.IncrementalPipelineOptions()
+        parts = [options, options.mapper, options.triangulation]
+        options.num_threads = options.mapper.num_threads = 1
+        options.ba_min_num_residuals_for_cpu_multi_threading = NEVER
+        options.min_model_size = MIN_IMAGES
+        options.extract_colors = False
+        # minutes of trying where two scenes are mixed
+        options.structure_less_registration_fallback = False
+        if known_cameras:
+            options.constant_cameras = {camera.camera_id for camera in cameras}
+    for part in parts:
+        part.random_seed = seed
+    return options
+
+
+def _model(reconstruction: Any, sensors: Sequence[str]) -> Model:
+    reconstruction.update_point_3d_errors()  # the global mapper's are of rays
+    poses, cameras = {}, {}
+    for image_id in sorted(reconstruction.reg_image_ids()):
+        image = reconstruction.images[image_id]
+        found = image.cam_from_world()
+        poses[image.name] = RigidTransform.from_matrix(
+            found.rotation.matrix(), np.asarray(found.translation)
+        )
+        camera = Camera.from_colmap(reconstruction.cameras[image.camera_id])
+        cameras[sensors[image.camera_id - 1]] = camera
+    return Model(
+        cameras,
+        poses,
+        reconstruction.num_points3D(),
+        reconstruction.compute_mean_reprojection_error(),
+    )
+
+
+def _why_none(seen: Sequence[tuple[Any, float]]) -> str:
+    """Why there is no model, by the verified pairs: their two-view geometry and median motion."""
+    if not seen:
+        return "no two photographs show enough of the same things to be matched"
+    if all(moved_px < _SAME_PX for _, moved_px in seen):
+        return "the photographs are all the same one; take some from other places"
+    kinds = load_pycolmap().TwoViewGeometryConfiguration
+    flat = (kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC)
+    configs = Counter(config for config, _ in seen)
+    if 2 * sum(configs[kind] for kind in flat) > len(seen):
+        return (
+            "the photographs were taken from one place, or show nothing but a plane: nothing tells "
+            "how far anything is; walk sideways between photographs"
+        )
+    return (
+        f"{len(seen)} pairs of photographs match, but no {MIN_IMAGES} of them hang together; take "
+        "more, with more overlap and from more places"
+    )
