@@ -27,15 +27,13 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.report.scene import corner_rays
 from megloc_kapture.geometry.cameras import principal_point_px
+from megloc_kapture.geometry.earth import earth_from_enu, geodetic
 from megloc_kapture.io.colmap import MapImage, write_model
 from megloc_kapture.io.files import write_bytes
 from megloc_kapture.io.ply import write_ply
 from megloc_kapture.values import ONE_FOCAL_MODELS, Camera, RigidTransform
 
 _MAP_COLOUR, _QUERY_COLOUR = (120, 120, 120), (220, 50, 32)
-# of WGS84: semi-major axis in metres, flattening
-_A, _F = 6_378_137.0, 1 / 298.257223563
-_E2 = _F * (2 - _F)
 # fx fy cx cy and distortion, by COLMAP's order of parameters
 _NERFSTUDIO: dict[str, tuple[str, tuple[str, ...]]] = {
     "SIMPLE_PINHOLE": ("OPENCV", ()),
@@ -207,11 +205,15 @@ def export_geojson(scene: Scene, output: Path, origin: GeoOrigin) -> None:
     ------
     DataError : the origin is no place on earth.
     """
+    if not (-90 <= origin.latitude_deg <= 90 and -180 <= origin.longitude_deg <= 180):
+        raise DataError(f"{origin.latitude_deg}, {origin.longitude_deg} is no latitude, longitude")
+    earth_from_world = earth_from_enu(origin.latitude_deg, origin.longitude_deg, origin.height_m)
     features = []
     for image in scene.images:
         world_from_cam = image.cam_from_world.inverse()
         east, north, _ = world_from_cam.rotation_matrix()[:, 2]
-        longitude, latitude, height = _geodetic(np.array(world_from_cam.translation), origin)
+        position = (earth_from_world @ world_from_cam).translation
+        latitude, longitude, height = geodetic(np.array(position))
         features.append(
             {
                 "type": "Feature",
@@ -260,43 +262,3 @@ def _nerfstudio_camera(camera: Camera) -> Mapping[str, Any]:
 
 def _number(value: float) -> str:
     return f"{value:.17g}"
-
-
-def _geodetic(
-    east_north_up_m: NDArray[np.float64], origin: GeoOrigin
-) -> tuple[float, float, float]:
-    """Longitude and latitude in degrees, and height in metres, of a point near the origin.
-
-    By way of earth-centred coordinates, and back by iteration on the latitude.
-    """
-    if not (-90 <= origin.latitude_deg <= 90 and -180 <= origin.longitude_deg <= 180):
-        raise DataError(f"{origin.latitude_deg}, {origin.longitude_deg} is no latitude, longitude")
-    phi, lam = math.radians(origin.latitude_deg), math.radians(origin.longitude_deg)
-    sin_phi, cos_phi, sin_lam, cos_lam = math.sin(phi), math.cos(phi), math.sin(lam), math.cos(lam)
-    radius = _A / math.sqrt(1 - _E2 * sin_phi**2)
-    start = np.array(
-        [
-            (radius + origin.height_m) * cos_phi * cos_lam,
-            (radius + origin.height_m) * cos_phi * sin_lam,
-            (radius * (1 - _E2) + origin.height_m) * sin_phi,
-        ]
-    )
-    ecef_from_enu = np.array(
-        [
-            [-sin_lam, -sin_phi * cos_lam, cos_phi * cos_lam],
-            [cos_lam, -sin_phi * sin_lam, cos_phi * sin_lam],
-            [0.0, cos_phi, sin_phi],
-        ]
-    )
-    x, y, z = start + ecef_from_enu @ east_north_up_m
-    distance, height = math.hypot(x, y), 0.0
-    latitude = math.atan2(z, distance * (1 - _E2))
-    for _ in range(8):
-        radius = _A / math.sqrt(1 - _E2 * math.sin(latitude) ** 2)
-        latitude = math.atan2(z + _E2 * radius * math.sin(latitude), distance)
-    # of the two formulas the one that does not divide by a small number
-    if abs(latitude) < math.pi / 4:
-        height = distance / math.cos(latitude) - radius
-    else:
-        height = z / math.sin(latitude) - radius * (1 - _E2)
-    return math.degrees(math.atan2(y, x)), math.degrees(latitude), height

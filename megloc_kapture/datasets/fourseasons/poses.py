@@ -14,7 +14,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from megloc_kapture.datasets.formats.fourseasons_files import (
     read_gnss_poses,
@@ -30,40 +29,10 @@ from megloc_kapture.datasets.fourseasons.recordings import (
 )
 from megloc_kapture.datasets.official import Missing
 from megloc_kapture.errors import DataError
+from megloc_kapture.geometry.earth import earth_from_enu, geodetic
 from megloc_kapture.io.dataset_tables import SimilarityTransform, World
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import RigidTransform
-
-_SEMI_MAJOR_M = 6378137.0
-_FLATTENING = 1 / 298.257223563
-_ECCENTRICITY_SQUARED = _FLATTENING * (2 - _FLATTENING)
-_ROUNDS = 8  # each gains more than two digits
-
-
-def earth_from_enu(latitude_deg: float, longitude_deg: float, height_m: float) -> RigidTransform:
-    """From the frame east, north, up at a position to earth-centred, earth-fixed (ECEF) metres."""
-    lat, lon = np.radians(latitude_deg), np.radians(longitude_deg)
-    east = np.array([-np.sin(lon), np.cos(lon), 0.0])
-    up = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
-    rotation = np.stack([east, np.cross(up, east), up], axis=1)
-    normal = _SEMI_MAJOR_M / np.sqrt(1 - _ECCENTRICITY_SQUARED * np.sin(lat) ** 2)
-    position = up * (normal + height_m)
-    position[2] -= normal * _ECCENTRICITY_SQUARED * np.sin(lat)
-    return RigidTransform.from_matrix(rotation, position)
-
-
-def geodetic(ecef_m: NDArray[np.float64]) -> tuple[float, float, float]:
-    """Latitude and longitude in degrees and height in metres of an ECEF position (3,)."""
-    x, y, z = (float(value) for value in ecef_m)
-    across = np.hypot(x, y)
-    lat = np.arctan2(z, across * (1 - _ECCENTRICITY_SQUARED))
-    for _ in range(_ROUNDS):
-        normal = _SEMI_MAJOR_M / np.sqrt(1 - _ECCENTRICITY_SQUARED * np.sin(lat) ** 2)
-        lat = np.arctan2(z + normal * _ECCENTRICITY_SQUARED * np.sin(lat), across)
-    height = across * np.cos(lat) + z * np.sin(lat)
-    height -= _SEMI_MAJOR_M * np.sqrt(1 - _ECCENTRICITY_SQUARED * np.sin(lat) ** 2)
-    return float(np.degrees(lat)), float(np.degrees(np.arctan2(y, x))), float(height)
-
 
 # from the centre of the earth, of roads
 _LEAST_RADIUS_M, _GREATEST_RADIUS_M = 6.3e6, 6.4e6
