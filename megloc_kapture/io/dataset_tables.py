@@ -9,7 +9,8 @@ names.csv           image, name: what each scored query is called in the pose fi
 relocalization.csv  file, reference, query: the pairs an MLAD challenge asks for, in its order;
                     ``file`` is the name of the pose file to hand in
 unreadable.csv      image, reason: queries whose image cannot be used, which were left out
-world.json          ``official_from_local`` and the unit of the local frame
+unregistered.csv    image, reason: photographs that are not in the map made of them
+world.json          ``official_from_local``, the unit of the local frame, where it lies on earth
 protocol.json       thresholds, the pose file's format and names, conditions and how they are pooled
 ==================  ================================================================================
 
@@ -50,9 +51,12 @@ PROTOCOL_FILE = "protocol.json"
 NAMES_FILE = "names.csv"
 RELOCALIZATION_FILE = "relocalization.csv"
 UNREADABLE_FILE = "unreadable.csv"
+UNREGISTERED_FILE = "unregistered.csv"
 # in the folder of the true poses
 NOWHERE_FILE = "nowhere.txt"
 _MAX_BYTES = 1 << 28
+# units of the local frame: a map that nobody knows the scale of has units of its own
+METRES, NO_METRES = "m", "units"
 
 # how far a quaternion may be off unit length before it is refused; below, it is normalised
 MAX_QUATERNION_NORM_ERROR = 1e-3
@@ -109,7 +113,12 @@ class World(Options):
     """
 
     official_from_local: SimilarityTransform = SimilarityTransform()
-    unit: str = Field(default="m", min_length=1)
+    unit: str = Field(default=METRES, min_length=1)
+    geo_origin: tuple[float, float, float] | None = Field(
+        default=None,
+        description="latitude and longitude in degrees and height in metres of the local frame's "
+        "origin, where its axes are East, North and Up",
+    )
 
     def pose_in_official(self, cam_from_local: RigidTransform) -> RigidTransform:
         """``cam_from_official`` of a ``cam_from_local``; lengths become the official ones."""
@@ -309,16 +318,39 @@ def write_names(folder: Path | str, names: Mapping[str, str]) -> None:
     _NAMES.write(Path(folder) / NAMES_FILE, [_NameRow(*item) for item in names.items()])
 
 
-def read_unreadable(folder: Path | str) -> dict[str, str]:
-    """Read ``unreadable.csv``: image -> reason, sorted by image."""
-    return dict(sorted(_UNREADABLE.read_if_there(table_path(folder, UNREADABLE_FILE))))
+def read_unreadable(folder: Path | str, name: str = UNREADABLE_FILE) -> dict[str, str]:
+    """Read ``unreadable.csv``, or another such table: image -> reason, sorted by image."""
+    return dict(sorted(_UNREADABLE.read_if_there(table_path(folder, name))))
 
 
-def write_unreadable(folder: Path | str, reasons: Mapping[str, str]) -> None:
-    """Write ``unreadable.csv``, sorted by image."""
+def write_unreadable(
+    folder: Path | str, reasons: Mapping[str, str], name: str = UNREADABLE_FILE
+) -> None:
+    """Write ``unreadable.csv``, or another such table, sorted by image."""
     _UNREADABLE.write(
-        Path(folder) / UNREADABLE_FILE, [_UnreadableRow(*row) for row in sorted(reasons.items())]
+        Path(folder) / name, [_UnreadableRow(*row) for row in sorted(reasons.items())]
     )
+
+
+def tables_of(root: Path | str) -> Path | None:
+    """The tables of a kapture folder: its own, else those of the workspace that it lies in."""
+    root = Path(root)
+    for folder in (root, root.resolve().parent):
+        if (folder / SIDE_TABLES / PROTOCOL_FILE).is_file():
+            return folder / SIDE_TABLES
+    return None
+
+
+def write_unit(root: Path, unit: str) -> None:
+    """Say in tables of its own that a kapture folder is in another unit than metres."""
+    write_protocol(root / SIDE_TABLES, Protocol())
+    write_world(root / SIDE_TABLES, World(unit=unit))
+
+
+def unit_of(root: Path | str) -> str:
+    """The unit of a map, or of results in it: m, or :data:`NO_METRES`; raises DataError."""
+    tables = tables_of(root)
+    return METRES if tables is None else read_world(tables).unit
 
 
 def read_relocalization(folder: Path | str) -> list[RelocalizationPair]:
