@@ -211,12 +211,16 @@ def _prior_of(camera: Camera, given: Camera) -> tuple[NDArray[np.float64], NDArr
     """The change that makes a camera the given one, and its standard deviations."""
     focal = focal_px(camera)
     shift = np.subtract(principal_point_px(given), principal_point_px(camera)) / focal
-    deviation = _PRINCIPAL_POINT_DEVIATION * max(camera.width, camera.height) / focal
+    # a focal length that is known this well was calibrated, or estimated of several images: the
+    # rest is known as well then
+    known = given.focal_deviation
+    share = min(_PRINCIPAL_POINT_DEVIATION, known)
+    deviation = share * max(camera.width, camera.height) / focal
     change = [math.log(focal_px(given) / focal), *shift]
-    deviations = [given.focal_deviation, deviation, deviation]
+    deviations = [known, deviation, deviation]
     if camera.model in RADIAL_MODELS:
         change.append(radial_distortion(given) - radial_distortion(camera))
-        deviations.append(_DISTORTION_DEVIATION)
+        deviations.append(min(_DISTORTION_DEVIATION, known))
     return np.array(change), np.array(deviations)
 
 

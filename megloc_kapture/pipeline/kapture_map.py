@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.geometry.cameras import shift_principal_point
-from megloc_kapture.io.dataset_tables import PROTOCOL_FILE, SIDE_TABLES
+from megloc_kapture.io.dataset_tables import tables_of, unit_of
 from megloc_kapture.io.kapture import FeatureReader, KaptureFolder
 from megloc_kapture.io.weights.registry import registry
 from megloc_kapture.localization.map_index import MapIndex
@@ -173,10 +173,8 @@ class KaptureMap:
             }
         keypoints = {n: MapKeypoints(folder, n, indices[n], origins[n]) for n in indices}
         # a workspace's map has its dataset's tables beside it, a foreign map has none
-        tables = folder.root.resolve().parent / SIDE_TABLES
-        restrictions = UNRESTRICTED
-        if (tables / PROTOCOL_FILE).is_file():
-            restrictions = Restrictions.read(tables)
+        tables = tables_of(folder.root)
+        restrictions = UNRESTRICTED if tables is None else Restrictions.read(tables)
         return cls(folder, keypoints, restrictions)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -212,6 +210,11 @@ class KaptureMap:
         if not _is_ours(self.folder, name):
             return MapKeypoints(self.folder, name, index, origin)
         return MapKeypoints(self.folder, name, index, replace(origin, keypoints="corner"))
+
+    @cached_property
+    def unit(self) -> str:
+        """Of the map's points and poses: m, or units of its own where nobody knows its scale."""
+        return unit_of(self.folder.root)
 
     def stored_types(self) -> list[str]:
         """Keypoints types that the map stores, whether any of them has a point."""

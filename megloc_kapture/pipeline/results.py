@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -10,9 +11,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.io.dataset_tables import METRES, write_unit
 from megloc_kapture.io.files import staged_output
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.tables import CONSISTENCY_FILE, write_consistency
+from megloc_kapture.localization.shared_camera import solve_with_shared_camera
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.photographs import Photographs
 from megloc_kapture.pipeline.queries import KaptureQueries
@@ -31,8 +34,8 @@ Candidates = Mapping[str, Sequence[str]]
 class Results(Mapping[str, Pose | Failure]):
     """Image name to result, in the order of the names (rigs: of their moments).
 
-    An image is localized when its result is asked for, together with those before it; what is
-    found is kept.
+    An image is localized when its result is asked for, together with those before it, and of
+    photographs all of them, for those of one camera tell of it together; what is found is kept.
 
     Parameters
     ----------
@@ -123,6 +126,8 @@ class Results(Mapping[str, Pose | Failure]):
             output, self.queries.data(), self.items(), fallback=fallback, first_candidates=best
         )
         self.queries.write_images(output)
+        if (unit := self.localizer.map.unit) != METRES:
+            write_unit(output, unit)
         tested = self.localizer.refiners.tested()
         if tested:
             write_consistency(output / CONSISTENCY_FILE, tested)
@@ -162,12 +167,28 @@ class Results(Mapping[str, Pose | Failure]):
             units = self.queries.read_units(rigs=self._rigs)
             results = self.localizer.localize_units(units, executor, candidates=self._candidates)
             tracked = track(results, len(self._units), "localizing")
+            if isinstance(self.queries, Photographs):
+                alone = [found for (found,) in tracked]
+                tracked = ([found] for found in self._with_shared_cameras(alone))
             for names, found in zip(self._units, tracked, strict=True):
                 for name, result in zip(names, found, strict=True):
                     if isinstance(result, Failure) and name in self.queries.faults:
                         yield name, replace(result, reason=self.queries.faults[name])
                     else:
                         yield name, result
+
+    def _with_shared_cameras(self, results: list[Pose | Failure]) -> list[Pose | Failure]:
+        """Results of photographs, each by itself; those of one camera are solved with one."""
+        data, of_sensor = self.queries.data(), defaultdict(list)
+        for at, ((name,), result) in enumerate(zip(self._units, results, strict=True)):
+            if isinstance(result, Pose):
+                of_sensor[data.record_of(name)[1]].append((at, result))
+        for found in of_sensor.values():
+            poses = [pose for _, pose in found]
+            solved = solve_with_shared_camera(poses, self.localizer.options.localization.pose)
+            for (at, _), pose in zip(found, solved, strict=True):
+                results[at] = pose
+        return results
 
     def _best_candidates(self) -> dict[str, tuple[str, RigidTransform]]:
         """Failed query to its best candidate and that image's pose."""
