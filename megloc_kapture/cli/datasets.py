@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import tyro
 
@@ -13,7 +14,7 @@ from megloc_kapture.datasets.colmap_map import find_colmap
 from megloc_kapture.datasets.kapture_folders import QUERY
 from megloc_kapture.datasets.megadepth import MegaDepthOptions, import_megadepth
 from megloc_kapture.errors import OptionError
-from megloc_kapture.io.dataset_tables import SIDE_TABLES
+from megloc_kapture.io.dataset_tables import METRES, SIDE_TABLES, write_unit
 from megloc_kapture.io.files import staged_output
 from megloc_kapture.pipeline.colmap_maps import import_colmap
 from megloc_kapture.pipeline.datasets import (
@@ -51,6 +52,9 @@ class Import(Common):
     """Of colmap: folder of the images; images/ beside the model or around it unless given."""
     database: Path | None = None
     """Of colmap: the features; database.db beside the model or around it unless given."""
+    unit: Literal["m", "units"] = "m"
+    """Of colmap: units says that nobody knows the model's scale, so that nothing takes it for
+    metres."""
     allow_missing: bool = False
     """Import what is there of a partial download."""
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
@@ -70,6 +74,8 @@ class Import(Common):
             return self._import_megadepth(console)
         if self.images or self.database:
             raise OptionError(f"--images and --database are of colmap, not of {self.dataset}")
+        if self.unit != METRES:
+            raise OptionError(f"--unit is of colmap, not of {self.dataset}")
         choice = choose_dataset(
             KAPTURE if name == SYNTHETIC else name,
             self.root,
@@ -100,6 +106,8 @@ class Import(Common):
             open_executor("processes") as executor,
         ):
             counts = import_colmap(source, out, work=Work(executor, console.track))
+            if self.unit != METRES:
+                write_unit(out, self.unit)
         for what, found in (("images", source.images), ("database", source.database)):
             console.say(f"{what}: {found or 'none'}")
         for what, value in counts.items():

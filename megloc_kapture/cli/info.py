@@ -14,6 +14,7 @@ from megloc_kapture.cli.common import Common, Reading, existing, opened_map
 from megloc_kapture.cli.console import Console
 from megloc_kapture.cli.refine_map import report_lines
 from megloc_kapture.errors import MeglocError
+from megloc_kapture.io.dataset_tables import METRES
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.kapture.points import read_point_covariances
 from megloc_kapture.mapping.uncertainty import point_deviations
@@ -68,6 +69,10 @@ class Info(Reading, Common):
         except MeglocError as error:
             line(console, "localizing", f"not possible: {error}")
             return
+        text = (
+            "metres" if opened.unit == METRES else f"none: {opened.unit} of its own, no scale known"
+        )
+        line(console, "unit", text)
         if fault := opened.fault():
             line(console, "FAULT", fault)
         for local_type, keypoints in opened.keypoints.items():

@@ -25,6 +25,7 @@ from megloc_kapture.cli.common import (
     refuse_idle,
 )
 from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.io.dataset_tables import METRES
 from megloc_kapture.io.files import staged_output
 from megloc_kapture.io.kapture import KaptureFolder, read_pairs
 from megloc_kapture.io.tables import STATUS_FILE
@@ -113,6 +114,8 @@ class Localize(Reading, Deciding, Common):
         focal = {remark for remark in remarks if "focal length" in remark}
         for remark in sorted(remarks.keys() - focal):
             console.say(f"left out of {remarks[remark]} queries: {remark}")
+        if kapture_map.unit != METRES:
+            console.say(f"positions are in {kapture_map.unit} of the map, whose scale is not known")
         if focal:
             number = sum(remarks[remark] for remark in focal)
             console.say(f"focal length: {number} remarks in {STATUS_FILE}")

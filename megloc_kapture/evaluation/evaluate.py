@@ -21,7 +21,7 @@ from megloc_kapture.evaluation.results import (
 )
 from megloc_kapture.evaluation.scoring import Evaluation, evaluate_pairs, evaluate_poses
 from megloc_kapture.evaluation.without_truth import WithoutTruth, evaluate_without_truth
-from megloc_kapture.io.dataset_tables import read_nowhere
+from megloc_kapture.io.dataset_tables import METRES, read_nowhere, unit_of
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import Failure, Pose, RigidTransform
 
@@ -110,6 +110,7 @@ def evaluate_results(
     true_poses = truth if isinstance(truth, Mapping) else KaptureFolder(Path(truth)).read().poses()
     nowhere = () if isinstance(truth, Mapping) else read_nowhere(truth)
     contexts = [_context(source, mapping) for source in results]
+    _check_metres(contexts)
     relative = benchmark.protocol.pose_file == "mlad" and bool(benchmark.pairs)
     references = _references(contexts, benchmark, mapping) if relative else {}
     limits = thresholds or benchmark.thresholds()
@@ -163,6 +164,8 @@ def results_without_truth(
     DataError : something is missing or broken, or there is no query.
     """
     contexts = [_context(source, mapping) for source in results]
+    if len(contexts) > 1:
+        _check_metres(contexts)
     if map_poses is None:
         map_poses = next((poses for context in contexts if (poses := context.map_poses())), {})
     known = {image for context in contexts for image in context.query_images()}
@@ -199,9 +202,20 @@ def _context(source: Localized, mapping: Path | str | None) -> ResultContext:
     poses = {image: found for image, found in source.items() if isinstance(found, Pose)}
     return ResultContext(
         mapping=None if mapping is None else KaptureFolder(mapping),
+        unit=METRES if mapping is None else unit_of(mapping),
         localized=poses,
         cameras={image: pose.camera for image, pose in poses.items() if pose.camera is not None},
     )
+
+
+def _check_metres(contexts: Sequence[ResultContext]) -> None:
+    """Raise DataError where poses are of a map without metres: no threshold applies to them."""
+    for context in contexts:
+        if context.unit != METRES:
+            raise DataError(
+                f"the poses are in {context.unit} of a map whose scale is not known, thresholds "
+                "are in metres; `megloc map --scale` makes a map in metres"
+            )
 
 
 def _labels(results: Sequence[Localized]) -> list[str]:

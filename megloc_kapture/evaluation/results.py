@@ -21,12 +21,14 @@ from megloc_kapture.evaluation.pose_files import (
 from megloc_kapture.evaluation.protocols import Benchmark
 from megloc_kapture.evaluation.provenance import read_confidences
 from megloc_kapture.io.dataset_tables import (
+    METRES,
     PROTOCOL_FILE,
     SIDE_TABLES,
     RelocalizationPair,
     World,
     read_groups,
     read_world,
+    unit_of,
 )
 from megloc_kapture.io.files import read_json_model
 from megloc_kapture.io.kapture import KaptureFolder
@@ -73,6 +75,7 @@ class ResultContext:
     seconds : stage of the run -> seconds that it took, in their order.
     localized : image -> what localizing gave, of results in memory.
     cameras : image -> its camera, of queries that are in no folder.
+    unit : of the map; thresholds in metres say nothing where it is another one.
     """
 
     queries: KaptureFolder | None = None
@@ -85,6 +88,7 @@ class ResultContext:
     seconds: Mapping[str, float] = field(default_factory=dict)
     localized: Mapping[str, Pose] = field(default_factory=dict)
     cameras: Mapping[str, Camera] = field(default_factory=dict)
+    unit: str = METRES
 
     def map_poses(self) -> dict[str, RigidTransform]:
         """``cam_from_world`` of the map's images; empty without a map.
@@ -158,6 +162,7 @@ def context_of(result: Path | str, *, mapping: Path | str | None = None) -> Resu
         clusters=read_clusters(clusters) if clusters.is_file() else {},
         refinements=_by_image(read_refinement(refinement)) if refinement.is_file() else {},
         consistency=read_consistency(consistency) if consistency.is_file() else (),
+        unit=unit_of(result),
         masked=[] if workspace is None else _masked(workspace),
         seconds={} if workspace is None else _seconds(workspace / _MANIFESTS),
     )

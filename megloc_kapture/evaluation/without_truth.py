@@ -24,6 +24,7 @@ from megloc_kapture.evaluation.metrics import (
 from megloc_kapture.evaluation.results import Poses, Result, ResultContext, are_ranked
 from megloc_kapture.evaluation.scoring import Outcome, Reported
 from megloc_kapture.geometry.poses import camera_centers, invert_quats, rotate, stack_poses
+from megloc_kapture.io.dataset_tables import METRES
 from megloc_kapture.io.tables import QueryStatus
 from megloc_kapture.values import RigidTransform
 
@@ -339,7 +340,9 @@ def _result(
     # a guess taken from a candidate agrees with it, which says nothing
     guessed = {image for image, status in statuses.items() if status.fallback != "none"}
     localized = [image for image in images if image in result.poses and image not in guessed]
-    near = near_candidates(result.poses, statuses, localized, map_poses)
+    near = {}
+    if result.context.unit == METRES:  # distances are told in metres, or not at all
+        near = near_candidates(result.poses, statuses, localized, map_poses)
     queries = tuple(
         _query(
             image,

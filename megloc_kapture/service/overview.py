@@ -16,7 +16,7 @@ _MAX_POINTS, _MAX_CAMERAS = 15_000, 3_000
 def map_overview(kapture_map: KaptureMap) -> bytes:
     """JSON: ``right`` and ``up``, unit vectors of the world, and an ``origin`` in it; on these
     ``points`` [x, y, ...] and ``cameras`` [x, y, direction x, direction y, ...]; how many
-    ``images`` there are.
+    ``images`` there are, and the ``unit`` of the world, ``m`` or ``units``.
 
     Of many points and cameras a sample.
     """
@@ -33,6 +33,7 @@ def map_overview(kapture_map: KaptureMap) -> bytes:
     points = _trimmed(np.concatenate([k.index.xyz for k in kapture_map.keypoints.values()]))
     content = {
         "images": len(names),
+        "unit": kapture_map.unit,
         "right": _rounded(view.right, 9),
         "up": _rounded(view.up, 9),
         "origin": origin.tolist(),

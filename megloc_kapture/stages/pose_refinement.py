@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
-from megloc_kapture.errors import PluginError
+from megloc_kapture.errors import OptionError, PluginError
 from megloc_kapture.geometry.poses import movement
 from megloc_kapture.io.csv_table import write_csv_table
-from megloc_kapture.io.dataset_tables import SIDE_TABLES
+from megloc_kapture.io.dataset_tables import METRES, SIDE_TABLES, unit_of
 from megloc_kapture.io.files import link_images
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
 from megloc_kapture.io.tables import (
@@ -111,6 +111,11 @@ class MapRefiners:
     def __init__(
         self, mapping: KaptureFolder, restrictions: Restrictions, options: PoseRefinementOptions
     ) -> None:
+        if options.refines() and (unit := unit_of(mapping.root)) != METRES:
+            raise OptionError(
+                f"pose_refinement.by {options.by[0].name}: its limits are in metres, the map is in "
+                f"{unit} of its own; `megloc map --scale` makes a map in metres"
+            )
         self.refiners = tuple(options.make_refiners())
         self.map = FolderSpec(mapping)
         self._mapping, self._restrictions, self._options = mapping, restrictions, options

@@ -23,6 +23,7 @@ from megloc_kapture.evaluation.results import are_ranked
 from megloc_kapture.evaluation.scoring import Evaluation
 from megloc_kapture.evaluation.without_truth import ResultWithoutTruth
 from megloc_kapture.geometry.poses import camera_centers, invert_quats, rotate, stack_poses
+from megloc_kapture.io.dataset_tables import METRES
 from megloc_kapture.values import RigidTransform
 
 # below this length of the mean "down" of unit vectors, cameras agree on no vertical
@@ -158,7 +159,8 @@ def views_without_truth(
             of_query[query.image] = of_query[first]
     if not any(one.estimate for one in drawn.values()):
         return []
-    return views_from_above(drawn, map_poses, of_query, prefix=prefix, with_truth=False)
+    unit = result.context.unit
+    return views_from_above(drawn, map_poses, of_query, prefix=prefix, with_truth=False, unit=unit)
 
 
 def views_from_above(
@@ -168,6 +170,7 @@ def views_from_above(
     *,
     prefix: str = "above",
     with_truth: bool = True,
+    unit: str = METRES,
 ) -> list[Block]:
     """Draw queries among the map's cameras, each coordinate frame on a page of its own.
 
@@ -188,7 +191,7 @@ def views_from_above(
             continue
         mapped = [pose for image, pose in map_poses.items() if of_map[image] == frame]
         name = prefix if len(known) == 1 else f"{prefix}{number}"
-        svg, num_outside = _draw(mine, mapped, name, with_truth=with_truth)
+        svg, num_outside = _draw(mine, mapped, name, with_truth=with_truth, unit=unit)
         if len(known) > 1 and frame:
             blocks.append(Heading(frame))
         if num_outside:
@@ -199,7 +202,12 @@ def views_from_above(
 
 
 def _draw(
-    drawn: list[DrawnQuery], map_poses: list[RigidTransform], prefix: str, *, with_truth: bool
+    drawn: list[DrawnQuery],
+    map_poses: list[RigidTransform],
+    prefix: str,
+    *,
+    with_truth: bool,
+    unit: str,
 ) -> tuple[str, int]:
     """The figure, and how many estimates lie outside its page.
 
@@ -255,7 +263,7 @@ def _draw(
             dots(seen(lost), "truth, no pose", 30, c=MISS, marker="+")
         axes.set_aspect("equal")
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-        axes.set(xlabel=f"{view.labels[0]} (m)", ylabel=f"{view.labels[1]} (m)")
+        axes.set(xlabel=f"{view.labels[0]} ({unit})", ylabel=f"{view.labels[1]} ({unit})")
         figure.legend(loc="outside lower center", ncols=5, fontsize=8)
         return to_svg(figure, prefix), int(outside.sum())
 

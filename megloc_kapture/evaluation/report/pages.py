@@ -54,6 +54,7 @@ from megloc_kapture.evaluation.without_truth import (
     ResultWithoutTruth,
     WithoutTruth,
 )
+from megloc_kapture.io.dataset_tables import METRES
 from megloc_kapture.values import RigidTransform
 
 Poses = Mapping[str, RigidTransform]
@@ -385,7 +386,9 @@ def _recall_heading(evaluation: Evaluation) -> str:
 
 
 def _retrieval_note(result: ResultWithoutTruth) -> str:
-    first = result.rows[-1].first_candidate
+    first, unit = result.rows[-1].first_candidate, result.context.unit
+    if unit != METRES:
+        return f"The map is in {unit} of its own, so nothing is said about distances."
     if first is None:
         return (
             "No map or no ranked candidates are known, so nothing is said about agreement with "

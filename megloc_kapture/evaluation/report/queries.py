@@ -329,7 +329,7 @@ class QueryPictures:
         facts = [role]
         if chosen.pose is not None and image in self._map_poses:
             apart = float(np.linalg.norm(chosen.pose.center() - self._map_poses[image].center()))
-            facts.append(f"{apart:.1f} m from the {chosen.pose_name} place")
+            facts.append(f"{apart:.1f} {self._context.unit} from the {chosen.pose_name} place")
         if count is not None:
             facts.append(counted(count, "match", "matches"))
         return tuple(facts)

@@ -28,6 +28,7 @@ from megloc_kapture.evaluation.without_truth import (
     RowWithoutTruth,
     WithoutTruth,
 )
+from megloc_kapture.io.dataset_tables import METRES
 
 _MAX_LABEL_WIDTH = 22
 # Okabe and Ito's palette: told apart with any colour vision, in print too; then four more, for
@@ -248,6 +249,8 @@ def result_table(result: ResultWithoutTruth) -> Table:
         ),
         column("% in its\ndirection", rows, facing, kind="count", text_heading="facing"),
     ]
+    if result.context.unit != METRES:
+        columns = [own for own in columns if "candidate" not in own.heading]
     return Table(
         tuple(own for own in columns if fallbacks or own.heading != "fallback"),
         styles=_total_last(rows),

@@ -25,6 +25,7 @@ from megloc_kapture.evaluation.without_truth import (
     ResultWithoutTruth,
     WithoutTruth,
 )
+from megloc_kapture.io.dataset_tables import METRES
 
 INTERVALS = "95 % confidence intervals of recall, queries taken as independent"
 # fewer are an example, not a measurement
@@ -183,6 +184,8 @@ def confidence_sentences(confidence: Confidence, coarsest: Threshold) -> list[st
 def retrieval_note(result: ResultWithoutTruth) -> str:
     """The legend of :func:`result_table`, or that there is no retrieval to agree with."""
     first = result.rows[-1].first_candidate
+    if result.context.unit != METRES:
+        return f"the map is in {result.context.unit} of its own, so nothing is said about distances"
     if first is None:
         return (
             "no map or no ranked candidates are known, so nothing is said about agreement with "
