@@ -15,7 +15,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any, Literal, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.report.renderers import REPORT_HTML
 from megloc_kapture.evaluation.report.reports import RECALL_JSON
 from megloc_kapture.features.image_bound import extract_bounded
+from megloc_kapture.io.colmap_mapping import Mapper
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.photos import guessed_camera, photo_of, read_photo, turned_upright
@@ -35,6 +36,11 @@ from megloc_kapture.pipeline.evaluation_plan import plan_evaluation, plan_map
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
 from megloc_kapture.pipeline.localizer import LOCALIZING, Localizer
+from megloc_kapture.pipeline.photograph_maps import (
+    options_of_photographs,
+    plan_photographs,
+    structure_options,
+)
 from megloc_kapture.pipeline.photographs import Photographs
 from megloc_kapture.pipeline.plan import run_plan
 from megloc_kapture.pipeline.presets import options_of_preset, options_with
@@ -45,6 +51,7 @@ from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS, load_plugin
 from megloc_kapture.stages.layout import EVALUATION, LOCALIZED, MAP
 from megloc_kapture.stages.options import PipelineOptions
+from megloc_kapture.stages.stage import Stage
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera, Failure, ImageFeatures, Pose
 
@@ -290,7 +297,60 @@ def build_map(
     source = KaptureFolder(mapping)
     options = options_of_preset(preset, assignments=set or {})
     place = Path(workspace or Path("runs") / f"{source.root.resolve().name}-{preset}")
-    stages = plan_map(source, options)
+    return _made(plan_map(source, options), place, options, workers, scheduler)
+
+
+def map_photographs(
+    images: Path | str | Sequence[Path | str],
+    preset: str = "classic",
+    *,
+    set: Changes | None = None,
+    camera: Camera | None = None,
+    scale: tuple[str, str, float] | Literal["gps"] | None = None,
+    mapper: Mapper = "incremental",
+    workspace: Path | str | None = None,
+    workers: int = 1,
+    scheduler: str | None = None,
+) -> Map:
+    """Make a map of photographs without poses; see :mod:`megloc_kapture.pipeline.photograph_maps`.
+
+    Parameters
+    ----------
+    images : photographs, videos, or folders of them.
+    camera : of all of them, of their pixels as they are stored; else focal lengths are EXIF's or
+        guesses, and estimated with the poses.
+    scale : ``"gps"``, the positions in EXIF; or two photographs, by their names, and the metres
+        between them. Without it the map has no metres: ``map.kapture_map.unit``.
+    mapper : COLMAP's, incremental or global.
+    workspace : where everything is kept, ``runs/IMAGES-PRESET`` unless given; what is done and
+        still true is kept, the map is its folder ``map``, ``megloc/unregistered.csv`` names the
+        photographs that are not in it.
+    workers : processes; more than one needs ``if __name__ == "__main__":`` in a script.
+    scheduler : address of a dask scheduler, whose workers do the work instead.
+
+    Raises
+    ------
+    DataError : no map can be made of the photographs; says what is wrong with them.
+    MeglocError : the options cannot be used.
+    """
+    paths = [Path(one) for one in ([images] if isinstance(images, str | Path) else images)]
+    options = options_of_photographs(preset, set or {})
+    photographs = Photographs(paths, camera)
+    asked = () if scale is None else (scale,) if scale == "gps" else tuple(map(str, scale))
+    structure = structure_options(photographs, mapper, asked, known_cameras=camera is not None)
+    title = paths[0].resolve().stem if paths else "photographs"
+    place = Path(workspace or Path("runs") / f"{title}-{preset}")
+    stages = plan_photographs(photographs, options, structure)
+    return _made(stages, place, options, workers, scheduler)
+
+
+def _made(
+    stages: Sequence[Stage],
+    place: Path,
+    options: PipelineOptions,
+    workers: int,
+    scheduler: str | None,
+) -> Map:
     opened = Workspace(place)
     with opened.lock(), single_threaded(), _open(workers, scheduler, opened.root) as executor:
         run_plan(stages, opened, Work(executor, num_threads=workers))

@@ -36,14 +36,15 @@ def existing(folders: Sequence[Path]) -> tuple[Path, ...]:
 
 
 def opened_map(path: Path, console: Console) -> Path:
-    """The kapture folder of a map; a COLMAP model's is made in the user's cache, and said."""
+    """The kapture folder of a map, or of a workspace; a COLMAP model's is made in the user's cache,
+    and said."""
     # commands that open no map do not wait for all stages
     from megloc_kapture.datasets.colmap_map import is_colmap
     from megloc_kapture.pipeline.colmap_maps import kapture_of
     from megloc_kapture.stages.work import Work
 
     if not is_colmap(path):
-        return path
+        return kapture_of(path)
     with open_executor("processes") as executor:
         folder = kapture_of(path, work=Work(executor, console.track))
     console.say(f"{path}: a COLMAP model, as kapture in {folder}")

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 _TEXT = """
+megloc map photos/ -o my_map
+megloc map photos/ walk.mp4 -o my_map --scale a.jpg b.jpg 2.35
 megloc localize -i my_map --images IMG_0001.jpg holiday/ walk.mp4 -o localized
 megloc localize -i my_map --query my_scene/query -o localized
 megloc eval kapture --root my_scene

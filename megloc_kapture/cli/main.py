@@ -81,6 +81,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "refine_poses:RefinePoses",
         "Refine the poses of localized queries; a pose that gets no better stays, and says why.",
     ),
+    "map": (
+        "map_photographs:MapPhotographs",
+        "Make a map of photographs without poses; what is done and still true is kept.",
+    ),
     "localize": (
         "localize:Localize",
         "Localize photographs, or the images of a kapture folder, in a kapture map.",

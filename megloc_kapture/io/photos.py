@@ -12,10 +12,12 @@ rounded millimetres are in it, so a camera that comes from here is not certain o
 from __future__ import annotations
 
 import io
+import math
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +36,7 @@ UNREAD_SUFFIXES = frozenset({".heic", ".heif", ".avif", ".dng", ".nef", ".cr2", 
 EXIF_DEVIATION, GUESS_DEVIATION = 0.1, 0.7
 # COLMAP's guess, times the larger side
 _GUESS = 1.2
-_ORIENTATION, _MAKE, _MODEL, _EXIF = 0x0112, 0x010F, 0x0110, 0x8769
+_ORIENTATION, _MAKE, _MODEL, _EXIF, _GPS = 0x0112, 0x010F, 0x0110, 0x8769, 0x8825
 
 
 @dataclass(frozen=True)
@@ -46,11 +48,14 @@ class Photo:
     camera : of the pixels as they are stored; its focal length is uncertain.
     orientation : EXIF's, 1 to 8: how the stored pixels are turned or mirrored; 1: not at all.
     make : of the camera, with its model; may be empty.
+    gps : latitude and longitude in degrees, height in metres (0 where it is not said); None
+        without.
     """
 
     camera: Camera
     orientation: int
     make: str
+    gps: tuple[float, float, float] | None = None
 
     @property
     def upright_camera(self) -> Camera:
@@ -97,8 +102,9 @@ def photo_of(image: Image.Image) -> Photo:
             exif = image.getexif()
             orientation, make, model = (exif.get(tag) for tag in (_ORIENTATION, _MAKE, _MODEL))
             focal = focal_from_exif(_blank_with_exif(exif, width, height)) if exif else None
+            gps = _position(exif.get_ifd(_GPS))
     except Exception:  # broken EXIF is as none: pillow raises many kinds on it
-        orientation = make = model = focal = None
+        orientation = make = model = focal = gps = None
     # pillow and OpenCV have turned TIFF files already
     turned = orientation in range(2, 9) and image.format != "TIFF"
     if focal is None:
@@ -106,7 +112,7 @@ def photo_of(image: Image.Image) -> Photo:
     else:
         camera = _centred(width, height, focal, EXIF_DEVIATION)
     named = " ".join(str(text).strip("\0 ") for text in (make, model) if text)
-    return Photo(camera, int(orientation or 1) if turned else 1, named)
+    return Photo(camera, int(orientation or 1) if turned else 1, named, gps)
 
 
 def turned_upright(pixels: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
@@ -123,6 +129,22 @@ def turned_upright(pixels: NDArray[np.uint8], orientation: int) -> NDArray[np.ui
 def _centred(width: int, height: int, focal: float, deviation: float) -> Camera:
     params = (focal, width / 2, height / 2, 0.0)
     return Camera("SIMPLE_RADIAL", width, height, params, deviation)
+
+
+def _position(gps: Mapping[int, Any]) -> tuple[float, float, float] | None:
+    """Latitude, longitude and height of EXIF's GPS table (EXIF 2.3, table 15)."""
+    if not {1, 2, 3, 4} <= gps.keys():
+        return None
+    found = []
+    for reference, tag, negative in ((1, 2, "S"), (3, 4, "W")):
+        degrees, minutes, seconds = map(float, gps[tag])
+        value = degrees + minutes / 60 + seconds / 3600
+        found.append(-value if gps[reference] == negative else value)
+    below = gps.get(5) in (1, b"\x01")
+    height = float(gps.get(6, 0.0)) * (-1 if below else 1)
+    if not (abs(found[0]) <= 90 and abs(found[1]) <= 180 and math.isfinite(height)):
+        return None
+    return found[0], found[1], height
 
 
 def _blank_with_exif(exif: Image.Exif, width: int, height: int) -> bytes:

@@ -39,7 +39,7 @@ from megloc_kapture.pipeline.evaluation_plan import plan_map
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.plan import run_plan
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, options_of_preset
-from megloc_kapture.pipeline.workspace import Workspace
+from megloc_kapture.pipeline.workspace import LOCK, Workspace
 from megloc_kapture.stages.layout import MAP
 from megloc_kapture.stages.work import HERE, Work
 
@@ -98,11 +98,12 @@ def import_colmap(source: ColmapFolders, output: Path, *, work: Work = HERE) -> 
 
 
 def kapture_of(path: Path | str, *, work: Work = HERE) -> Path:
-    """The kapture folder of a map: the path itself, or where a COLMAP model is imported to.
+    """The kapture folder of a map: the path itself, the map of a workspace of ours, or where a
+    COLMAP model is imported to.
 
     Parameters
     ----------
-    path : kapture folder, or a COLMAP model or workspace, see
+    path : kapture folder, workspace, or a COLMAP model or workspace, see
         :func:`~megloc_kapture.datasets.colmap_map.find_colmap`.
     work : where features are extracted, if they have to be.
 
@@ -112,6 +113,8 @@ def kapture_of(path: Path | str, *, work: Work = HERE) -> Path:
     OutputError : the cache cannot be written.
     """
     path = Path(path)
+    if (path / LOCK).is_file() and (path / MAP).is_dir():
+        return path / MAP
     if not is_colmap(path):
         return path
     source = find_colmap(path)

@@ -9,9 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, OptionError, OutputError, suggestion
+from megloc_kapture.io.dataset_tables import read_world, tables_of
 from megloc_kapture.io.files import staged_output
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline import export_formats as formats
+from megloc_kapture.pipeline.colmap_maps import kapture_of
 from megloc_kapture.pipeline.export_formats import GeoOrigin, PosedImage, Scene
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 
@@ -39,7 +41,8 @@ def export(
     query : kapture folder of localized queries, with the map's world. Trajectories are of the
         queries alone where they are given.
     sensor : images of this camera only.
-    origin : of geojson, where the world's origin lies on earth.
+    origin : of geojson, where the world's origin lies on earth; a map of photographs whose
+        positions were known brings it.
 
     Returns
     -------
@@ -55,10 +58,13 @@ def export(
         raise OptionError(f"unknown format {name!r}; {suggestion(name, get_args(ExportFormat))}")
     if map is None and query is None:
         raise OptionError("nothing to export: give a map, or localized queries")
+    if name == "geojson" and origin is None:
+        origin = _origin_of(map)
     if (name == "geojson") != (origin is not None):
         raise OptionError(
             "geojson needs to know where the world's origin lies, and nothing else does "
-            "(--geo-origin LATITUDE,LONGITUDE[,HEIGHT]; its axes are East, North, Up)"
+            "(--geo-origin LATITUDE,LONGITUDE[,HEIGHT]; its axes are East, North, Up); a map of "
+            "`megloc map --scale gps` knows it"
         )
     scene = _scene(map, query, sensor, trajectory=name in ("tum", "kitti"))
     if not scene.images:
@@ -82,6 +88,15 @@ def export(
     return len(scene.images)
 
 
+def _origin_of(given: KaptureMap | Path | str | None) -> GeoOrigin | None:
+    """Where the origin of a map's world lies on earth; None where it does not say so."""
+    if given is None:
+        return None
+    tables = tables_of(given.folder.root if isinstance(given, KaptureMap) else kapture_of(given))
+    known = None if tables is None else read_world(tables).geo_origin
+    return None if known is None else GeoOrigin(*known)
+
+
 def _scene(
     given: KaptureMap | Path | str | None,
     query: Path | str | None,
@@ -94,8 +109,8 @@ def _scene(
     if given is not None and not (trajectory and query is not None):
         if isinstance(given, KaptureMap):
             opened = given
-        elif (folder := KaptureFolder(given)).has_points():
-            opened = KaptureMap.open(given)
+        elif (folder := KaptureFolder(kapture_of(given))).has_points():
+            opened = KaptureMap.open(folder.root)
         else:
             images += _posed_images(folder, None, sensor, is_query=False)
         if opened is not None:

@@ -1,4 +1,4 @@
-"""Plain photographs and videos as queries: their cameras are read out of EXIF or guessed."""
+"""Plain photographs and videos: their cameras are read out of EXIF or guessed."""
 
 from __future__ import annotations
 
@@ -29,10 +29,11 @@ class _Image:
     orientation: int
     make: str
     is_frame: bool
+    gps: tuple[float, float, float] | None = None
 
 
 class Photographs:
-    """Image files, folders of them, and videos, as the queries of a run.
+    """Image files, folders of them, and videos, as the queries of a run, or to make a map of.
 
     Without a camera an image is turned upright by its EXIF orientation, its camera is of the turned
     image, and its focal length is EXIF's or a guess, estimated with the pose in any case. A given
@@ -108,6 +109,14 @@ class Photographs:
         image = self._images[name]
         return Query(image.camera, image.path, name, orientation=image.orientation)
 
+    def gps(self) -> dict[str, tuple[float, float, float]]:
+        """Latitude, longitude and height of the images whose EXIF has them."""
+        return {name: one.gps for name, one in self._images.items() if one.gps is not None}
+
+    def files(self) -> dict[str, Path]:
+        """The files of the images that can be read; of frames those that were taken out."""
+        return {name: self._images[name].path for name in self.names}
+
     def data(self) -> KaptureData:
         """Cameras and records, the cameras as they were before the run."""
         data = KaptureData()
@@ -142,7 +151,7 @@ class Photographs:
         if camera is None:
             photo = read_photo(path)
             self._images[name] = _Image(
-                path, photo.upright_camera, photo.orientation, photo.make, is_frame
+                path, photo.upright_camera, photo.orientation, photo.make, is_frame, photo.gps
             )
             return
         check_image_file(path, camera)

@@ -124,8 +124,9 @@ def pair_map_images(
 ) -> list[ImagePair]:
     """Pairs of map images with a pose, each once, first name before second, sorted.
 
-    Images of different coordinate frames are never paired. The score is the cosine similarity
-    where retrieval named the pair, else 1.
+    Where no image has a pose, of all of them, by methods that look at none. Images of different
+    coordinate frames are never paired. The score is the cosine similarity where retrieval named the
+    pair, else 1.
 
     Parameters
     ----------
@@ -138,7 +139,7 @@ def pair_map_images(
     """
     data = mapping.read()
     poses = data.poses()
-    images = sorted(poses)
+    images = sorted(poses) or data.image_names()
     seen = _NOTHING_SEEN
     if options.needs_points():
         seen = _SeenPoints.read(covisible or mapping, images)

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
 # as imported; kapture folders
 MAPPING, QUERY, QUERY_GT, REFERENCE = "mapping", "query", "query_gt", "reference"
 PREPROCESSED = "preprocessed"
+POSED, PHOTOGRAPH_MATCHES = "posed", "matches/photographs"  # of photographs without poses
 LOCAL_FEATURES, GLOBAL_FEATURES = "local_features", "global_features"
 MAPPING_PAIRS, QUERY_PAIRS = "pairs/mapping.txt", "pairs/query.txt"
 QUERY_CANDIDATES = "pairs/query_candidates.txt"  # before they are reranked
@@ -28,10 +29,14 @@ class Layout:
     """Where, with these options, the images, features and poses are that stages read."""
 
     options: PipelineOptions
+    posed: bool = False
 
     @property
     def mapping(self) -> str:
-        """Kapture folder of the map's images, as everything after pre-processing sees them."""
+        """Kapture folder of the map's images, as everything after pre-processing sees them; of
+        photographs, once they have poses, the posed ones."""
+        if self.posed:
+            return POSED
         return f"{PREPROCESSED}/{MAPPING}" if self.options.preprocesses() else MAPPING
 
     @property

@@ -356,6 +356,12 @@ def iterate_candidates(pairs: Sequence[ImagePair]) -> Iterator[tuple[str, list[s
 MATCHING_OPTIONS = ("map", "local_features", "given_features", "matching", "verification")
 
 
+def mapping_pairs(work: StageWork, mapping: KaptureFolder) -> list[ImagePair]:
+    """The pairs of map images; photographs that got no pose are none of these any more."""
+    names = set(mapping.read().image_names())
+    return [p for p in read_pairs(work.path(MAPPING_PAIRS)) if {p.query, p.map} <= names]
+
+
 class MatchMapping(PipelineStage):
     """Match and verify pairs of map images."""
 
@@ -375,9 +381,13 @@ class MatchMapping(PipelineStage):
     def plugins(self) -> Sequence[object]:
         return [self.options.make_matcher(name) for name in self.options.own_types()]
 
+    def verification(self) -> Verification:
+        """How the matches are verified."""
+        return self.options.verify_mapping()
+
     def run(self, work: StageWork) -> Mapping[str, float]:
         mapping = work.folder(self.layout.mapping, FEATURES)
-        pairs = read_pairs(work.path(MAPPING_PAIRS))
+        pairs = mapping_pairs(work, mapping)
         counts: Counter[str] = Counter()
         for local_type in self.options.own_types():
             found = match_pairs(
@@ -386,8 +396,8 @@ class MatchMapping(PipelineStage):
                 pairs,
                 local_type,
                 self.options.make_matcher(local_type),
-                self.options.verify_mapping(),
-                work.out / MAPPING_MATCHES,
+                self.verification(),
+                work.out / self.writes[0],
                 work=work,
             )
             counts.update(found)

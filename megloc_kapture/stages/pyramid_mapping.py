@@ -27,7 +27,6 @@ from megloc_kapture.io.kapture import (
     ImagePair,
     KaptureFolder,
     MatchesWriter,
-    read_pairs,
 )
 from megloc_kapture.mapping.pairs import views_can_overlap
 from megloc_kapture.matching.guided_pyramid import (
@@ -59,7 +58,12 @@ from megloc_kapture.stages.layout import (
     MAPPING_PYRAMID,
 )
 from megloc_kapture.stages.local_features import read_frame
-from megloc_kapture.stages.matches import MATCHING_OPTIONS, Features, cached_features
+from megloc_kapture.stages.matches import (
+    MATCHING_OPTIONS,
+    Features,
+    cached_features,
+    mapping_pairs,
+)
 from megloc_kapture.stages.pyramid_queries import COLUMNS, PyramidFeatures, table_path
 from megloc_kapture.stages.stage import PipelineStage, StageWork
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
@@ -380,10 +384,11 @@ class PyramidMapping(PipelineStage):
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         counts: dict[str, float] = {}
+        mapping = work.folder(self.layout.mapping, FEATURES, MAPPING_MATCHES)
         for extractor in self.options.make_extractors():
             found = pyramid_mapping(
-                work.folder(self.layout.mapping, FEATURES, MAPPING_MATCHES),
-                read_pairs(work.path(MAPPING_PAIRS)),
+                mapping,
+                mapping_pairs(work, mapping),
                 extractor.name,
                 extractor,
                 self.options.make_matcher(extractor.name),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from itertools import product
 from pathlib import Path
 
@@ -71,7 +71,7 @@ def triangulate_map(
     by_type: dict[str, float] = {}
     of_type = {name: (matches.matches(name), mapping.keypoints(name)) for name in types}
     for type_name, (reader, keypoints) in of_type.items():
-        verified = _verified(reader, images, asked)
+        verified = verified_matches(reader, images, asked)
         map_images = [
             MapImage(image, data.camera_of(image), poses[image], keypoints.read(image)[:, :2])
             for image in images
@@ -110,12 +110,12 @@ def triangulate_map(
     }
 
 
-def _verified(
+def verified_matches(
     reader: MatchesReader,
     images: Sequence[str],
-    asked: set[tuple[str, ...]] | None,
+    asked: Collection[tuple[str, ...]] | None = None,
 ) -> dict[tuple[int, int], NDArray[np.int64]]:
-    """Matches by pairs of rows of ``images``, those of the pairs asked for (first name first)."""
+    """Matches by pairs of rows of ``images``; of the pairs asked for alone (first name first)."""
     row_of = {image: row for row, image in enumerate(images)}
     verified = {}
     for a, b in reader.pairs:

@@ -1,0 +1,208 @@
+"""Stages: photographs without poses are matched, and COLMAP's mapper finds their poses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.geometry.alignment import GeoPosition, align_to_earth
+from megloc_kapture.io.colmap_mapping import Mapper, Model, Photograph, reconstruct
+from megloc_kapture.io.dataset_tables import (
+    METRES,
+    NO_METRES,
+    SIDE_TABLES,
+    UNREGISTERED_FILE,
+    WORLD_FILE,
+    World,
+    read_unreadable,
+    write_unreadable,
+    write_world,
+)
+from megloc_kapture.io.files import link_images
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
+from megloc_kapture.io.tables import read_match_counts
+from megloc_kapture.matching.chance import agree_by_chance
+from megloc_kapture.stages.layout import FEATURES, LOCAL_FEATURES, PHOTOGRAPH_MATCHES, POSED
+from megloc_kapture.stages.matches import MATCHING_OPTIONS, MatchMapping, Verification
+from megloc_kapture.stages.options import PipelineOptions
+from megloc_kapture.stages.stage import LOCAL_TYPES, PipelineStage, StageWork
+from megloc_kapture.stages.triangulation import verified_matches
+from megloc_kapture.values import Options, RigidTransform
+
+_UNTURNED = RigidTransform.identity()
+
+
+class StructureOptions(Options):
+    """How photographs get poses, and what tells the scale of their world.
+
+    Attributes
+    ----------
+    known_cameras : the cameras stay as they are given.
+    distance : two images and the metres between their camera centres.
+    gps : latitude and longitude in degrees and height in metres, by image.
+    """
+
+    mapper: Mapper = "incremental"
+    known_cameras: bool = False
+    distance: tuple[str, str, float] | None = None
+    gps: dict[str, GeoPosition] | None = None
+    seed: int = Field(default=0, ge=0)
+
+
+class MatchPhotographs(MatchMapping):
+    """Match photographs without poses; verified by a two-view model."""
+
+    name = "photograph_matches"
+    uses = (*MATCHING_OPTIONS, "query_verification")
+    writes = (PHOTOGRAPH_MATCHES,)
+
+    def verification(self) -> Verification:
+        return self.options.verify_queries()
+
+
+class FindPoses(PipelineStage):
+    """Find poses and cameras of matched photographs; of several models the largest is the map's."""
+
+    name = "poses"
+    uses = (*LOCAL_TYPES, "query_verification")
+    writes = (POSED, f"{SIDE_TABLES}/{WORLD_FILE}", f"{SIDE_TABLES}/{UNREGISTERED_FILE}")
+
+    def __init__(self, options: PipelineOptions, structure: StructureOptions) -> None:
+        super().__init__(options)
+        self._structure = structure
+
+    @property
+    def reads(self) -> Sequence[str]:  # type: ignore[override]
+        return (self.layout.mapping, SIDE_TABLES, LOCAL_FEATURES, PHOTOGRAPH_MATCHES)
+
+    def settings(self) -> dict[str, Any]:
+        return {**super().settings(), "structure": self._structure.model_dump(mode="json")}
+
+    def run(self, work: StageWork) -> Mapping[str, float]:
+        mapping = work.folder(self.layout.mapping, FEATURES, PHOTOGRAPH_MATCHES)
+        data, structure = mapping.read(), self._structure
+        models = self._models(work, mapping, data)
+        world, model, counts = _scaled(models[0], structure)
+        tables = work.out / SIDE_TABLES
+        reasons = read_unreadable(work.path(SIDE_TABLES))
+        for image in data.image_names():
+            reasons |= {} if image in model.poses else {image: "no model: too few matches agree"}
+        for number, other in enumerate(models[1:], start=2):
+            reasons |= {
+                image: f"model {number}, of {len(other.poses)} photographs, which does not hang "
+                "together with the map"
+                for image in other.poses.keys() - model.poses.keys()
+            }
+        write_unreadable(tables, reasons, UNREGISTERED_FILE)
+        write_world(tables, world)
+        write_posed(work.out / POSED, data, model)
+        link_images(mapping.root, work.out / POSED)
+        return {
+            "photographs": len(data.image_names()) + len(read_unreadable(work.path(SIDE_TABLES))),
+            "with_a_pose": len(model.poses),
+            "models": len(models),
+            "points": model.num_points,
+            "mean_reprojection_error_px": round(model.error_px, 4),
+            **counts,
+        }
+
+    def _models(self, work: StageWork, mapping: KaptureFolder, data: KaptureData) -> list[Model]:
+        local_type = self.options.main_type()
+        keypoints, images = mapping.keypoints(local_type), data.image_names()
+        photographs = [
+            Photograph(
+                image,
+                data.record_of(image)[1],
+                data.camera_of(image),
+                keypoints.read(image)[:, :2],
+            )
+            for image in images
+        ]
+        counts = read_match_counts(work.path(PHOTOGRAPH_MATCHES), local_type)
+        asked = {
+            (pair.image, pair.other)
+            for pair in counts
+            if not agree_by_chance(
+                pair.verified,
+                pair.matches,
+                data.camera_of(pair.image),
+                data.camera_of(pair.other),
+                self.options.query_verification.max_error_px,
+            )
+        }
+        matches = verified_matches(mapping.matches(local_type), images, asked)
+        structure = self._structure
+        try:
+            return reconstruct(
+                photographs,
+                matches,
+                structure.mapper,
+                known_cameras=structure.known_cameras,
+                seed=structure.seed,
+                scratch=work.out,
+            )
+        except DataError as error:
+            raise DataError(f"no map can be made: {error.message}", path=error.path) from error
+
+
+def write_posed(output: Path, data: KaptureData, model: Model) -> None:
+    """Write sensors, records and poses of the images of a model, without the others."""
+    records = {key: name for key, name in data.records_camera.items() if name in model.poses}
+    sensors = {
+        sensor: Sensor.from_camera(camera, name=data.sensors[sensor].name)
+        for sensor, camera in model.cameras.items()
+    }
+    poses = {key: model.poses[name] for key, name in records.items()}
+    write_sensors(
+        output, replace(data, sensors=sensors, records_camera=records, trajectories=poses)
+    )
+
+
+def _scaled(model: Model, structure: StructureOptions) -> tuple[World, Model, dict[str, float]]:
+    """The model in metres where they are known, its world, and counts for the log.
+
+    Raises
+    ------
+    DataError : what should tell the scale does not.
+    """
+    if structure.distance is not None:
+        first, second, metres = structure.distance
+        for name in (first, second):
+            if name not in model.poses:
+                raise DataError(f"--scale: the map has no photograph {name!r}")
+        centers = [model.poses[name].center() for name in (first, second)]
+        apart = float(np.linalg.norm(np.subtract(*centers)))
+        if apart == 0:
+            raise DataError(f"--scale: {first} and {second} were taken at the same place")
+        return (
+            World(unit=METRES),
+            _moved(model, metres / apart),
+            {"metres_per_unit": metres / apart},
+        )
+    if structure.gps is None:
+        return World(unit=NO_METRES), model, {}
+    found = align_to_earth(
+        {name: pose.center() for name, pose in model.poses.items()}, structure.gps
+    )
+    counts = {
+        "gps_positions": found.num_positions,
+        "gps_residual_m": round(found.residual_m, 3),
+        "metres_per_unit": found.scale,
+    }
+    world = World(unit=METRES, geo_origin=found.origin)
+    return world, _moved(model, found.scale, found.enu_from_map), counts
+
+
+def _moved(model: Model, scale: float, turned: RigidTransform = _UNTURNED) -> Model:
+    """The model in the world ``turned(scale * x)``."""
+    back, poses = turned.inverse(), {}
+    for name, pose in model.poses.items():
+        x, y, z = (scale * np.array(pose.translation)).tolist()
+        poses[name] = RigidTransform(pose.quat_wxyz, (x, y, z)) @ back
+    return replace(model, poses=poses)

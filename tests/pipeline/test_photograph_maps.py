@@ -1,0 +1,296 @@
+"""Photographs without poses become a map: against the poses they were rendered or surveyed with."""
+
+from __future__ import annotations
+
+import filecmp
+import shutil
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+import megloc_kapture as megloc
+from megloc_kapture.cli.main import main
+from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.geometry.earth import earth_from_enu, geodetic
+from megloc_kapture.io.dataset_tables import read_unreadable, read_world
+from megloc_kapture.io.images import write_image
+from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.pipeline.photograph_maps import options_of_photographs
+from megloc_kapture.values import Pose, RigidTransform
+from tests.rendering import corner
+
+UNREGISTERED = "unregistered.csv"
+FEW: Any = {"set": {"local_features.options.max_keypoints": 700}}
+Poses = Mapping[str, RigidTransform]
+
+
+def true_poses(*folders: Path) -> dict[str, RigidTransform]:
+    found: dict[str, RigidTransform] = {}
+    for folder in folders:
+        found |= {Path(n).name: pose for n, pose in KaptureFolder(folder).read().poses().items()}
+    return found
+
+
+def errors(found: Poses, truth: Poses) -> tuple[NDArray[np.float64], float, float]:
+    """Distances of camera centres from the true ones after a similarity (COLMAP's, robust), as
+    shares of the scene's size; that size; the scale."""
+    import pycolmap
+
+    names = sorted(found)
+    own = np.array([found[name].center() for name in names])
+    true = np.array([truth[Path(name).name].center() for name in names])
+    size = float(np.linalg.norm(np.ptp(true, axis=0)))
+    options = pycolmap.RANSACOptions()
+    options.max_error, options.random_seed = 0.02 * size, 0
+    report = pycolmap.estimate_sim3d_robust(own, true, options)
+    aligned = report["tgt_from_src"]
+    moved = np.array([aligned * point for point in own])
+    return np.linalg.norm(moved - true, axis=1) / size, size, float(aligned.scale)
+
+
+def put(folder: Path, images: Iterable[Path], prefix: str = "") -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    for image in images:
+        shutil.copyfile(image.resolve(), folder / f"{prefix}{image.name}")
+    return folder
+
+
+def images_of(scene: Path) -> list[Path]:
+    folders = (scene / part / "sensors" / "records_data" for part in ("mapping", "query"))
+    return sorted(path for folder in folders for path in folder.rglob("*.jpg"))
+
+
+def with_exif(image: Path, *, focal_35mm: int | None = None, gps: Any = None) -> None:
+    exif = Image.Exif()
+    exif[0x010F], exif[0x0110] = "Maker", "Model"
+    if focal_35mm is not None:
+        exif.get_ifd(0x8769)[0xA405] = focal_35mm
+    if gps is not None:
+        table = exif.get_ifd(0x8825)
+        for at, value, names in ((1, gps[0], "NS"), (3, gps[1], "EW")):
+            seconds, whole = 3600 * abs(value), int(abs(value))
+            minutes = int(seconds / 60 - 60 * whole)
+            table[at] = names[0] if value >= 0 else names[1]
+            table[at + 1] = (float(whole), float(minutes), seconds - 3600 * whole - 60 * minutes)
+        table[5], table[6] = b"\x00", gps[2]
+    Image.open(image).save(image, exif=exif, quality=95)
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """``photos/`` of a rendered corner of a room, ``mapping/`` and ``query_gt/`` with its truth."""
+    root: Path = tmp_path_factory.mktemp("room")
+    corner.write_scene(root)
+    put(root / "photos", images_of(root))
+    return root
+
+
+@pytest.fixture(scope="module")
+def made(room: Path) -> megloc.Map:
+    return megloc.map_photographs(room / "photos", workspace=room / "workspace", **FEW)
+
+
+def test_poses_and_camera_are_the_true_ones(room: Path, made: megloc.Map) -> None:
+    poses = made.kapture_map.poses
+    assert len(poses) == 11
+    found, size, _ = errors(poses, true_poses(room / "mapping", room / "query_gt"))
+    print(f"median {np.median(found):.5f}, worst {found.max():.5f} of {size:.2f} m")
+    assert np.median(found) < 0.01 and found.max() < 0.02
+    focal = made.kapture_map.camera("0000.jpg").params[0]
+    assert abs(focal / 301 - 1) < 0.05  # the guess is 480 px
+    assert made.kapture_map.unit == "units"
+    assert read_unreadable(room / "workspace" / "megloc", UNREGISTERED) == {}
+
+
+def test_rotations_are_the_true_ones(room: Path, made: megloc.Map) -> None:
+    truth, poses = true_poses(room / "mapping", room / "query_gt"), made.kapture_map.poses
+    for first, second in (("0000.jpg", "0010.jpg"), ("0002.jpg", "0007.jpg")):
+        own, true = ((p[second] @ p[first].inverse()).rotation_matrix() for p in (poses, truth))
+        assert Rotation.from_matrix(own @ true.T).magnitude() < np.radians(1.0)
+
+
+def test_everything_works_in_it(room: Path, made: megloc.Map, tmp_path: Path) -> None:
+    workspace = room / "workspace"
+    opened = megloc.open_map(workspace)  # a workspace stands for its map
+    results = opened.localize([room / "photos" / "0003.jpg", room / "photos" / "0007.jpg"])
+    assert all(isinstance(results[name], Pose) for name in ("0003.jpg", "0007.jpg"))
+    results.save(tmp_path / "localized")
+    assert read_world(tmp_path / "localized" / "megloc").unit == "units"
+    opened.view(tmp_path / "view.html", tmp_path / "localized")
+    megloc.export("colmap", tmp_path / "model", map=workspace)
+    import pycolmap
+
+    assert len(pycolmap.Reconstruction(str(tmp_path / "model")).images) == 11
+    KaptureFolder(workspace / "map").validate(deep=True)
+
+
+def test_what_is_in_metres_is_refused(room: Path, made: megloc.Map, tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match=r"rendering: its limits are in metres, the map is in"):
+        made.localize(room / "photos" / "0003.jpg", refine="rendering")
+    results = made.localize([room / "photos" / "0003.jpg"])
+    results.save(tmp_path / "localized")
+    with pytest.raises(DataError, match="thresholds are in metres"):
+        megloc.evaluate(tmp_path / "localized", truth=room / "query_gt")
+    with pytest.raises(OptionError, match="where the world's origin lies"):
+        megloc.export("geojson", tmp_path / "a.geojson", map=room / "workspace")
+
+
+def test_same_bytes_in_any_order(room: Path, made: megloc.Map, tmp_path: Path) -> None:
+    shuffled = [room / "photos" / f"{at:04}.jpg" for at in (7, 3, 10, 0, 5, 1, 9, 2, 8, 4, 6)]
+    megloc.map_photographs(shuffled, workspace=tmp_path / "again", **FEW)
+    names = ["sensors/trajectories.txt", "sensors/sensors.txt", "reconstruction/points3d.txt"]
+    names.append("reconstruction/observations.txt")
+    maps = room / "workspace" / "map", tmp_path / "again" / "map"
+    assert filecmp.cmpfiles(*maps, names, shallow=False)[0] == names
+
+
+def test_a_distance_tells_the_scale(room: Path, made: megloc.Map, tmp_path: Path) -> None:
+    truth = true_poses(room / "mapping", room / "query_gt")
+    metres = float(np.linalg.norm(truth["0000.jpg"].center() - truth["0010.jpg"].center()))
+    shutil.copytree(room / "workspace", tmp_path / "scaled", symlinks=True)
+    scale = ("0000.jpg", "0010.jpg", metres)
+    workspace = tmp_path / "scaled"
+    scaled = megloc.map_photographs(room / "photos", workspace=workspace, scale=scale, **FEW)
+    assert scaled.kapture_map.unit == "m"
+    assert abs(errors(scaled.kapture_map.poses, truth)[2] - 1) < 0.01
+
+
+def test_gps_tells_scale_and_axes(room: Path, tmp_path: Path) -> None:
+    truth = true_poses(room / "mapping", room / "query_gt")
+    photos = put(tmp_path / "photos", (room / "photos").iterdir())
+    # twenty times the room: receivers know no centimetres
+    at = {name: 20 * (pose.center() - truth["0000.jpg"].center()) for name, pose in truth.items()}
+    earth = earth_from_enu(48.1, -11.6, 520.0)
+    rng = np.random.default_rng(0)
+    for name, position in at.items():
+        noisy = position + rng.normal(0, 0.3, 3) + (50.0 * (name == "0004.jpg"))
+        with_exif(photos / name, gps=geodetic(earth.apply(noisy[None])[0]))
+    found = megloc.map_photographs(photos, workspace=tmp_path / "map", scale="gps", **FEW)
+    assert found.kapture_map.unit == "m"
+    poses = found.kapture_map.poses
+    assert abs(errors(poses, truth)[2] * 20 - 1) < 0.05
+    own = np.array([poses[name].center() for name in sorted(at)])
+    true = np.array([at[name] for name in sorted(at)])
+    apart = (own - own.mean(axis=0)) - (true - true.mean(axis=0))
+    assert np.linalg.norm(apart, axis=1).max() < 2.0  # East, North, Up
+    megloc.export("geojson", tmp_path / "a.geojson", map=tmp_path / "map")
+
+
+def test_two_scenes_are_two_models(
+    room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    photos = put(tmp_path / "photos", images_of(room))
+    monkeypatch.setattr(corner, "WALLS", corner.WALLS[::-1])  # which changes their textures
+    corner.write_scene(tmp_path / "other")
+    others = images_of(tmp_path / "other")[:7]
+    put(photos, others, prefix="other_")
+    (photos / "broken.jpg").write_bytes((photos / "0001.jpg").read_bytes()[:3000])
+    found = megloc.map_photographs(photos, workspace=tmp_path / "map", **FEW)
+    assert sorted(found.kapture_map.poses) == [f"{at:04}.jpg" for at in range(11)]
+    reasons = read_unreadable(tmp_path / "map" / "megloc", UNREGISTERED)
+    assert reasons.pop("broken.jpg").startswith("cannot be read")
+    assert sorted(reasons) == [f"other_{image.name}" for image in others]
+    assert all(reason.startswith("model 2, of 7 photographs") for reason in reasons.values())
+
+
+def test_what_makes_no_map_is_refused_with_the_reason(room: Path, tmp_path: Path) -> None:
+    photos = sorted((room / "photos").iterdir())
+    with pytest.raises(DataError, match="2 photographs are too few for a map; give 3 or more"):
+        megloc.map_photographs(photos[:2], workspace=tmp_path / "few")
+    assert not (tmp_path / "few").exists()
+    for at in range(4):
+        put(tmp_path / "same", photos[:1], prefix=f"{at}_")
+    with pytest.raises(DataError, match="are all the same one"):
+        megloc.map_photographs(tmp_path / "same", workspace=tmp_path / "of_same", **FEW)
+    turned = tmp_path / "turned"
+    for at, yaw in enumerate((-14.0, -7.0, 0.0, 7.0, 14.0)):
+        write_image(turned / f"{at}.png", corner.render(corner.pose_at((0.2, 0, 0.1), yaw, 2.0)))
+    with pytest.raises(DataError, match="taken from one place"):
+        megloc.map_photographs(turned, workspace=tmp_path / "of_turned", **FEW)
+    strangers = tmp_path / "strangers"
+    for at in range(4):
+        noise = np.random.default_rng(at).integers(0, 255, (40, 60, 3), dtype=np.uint8)
+        write_image(strangers / f"{at}.png", cv2.resize(noise, (480, 320)))
+    with pytest.raises(DataError, match="enough of the same things"):
+        megloc.map_photographs(strangers, workspace=tmp_path / "of_strangers", **FEW)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        ({"scale": ("0000.jpg", "0001.jpg", -1.0)}, "no distance in metres"),
+        ({"scale": ("0000.jpg", "none.jpg", 1.0)}, "no photograph 'none.jpg'"),
+        ({"scale": "gps"}, "0 photographs have a GPS position"),
+        ({"set": {"mapping_pairs.by": ["poses"]}}, "have no poses yet"),
+        ({"set": {"preprocessing.undistort": True}}, "the distortion is not known"),
+        ({"set": {"map": "lift"}}, "points are triangulated"),
+    ],
+)
+def test_options_that_cannot_be_are_refused(
+    room: Path, tmp_path: Path, arguments: dict[str, Any], reason: str
+) -> None:
+    with pytest.raises((OptionError, DataError), match=reason):
+        megloc.map_photographs(room / "photos", workspace=tmp_path / "map", **arguments)
+    assert not (tmp_path / "map").exists()
+
+
+def test_presets_lose_what_needs_poses() -> None:
+    options = options_of_photographs("megloc")
+    assert options.mapping_pairs.by == ("retrieval",)
+    assert not options.preprocessing.undistort
+
+
+SCENES = {"fountain_p11": (11, 0.002), "herzjesu_p25": (25, 0.003)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mapper", ["incremental", "global"])
+@pytest.mark.parametrize("scene", SCENES)
+def test_surveyed_facades(shared_data: Path, tmp_path: Path, scene: str, mapper: Any) -> None:
+    root = shared_data / "scenes" / scene
+    number, worst = SCENES[scene]
+    found = megloc.map_photographs(images_of(root), workspace=tmp_path / "map", mapper=mapper)
+    poses = found.kapture_map.poses
+    assert len(poses) == number
+    shares, size, _ = errors(poses, true_poses(root / "mapping", root / "query_gt"))
+    print(f"{scene}, {mapper}: median {np.median(shares):.5f}, worst {shares.max():.5f}, {size} m")
+    assert shares.max() < worst
+    focal = found.kapture_map.camera(found.kapture_map.images[0]).params[0]
+    assert abs(focal / 1381 - 1) < 0.01
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("focal_35mm", [None, 25, 32, 42])
+def test_twenty_photographs_in_three_commands(
+    shared_data: Path, tmp_path: Path, focal_35mm: int | None
+) -> None:
+    """The true focal length is 32 mm of a 35 mm film."""
+    root = shared_data / "scenes" / "herzjesu_p25"
+    photos, others = images_of(root), images_of(root)[2::5]
+    for image in photos:
+        folder = put(tmp_path / ("others" if image in others else "photos"), [image])
+        if focal_35mm is not None:
+            with_exif(folder / image.name, focal_35mm=focal_35mm)
+    workspace, localized = tmp_path / "map", tmp_path / "localized"
+    for arguments in (
+        ("map", tmp_path / "photos", "-o", workspace),
+        ("localize", "-i", workspace, "--images", tmp_path / "others", "-o", localized),
+        ("view", workspace, localized, "-o", tmp_path / "view.html"),
+    ):
+        with pytest.raises(SystemExit) as end:
+            main([str(argument) for argument in arguments])
+        assert end.value.code == 0
+    truth = true_poses(root / "mapping", root / "query_gt")
+    found = KaptureFolder(workspace / "map").read().poses()
+    queries = KaptureFolder(localized).read().poses()
+    assert (len(found), len(queries)) == (20, 5)
+    shares, size, _ = errors({**found, **queries}, truth)
+    print(f"{focal_35mm}: map {shares[:20].max():.5f}, all {shares.max():.5f} of {size:.1f} m")
+    assert shares.max() < 0.006
