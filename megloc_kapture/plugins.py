@@ -36,6 +36,7 @@ LOCAL_FEATURES = "megloc_kapture.local_features"
 MATCHERS = "megloc_kapture.matchers"
 GLOBAL_FEATURES = "megloc_kapture.global_features"
 SEGMENTERS = "megloc_kapture.segmenters"
+DEPTH_ESTIMATORS = "megloc_kapture.depth_estimators"
 POSE_RANKERS = "megloc_kapture.pose_rankers"
 IMAGE_DISTANCES = "megloc_kapture.image_distances"
 POSE_REFINERS = "megloc_kapture.pose_refiners"
@@ -168,6 +169,63 @@ class DepthView:
     camera: Camera
     depth_m: NDArray[np.float32]
     image_from_depth: RigidTransform
+
+
+@dataclass(frozen=True, eq=False)
+class StereoView:
+    """An image without distortion, for stereo.
+
+    Attributes
+    ----------
+    image : uint8 (H, W, 3), RGB.
+    camera : PINHOLE, of that size.
+    mask : bool (H, W), True = use; None: all of it.
+    """
+
+    image: NDArray[np.uint8]
+    camera: Camera
+    cam_from_world: RigidTransform
+    mask: NDArray[np.bool_] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class DepthEstimate:
+    """Depth of an image by stereo; 0 in all three where nothing is known.
+
+    Attributes
+    ----------
+    depth_m : float32 (H, W), along the optical axis, in the map's unit.
+    sigma_m : float32 (H, W), its standard deviation.
+    normals : float32 (H, W, 3), unit length, in the camera's frame, towards the camera.
+    """
+
+    depth_m: NDArray[np.float32]
+    sigma_m: NDArray[np.float32]
+    normals: NDArray[np.float32]
+
+
+@runtime_checkable
+class DepthEstimator(Protocol):
+    """Group ``megloc_kapture.depth_estimators``: an image and its neighbours to its depth."""
+
+    def estimate(
+        self,
+        reference: StereoView,
+        sources: Sequence[StereoView],
+        depth_range_m: tuple[float, float],
+    ) -> DepthEstimate:
+        """Depth of the reference's pixels.
+
+        Parameters
+        ----------
+        sources : at least one, best first.
+        depth_range_m : nearest and farthest depth there may be.
+
+        Raises
+        ------
+        MeglocError : the views cannot be used; the image stays without depth, with the reason.
+        """
+        ...
 
 
 class RankingScene(Protocol):
@@ -360,6 +418,7 @@ _PROTOCOLS: dict[str, type] = {
     GLOBAL_FEATURES: GlobalFeatureExtractor,
     MATCHERS: Matcher,
     SEGMENTERS: Segmenter,
+    DEPTH_ESTIMATORS: DepthEstimator,
     POSE_RANKERS: PoseRanker,
     IMAGE_DISTANCES: ImageDistance,
     POSE_REFINERS: PoseRefiner,

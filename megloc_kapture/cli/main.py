@@ -77,6 +77,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "refine_map:RefineMap",
         "Take points and observations out of a map that its images, or depth maps, contradict.",
     ),
+    "densify": (
+        "densify:Densify",
+        "Estimate depth of a map's images that have none, by multi-view stereo.",
+    ),
     "refine-poses": (
         "refine_poses:RefinePoses",
         "Refine the poses of localized queries; a pose that gets no better stays, and says why.",

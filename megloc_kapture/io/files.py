@@ -20,7 +20,7 @@ import secrets
 import shutil
 import socket
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -377,9 +377,11 @@ def _merge(source: Path, target: Path) -> None:
 # -------------------------------------------------------- links; OutputError where one cannot be
 
 
-def link_images(source_root: Path, output_root: Path) -> None:
+def link_images(
+    source_root: Path, output_root: Path, folders: Sequence[str] = ("records_data", "masks")
+) -> None:
     """Make ``output_root/sensors/records_data`` (and masks) a link to ``source_root``'s."""
-    for name in ("records_data", "masks"):
+    for name in folders:
         source = Path(source_root).resolve() / "sensors" / name
         link = Path(output_root) / "sensors" / name
         if source.exists():

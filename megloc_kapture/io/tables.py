@@ -291,6 +291,49 @@ def write_consistency(path: Path, rows: Iterable[ConsistencyRow]) -> None:
 
 
 @dataclass(frozen=True)
+class DepthRow:
+    """One row of ``reconstruction/depth.csv``: depth of a map image by stereo.
+
+    Attributes
+    ----------
+    sources : the images it was compared with, best first.
+    near_m, far_m : depths that were looked at.
+    fill : share of the pixels that have depth.
+    reason : why there is none; empty where there is.
+    """
+
+    image: str
+    sources: tuple[str, ...]
+    near_m: float
+    far_m: float
+    fill: float
+    reason: str
+
+
+_DEPTH = Table(
+    DepthRow,
+    {
+        "image": TEXT,
+        "sources": IMAGES,
+        "near_m": number(".6g"),
+        "far_m": number(".6g"),
+        "fill": number(".4f"),
+        "reason": TEXT,
+    },
+)
+
+
+def read_depth_rows(path: Path | str) -> list[DepthRow]:
+    """Read ``depth.csv`` (the file itself), in its order."""
+    return list(_DEPTH.read(path))
+
+
+def write_depth_rows(path: Path, rows: Iterable[DepthRow]) -> None:
+    """Write ``depth.csv`` (the file itself), in the order given."""
+    _DEPTH.write(path, rows)
+
+
+@dataclass(frozen=True)
 class PairCount:
     """One row of ``match_counts.csv``: matches that were found, and that verification left."""
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
-from megloc_kapture.geometry.cameras import bearing_rays, px_from_cam
+from megloc_kapture.geometry.cameras import bearing_rays, focal_px, px_from_cam
 from megloc_kapture.values import Camera, Options, RigidTransform
 
 Floats = NDArray[np.float64]
@@ -23,6 +23,8 @@ Floats = NDArray[np.float64]
 # rounds find it, and what has not settled to a hundredth of its depth lies behind an edge
 _ROUNDS = 6
 _SETTLED = 0.01
+# one over the noise, in pixels, that a deviation of estimated depth is due to
+_PIXELS_OF_SIGMA = 3.0
 _SAME_CENTRE_M = 1e-9  # an offset that is left over from composing transforms
 # coefficients of z^0, z^1, z^2 of 0.0012 + 0.0019 (z - 0.4)^2
 _STRUCTURED_LIGHT = (0.001504, -0.00152, 0.0019)
@@ -85,6 +87,45 @@ def lift_keypoints(
         z = np.where(np.isfinite(lifted[:, 2]) & (lifted[:, 2] > 0), lifted[:, 2], z)
     points[settled] = (rays * z[:, None])[settled]
     return points, settled
+
+
+def lift_with_covariances(
+    keypoints_px: NDArray[np.floating[Any]],
+    depth_m: NDArray[np.float32],
+    sigma_m: NDArray[np.float32],
+    image_camera: Camera,
+    depth_camera: Camera,
+    options: LiftingOptions | None = None,
+) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """:func:`lift_keypoints` through a depth map of the image's own centre, with covariances.
+
+    Across the ray a keypoint is off by its own noise; along it by the deviation of depth, which
+    is taken for that of keypoints with a noise of a third of a pixel (``map_noise`` of the pose).
+
+    Parameters
+    ----------
+    sigma_m : float32 (H, W), standard deviation of depth, 0 where unknown.
+
+    Returns
+    -------
+    points, valid : as of :func:`lift_keypoints`.
+    covariances : float64 (N, 3, 3) in the camera's frame for a noise of 1 px.
+    """
+    same = RigidTransform.identity()
+    points, valid = lift_keypoints(keypoints_px, depth_m, image_camera, depth_camera, same, options)
+    pixels = np.floor(np.nan_to_num(px_from_cam(depth_camera, points))).astype(np.int64)
+    rows = np.clip(pixels[:, 1], 0, depth_m.shape[0] - 1)
+    columns = np.clip(pixels[:, 0], 0, depth_m.shape[1] - 1)
+    along = sigma_m[rows, columns].astype(np.float64)
+    valid &= along > 0
+    across = np.square(points[:, 2] / focal_px(image_camera))
+    rays = points / points[:, 2:]
+    covariances = np.square(_PIXELS_OF_SIGMA * along)[:, None, None] * (
+        rays[:, :, None] * rays[:, None, :]
+    )
+    covariances[:, 0, 0] += across
+    covariances[:, 1, 1] += across
+    return points, covariances, valid
 
 
 def sample_depth(depth_m: NDArray[np.float32], pixels: Floats, max_jump: float) -> Floats:

@@ -20,6 +20,7 @@ from megloc_kapture.pipeline.missing_weights import check_weights
 from megloc_kapture.pipeline.run import Run
 from megloc_kapture.pipeline.submission import write_submission
 from megloc_kapture.plugins import STAGES, load_plugin
+from megloc_kapture.stages.densifying import Densify
 from megloc_kapture.stages.global_features import ExtractGlobalFeatures
 from megloc_kapture.stages.image_pairs import PairMapping, PairQueries
 from megloc_kapture.stages.layout import (
@@ -60,6 +61,7 @@ PIPELINE: tuple[type[PipelineStage], ...] = (
     LiftPoints,
     GivenMap,
     RefineMap,
+    Densify,
     PairQueries,
     MatchQueries,
     RerankQueries,
@@ -110,7 +112,7 @@ def plan_map(mapping: KaptureFolder, options: PipelineOptions) -> list[Stage]:
     options.retrieval()
     if options.uses_given_map() or options.pairs_by_points():
         raise OptionError("images with poses come with no model: map, mapping_pairs.by")
-    behind = PIPELINE.index(RefineMap) + 1
+    behind = PIPELINE.index(Densify) + 1
     kinds = [kind for kind in PIPELINE[:behind] if kind.is_wanted(options)]
     return [ImportMapping(mapping), *(kind(options) for kind in kinds)]
 

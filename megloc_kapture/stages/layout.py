@@ -17,7 +17,7 @@ MAPPING_PAIRS, QUERY_PAIRS = "pairs/mapping.txt", "pairs/query.txt"
 QUERY_CANDIDATES = "pairs/query_candidates.txt"  # before they are reranked
 MAPPING_MATCHES, QUERY_MATCHES = "matches/mapping", "matches/query"
 MAPPING_PYRAMID, QUERY_PYRAMID = "pyramid/mapping", "pyramid/query"
-UNREFINED, MAP = "map_unrefined", "map"
+UNREFINED, SPARSE, MAP = "map_unrefined", "map_sparse", "map"
 UNREFINED_POSES, REFINEMENT_TIMING = "localized_unrefined", "timing_refinement.csv"
 LOCALIZED, SUBMISSIONS, EVALUATION = "localized", "submissions", "evaluation"
 TIMING = "timing.csv"
@@ -62,6 +62,11 @@ class Layout:
         """Features folders with the matches of queries."""
         again = self.options.matches_again()
         return (QUERY_MATCHES, QUERY_PYRAMID) if again else (QUERY_MATCHES,)
+
+    @property
+    def sparse_map(self) -> str:
+        """The map before depth is estimated, where it is."""
+        return MAP if self.options.mvs.mode == "off" else SPARSE
 
     @property
     def candidates(self) -> str:

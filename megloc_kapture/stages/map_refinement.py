@@ -48,7 +48,7 @@ from megloc_kapture.mapping.rejection import (
     track_lengths,
 )
 from megloc_kapture.mapping.uncertainty import point_covariances, point_deviations
-from megloc_kapture.stages.layout import MAP, UNREFINED
+from megloc_kapture.stages.layout import UNREFINED
 from megloc_kapture.stages.rigs import DepthRecord, depth_records
 from megloc_kapture.stages.stage import PipelineStage, StageWork
 from megloc_kapture.stages.triangulation import copy_features
@@ -475,8 +475,13 @@ class RefineMap(PipelineStage):
     version = 2
     uses = ("refinement",)
     reads = (UNREFINED,)
-    writes = (MAP,)
+
+    @property
+    def writes(self) -> Sequence[str]:  # type: ignore[override]
+        return (self.layout.sparse_map,)
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         folder, options = work.folder(UNREFINED), self.options.refinement
-        return refine_map(folder, work.out / MAP, options, link_features=True, work=work)
+        return refine_map(
+            folder, work.out / self.layout.sparse_map, options, link_features=True, work=work
+        )

@@ -21,6 +21,7 @@ from megloc_kapture.plugins import (
 )
 from megloc_kapture.retrieval.fusion import FusionOptions
 from megloc_kapture.stages.candidates import QueryPairsOptions, Retrieval
+from megloc_kapture.stages.densifying import DensifyOptions
 from megloc_kapture.stages.global_features import GlobalFeaturesChoice
 from megloc_kapture.stages.image_pairs import MappingPairsOptions
 from megloc_kapture.stages.map_refinement import MapRefinementOptions
@@ -82,6 +83,7 @@ class PipelineOptions(Options):
     triangulation: TriangulationOptions = TriangulationOptions()
     lifting: LiftingOptions = LiftingOptions()
     refinement: MapRefinementOptions = MapRefinementOptions()
+    mvs: DensifyOptions = DensifyOptions()
     localization: LocalizationOptions = LocalizationOptions()
     pose_refinement: PoseRefinementOptions = PoseRefinementOptions()
     stages: dict[str, dict[str, Any]] = Field(

@@ -1,0 +1,240 @@
+"""Depth by plane sweep, semi-global matching and slanted planes; no network, no GPU.
+
+The reference is compared with its sources under planes parallel to it, evenly spaced in inverse
+depth (Collins, CVPR 1996; Gallup et al., CVPR 2007), by the mean of the two best zero-mean
+normalised cross-correlations of small windows. Semi-global matching (Hirschmueller, PAMI 2008)
+makes a surface of it, at half the size; PatchMatch (Bleyer et al., BMVC 2011) tilts and sharpens it
+at the whole. A pixel ``p`` (homogeneous) of inverse depth ``w`` lies in a source at
+``infinity p + w baseline``, with ``infinity = K_s R K^-1`` and ``baseline = K_s t``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from megloc_kapture.geometry.warping import scaled_camera
+from megloc_kapture.mvs.views import pinhole_matrix, relative_projection
+from megloc_kapture.plugins import DepthEstimate, StereoView
+from megloc_kapture.values import Camera, Options
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.float32]
+Projections = Sequence[tuple[Floats, Floats]]
+
+_BLOCK = 16  # planes at a time
+_MIN_PLANES = 16
+_REACH = 3  # half the side of a window
+_TONE = 20.0  # of 255, at which a pixel of a window counts 1/e
+# semi-global penalties of a step of one label, of more, and the contrast that halves the latter
+_P1, _P2, _EDGE = 8.0, 40.0, 20.0
+_DIRECTIONS = [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1)]
+# matching error in pixels, and multiple of the bound of least squares: docs/experiments/mvs.md
+_CALIBRATION = np.array([0.15, 4.0])
+_MAX_COST = 0.7  # 1 - ZNCC
+
+
+class SweepOptions(Options):
+    """Options of the plane sweep; defaults: docs/experiments/mvs.md."""
+
+    max_planes: int = Field(
+        default=128, ge=_MIN_PLANES, le=512, description="depths that are tried, at half the size"
+    )
+    passes: int = Field(
+        default=2,
+        ge=1,
+        le=8,
+        description="of PatchMatch over slanted planes; each takes 2.5 s for 768x512",
+    )
+
+
+class Sweep:
+    """Plane sweep at half the size, semi-global matching, slanted planes at the whole size."""
+
+    name = "sweep"
+    Options = SweepOptions
+
+    def __init__(self, options: SweepOptions | None = None) -> None:
+        self.options = options or SweepOptions()
+
+    def estimate(
+        self,
+        reference: StereoView,
+        sources: Sequence[StereoView],
+        depth_range_m: tuple[float, float],
+    ) -> DepthEstimate:
+        """Depth of the reference; see :class:`~megloc_kapture.plugins.DepthEstimator`."""
+        near, far = depth_range_m
+        limits = np.array([1.0 / far, 1.0 / near])
+        half = [_halved(view) for view in (reference, *sources)]
+        inverse, step = sweep(half[0], half[1:], limits, self.options.max_planes)
+        size = reference.camera.width, reference.camera.height
+        planes = tangent_planes(cv2.resize(inverse, size, interpolation=cv2.INTER_LINEAR))
+        deviations = refine(reference, sources, planes, limits, 0.5 * step, self.options.passes)
+        # what lies at the far end may lie beyond it: the sky
+        deviations[planes[..., 0] <= limits[0] + 0.5 * step] = 0.0
+        return as_estimate(reference.camera, planes, deviations)
+
+
+def as_estimate(camera: Camera, planes: Floats, deviations: NDArray[np.floating]) -> DepthEstimate:
+    """Depth, its deviation and normals of planes (H, W, 3), where deviations (H, W) are not 0."""
+    known = deviations > 0
+    inverse = np.where(known, planes[..., 0], 1.0)
+    depth = np.where(known, 1.0 / inverse, 0.0)
+    y, x = np.mgrid[: known.shape[0], : known.shape[1]]
+    offset = planes[..., 0] - planes[..., 1] * x - planes[..., 2] * y
+    # n X = 1 on the plane, and n X / z = n K^-1 p = inverse depth
+    covector = np.stack([planes[..., 1], planes[..., 2], offset], axis=-1)
+    normals = -covector @ pinhole_matrix(camera)
+    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
+    return DepthEstimate(
+        depth.astype(np.float32),
+        (deviations * depth**2).astype(np.float32),
+        np.where(known[..., None], normals, 0.0).astype(np.float32),
+    )
+
+
+def stereo_image(view: StereoView) -> Image:
+    """Grey float32 (H, W) around 0; NaN where the mask says so."""
+    grey = cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    grey -= np.float32(grey.mean(dtype=np.float64))
+    if view.mask is not None:
+        grey[~view.mask] = np.nan
+    return grey
+
+
+def _halved(view: StereoView) -> StereoView:
+    camera = scaled_camera(view.camera, 0.5)
+    size, mask = (camera.width, camera.height), view.mask
+    image = np.asarray(cv2.resize(view.image, size, interpolation=cv2.INTER_AREA), np.uint8)
+    if mask is not None:
+        mask = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
+    return StereoView(image, camera, view.cam_from_world, mask)
+
+
+def sweep(
+    reference: StereoView, sources: Sequence[StereoView], limits: Floats, max_planes: int
+) -> tuple[Image, float]:
+    """Inverse depth float32 (H, W) between limits (far, near), and the step between planes."""
+    projections = [relative_projection(reference, source) for source in sources]
+    step = pixel_step(projections, reference.camera, limits)
+    wanted = int(np.ceil((limits[1] - limits[0]) / step)) + 1
+    planes = np.linspace(limits[0], limits[1], int(np.clip(wanted, _MIN_PLANES, max_planes)))
+    grey = stereo_image(reference)
+    volume = cost_volume(grey, [stereo_image(one) for one in sources], projections, planes)
+    step = float(planes[1] - planes[0])
+    return (planes[0] + step * semi_global(volume, grey)).astype(np.float32), step
+
+
+def pixel_step(projections: Projections, camera: Camera, limits: Floats) -> float:
+    """Difference of inverse depth that moves a pixel by one in the source where it moves most.
+
+    The mean between the limits (far, near), of the median over the image.
+    """
+    x, y = np.meshgrid(*(np.linspace(0.1, 0.9, 5) * n for n in (camera.width, camera.height)))
+    pixels = np.stack([x.ravel(), y.ravel(), np.ones(x.size)])
+    steps = np.linspace(limits[0], limits[1], 17)[:, None]
+    longest = 1.0
+    for infinity, baseline in projections:
+        path = (infinity @ pixels)[:, None] + steps * baseline[:, None, None]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            px = np.where(path[2] > 1e-6, path[:2] / path[2], np.nan)
+        lengths = np.nansum(np.linalg.norm(np.diff(px, axis=1), axis=0), axis=0)
+        longest = max(longest, float(np.median(lengths)))
+    return float(limits[1] - limits[0]) / longest
+
+
+def cost_volume(
+    reference: Image, sources: Sequence[Image], projections: Projections, inverse_depths: Floats
+) -> NDArray[np.uint8]:
+    """Matching cost uint8 (H, W, D) under planes of inverse depths (D,); see ``correlate``."""
+    from megloc_kapture.mvs.kernels import correlate
+
+    height, width = reference.shape
+    volume = np.empty((height, width, len(inverse_depths)), np.uint8)
+    warped = np.empty((len(sources), height, width), np.float32)
+    block = np.empty((_BLOCK, height, width), np.uint8)
+    for start in range(0, len(inverse_depths), _BLOCK):
+        some = inverse_depths[start : start + _BLOCK]
+        for number, inverse in enumerate(some):
+            for s, (infinity, baseline) in enumerate(projections):
+                homography = infinity.copy()
+                homography[:, 2] += inverse * baseline
+                cv2.warpPerspective(
+                    sources[s],
+                    homography,
+                    (width, height),
+                    dst=warped[s],
+                    flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+                    borderMode=cv2.BORDER_CONSTANT,
+                    borderValue=float("nan"),
+                )
+            correlate(reference, warped, _REACH, block[number])
+        volume[:, :, start : start + len(some)] = block[: len(some)].transpose(1, 2, 0)
+    return volume
+
+
+def semi_global(volume: NDArray[np.uint8], grey: Image) -> Floats:
+    """Fractional labels float64 (H, W) of the least sum of the path costs of eight directions."""
+    from megloc_kapture.mvs.kernels import add_path, best_labels
+
+    total = np.zeros(volume.shape, np.uint16)
+    smooth = np.nan_to_num(grey)
+    for dy, dx in _DIRECTIONS:
+        add_path(volume, smooth, _P1, _P2, _EDGE, dy, dx, total)
+    labels = np.empty(volume.shape[:2])
+    best_labels(total, labels)
+    return labels
+
+
+def tangent_planes(inverse: NDArray[Any]) -> Floats:
+    """Planes float64 (H, W, 3) of inverse depth (H, W): its value, and its slopes when smoothed."""
+    smooth = cv2.GaussianBlur(cv2.medianBlur(inverse, 5), (0, 0), 2)
+    slopes = [cv2.Scharr(smooth, cv2.CV_32F, *axis) / 32 for axis in ((1, 0), (0, 1))]
+    return np.stack([inverse, *slopes], axis=-1).astype(np.float64)
+
+
+def refine(
+    reference: StereoView,
+    sources: Sequence[StereoView],
+    planes: Floats,
+    limits: Floats,
+    step: float,
+    passes: int,
+) -> Image:
+    """Move planes (H, W, 3), in place, to where they match best, by so many passes.
+
+    Returns
+    -------
+    float32 (H, W), the standard deviation of inverse depth; 0 where nothing matches.
+    """
+    from megloc_kapture.mvs.kernels import plane_deviations, refine_planes
+
+    grey = stereo_image(reference)
+    projections = [relative_projection(reference, source) for source in sources]
+    views = (
+        _stacked([stereo_image(source) for source in sources]),
+        np.array([infinity for infinity, _ in projections]),
+        np.array([baseline for _, baseline in projections]),
+    )
+    costs = np.full(grey.shape, 2.0, np.float32)
+    for turn in range(passes):
+        refine_planes(grey, *views, planes, costs, _REACH, _TONE, turn, step, limits)
+    deviations = np.empty(grey.shape, np.float32)
+    plane_deviations(grey, *views, planes, _REACH, _TONE, _CALIBRATION, deviations)
+    deviations[costs > _MAX_COST] = 0.0
+    return deviations
+
+
+def _stacked(images: Sequence[Image]) -> Image:
+    """Images of any sizes as one array (S, H, W), NaN beyond each."""
+    height, width = np.max([image.shape for image in images], axis=0)
+    stacked = np.full((len(images), height, width), np.nan, np.float32)
+    for image, place in zip(images, stacked, strict=True):
+        place[: image.shape[0], : image.shape[1]] = image
+    return stacked

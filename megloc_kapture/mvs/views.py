@@ -1,0 +1,145 @@
+"""Views for stereo: images without distortion at a working size, and which go together."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.geometry.cameras import px_from_cam
+from megloc_kapture.geometry.warping import scaled_camera
+from megloc_kapture.io.colmap import undistorted_pinhole
+from megloc_kapture.plugins import StereoView
+from megloc_kapture.values import ONE_FOCAL_MODELS, Camera, RigidTransform
+
+Floats = NDArray[np.float64]
+
+# angles between two rays to a point, degrees: below the first depth is weak, beyond the second
+# surfaces look different; after Schoenberger et al., ECCV 2016, section 4.1, and MVSNet
+_BEST_ANGLES_DEG = (5.0, 20.0)
+_WIDENED = (0.8, 1.25)
+
+
+def stereo_camera(camera: Camera, max_size_px: int) -> Camera:
+    """The PINHOLE camera of the undistorted image whose longer side is at most ``max_size_px``."""
+    if camera.model not in ("PINHOLE", "SIMPLE_PINHOLE"):
+        camera = undistorted_pinhole(camera)
+    elif camera.model in ONE_FOCAL_MODELS:
+        focal, cx, cy = camera.params
+        camera = replace(camera, model="PINHOLE", params=(focal, focal, cx, cy))
+    camera = scaled_camera(camera, min(1.0, max_size_px / max(camera.width, camera.height)))
+    return replace(camera, focal_deviation=0.0)
+
+
+def pinhole_matrix(camera: Camera) -> Floats:
+    """K (3, 3) of a PINHOLE camera for array coordinates: the first pixel's centre at (0, 0)."""
+    fx, fy, cx, cy = camera.params
+    return np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]])
+
+
+def relative_projection(reference: StereoView, source: StereoView) -> tuple[Floats, Floats]:
+    """``infinity`` (3, 3) and ``baseline`` (3,): a pixel p of inverse depth w lies in the source
+    at ``infinity p + w baseline``, in array coordinates."""
+    source_from_reference = source.cam_from_world @ reference.cam_from_world.inverse()
+    k, k_source = pinhole_matrix(reference.camera), pinhole_matrix(source.camera)
+    infinity = k_source @ source_from_reference.rotation_matrix() @ np.linalg.inv(k)
+    return infinity, k_source @ np.array(source_from_reference.translation)
+
+
+def stereo_view(
+    image: NDArray[np.uint8],
+    camera: Camera,
+    cam_from_world: RigidTransform,
+    mask: NDArray[np.bool_] | None,
+    max_size_px: int,
+) -> StereoView:
+    """An image, its distortion undone, as stereo takes it.
+
+    Parameters
+    ----------
+    image : uint8 (H, W, 3), RGB; ``camera`` any of COLMAP's models.
+    mask : bool (H, W), True = use; None without one.
+    """
+    pinhole = stereo_camera(camera, max_size_px)
+    size = pinhole.width, pinhole.height
+    if camera.model in ("PINHOLE", "SIMPLE_PINHOLE"):
+        small = image
+        if size != (camera.width, camera.height):
+            small = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+        if mask is not None:
+            mask = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
+        return StereoView(small, pinhole, cam_from_world, mask)
+    # reduced first, so that nothing is aliased
+    scale = min(1.0, max(size) / max(camera.width, camera.height))
+    lens = scaled_camera(camera, scale)
+    x, y = _undistortion(lens, pinhole)
+    reduced = cv2.resize(image, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
+    small = np.asarray(cv2.remap(reduced, x, y, cv2.INTER_LINEAR), np.uint8)
+    allowed = np.ones(image.shape[:2], np.float32) if mask is None else mask.astype(np.float32)
+    size = lens.width, lens.height
+    allowed = np.asarray(cv2.resize(allowed, size, interpolation=cv2.INTER_AREA), np.float32)
+    seen = np.asarray(cv2.remap(allowed, x, y, cv2.INTER_LINEAR) > 0.999)
+    return StereoView(small, pinhole, cam_from_world, None if seen.all() else seen)
+
+
+def _undistortion(lens: Camera, pinhole: Camera) -> tuple[NDArray[np.float32], ...]:
+    """Array coordinates float32 (H, W) in the lens' image, x and y, of a pinhole's pixels."""
+    fx, fy, cx, cy = pinhole.params
+    u, v = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5)
+    rays = np.stack([(u.ravel() - cx) / fx, (v.ravel() - cy) / fy, np.ones(u.size)], axis=1)
+    px = np.nan_to_num(px_from_cam(lens, rays) - 0.5, nan=-1e4).astype(np.float32)
+    return px[:, 0].reshape(u.shape), px[:, 1].reshape(u.shape)
+
+
+def choose_sources(
+    image: int,
+    candidates: NDArray[np.bool_],
+    xyz: Floats,
+    points_of: list[NDArray[np.int64]],
+    images_of: tuple[NDArray[np.int64], NDArray[np.int64]],
+    centers: Floats,
+    count: int,
+) -> list[int]:
+    """The images that tell most of an image's depth, best first: by shared points and angles.
+
+    A shared point counts by the angle between the two rays to it: fully within 5 to 20 degrees,
+    less by the square of the ratio outside.
+
+    Parameters
+    ----------
+    candidates : bool (I,), images that may serve.
+    points_of : rows of ``xyz`` that each image observes.
+    images_of : first observation of each point (N + 1,), and the images (O,) in that order.
+    centers : float64 (I, 3), of the cameras.
+    count : at most so many.
+    """
+    starts, images = images_of
+    points = points_of[image]
+    counts = starts[points + 1] - starts[points]
+    within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    others = images[np.repeat(starts[points], counts) + within]
+    seen = xyz[np.repeat(points, counts)]
+    to_own, to_other = centers[image] - seen, centers[others] - seen
+    sine = np.linalg.norm(np.cross(to_own, to_other), axis=1)
+    angle = np.rad2deg(np.arctan2(sine, (to_own * to_other).sum(axis=1)))
+    low, high = _BEST_ANGLES_DEG
+    weight = np.square(np.minimum(np.minimum(angle / low, high / np.maximum(angle, 1e-9)), 1.0))
+    scores = np.bincount(others, weights=weight, minlength=len(centers))
+    scores[~candidates] = 0.0
+    scores[image] = 0.0
+    best = np.argsort(-scores, kind="stable")[:count]
+    return [int(other) for other in best if scores[other] > 0]
+
+
+def depth_range(depths: Floats) -> tuple[float, float] | None:
+    """Nearest and farthest depth to look at, from those of sparse points (N,); None: too few.
+
+    The 1st and the 99th percentile, the range widened to 0.8 and 1.25 of them.
+    """
+    depths = depths[depths > 0]
+    if len(depths) < 8:
+        return None
+    low, high = np.percentile(depths, [1, 99])
+    return float(low * _WIDENED[0]), float(high * _WIDENED[1])
