@@ -213,22 +213,42 @@ def refine(
     -------
     float32 (H, W), the standard deviation of inverse depth; 0 where nothing matches.
     """
-    from megloc_kapture.mvs.kernels import plane_deviations, refine_planes
+    from megloc_kapture.mvs.kernels import refine_planes
 
     grey = stereo_image(reference)
+    views = _compared(reference, sources)
+    costs = np.full(grey.shape, 2.0, np.float32)
+    for turn in range(passes):
+        refine_planes(grey, *views, planes, costs, _REACH, _TONE, turn, step, limits)
+    deviations = matching_deviations(reference, sources, planes, _CALIBRATION)
+    deviations[costs > _MAX_COST] = 0.0
+    return deviations
+
+
+def matching_deviations(
+    reference: StereoView, sources: Sequence[StereoView], planes: Floats, calibration: Floats
+) -> Image:
+    """Standard deviation (H, W) of the inverse depth of planes, by how they match.
+
+    0 where nothing matches; ``calibration``: see ``plane_deviations`` of the kernels.
+    """
+    from megloc_kapture.mvs.kernels import plane_deviations
+
+    grey = stereo_image(reference)
+    found = np.empty(grey.shape, np.float32)
+    views = _compared(reference, sources)
+    plane_deviations(grey, *views, planes, _REACH, _TONE, calibration, found)
+    return found
+
+
+def _compared(reference: StereoView, sources: Sequence[StereoView]) -> tuple[Image, Floats, Floats]:
+    """Sources as the kernels take them: images (S, H, W), ``infinity`` and ``baseline`` of each."""
     projections = [relative_projection(reference, source) for source in sources]
-    views = (
+    return (
         _stacked([stereo_image(source) for source in sources]),
         np.array([infinity for infinity, _ in projections]),
         np.array([baseline for _, baseline in projections]),
     )
-    costs = np.full(grey.shape, 2.0, np.float32)
-    for turn in range(passes):
-        refine_planes(grey, *views, planes, costs, _REACH, _TONE, turn, step, limits)
-    deviations = np.empty(grey.shape, np.float32)
-    plane_deviations(grey, *views, planes, _REACH, _TONE, _CALIBRATION, deviations)
-    deviations[costs > _MAX_COST] = 0.0
-    return deviations
 
 
 def _stacked(images: Sequence[Image]) -> Image:

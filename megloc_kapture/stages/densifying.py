@@ -127,6 +127,7 @@ def densify_map(
     output: Path,
     options: DensifyOptions,
     *,
+    estimator: DepthEstimator | None = None,
     restrictions: Restrictions = UNRESTRICTED,
     link_features: bool = False,
     work: Work = HERE,
@@ -135,6 +136,7 @@ def densify_map(
 
     Parameters
     ----------
+    estimator : that of the options unless given.
     restrictions : images are compared within a frame, location and condition only.
     link_features : as of :func:`~megloc_kapture.stages.map_refinement.refine_map`.
 
@@ -147,7 +149,7 @@ def densify_map(
     DataError : no map, or one that cannot be densified; names the file.
     PluginError, MissingWeightsError : the estimator cannot be made.
     """
-    estimator = options.make_estimator()
+    estimator = estimator or options.make_estimator()
     data = source.read()
     _check(source, data)
     jobs, rows = _plan(source, output, options, estimator, restrictions)

@@ -27,7 +27,7 @@ CONVERTER = "docs/weights.md, section 'Checkpoints with foreign objects'"
 _INDEX = ".index"
 _TAR_MAGIC = slice(257, 262)
 # under these keys training scripts keep the state dict
-_STATE_KEYS = ("state_dict", "model_state")
+_STATE_KEYS = ("state_dict", "model_state", "model")
 
 
 def read_checkpoint(
@@ -37,8 +37,8 @@ def read_checkpoint(
 
     Parameters
     ----------
-    content : the file's bytes: of torch (also with ``state_dict`` or ``model_state`` in it),
-        safetensors, npz, ONNX (initialisers), MATLAB's ``.mat`` of NetVLAD, TensorFlow's
+    content : the file's bytes: of torch (also with ``state_dict``, ``model_state`` or ``model`` in
+        it), safetensors, npz, ONNX (initialisers), MATLAB's ``.mat`` of NetVLAD, TensorFlow's
         ``.index``, or a tar of the latter.
     where : the file; its ending says what it is, save for tars and torch's files.
     read_beside : content of the file beside it whose name ends otherwise than in

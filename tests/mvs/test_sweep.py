@@ -1,0 +1,136 @@
+"""Depth by plane sweep, against the exact depth of two walls."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from corner import CAMERA, WALLS, depth_m, pose_at, render
+
+from megloc_kapture.geometry.warping import scaled_camera
+from megloc_kapture.mvs.consistency import AgreementOptions, agreeing_views, confirmed
+from megloc_kapture.mvs.sweep import Sweep, as_estimate, refine, stereo_image
+from megloc_kapture.mvs.views import stereo_view
+from megloc_kapture.plugins import DepthEstimate, DepthEstimator, StereoView
+
+POSES = [pose_at((x, 0.1 * (-1) ** i, 0.0), 0.5 * i, 0.0) for i, x in enumerate((0, -0.5, 0.5))]
+RANGE = (3.0, 9.0)
+SIZE = 240
+
+
+def view(number: int) -> StereoView:
+    return stereo_view(render(POSES[number]), CAMERA, POSES[number], None, SIZE)
+
+
+def truth(number: int) -> np.ndarray:
+    exact = depth_m(POSES[number])
+    return cv2.resize(exact, (240, 180), interpolation=cv2.INTER_NEAREST)
+
+
+@pytest.fixture(scope="module")
+def estimates() -> list[DepthEstimate]:
+    views = [view(number) for number in range(3)]
+    sweep: DepthEstimator = Sweep()
+    return [
+        sweep.estimate(views[n], [views[m] for m in range(3) if m != n], RANGE) for n in range(3)
+    ]
+
+
+def test_depth_sigma_and_normals_of_two_walls(estimates: list[DepthEstimate]) -> None:
+    exact, found = truth(0), estimates[0]
+    known = (found.depth_m > 0) & (exact > 0)
+    assert known.mean() > 0.85
+    error = np.abs(found.depth_m - exact)[known]
+    assert np.median(error / exact[known]) < 0.002
+    assert np.mean(error < 0.02 * exact[known]) > 0.97
+    # rendered without noise, so most errors lie below the deviations of photographs
+    assert np.mean(error < 2 * found.sigma_m[known]) > 0.9
+    rotation = POSES[0].rotation_matrix()
+    normals = [rotation @ np.cross([0.0, 1.0, 0.0], along) for _, along, _, _ in WALLS]
+    cosines = np.max([np.abs(found.normals[known] @ normal) for normal in normals], axis=0)
+    assert np.median(np.rad2deg(np.arccos(np.minimum(cosines, 1)))) < 4
+    fx, fy, cx, cy = view(0).camera.params
+    y, x = np.mgrid[: exact.shape[0], : exact.shape[1]]
+    rays = np.stack([(x + 0.5 - cx) / fx, (y + 0.5 - cy) / fy, np.ones_like(exact)], axis=-1)
+    assert ((found.normals * rays).sum(axis=-1)[known] < 0).all()  # towards the camera
+
+
+def test_other_views_confirm_what_is_right(estimates: list[DepthEstimate]) -> None:
+    views = [view(number) for number in range(3)]
+    others = [(views[n], estimates[n].depth_m) for n in (1, 2)]
+    kept = confirmed(views[0], estimates[0], others, AgreementOptions())
+    exact = truth(0)
+    known = kept.depth_m > 0
+    assert known.mean() > 0.8
+    assert np.mean(np.abs(kept.depth_m - exact)[known] < 0.02 * exact[known]) > 0.985
+    assert (kept.sigma_m > 0).sum() == known.sum() == np.any(kept.normals != 0, axis=-1).sum()
+    # a surface that is not there, in one view only
+    wrong = estimates[0].depth_m.copy()
+    wrong[60:90, 60:90] *= 0.9
+    assert not agreeing_views(views[0], wrong, others, AgreementOptions())[62:88, 62:88].any()
+
+
+def test_textureless_and_masked_pixels_are_unknown() -> None:
+    images = [render(pose) for pose in POSES[:2]]
+    for image in images:
+        image[80:200, 40:160] = 128
+    mask = np.ones(images[0].shape[:2], bool)
+    mask[100:200, 250:350] = False
+    first = stereo_view(images[0], CAMERA, POSES[0], mask, SIZE)
+    second = stereo_view(images[1], CAMERA, POSES[1], None, SIZE)
+    found = Sweep().estimate(first, [second], RANGE)
+    assert not found.depth_m[55:112, 32:88].any()
+    assert not found.depth_m[60:120, 150:210].any()
+    assert (found.depth_m[:, 100:140] > 0).mean() > 0.6
+
+
+def test_sources_of_other_sizes_and_the_same_bytes_twice() -> None:
+    camera = scaled_camera(CAMERA, 0.5)
+    small = StereoView(
+        cv2.resize(render(POSES[2]), (200, 150), interpolation=cv2.INTER_AREA), camera, POSES[2]
+    )
+    views = [view(0), view(1), small]
+    first, again = (Sweep().estimate(views[0], views[1:], RANGE) for _ in range(2))
+    for name in ("depth_m", "sigma_m", "normals"):
+        assert getattr(first, name).tobytes() == getattr(again, name).tobytes()
+    exact, known = truth(0), first.depth_m > 0
+    assert np.mean(np.abs(first.depth_m - exact)[known] < 0.02 * exact[known]) > 0.95
+
+
+def test_deviations_follow_the_noise_of_the_images() -> None:
+    """Twice the noise, twice the errors and twice the deviations."""
+    ratios, deviations = [], []
+    exact = truth(0)
+    limits = np.array([1 / RANGE[1], 1 / RANGE[0]])
+    for noise in (4.0, 8.0):
+        rng = np.random.default_rng(3)
+        views = [view(0), view(1)]
+        views = [
+            StereoView(
+                np.clip(one.image + rng.normal(0, noise, one.image.shape), 0, 255).astype(np.uint8),
+                one.camera,
+                one.cam_from_world,
+            )
+            for one in views
+        ]
+        slopes = [cv2.Scharr(1 / exact, cv2.CV_32F, *axis) / 32 for axis in ((1, 0), (0, 1))]
+        planes = np.stack([1 / exact, *slopes], axis=-1).astype(np.float64)
+        deviation = refine(views[0], views[1:], planes, limits, 0.001, 2)
+        known = (deviation > 0) & (np.abs(stereo_image(views[0])) < 1e9)
+        error = np.abs(planes[..., 0] - 1 / exact)[known]
+        ratios.append(np.percentile(error, 68) / np.median(deviation[known]))
+        deviations.append(np.median(deviation[known]))
+    assert 1.2 < deviations[1] / deviations[0] < 2.2
+    assert 0.75 < ratios[1] / ratios[0] < 1.6
+
+
+def test_an_estimate_of_planes_is_unknown_where_its_deviation_is() -> None:
+    planes = np.zeros((3, 4, 3))
+    planes[..., 0] = 0.5
+    found = as_estimate(
+        scaled_camera(CAMERA, 0.01), planes, np.array([[0.01] * 4, [0.0] * 4] * 1 + [[0.02] * 4])
+    )
+    assert found.depth_m.tolist() == [[2.0] * 4, [0.0] * 4, [2.0] * 4]
+    np.testing.assert_allclose(found.sigma_m, np.array([[0.04] * 4, [0] * 4, [0.08] * 4]))
+    np.testing.assert_allclose(found.normals[0], [[0, 0, -1]] * 4)
+    assert not found.normals[1].any()

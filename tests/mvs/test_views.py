@@ -1,0 +1,88 @@
+"""Views for stereo: distortion undone, planes carried over, sources chosen."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from corner import CAMERA, pose_at
+from numpy.typing import NDArray
+
+from megloc_kapture.geometry.cameras import bearing_rays, project, px_from_cam
+from megloc_kapture.mvs.views import (
+    choose_sources,
+    depth_range,
+    relative_projection,
+    stereo_view,
+)
+from megloc_kapture.plugins import StereoView
+from megloc_kapture.values import Camera
+
+LENS = Camera("OPENCV", 400, 300, (310.0, 305.0, 203.0, 147.0, -0.2, 0.05, 0.001, -0.002))
+
+
+def _ramps(camera: Camera) -> NDArray[np.uint8]:
+    y, x = np.mgrid[: camera.height, : camera.width]
+    return np.stack([x / 2, y / 2, np.zeros_like(x)], axis=-1).astype(np.uint8)
+
+
+def test_a_plane_is_carried_to_where_its_points_project() -> None:
+    reference = StereoView(_ramps(CAMERA), CAMERA, pose_at((0.2, -0.1, 0.3), 5, -3))
+    source = StereoView(_ramps(CAMERA), CAMERA, pose_at((-0.7, 0.2, 0.1), -2, 4))
+    normal, distance = np.array([0.3, -0.2, 0.9]), 4.0  # of the plane, in the reference's frame
+    px = np.random.default_rng(0).uniform(0, 300, (200, 2))
+    rays = bearing_rays(CAMERA, px)
+    inverse = rays @ normal / distance
+    world = reference.cam_from_world.inverse().apply(rays / inverse[:, None])
+    infinity, baseline = relative_projection(reference, source)
+    pixels = np.column_stack([px - 0.5, np.ones(len(px))])
+    path = pixels @ infinity.T + inverse[:, None] * baseline
+    found = path[:, :2] / path[:, 2:] + 0.5
+    np.testing.assert_allclose(found, project(CAMERA, source.cam_from_world, world), atol=1e-8)
+    # as a homography: the plane's inverse depth is linear in the pixel
+    covector = np.linalg.lstsq(pixels, inverse, rcond=None)[0]
+    bent = pixels @ (infinity + np.outer(baseline, covector)).T
+    np.testing.assert_allclose(bent[:, :2] / bent[:, 2:] + 0.5, found, atol=1e-8)
+
+
+@pytest.mark.parametrize("size", [400, 200])
+def test_distortion_is_undone(size: int) -> None:
+    view = stereo_view(_ramps(LENS), LENS, pose_at((0, 0, 0), 0, 0), None, size)
+    assert view.camera.model == "PINHOLE" and max(view.image.shape) <= size
+    y, x = np.mgrid[10 : view.camera.height - 10 : 7, 10 : view.camera.width - 10 : 7]
+    px = np.stack([x.ravel() + 0.5, y.ravel() + 0.5], axis=1)
+    expected = (px_from_cam(LENS, bearing_rays(view.camera, px)) - 0.5) / 2
+    shown = view.image[y.ravel(), x.ravel(), :2].astype(float)
+    assert np.abs(shown - expected).max() < 1.6  # grey levels; a pixel is half a level
+
+
+def test_a_mask_and_what_the_lens_does_not_show_are_left_out() -> None:
+    mask = np.ones((300, 400), bool)
+    mask[100:120, 50:80] = False
+    view = stereo_view(_ramps(CAMERA), CAMERA, pose_at((0, 0, 0), 0, 0), mask, 200)
+    assert view.mask is not None
+    assert not view.mask[50:60, 25:40].any()
+    assert view.mask.sum() >= view.mask.size - 12 * 17
+
+
+def test_sources_share_points_under_an_angle() -> None:
+    xyz = np.random.default_rng(2).uniform([-1, -1, 9], [1, 1, 11], (60, 3))
+    # 0 asks; 1 stands beside it, 2 at 11 degrees, 3 at 60 degrees, 4 sees nothing of it
+    centers = np.array([[0, 0, 0], [0.05, 0, 0], [2, 0, 0], [17, 0, 0], [2, 0.1, 0]], float)
+    seen = [np.arange(40), np.arange(40), np.arange(20), np.arange(40), np.arange(40, 60)]
+    ids = np.concatenate(seen)
+    order = np.argsort(ids, kind="stable")
+    starts = np.concatenate([[0], np.cumsum(np.bincount(ids, minlength=60))])
+    images = np.repeat(np.arange(5), [len(one) for one in seen])[order]
+    everybody = np.ones(5, bool)
+    arguments = (xyz, seen, (starts, images), centers)
+    assert choose_sources(0, everybody, *arguments, 4) == [2, 3, 1]
+    assert choose_sources(0, everybody, *arguments, 1) == [2]
+    others = np.array([True, True, False, True, True])
+    assert choose_sources(0, others, *arguments, 4) == [3, 1]
+
+
+def test_the_range_of_depth_leaves_outliers_out() -> None:
+    depths = np.concatenate([np.linspace(5, 10, 200), [900.0, -4.0]])
+    near, far = depth_range(depths) or (0.0, 0.0)
+    assert 3.9 < near < 4.1 and 12.4 < far < 12.6
+    assert depth_range(np.array([3.0, 4.0, -1.0])) is None
