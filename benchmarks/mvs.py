@@ -282,8 +282,8 @@ def sensor_depth(scene: Path, out: Path, estimator: DepthEstimator, name: str) -
     for image in sorted(depth_records(densified.read())):
         _, depth = _depth_of(densified, image)
         png = scene / "depth_png" / Path(image).with_suffix(".png")
-        truth = np.asarray(cv2.imread(str(png), cv2.IMREAD_UNCHANGED), np.float32) / 1000
-        truth = cv2.resize(truth, depth.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        stored = np.asarray(cv2.imread(str(png), cv2.IMREAD_UNCHANGED), np.float64) / 1000
+        truth = cv2.resize(stored, depth.shape[::-1], interpolation=cv2.INTER_NEAREST)
         sigma = read_sigma(densified.root, image)
         assert sigma is not None
         there = (depth > 0) & (truth > 0)

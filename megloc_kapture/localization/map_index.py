@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -66,6 +67,11 @@ class MapIndex:
             point_ids=_read_only(points),
             covariances=covariances,
         )
+
+    @cached_property
+    def seen_once(self) -> NDArray[np.bool_]:
+        """Points (N,) that one image observes: lifted through its depth, not triangulated."""
+        return np.bincount(self.point_ids, minlength=len(self.xyz)) == 1
 
     def observed(self, image: str) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         """Keypoint rows (ascending) and their point rows of one image; empty if it has none."""
@@ -151,6 +157,7 @@ class ObservedMatches:
     similarities : float64 (M,), higher is better.
     image_rows : int64 (M,), which of the map images the match is with, from 0.
     num_images : int, of the map images, whether they have matches or not.
+    seen_once : bool (M,), of the points; None: none is.
     """
 
     keypoint_ids: NDArray[np.int64]
@@ -158,12 +165,14 @@ class ObservedMatches:
     similarities: NDArray[np.float64]
     image_rows: NDArray[np.int64]
     num_images: int
+    seen_once: NDArray[np.bool_] | None = None
 
     def resolve(self, rows: NDArray[np.bool_] | None = None) -> Correspondences:
         """One point per keypoint and one keypoint per point, of the matches with some images.
 
         The same keypoint can meet several points through different map images, and the reverse.
-        What most images say wins; then the most similar descriptors; then the smaller ids.
+        A point that several images observe comes before one that was lifted through one's depth;
+        then what most images say wins; then the most similar descriptors; then the smaller ids.
         Conflicts are settled greedily from the best on, so that a loser may still get its second
         choice. Images that are left out have no say.
 
@@ -190,8 +199,11 @@ class ObservedMatches:
         best = np.maximum.reduceat(self.similarities[taken], first)
         support = np.diff(first, append=len(taken))
         keypoints, points = keypoints[first], points[first]
+        order = [-best, -support]
+        if self.seen_once is not None:
+            order.append(self.seen_once[taken][first])
         chosen = index_kernels.choose(
-            np.lexsort((-best, -support)),
+            np.lexsort(order),
             np.cumsum(np.diff(keypoints, prepend=keypoints[0]) != 0),
             np.unique(points, return_inverse=True)[1],
         )
@@ -230,4 +242,11 @@ def observed_matches(
         np.concatenate([pairs for _, pairs, _ in matches], dtype=np.int64),
         np.concatenate([scores for _, _, scores in matches], dtype=np.float64),
     )
-    return ObservedMatches(keypoint_ids, point_ids, similarities, image_rows, len(matches))
+    return ObservedMatches(
+        keypoint_ids,
+        point_ids,
+        similarities,
+        image_rows,
+        len(matches),
+        index.seen_once[point_ids],
+    )

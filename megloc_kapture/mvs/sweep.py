@@ -35,7 +35,7 @@ _TONE = 20.0  # of 255, at which a pixel of a window counts 1/e
 _P1, _P2, _EDGE = 8.0, 40.0, 20.0
 _DIRECTIONS = [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1)]
 # matching error in pixels, and multiple of the bound of least squares: docs/experiments/mvs.md
-_CALIBRATION = np.array([0.15, 4.0])
+CALIBRATION = np.array([0.15, 4.0])
 _MAX_COST = 0.7  # 1 - ZNCC
 
 
@@ -97,6 +97,19 @@ def as_estimate(camera: Camera, planes: Floats, deviations: NDArray[np.floating]
         (deviations * depth**2).astype(np.float32),
         np.where(known[..., None], normals, 0.0).astype(np.float32),
     )
+
+
+def planes_of(camera: Camera, depth_m: NDArray[Any], normals: NDArray[Any]) -> Floats:
+    """Planes float64 (H, W, 3) of depth (H, W) and normals (H, W, 3); undoes ``as_estimate``."""
+    matrix = pinhole_matrix(camera)
+    y, x = np.mgrid[: depth_m.shape[0], : depth_m.shape[1]]
+    covector = normals.astype(np.float64) @ np.linalg.inv(matrix)
+    along = covector[..., 0] * x + covector[..., 1] * y + covector[..., 2]
+    # along is n X / z, and inverse depth 1 / z at the pixel
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slopes = covector[..., :2] / (along * depth_m)[..., None]
+    slopes = np.where(np.isfinite(slopes), slopes, 0.0)
+    return np.concatenate([1.0 / depth_m.astype(np.float64)[..., None], slopes], axis=-1)
 
 
 def stereo_image(view: StereoView) -> Image:
@@ -220,7 +233,7 @@ def refine(
     costs = np.full(grey.shape, 2.0, np.float32)
     for turn in range(passes):
         refine_planes(grey, *views, planes, costs, _REACH, _TONE, turn, step, limits)
-    deviations = matching_deviations(reference, sources, planes, _CALIBRATION)
+    deviations = matching_deviations(reference, sources, planes, CALIBRATION)
     deviations[costs > _MAX_COST] = 0.0
     return deviations
 

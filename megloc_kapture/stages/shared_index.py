@@ -69,19 +69,23 @@ def index_map(folder: KaptureFolder, local_type: str) -> MapIndex:
 def observed_keypoints(
     folder: KaptureFolder, index: MapIndex, images: Iterable[str]
 ) -> list[ObservedKeypoints]:
-    """Images that have a pose and keypoints, which are as they are stored."""
+    """Images that have a pose and keypoints, which are as they are stored.
+
+    Points that were lifted from their keypoint fit it by themselves and say nothing of the map:
+    they are left out of a map that has others.
+    """
     data, keypoints = folder.read(), folder.keypoints(index.local_type)
     poses = data.poses()
-    return [
-        ObservedKeypoints(
-            image,
-            data.camera_of(image),
-            poses[image],
-            keypoints.read(image)[:, :2],
-            *index.observed(image),
-        )
-        for image in images
-    ]
+    lifted = index.seen_once
+    telling = lifted if lifted[index.point_ids].all() else ~lifted
+    found = []
+    for image in images:
+        rows, points = index.observed(image)
+        told = telling[points]
+        pixels = keypoints.read(image)[:, :2]
+        camera, pose = data.camera_of(image), poses[image]
+        found.append(ObservedKeypoints(image, camera, pose, pixels, rows[told], points[told]))
+    return found
 
 
 def with_noise(folder: KaptureFolder, index: MapIndex) -> MapIndex:
