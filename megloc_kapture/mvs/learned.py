@@ -20,7 +20,7 @@ from megloc_kapture.plugins import DepthEstimate, StereoView
 from megloc_kapture.values import Options
 
 # matching error in pixels, and multiple of the bound of least squares: docs/experiments/mvs.md
-_CALIBRATION = np.array([0.8, 8.0])
+_CALIBRATION = np.array([0.5, 5.0])
 
 
 class LearnedStereoOptions(Options):
