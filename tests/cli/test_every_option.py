@@ -25,6 +25,7 @@ pytestmark = pytest.mark.slow
 
 FEW = "local_features.rootsift.options.max_keypoints=300"
 TWO = ('local_features=["rootsift","sift"]', FEW)
+STEREO = ("mvs.mode=depth", "mvs.max_size_px=96")
 FUSED = (
     *TWO,
     'global_features=[{name="vlad"},{name="vlad",options={local_type="sift"}}]',
@@ -212,6 +213,14 @@ CASES: dict[str, Case] = {
         "4", "map/", ("refinement.consistency.max_reprojection_error_px=0.5",), localize=OF_MAPS
     ),
     "refinement.ply": Case("true", "map/reconstruction/refinement_kept.ply", localize=OF_MAPS),
+    "mvs.mode": Case("points", "map/", STEREO, localize=OF_MAPS),
+    "mvs.estimator": Case('{name="sweep",options={passes=1}}', "map/", STEREO, localize=OF_MAPS),
+    "mvs.num_sources": Case("1", "map/", STEREO, localize=OF_MAPS),
+    "mvs.max_size_px": Case("80", "map/", STEREO, localize=OF_MAPS),
+    "mvs.agreement.min_views": Case("2", "map/", STEREO, localize=OF_MAPS),
+    "mvs.agreement.max_error_px": Case("0.1", "map/", STEREO, localize=OF_MAPS),
+    "mvs.agreement.max_relative_error": Case("0.0005", "map/", STEREO, localize=OF_MAPS),
+    "mvs.agreement.max_relative_sigma": Case("0.003", "map/", STEREO, localize=OF_MAPS),
     "localization.clusters.by": Case(
         '"poses"',
         context=("localization.clusters.max_clusters=1",),
