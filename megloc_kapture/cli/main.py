@@ -124,6 +124,14 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "Train SuperGlue, or a detector's descriptors, on kapture folders with depth and on "
         "photographs.",
     ),
+    "train-field": (
+        "field:TrainField",
+        "Train a neural field (NeRF-W) on the images of a map, to render views and refine poses.",
+    ),
+    "render": (
+        "field:Render",
+        "Render a view of a neural field, or all views of a result, in colour and depth.",
+    ),
     "weights": (
         "weights:WeightsCommand",
         "List, fetch, add, convert and check the weights of networks.",

@@ -1,4 +1,4 @@
-"""``megloc refine-poses``: better poses of localized queries, by ICP or by rendering."""
+"""``megloc refine-poses``: better poses of localized queries, by ICP, by rendering or by a neural field."""
 
 from __future__ import annotations
 
@@ -35,7 +35,8 @@ class RefinePoses(Linked, StageCommand):
     output: Output
     """Kapture folder of the refined result, with status.csv and the tables of refinement."""
     by: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
-    """Pose refiner: icp or rendering; repeated, one after another; the preset's unless given."""
+    """Pose refiner: icp, rendering or field; repeated, one after another; the preset's unless
+    given."""
     force: Force = False
     """Write into a folder that has other things in it."""
 

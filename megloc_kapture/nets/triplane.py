@@ -131,9 +131,7 @@ class TriPlane(nn.Module):
 
 
 def _mlp(entering: int, leaving: int) -> nn.Sequential:
-    return nn.Sequential(
-        nn.Linear(entering, _HIDDEN), nn.ReLU(), nn.Linear(_HIDDEN, leaving)
-    )
+    return nn.Sequential(nn.Linear(entering, _HIDDEN), nn.ReLU(), nn.Linear(_HIDDEN, leaving))
 
 
 def _repeated(values: torch.Tensor, count: int) -> torch.Tensor:

@@ -37,7 +37,7 @@ _CHUNK = 8192  # rays that are rendered at once
 # Adam's rates at the beginning; at the end a thirtieth
 _PLANE_RATE, _RATE, _NERF_RATE = 2e-2, 5e-3, 5e-4
 _DECAY = 1 / 30
-_FIT_RATE, _FIT_STEPS, _FIT_RAYS = 0.1, 40, 1024
+_FIT_RATE, _FIT_STEPS, _FIT_RAYS = 0.1, 30, 512
 
 
 class TrainingOptions(NetworkOptions):
@@ -123,9 +123,7 @@ class NeuralField:
     images : names, in the order of the embeddings' rows.
     """
 
-    def __init__(
-        self, module: NerfW | TriPlane, frame: FieldFrame, images: Sequence[str]
-    ) -> None:
+    def __init__(self, module: NerfW | TriPlane, frame: FieldFrame, images: Sequence[str]) -> None:
         self.module, self.frame, self.images = module, frame, tuple(images)
         self.device = next(module.parameters()).device
 
@@ -134,9 +132,7 @@ class NeuralField:
         directions = _camera_rays(camera) @ cam_from_world.rotation_matrix()
         origin = (cam_from_world.center() - self.frame.centre) / self.frame.scale
         there = self._tensor(directions / self.frame.scale)
-        return Rays(
-            self._tensor(origin).expand_as(there), there, self.frame.near, self.frame.far
-        )
+        return Rays(self._tensor(origin).expand_as(there), there, self.frame.near, self.frame.far)
 
     def appearance_of(self, image: str) -> torch.Tensor | None:
         """Embedding (A,) of an image's light; None where the field has none of them.
@@ -181,10 +177,11 @@ class NeuralField:
             if appearance is not None:
                 part = replace(part, appearance=appearance.expand(len(part.origins), -1))
             parts.append(self.module.render(part))
-        return Rendered(
-            *(torch.cat([getattr(one, name) for one in parts]) for name in _PER_RAY),
-            transient_density=parts[0].transient_density,
+        rgb, depth, opacity, beta, weights = (
+            torch.cat([getattr(one, name) for one in parts])
+            for name in ("rgb", "depth", "opacity", "beta", "weights")
         )
+        return Rendered(rgb, depth, opacity, beta, weights, parts[0].transient_density)
 
     def fit_appearance(
         self, rays: Rays, rgb: torch.Tensor, *, seed: int = 0
@@ -202,10 +199,19 @@ class NeuralField:
             part = replace(select(rays, rows), appearance=fitted.expand(len(rows), -1))
             difference = self.module.render(part).rgb - rgb[rows]
             # what is transient in the image must not pull on its light
-            loss = nn_huber(difference)
+            loss = _huber(difference)
             (fitted.grad,) = torch.autograd.grad(loss, [fitted])
             optimizer.step()
         return fitted.detach()
+
+    def fitted_appearance(self, view: FieldView, max_side_px: int) -> torch.Tensor | None:
+        """Embedding (A,) of a view's light, of an image reduced to that longer side."""
+        camera, rgb, usable, _ = _pixels(view, max_side_px)
+        rows = torch.from_numpy(np.flatnonzero(usable)).to(self.device)
+        if not len(rows):
+            return None
+        rays = select(self.rays(camera, view.cam_from_world), rows)
+        return self.fit_appearance(rays, self._tensor(rgb.astype(np.float32) / 255)[rows])
 
     def held_out_psnr(self, view: FieldView) -> float:
         """PSNR in dB on the right half of an image, its appearance fitted on the left one."""
@@ -229,10 +235,7 @@ class NeuralField:
         return torch.from_numpy(np.asarray(values, np.float32)).to(self.device)
 
 
-_PER_RAY = ("rgb", "depth", "opacity", "beta", "weights")
-
-
-def nn_huber(difference: torch.Tensor) -> torch.Tensor:
+def _huber(difference: torch.Tensor) -> torch.Tensor:
     """Mean Huber loss of differences of colour, linear from a tenth of full scale."""
     return torch.nn.functional.huber_loss(difference, torch.zeros_like(difference), delta=0.1)
 
@@ -313,7 +316,7 @@ def train_field(
             weight = options.depth_weight / (2 * 0.03**2)
             loss = loss + weight * torch.where(known, error.clamp(max=1.0), 0.0).mean() * 0.1
         optimizer.zero_grad(set_to_none=True)
-        loss.backward()
+        torch.autograd.backward(loss)
         optimizer.step()
         if progress is not None and (step + 1) % shown == 0 and step + 1 < options.steps:
             scores = [field.held_out_psnr(view) for view in small[:2]]
@@ -345,19 +348,23 @@ def _pixels(
         size = f"{view.camera.width}x{view.camera.height}"
         raise DataError(f"image {view.name}: {view.image.shape} does not fit a camera of {size}")
     camera = reduced(view.camera, max_side_px)
-    size = camera.width, camera.height
+    pixels = camera.width, camera.height
     image = view.image
     if camera is not view.camera:
-        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-    usable = np.isfinite(_camera_rays(camera)).all(axis=1)
+        image = np.asarray(cv2.resize(image, pixels, interpolation=cv2.INTER_AREA), np.uint8)
+    usable = np.asarray(np.isfinite(_camera_rays(camera)).all(axis=1))
     if view.mask is not None:
-        mask = cv2.resize(view.mask.astype(np.uint8), size, interpolation=cv2.INTER_AREA)
-        usable &= mask.ravel() > 0
+        mask = cv2.resize(view.mask.astype(np.uint8), pixels, interpolation=cv2.INTER_AREA)
+        usable = usable & (np.asarray(mask).ravel() > 0)
     depth = None
     if view.depth is not None:
         one = view.depth
         source = WarpSource(
-            view.image, view.camera, view.cam_from_world, one.depth_m, one.camera,
+            view.image,
+            view.camera,
+            view.cam_from_world,
+            one.depth_m,
+            one.camera,
             one.image_from_depth,
         )
         warped = warp_to_view(

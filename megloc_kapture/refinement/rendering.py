@@ -99,6 +99,27 @@ def refine_by_rendering(
         return _Refining(query, references, options, features, threads).refine(cam_from_world)
 
 
+def judge_by_rendering(
+    query: RenderingQuery,
+    references: Sequence[RenderingReference],
+    start: RigidTransform,
+    found: RigidTransform,
+    options: RenderingOptions,
+) -> PoseRefinement:
+    """Judge a pose that was found by other means, aligned at the finest level, as above.
+
+    Parameters
+    ----------
+    start, found : the old ``cam_from_world`` and the one that may replace it.
+
+    Raises
+    ------
+    DataError : as above.
+    """
+    with ThreadPoolExecutor(2) as threads:
+        return _Refining(query, references, options, None, threads).judge(start, found)
+
+
 def displacement_by_rendering(
     query: RenderingQuery,
     references: Sequence[RenderingReference],
@@ -175,6 +196,13 @@ class _Refining:
         if sight is None:
             return _uncovered(start, overlap)
         return self._decide(start, overlap, self._align(0, start, sight))
+
+    def judge(self, start: RigidTransform, pose: RigidTransform) -> PoseRefinement:
+        """See :func:`judge_by_rendering`."""
+        sight, overlap = self._visibility(pose)
+        if sight is None:
+            return _uncovered(start, overlap)
+        return self._decide(start, overlap, self._align(0, pose, sight))
 
     def _visibility(self, start: RigidTransform) -> tuple[Visibility | None, float]:
         """Visibility of the references, if it is enough, and the share of the query covered."""

@@ -1,0 +1,172 @@
+"""``megloc train-field`` and ``megloc render``: a map as a neural field, and views of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from megloc_kapture.cli.common import Common, Force, Input, Linked, Output
+from megloc_kapture.errors import DataError, OptionError, OutputError
+from megloc_kapture.io.files import staged_output
+from megloc_kapture.io.images import WRITABLE_SUFFIXES
+from megloc_kapture.io.kapture.sensors import unit_quaternion
+from megloc_kapture.pipeline.executors import single_threaded
+from megloc_kapture.values import RigidTransform
+
+FIELD = "field"
+RENDERED = "rendered"
+_MILLIMETRES = 1000.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainField(Linked, Common):
+    """Train a neural field (NeRF-W) on the images of a map, to render views and refine poses."""
+
+    input: Input
+    """Kapture map: images with poses; masks and depth maps are used where there are any."""
+    output: Output
+    """Folder of the field: field.json and field.safetensors."""
+    kind: Literal["triplane", "nerfw"] = "triplane"
+    """triplane: minutes on a processor; nerfw: the published network, which needs a GPU."""
+    steps: int = 4000
+    """Of the training."""
+    minutes: float | None = None
+    """End after so many at the latest; only without are the bytes the same twice."""
+    max_side: int = 320
+    """Longer side of the images that are trained on, px; larger ones are reduced."""
+    seed: int = 0
+    """Of everything that is drawn."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """auto: a GPU where there is one."""
+    force: Force = False
+    """Write into a folder that has other things in it."""
+
+    def run(self) -> int:
+        """Run it."""
+        from pydantic import ValidationError
+
+        from megloc_kapture.io.files import first_problem
+        from megloc_kapture.refinement.neural_field import TrainingOptions
+        from megloc_kapture.stages.neural_field import train_field_of_map
+
+        console = self.console()
+        try:
+            options = TrainingOptions(
+                kind=self.kind,
+                steps=self.steps,
+                minutes=self.minutes,
+                max_side_px=self.max_side,
+                seed=self.seed,
+                device=self.device,
+            )
+        except ValidationError as error:
+            raise OptionError(first_problem(error)) from error
+
+        def progress(step: int, seconds: float, psnr_db: list[float]) -> None:
+            held_out = ", ".join(f"{value:.1f}" for value in psnr_db)
+            console.say(
+                f"  step {step} of {self.steps}, {seconds:.0f} s"
+                + (f", held-out images {held_out} dB" if held_out else "")
+            )
+
+        with (
+            single_threaded(),
+            staged_output(self.output, kind=FIELD, force=self.force) as out,
+        ):
+            psnr_db = train_field_of_map(self.kapture(self.input), out, options, progress=progress)
+        mean = f"{sum(psnr_db.values()) / len(psnr_db):.1f} dB" if psnr_db else "none held out"
+        console.result(f"{self.output}: PSNR of {len(psnr_db)} held-out images: {mean}")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Render(Linked, Common):
+    """Render a view of a neural field, or all views of a result, in colour and depth."""
+
+    field: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FIELD")]
+    """Folder that megloc train-field wrote."""
+    output: Output
+    """Image file for --pose, kapture folder for --along."""
+    pose: str | None = None
+    """cam_from_world as qw,qx,qy,qz,tx,ty,tz; write --pose=... where the first is negative."""
+    camera: str | None = None
+    """Of --pose: MODEL,WIDTH,HEIGHT,PARAMETERS, as COLMAP defines them."""
+    depth: Path | None = None
+    """Of --pose: file for the depth, 16-bit PNG in thousandths of the map's unit, 0 where empty."""
+    along: Path | None = None
+    """Kapture folder, e.g. a result: all its images that have poses are rendered, with depth."""
+    appearance: str | None = None
+    """An image that was trained on, in whose light to render; the mean of all unless given."""
+    force: Force = False
+    """Overwrite a file, or write into a folder that has other things in it."""
+
+    def run(self) -> int:
+        """Run it."""
+        from megloc_kapture.stages.neural_field import open_field, render_along
+
+        console = self.console()
+        if (self.pose is None) == (self.along is None):
+            raise OptionError("say what to render: either --pose and --camera, or --along")
+        if self.along is not None:
+            for name in ("camera", "depth"):
+                if getattr(self, name) is not None:
+                    raise OptionError(f"--{name} changes nothing: it is of --pose")
+            field = open_field(self.field)
+            with (
+                single_threaded(),
+                staged_output(self.output, kind=RENDERED, force=self.force) as out,
+            ):
+                count = render_along(
+                    field, self.kapture(self.along), out, appearance=self.appearance
+                )
+            console.result(f"{count} views rendered: {self.output}")
+            return 0
+        self._render_one()
+        console.result(f"rendered: {self.output}")
+        return 0
+
+    def _render_one(self) -> None:
+        import cv2
+        import numpy as np
+
+        from megloc_kapture.cli.localize import camera_of_text
+        from megloc_kapture.io.files import write_bytes
+        from megloc_kapture.io.images import write_image
+        from megloc_kapture.stages.neural_field import open_field
+
+        if self.pose is None or self.camera is None:
+            raise OptionError("--pose needs the --camera that looks")
+        pose, camera = _pose_of_text(self.pose), camera_of_text(self.camera)
+        endings: list[tuple[Path, tuple[str, ...]]] = [(self.output, WRITABLE_SUFFIXES)]
+        if self.depth is not None:
+            endings.append((self.depth, (".png",)))
+        for path, known in endings:
+            if path.suffix.lower() not in known:
+                raise OptionError(f"{path}: the file must end in {' or '.join(known)}")
+            if path.exists() and not self.force:
+                raise OutputError(f"{path}: stands there; -f replaces it")
+        with single_threaded():
+            field = open_field(self.field)
+            light = None if self.appearance is None else field.appearance_of(self.appearance)
+            found = field.render(camera, pose, appearance=light)
+        write_image(self.output, found.image)
+        if self.depth is not None:
+            stored = np.clip(np.round(found.depth_m * _MILLIMETRES), 0, 65535).astype(np.uint16)
+            write_bytes(self.depth, cv2.imencode(".png", stored)[1].tobytes())
+
+
+def _pose_of_text(text: str) -> RigidTransform:
+    """``cam_from_world`` of ``qw,qx,qy,qz,tx,ty,tz``; raises OptionError."""
+    try:
+        w, x, y, z, *translation = map(float, text.split(","))
+        quat = unit_quaternion((w, x, y, z))
+        tx, ty, tz = translation
+        if not all(map(math.isfinite, translation)):
+            raise ValueError
+    except (ValueError, DataError):
+        raise OptionError(f"--pose {text}: give qw,qx,qy,qz,tx,ty,tz") from None
+    return RigidTransform(quat, (tx, ty, tz))

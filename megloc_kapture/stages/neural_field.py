@@ -1,0 +1,182 @@
+"""Neural fields of kapture maps: trained, kept in a folder, read again, rendered.
+
+A folder has ``field.json``, what the field is and was trained on, and ``field.safetensors``, its
+tensors; nothing in either can run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.files import read_json_model, write_bytes, write_json_model
+from megloc_kapture.io.images import write_depth_map, write_image
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
+from megloc_kapture.io.weights import WeightsFile, describe, read_weights
+from megloc_kapture.nets.runtime import Device, load_strictly, pick_device
+from megloc_kapture.refinement.neural_field import (
+    FieldFrame,
+    FieldView,
+    Kind,
+    NeuralField,
+    TrainingOptions,
+    build_field,
+    train_field,
+)
+from megloc_kapture.stages.ranking_scene import KaptureScene
+
+FIELD_FILE, MANIFEST_FILE = "field.safetensors", "field.json"
+
+
+class FieldManifest(BaseModel):
+    """``field.json``.
+
+    Attributes
+    ----------
+    images : those trained on, in the order of the embeddings.
+    held_out_psnr_db : of each held-out image.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: Kind
+    frame: FieldFrame
+    images: Annotated[list[str], Field(min_length=1)]
+    held_out_psnr_db: dict[str, float | None]
+    options: TrainingOptions
+
+
+def train_field_of_map(
+    mapping: KaptureFolder,
+    output: Path,
+    options: TrainingOptions,
+    *,
+    progress: Callable[[int, float, list[float]], None] | None = None,
+) -> Mapping[str, float]:
+    """Train a field on the images of a map that have poses, and write it into a folder.
+
+    Parameters
+    ----------
+    mapping : kapture with images and poses; masks and depth are used where they are.
+    progress : see :func:`~megloc_kapture.refinement.neural_field.train_field`.
+
+    Returns
+    -------
+    PSNR in dB of each held-out image by name.
+
+    Raises
+    ------
+    DataError : too few images, or one, its mask or its depth cannot be read.
+    """
+    from safetensors.torch import save
+
+    field, psnr = train_field(views_of(mapping), options, progress=progress)
+    module = field.module.cpu()
+    tensors = {name: value.contiguous() for name, value in module.state_dict().items()}
+    write_bytes(output / FIELD_FILE, save(tensors))
+    known = {name: None if value != value else value for name, value in psnr.items()}
+    manifest = FieldManifest(
+        kind=options.kind,
+        frame=field.frame,
+        images=list(field.images),
+        held_out_psnr_db=known,
+        options=options,
+    )
+    write_json_model(output / MANIFEST_FILE, manifest)
+    return psnr
+
+
+def views_of(mapping: KaptureFolder) -> list[FieldView]:
+    """The images of a map that have poses, sorted by name, with their masks and depth."""
+    scene = KaptureScene(mapping)
+    return [
+        FieldView(
+            name,
+            scene.map_image(name),
+            scene.map_camera(name),
+            pose,
+            scene.map_mask(name),
+            scene.map_depth(name),
+        )
+        for name, pose in mapping.read().poses().items()
+    ]
+
+
+def open_field(folder: Path, device: Device = "auto") -> NeuralField:
+    """A field out of its folder; one that has been opened stays in memory.
+
+    Raises
+    ------
+    DataError : missing, damaged, or the tensors are not those of the manifest; names the file.
+    """
+    return _opened(weights_file(folder), device)
+
+
+def weights_file(folder: Path) -> WeightsFile:
+    """The tensors of a field; raises DataError where there is none."""
+    if not (folder / FIELD_FILE).is_file():
+        raise DataError(f"no {FIELD_FILE} here; megloc train-field writes one", path=folder)
+    return describe(FIELD_FILE, (folder / FIELD_FILE).absolute())
+
+
+@lru_cache(maxsize=2)
+def _opened(file: WeightsFile, device: Device) -> NeuralField:
+    manifest = read_json_model(file.path.with_name(MANIFEST_FILE), FieldManifest)
+    module = build_field(manifest.kind, len(manifest.images))
+    load_strictly(module, read_weights(file), str(file.path))
+    module.requires_grad_(False)
+    return NeuralField(module.to(pick_device(device)), manifest.frame, manifest.images)
+
+
+def render_along(
+    field: NeuralField,
+    folder: KaptureFolder,
+    output: Path,
+    *,
+    appearance: str | None = None,
+    max_side_px: int | None = None,
+) -> int:
+    """Render all images of a kapture that have poses, as a kapture with depth of its own.
+
+    Parameters
+    ----------
+    appearance : image that was trained on, whose light it is; the mean of all unless given.
+    max_side_px : longer side of the renderings; larger cameras are reduced.
+
+    Returns
+    -------
+    The number of renderings.
+
+    Raises
+    ------
+    DataError : no image has a pose, or the field does not know the appearance.
+    """
+    data = folder.read()
+    poses = data.poses()
+    if not poses:
+        raise DataError("no image here has a pose", path=folder.root)
+    light = None if appearance is None else field.appearance_of(appearance)
+    written = KaptureData()
+    for name, pose in poses.items():
+        timestamp, sensor = data.record_of(name)
+        rendering = field.render(
+            data.camera_of(name), pose, appearance=light, max_side_px=max_side_px
+        )
+        image, depth = f"{Path(name).with_suffix('')}.png", f"{Path(name).with_suffix('')}.depth"
+        ids = sensor, f"{sensor}_depth"
+        for one, kind in zip(ids, ("camera", "depth"), strict=True):
+            written.sensors[one] = Sensor.from_camera(rendering.camera, sensor_type=kind)
+            written.trajectories[timestamp, one] = pose
+        written.records_camera[timestamp, ids[0]] = image
+        written.records_depth[timestamp, ids[1]] = depth
+        folder_of = output / "sensors" / "records_data"
+        (folder_of / image).parent.mkdir(parents=True, exist_ok=True)
+        write_image(folder_of / image, rendering.image)
+        write_depth_map(folder_of / depth, rendering.depth_m)
+    write_sensors(output, written)
+    return len(poses)

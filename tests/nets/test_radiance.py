@@ -1,0 +1,190 @@
+"""Volume rendering against closed form; NeRF-W's loss and network against the paper's."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from megloc_kapture.nets.nerfw import NerfW  # noqa: E402
+from megloc_kapture.nets.radiance import (  # noqa: E402
+    Rays,
+    Samples,
+    about_depth,
+    composite,
+    frequencies,
+    importance,
+    nerf_w_loss,
+    spacings,
+    static_part,
+    stratified,
+)
+from megloc_kapture.nets.triplane import TriPlane  # noqa: E402
+
+
+def rays_of(count: int, *, near: float = 0.5, far: float = 4.0, seed: int = 0) -> Rays:
+    generator = torch.Generator().manual_seed(seed)
+    directions = torch.randn(count, 3, generator=generator)
+    return Rays(torch.zeros(count, 3), directions, near, far)
+
+
+def random_samples(shape: tuple[int, int], dtype: torch.dtype) -> Samples:
+    generator = torch.Generator().manual_seed(3)
+
+    def drawn(*more: int) -> torch.Tensor:
+        return torch.rand(*shape, *more, generator=generator, dtype=dtype)
+
+    return Samples(2 * drawn(), drawn(3), drawn(), drawn(3), drawn())
+
+
+def test_a_slab_of_constant_density_is_beer_and_lambert() -> None:
+    edges = torch.linspace(1.0, 3.0, 2001, dtype=torch.float64)
+    t, deltas = (0.5 * (edges[1:] + edges[:-1]))[None], torch.diff(edges)[None]
+    sigma, colour = 0.8, torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)
+    samples = Samples(torch.full_like(t, sigma), colour.expand(1, t.shape[1], 3))
+    found = composite(t, deltas, samples)
+    opacity = 1 - math.exp(-sigma * 2)
+    # the mean of an exponential distribution cut off at the slab's end
+    depth = 1 + 1 / sigma - 2 * math.exp(-sigma * 2) / opacity
+    assert found.opacity.item() == pytest.approx(opacity, abs=1e-12)
+    assert found.depth.item() == pytest.approx(depth, rel=1e-6)
+    torch.testing.assert_close(found.rgb[0], opacity * colour)
+    assert found.beta.item() == pytest.approx(0.03)
+
+
+def test_a_transient_slab_shares_the_light_by_density() -> None:
+    edges = torch.linspace(0.0, 1.0, 4001, dtype=torch.float64)
+    t, deltas = (0.5 * (edges[1:] + edges[:-1]))[None], torch.diff(edges)[None]
+    ones = torch.ones_like(t)
+    black, white = torch.zeros(1, t.shape[1], 3), torch.ones(1, t.shape[1], 3)
+    samples = Samples(0.5 * ones, black.double(), 1.5 * ones, white.double(), 0.4 * ones)
+    found = composite(t, deltas, samples)
+    opacity = 1 - math.exp(-2.0)
+    assert found.rgb[0, 0].item() == pytest.approx(0.75 * opacity, rel=1e-3)
+    assert found.beta.item() == pytest.approx(0.03 + 0.4 * 0.75 * opacity, rel=1e-3)
+    assert found.opacity.item() == pytest.approx(opacity, abs=1e-12)
+    assert found.transient_density.item() == pytest.approx(1.5)
+
+
+def test_without_what_is_transient_it_is_nerf_a() -> None:
+    samples = random_samples((5, 12), torch.float64)
+    t = torch.linspace(1, 2, 12, dtype=torch.float64).expand(5, -1)
+    deltas = torch.full_like(t, 0.1)
+    assert samples.transient_sigma is not None
+    off = replace(samples, transient_sigma=torch.zeros_like(samples.transient_sigma))
+    with_none, with_zero = composite(t, deltas, static_part(samples)), composite(t, deltas, off)
+    for name in ("rgb", "depth", "opacity", "beta", "weights"):
+        torch.testing.assert_close(getattr(with_none, name), getattr(with_zero, name))
+    seen = torch.rand(5, 3, dtype=torch.float64)
+    squared = torch.square(with_none.rgb - seen).mean()
+    expected = squared / (2 * 0.03**2) + math.log(0.03) + 3
+    torch.testing.assert_close(nerf_w_loss(with_none, seen), expected)
+
+
+def test_gradients_are_those_of_differences() -> None:
+    samples = random_samples((3, 7), torch.float64)
+    t = torch.sort(torch.rand(3, 7, dtype=torch.float64) + 1, dim=1).values
+    deltas = torch.full_like(t, 0.2)
+    seen = torch.rand(3, 3, dtype=torch.float64)
+    values = [
+        value.clone().requires_grad_()
+        for value in (
+            samples.sigma,
+            samples.rgb,
+            samples.transient_sigma,
+            samples.transient_rgb,
+            samples.transient_beta,
+        )
+        if value is not None
+    ]
+
+    def loss(*parts: torch.Tensor) -> torch.Tensor:
+        return nerf_w_loss(composite(t, deltas, Samples(*parts)), seen)
+
+    assert torch.autograd.gradcheck(loss, values)
+
+
+def test_samples_lie_where_they_should() -> None:
+    rays = rays_of(50)
+    generator = torch.Generator().manual_seed(1)
+    t = stratified(rays, 32, generator)
+    assert (torch.diff(t, dim=1) > 0).all() and t.min() >= 0.5 and t.max() <= 4.0
+    weights = torch.where((t > 1.9) & (t < 2.1), 1.0, 0.0)
+    more = importance(t, weights, 64, generator)
+    assert ((more > 1.7) & (more < 2.3)).float().mean() > 0.98
+    depth = torch.tensor([0.0, 2.0])
+    found = about_depth(depth, torch.full((2, 8), 9.0), generator)
+    assert (found[0] == 9).all() and ((found[1] - 2).abs() <= 0.06 + 1e-6).all()
+    lengths = torch.linalg.vector_norm(rays.directions, dim=1)
+    torch.testing.assert_close(spacings(t, rays).sum(1), (4.0 - t[:, 0]) * lengths)
+
+
+def test_encoding_has_the_order_of_the_public_code() -> None:
+    values = torch.tensor([[0.1, 0.2, 0.3]])
+    found = frequencies(values, 2)
+    expected = [values, values.sin(), values.cos(), (2 * values).sin(), (2 * values).cos()]
+    torch.testing.assert_close(found, torch.cat(expected, dim=1))
+
+
+def linear(entering: int, leaving: int) -> int:
+    return (entering + 1) * leaving
+
+
+def test_nerfw_has_the_names_and_sizes_of_the_public_branch() -> None:
+    field = NerfW(7)
+    names = set(field.state_dict())
+    blocks = [f"xyz_encoding_{number}.0" for number in range(1, 9)]
+    blocks += ["xyz_encoding_final", "dir_encoding.0", "static_sigma.0", "static_rgb.0"]
+    moving = [f"transient_encoding.{number}" for number in (0, 2, 4, 6)]
+    moving += ["transient_sigma.0", "transient_rgb.0", "transient_beta.0"]
+    assert names == {
+        "embedding_a.weight",
+        "embedding_t.weight",
+        *(f"nerf_coarse.{block}.{kind}" for block in blocks for kind in ("weight", "bias")),
+        *(f"nerf_fine.{one}.{kind}" for one in blocks + moving for kind in ("weight", "bias")),
+    }
+    trunk = linear(63, 256) + 6 * linear(256, 256) + linear(256 + 63, 256) + linear(256, 256)
+    heads = linear(256, 1) + linear(128, 3)
+    coarse = trunk + heads + linear(256 + 27, 128)
+    fine = trunk + heads + linear(256 + 27 + 48, 128)
+    fine += linear(256 + 16, 128) + 3 * linear(128, 128) + 2 * linear(128, 1) + linear(128, 3)
+    assert sum(value.numel() for value in field.nerf_coarse.parameters()) == coarse
+    assert sum(value.numel() for value in field.nerf_fine.parameters()) == fine
+    assert field.embedding_a.weight.shape == (7, 48) and field.embedding_t.weight.shape == (7, 16)
+    assert tuple(field.state_dict()["nerf_fine.xyz_encoding_5.0.weight"].shape) == (256, 319)
+
+
+@pytest.mark.parametrize("kind", [NerfW, TriPlane])
+def test_a_field_renders_rays(kind: type[NerfW] | type[TriPlane]) -> None:
+    torch.manual_seed(0)
+    field = kind(3)
+    generator = torch.Generator().manual_seed(0)
+    rays = rays_of(9)
+    assert field.appearance is not None and field.transient is not None
+    images = torch.arange(9) % 3
+    full = replace(rays, appearance=field.appearance(images), transient=field.transient(images))
+    seen = field.render(full, generator)
+    for value, shape in ((seen.rgb, (9, 3)), (seen.depth, (9,)), (seen.beta, (9,))):
+        assert value.shape == shape and torch.isfinite(value).all()
+    assert ((seen.opacity >= 0) & (seen.opacity <= 1 + 1e-6)).all() and (seen.beta > 0.03).all()
+    nerf_w_loss(seen, torch.rand(9, 3)).backward()
+    assert all(value.grad is not None for value in field.parameters())
+    plain = field.render(rays)
+    assert (plain.beta == 0.03).all() and plain.transient_density == 0
+    # what is transient in one image is nowhere else, its light is
+    torch.testing.assert_close(plain.rgb, field.render(rays).rgb)
+    other = replace(rays, appearance=field.appearance(images) + 1.0)
+    assert not torch.equal(field.render(other).rgb, plain.rgb)
+
+
+def test_space_beyond_the_planes_is_contracted_without_a_seam() -> None:
+    from megloc_kapture.nets.triplane import _contracted
+
+    points = torch.tensor([0.0, 0.5, 1.0, 1.0 + 1e-6, 3.0, 1e6, -3.0], dtype=torch.float64)
+    found = _contracted(points)
+    torch.testing.assert_close(found[:3], points[:3])
+    assert (torch.diff(found[:6]) > 0).all() and found[5] < 1.5 and found[6] == -found[4]
+    assert found[3].item() == pytest.approx(1 + 1e-6, abs=1e-10)
