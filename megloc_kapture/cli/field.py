@@ -99,6 +99,8 @@ class Render(Linked, Common):
     """Of --pose: file for the depth, 16-bit PNG in thousandths of the map's unit, 0 where empty."""
     along: Path | None = None
     """Kapture folder, e.g. a result: all its images that have poses are rendered, with depth."""
+    max_side: int | None = None
+    """Of --along: longer side of the renderings, px; larger cameras are reduced."""
     appearance: str | None = None
     """An image that was trained on, in whose light to render; the mean of all unless given."""
     force: Force = False
@@ -111,6 +113,10 @@ class Render(Linked, Common):
         console = self.console()
         if (self.pose is None) == (self.along is None):
             raise OptionError("say what to render: either --pose and --camera, or --along")
+        if self.along is None and self.max_side is not None:
+            raise OptionError("--max-side changes nothing: it is of --along")
+        if self.max_side is not None and self.max_side < 1:
+            raise OptionError(f"--max-side {self.max_side} is not positive")
         if self.along is not None:
             for name in ("camera", "depth"):
                 if getattr(self, name) is not None:
@@ -121,7 +127,11 @@ class Render(Linked, Common):
                 staged_output(self.output, kind=RENDERED, force=self.force) as out,
             ):
                 count = render_along(
-                    field, self.kapture(self.along), out, appearance=self.appearance
+                    field,
+                    self.kapture(self.along),
+                    out,
+                    appearance=self.appearance,
+                    max_side_px=self.max_side,
                 )
             console.result(f"{count} views rendered: {self.output}")
             return 0

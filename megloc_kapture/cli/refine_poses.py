@@ -1,4 +1,4 @@
-"""``megloc refine-poses``: better poses of localized queries, by ICP, by rendering or by a neural field."""
+"""``megloc refine-poses``: better poses of localized queries: ICP, rendering or a neural field."""
 
 from __future__ import annotations
 

@@ -29,8 +29,8 @@ _GEOMETRY, _HIDDEN = 15, 64
 _APPEARANCE, _TRANSIENT = 8, 16
 _DIRECTION_FREQUENCIES, _POINT_FREQUENCIES = 2, 3
 # samples of a ray: to look where something is, then spread evenly, then where it is
-_LOOKING, _SPREAD, _THERE = 48, 8, 16
-_REACH = 1.5  # beyond 1 space is contracted, to this at infinity
+_LOOKING, _SPREAD, _THERE = 32, 8, 16
+_REACH = 1.25  # beyond 1 space is contracted, to this at infinity
 _MAX_LOG_DENSITY = 12.0
 _AXES = ((0, 1), (0, 2), (1, 2))
 

@@ -271,8 +271,13 @@ _STEPS = (
         _refines_by("rendering"),
         lambda o, facts: "" if facts.map_depth else "the map images have no depth",
     ),
+    _Step(
+        "rendering by a neural field (NeRF-W)",
+        "pose_refinement.by",
+        _refines_by("field"),
+        lambda o, facts: "it needs a field of the map (megloc train-field)",
+    ),
 )
 _MISSING = (
     "depth of map images by multi-view stereo",
-    "rendering by a neural field (NeRF-W)",
 )

@@ -37,7 +37,8 @@ _CHUNK = 8192  # rays that are rendered at once
 # Adam's rates at the beginning; at the end a thirtieth
 _PLANE_RATE, _RATE, _NERF_RATE = 2e-2, 5e-3, 5e-4
 _DECAY = 1 / 30
-_FIT_RATE, _FIT_STEPS, _FIT_RAYS = 0.1, 30, 512
+# of an appearance: Adam's rate, its steps, the rays of each, and those that are drawn of
+_FIT_RATE, _FIT_STEPS, _FIT_RAYS, _FIT_OF = 0.1, 20, 512, 2048
 
 
 class TrainingOptions(NetworkOptions):
@@ -191,15 +192,19 @@ class NeuralField:
         if embedding is None:
             return None
         generator = torch.Generator().manual_seed(seed)
+        drawn = torch.randperm(len(rgb), generator=generator)[:_FIT_OF].to(self.device)
+        rays, rgb = select(rays, drawn), rgb[drawn]
+        with torch.no_grad():  # where samples lie does not depend on the light
+            seen = self.render_rays(rays)
+            rays = replace(rays, depth=torch.where(seen.opacity > 0.5, seen.depth, 0.0))
         fitted = embedding.weight.detach().mean(0).clone().requires_grad_()
         optimizer = torch.optim.Adam([fitted], lr=_FIT_RATE)
         for _ in range(_FIT_STEPS):
             rows = torch.randint(len(rgb), (min(_FIT_RAYS, len(rgb)),), generator=generator)
             rows = rows.to(self.device)
             part = replace(select(rays, rows), appearance=fitted.expand(len(rows), -1))
-            difference = self.module.render(part).rgb - rgb[rows]
             # what is transient in the image must not pull on its light
-            loss = _huber(difference)
+            loss = _huber(self.module.render(part).rgb - rgb[rows])
             (fitted.grad,) = torch.autograd.grad(loss, [fitted])
             optimizer.step()
         return fitted.detach()

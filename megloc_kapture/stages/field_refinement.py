@@ -2,7 +2,9 @@
 
 Render, match, solve: colour and depth are rendered at the initial pose, local features of query and
 rendering matched, lifted by the rendered depth, and the pose solved (as GS-CPR, Liu et al., ICLR
-2025, does with splats); once more from there. Descending on colours is slower and heals less.
+2025, does with splats). Renderings from there are aligned with the query as map images are by
+``rendering``, and the pose is accepted by its rules. Descending on colours from the initial pose is
+slower and heals less.
 """
 
 from __future__ import annotations
@@ -43,7 +45,8 @@ from megloc_kapture.values import Camera, Failure, ImageFeatures, Options, Rigid
 if TYPE_CHECKING:
     from megloc_kapture.refinement.neural_field import FieldRendering
 
-_ROUNDS = 2
+# of the pose that was solved, each by a rendering from where the last one led
+_ALIGNMENTS = 2
 # neighbouring rendered depths that differ by more, a share, are of an edge: not lifted
 _MAX_JUMP = 0.05
 _MAX_ERROR_PX = 3.0
@@ -125,31 +128,28 @@ class FieldRefiner:
         image, mask = scene.query_image(query), scene.query_mask(query)
         view = FieldView(query, image, camera, cam_from_world, mask)
         light = field.fitted_appearance(view, self.options.max_side_px)
-        pose, matched = cam_from_world, None
-        for _ in range(_ROUNDS):
-            rendering = field.render(
-                camera, pose, appearance=light, max_side_px=self.options.max_side_px
-            )
-            if matched is None:
-                matched = self._extract(image, mask, rendering.camera)
-            solved = self._solve(matched, rendering, pose)
-            if isinstance(solved, Failure):
-                return PoseRefinement(cam_from_world, f"query and rendering: {solved.reason}")
-            pose = solved
-        shown = field.render(camera, pose, appearance=light, max_side_px=self.options.max_side_px)
-        depth = DepthView(shown.camera, shown.depth_m, RigidTransform.identity())
-        return judge_by_rendering(
-            RenderingQuery(image, camera, mask),
-            [RenderingReference(shown.image, shown.camera, pose, depth)],
-            cam_from_world,
-            pose,
-            RenderingOptions(
-                max_side_px=self.options.max_side_px,
-                levels=1,
-                max_translation_m=self.options.max_translation_m,
-                max_rotation_deg=self.options.max_rotation_deg,
-            ),
+        side = self.options.max_side_px
+        first = field.render(camera, cam_from_world, appearance=light, max_side_px=side)
+        solved = self._solve(self._extract(image, mask, first.camera), first, cam_from_world)
+        if isinstance(solved, Failure):
+            return PoseRefinement(cam_from_world, f"query and rendering: {solved.reason}")
+        seen = RenderingQuery(image, camera, mask)
+        options = RenderingOptions(
+            max_side_px=side,
+            levels=1,
+            max_translation_m=self.options.max_translation_m,
+            max_rotation_deg=self.options.max_rotation_deg,
         )
+        pose = solved
+        for _ in range(_ALIGNMENTS):
+            shown = field.render(camera, pose, appearance=light, max_side_px=side)
+            depth = DepthView(shown.camera, shown.depth_m, RigidTransform.identity())
+            reference = RenderingReference(shown.image, shown.camera, pose, depth)
+            judged = judge_by_rendering(seen, [reference], cam_from_world, pose, options)
+            if not judged.accepted:
+                break
+            pose = judged.cam_from_world
+        return judged
 
     def _extract(
         self, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None, camera: Camera

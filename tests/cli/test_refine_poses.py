@@ -44,8 +44,9 @@ def test_refiners_work_one_after_another(megloc: Any, finished: Path, tmp_path: 
 
 def test_what_is_refused(megloc: Any, finished: Path, tmp_path: Path) -> None:
     megloc(*command(finished, tmp_path / "out"), "--by", "magic").refused(
-        "no plugin 'magic' in megloc_kapture.pose_refiners; registered: icp, rendering"
+        "no plugin 'magic' in megloc_kapture.pose_refiners; registered: field, icp, rendering"
     )
+    megloc(*command(finished, tmp_path / "out"), "--by", "field").refused("train-field")
     bare = [*command(finished, tmp_path / "out")]
     bare[bare.index("--poses") + 1] = finished / "query"
     megloc(*bare, "--by", "icp").refused(r"status\.csv")

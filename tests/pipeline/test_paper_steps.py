@@ -31,10 +31,11 @@ TRAINED = "descriptors and matcher trained anew"
 # by anybody, or with public weights
 NOT_YET = {
     "depth of map images by multi-view stereo",
-    "rendering by a neural field (NeRF-W)",
     TRAINED,
 }
+WITHOUT_FIELD = "rendering by a neural field (NeRF-W)"
 WITHOUT_DEPTH = {
+    WITHOUT_FIELD,
     "points verified by depth",
     "clusters ranked by LPIPS of aligned views",
     "poses refined by ICP",
@@ -46,6 +47,7 @@ OFF = {
     "robotcar": {*WITHOUT_DEPTH, SEQUENCE},
     "4seasons": {*WITHOUT_DEPTH, COVISIBLE},
     "inloc": {
+        WITHOUT_FIELD,
         "people and vehicles masked",
         "the own car masked",
         "map pairs by poses",
@@ -58,6 +60,7 @@ OFF = {
     },
     # nobody knows what is in a user's folders
     "kapture": {
+        WITHOUT_FIELD,
         "people and vehicles masked",
         "the own car masked",
         COVISIBLE,

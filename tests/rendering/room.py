@@ -8,6 +8,7 @@ from functools import cache
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.values import Camera, RigidTransform
@@ -94,15 +95,13 @@ def render(
     for surface in np.unique(6 * number + face):
         rows = np.flatnonzero(6 * number + face == surface)
         across = [axis for axis in range(3) if axis != surface % 3]
-        at = (points[rows][:, across] * 64 + 20.0 * surface).astype(np.float32)
-        looked = cv2.remap(
-            _texture(int(surface)),
-            (at[:, 0] % _TEXTURE_PX)[None],
-            (at[:, 1] % _TEXTURE_PX)[None],
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_WRAP,
-        )[0]
-        colour[rows] = looked
+        at = points[rows][:, across].T * 64 + 20.0 * surface
+        texture = _texture(int(surface))
+        looked = [
+            map_coordinates(texture[..., channel], at[::-1], order=1, mode="grid-wrap")
+            for channel in range(3)
+        ]
+        colour[rows] = np.stack(looked, axis=1)
     tint, stands = LIGHTS[light]
     away = points - stands
     distance = np.linalg.norm(away, axis=1)

@@ -1,0 +1,152 @@
+"""Neural fields of a ray-cast room, whose light, movers, depth and poses are known."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+import room  # noqa: E402
+
+from megloc_kapture.errors import DataError  # noqa: E402
+from megloc_kapture.nets.triplane import TriPlane  # noqa: E402
+from megloc_kapture.pipeline.executors import single_threaded  # noqa: E402
+from megloc_kapture.plugins import DepthView  # noqa: E402
+from megloc_kapture.refinement.neural_field import (  # noqa: E402
+    FieldView,
+    NeuralField,
+    TrainingOptions,
+    _pixels,
+    train_field,
+)
+from megloc_kapture.values import Camera, RigidTransform  # noqa: E402
+
+SMALL = Camera("PINHOLE", 32, 24, (22.0, 22.0, 16.0, 12.0))
+QUICK = TrainingOptions(steps=8, rays_per_step=128, device="cpu")
+IDENTITY = RigidTransform.identity()
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread() -> Iterator[None]:
+    """The same bytes need it, and so does a machine that does other things as well."""
+    with single_threaded():
+        yield
+
+
+def views(
+    count: int, camera: Camera = SMALL, *, seed: int = 1, depth: bool = True, moving: bool = False
+) -> list[FieldView]:
+    found = []
+    for number, pose in enumerate(room.poses(count, seed)):
+        mover = number if moving and number % 5 < 3 else None
+        seen = room.render(pose, camera=camera, light=number % 2, moving=mover)
+        known = DepthView(camera, seen.depth_m, IDENTITY) if depth else None
+        found.append(FieldView(f"{number:03}.png", seen.image, camera, pose, None, known))
+    return found
+
+
+def depth_error(field: NeuralField, tests: list[FieldView]) -> float:
+    """Median share by which rendered depths are off."""
+    errors = []
+    for view in tests:
+        assert view.depth is not None
+        known = view.depth.depth_m
+        found = field.render(view.camera, view.cam_from_world).depth_m
+        errors.append(np.abs(found - known) / known)
+    return float(np.median(errors))
+
+
+def test_a_small_field_learns_the_room_and_the_same_bytes_twice() -> None:
+    seen: list[tuple[int, list[float]]] = []
+    options = TrainingOptions(steps=80, rays_per_step=256, device="cpu")
+
+    def progress(step: int, seconds: float, psnr_db: list[float]) -> None:
+        seen.append((step, psnr_db))
+
+    field, psnr = train_field(views(8), options, progress=progress)
+    assert set(psnr) == {"007.png"} and len(field.images) == 7
+    # an image of one colour has 14 dB
+    assert min(psnr.values()) > 16 and depth_error(field, views(4)) < 0.2
+    assert [step for step, _ in seen] == list(range(10, 80, 10))
+    assert all(len(values) == 1 for _, values in seen)
+    one, other = (train_field(views(5), QUICK)[0].module.state_dict() for _ in range(2))
+    assert all(torch.equal(one[name], other[name]) for name in one)
+    changed, _ = train_field(views(5), QUICK.model_copy(update={"seed": 1}))
+    assert not torch.equal(changed.module.state_dict()["planes.0"], one["planes.0"])
+
+
+def test_masked_pixels_change_nothing() -> None:
+    plain = views(4)
+    mask = np.ones((24, 32), bool)
+    mask[:, :10] = False
+    spoiled, masked = [], []
+    for view in plain:
+        image = view.image.copy()
+        image[~mask] = 255
+        arguments = (view.camera, view.cam_from_world, mask, view.depth)
+        masked.append(FieldView(view.name, view.image, *arguments))
+        spoiled.append(FieldView(view.name, image, *arguments))
+    one, other, whole = (
+        train_field(given, QUICK)[0].module.state_dict() for given in (masked, spoiled, plain)
+    )
+    assert all(torch.equal(one[name], other[name]) for name in one)
+    assert not torch.equal(one["planes.0"], whole["planes.0"])
+
+
+def test_depth_of_another_camera_is_brought_to_the_image() -> None:
+    plain = views(4)
+    finer = Camera("PINHOLE", 64, 48, (44.0, 44.0, 32.0, 24.0))
+    shift = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.03, 0.0, 0.0))
+    moved = []
+    for view in plain:
+        assert view.depth is not None
+        seen = room.render(shift.inverse() @ view.cam_from_world, camera=finer)
+        depth = DepthView(finer, seen.depth_m, shift)
+        moved.append(
+            FieldView(view.name, view.image, view.camera, view.cam_from_world, None, depth)
+        )
+    for view, other in zip(plain, moved, strict=True):
+        own, brought = _pixels(view, 32)[3], _pixels(other, 32)[3]
+        assert own is not None and brought is not None
+        both = (own > 0) & (brought > 0)
+        assert both.mean() > 0.75
+        assert np.median(np.abs(brought[both] / own[both] - 1)) < 0.01
+
+
+def test_what_cannot_be_trained_is_refused() -> None:
+    few = views(1)
+    with pytest.raises(DataError, match="1 images with poses and pixels are too few"):
+        train_field(few, QUICK)
+    one = few[0]
+    wrong = FieldView(one.name, one.image[:-1], one.camera, one.cam_from_world)
+    with pytest.raises(DataError, match=r"000\.png: \(23, 32, 3\) does not fit .* 32x24"):
+        train_field([wrong, wrong], QUICK)
+    hidden = FieldView(
+        one.name, one.image, one.camera, one.cam_from_world, np.zeros((24, 32), bool)
+    )
+    with pytest.raises(DataError, match="no pixel"):
+        train_field([hidden, hidden], QUICK)
+    field, _ = train_field(views(4, depth=False), QUICK)
+    with pytest.raises(DataError, match="not trained on an image 'x'"):
+        field.appearance_of("x")
+
+
+@pytest.mark.slow
+def test_two_lights_and_what_moves_need_their_embeddings() -> None:
+    clean = views(10, room.CAMERA, seed=2)
+    trained = views(40, room.CAMERA, moving=True)
+    psnr_db, errors = [], []
+    for unconstrained in (True, False):
+        torch.manual_seed(0)
+        kept = len(trained) - len(trained[7::8])
+        module = TriPlane(kept, unconstrained=unconstrained)
+        options = TrainingOptions(steps=1200, rays_per_step=1024, device="cpu")
+        field, _ = train_field(trained, options, module=module)
+        psnr_db.append(float(np.mean([field.held_out_psnr(view) for view in clean])))
+        errors.append(depth_error(field, clean))
+    print(f"PSNR {psnr_db[0]:.1f} dB, without embeddings {psnr_db[1]:.1f} dB; depth {errors}")
+    assert psnr_db[0] >= 24 and psnr_db[0] >= psnr_db[1] + 2
+    assert errors[0] < 0.02

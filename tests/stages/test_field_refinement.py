@@ -1,0 +1,138 @@
+"""Poses refined by what a field shows, against the true ones of a ray-cast room."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import room
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from megloc_kapture.errors import OptionError
+from megloc_kapture.geometry.poses import movement
+from megloc_kapture.plugins import POSE_REFINERS, PoseRefinement, load_plugin
+from megloc_kapture.values import Camera, RigidTransform
+
+pytest.importorskip("torch")
+
+from megloc_kapture.io.images import write_depth_map, write_image  # noqa: E402
+from megloc_kapture.io.kapture import (  # noqa: E402
+    KaptureData,
+    KaptureFolder,
+    Sensor,
+    write_sensors,  # noqa: E402
+)
+from megloc_kapture.pipeline.executors import single_threaded  # noqa: E402
+from megloc_kapture.refinement.neural_field import FieldRendering, TrainingOptions  # noqa: E402
+from megloc_kapture.stages import neural_field  # noqa: E402
+
+LARGER = Camera("PINHOLE", 320, 240, (220.0, 220.0, 160.0, 120.0))
+
+
+class Query:
+    """A scene of one query image."""
+
+    def __init__(self, image: NDArray[np.uint8]) -> None:
+        self.image = image
+
+    def query_image(self, name: str) -> NDArray[np.uint8]:
+        return self.image
+
+    def query_mask(self, name: str) -> None:
+        return None
+
+
+class ExactField:
+    """A field that has learned the room without error, in its first light."""
+
+    def fitted_appearance(self, *_: Any) -> None:
+        return None
+
+    def render(self, camera: Camera, pose: RigidTransform, **_: Any) -> FieldRendering:
+        seen = room.render(pose, camera=camera)
+        return FieldRendering(seen.image, seen.depth_m, camera)
+
+
+def perturbed(
+    pose: RigidTransform, metres: float, degrees: float, rng: np.random.Generator
+) -> RigidTransform:
+    axis, step = (value / np.linalg.norm(value) for value in rng.normal(size=(2, 3)))
+    rotation = Rotation.from_rotvec(np.radians(degrees) * axis).as_matrix()
+    rotation = rotation @ pose.rotation_matrix()
+    return RigidTransform.from_matrix(rotation, -rotation @ (pose.center() + metres * step))
+
+
+def refined(
+    field: Path | str, camera: Camera, image: NDArray[np.uint8], start: RigidTransform
+) -> PoseRefinement:
+    refiner = load_plugin(POSE_REFINERS, "field", {"field": str(field)})
+    found = refiner.refine("query", camera, start, [], Query(image))
+    assert isinstance(found, PoseRefinement)
+    return found
+
+
+def test_from_ten_centimetres_to_millimetres(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(neural_field, "open_field", lambda *_: ExactField())
+    rng = np.random.default_rng(0)
+    for number, truth in enumerate(room.poses(3, 4)):
+        seen = room.render(truth, camera=LARGER, light=number % 2, moving=number)
+        found = refined("exact", LARGER, seen.image, perturbed(truth, 0.1, 2.0, rng))
+        error_m, error_deg = movement(truth, found.cam_from_world)
+        assert found.accepted and error_m < 0.005 and error_deg < 0.1, (found, error_m, error_deg)
+        assert found.covariance is not None and found.measures["moved_m"] == pytest.approx(
+            0.1, abs=0.01
+        )
+
+
+def test_what_does_not_look_alike_stays_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(neural_field, "open_field", lambda *_: ExactField())
+    truth = room.poses(1, 4)[0]
+    noise = np.random.default_rng(0).integers(0, 255, (240, 320, 3), np.uint8)
+    found = refined("exact", LARGER, noise, truth)
+    assert not found.accepted and found.cam_from_world == truth and found.reason
+    # nor does a pose that is right already gain anything
+    seen = room.render(truth, camera=LARGER).image
+    same = refined("exact", LARGER, seen, truth)
+    assert not same.accepted and same.cam_from_world == truth
+
+
+def test_a_field_is_needed() -> None:
+    with pytest.raises(OptionError, match="train-field"):
+        load_plugin(POSE_REFINERS, "field")
+
+
+@pytest.mark.slow
+def test_a_trained_field_refines_poses(tmp_path: Path) -> None:
+    data = KaptureData(sensors={"cam": Sensor.from_camera(room.CAMERA)})
+    data.sensors["depth"] = Sensor.from_camera(room.CAMERA, sensor_type="depth")
+    data.rigs["both"] = dict.fromkeys(("cam", "depth"), RigidTransform.identity())
+    images = tmp_path / "map" / "sensors" / "records_data"
+    images.mkdir(parents=True)
+    for number, pose in enumerate(room.poses(40, 1)):
+        name = f"{number:03}.png"
+        moving = number if number % 5 < 3 else None
+        seen = room.render(pose, light=number % 2, moving=moving)
+        write_image(images / name, seen.image)
+        write_depth_map(images / f"{name}.depth", seen.depth_m)
+        data.records_camera[number, "cam"] = name
+        data.records_depth[number, "depth"] = f"{name}.depth"
+        data.trajectories[number, "cam"] = pose
+    write_sensors(tmp_path / "map", data)
+    out = tmp_path / "field"
+    out.mkdir()
+    rng = np.random.default_rng(5)
+    errors = []
+    with single_threaded():
+        options = TrainingOptions(steps=1500, rays_per_step=1024, device="cpu")
+        neural_field.train_field_of_map(KaptureFolder(tmp_path / "map"), out, options)
+        for number, truth in enumerate(room.poses(20, 7)):
+            seen = room.render(truth, light=number % 2)
+            found = refined(out, room.CAMERA, seen.image, perturbed(truth, 0.1, 2.0, rng))
+            errors.append(movement(truth, found.cam_from_world))
+    good = np.mean([error_m < 0.01 and error_deg < 0.2 for error_m, error_deg in errors])
+    median = np.median(errors, axis=0)
+    print(f"{good:.0%} below 1 cm and 0.2 deg, median {median[0] * 100:.2f} cm {median[1]:.3f} deg")
+    assert good >= 0.5 and median[0] < 0.01
