@@ -7,7 +7,7 @@ where directions have z = 1 in their camera, t is depth along its optical axis.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 import torch
@@ -201,8 +201,3 @@ def nerf_w_loss(rendered: Rendered, rgb: torch.Tensor) -> torch.Tensor:
     if rendered.coarse_rgb is not None:
         loss = loss + 0.5 * torch.square(rendered.coarse_rgb - rgb).mean()
     return loss
-
-
-def static_part(samples: Samples) -> Samples:
-    """The samples without what is transient."""
-    return replace(samples, transient_sigma=None, transient_rgb=None, transient_beta=None)

@@ -58,7 +58,7 @@ class TrainingOptions(NetworkOptions):
         default=320, ge=16, description="longer side of an image; larger ones are reduced"
     )
     depth_weight: float = Field(
-        default=0.1, ge=0, description="of the relative error of depth in the loss"
+        default=5.5, ge=0, description="of the relative error of depth in NeRF-W's loss"
     )
     seed: int = 0
 
@@ -314,12 +314,10 @@ def train_field(
         with torch.autocast(device.type, torch.bfloat16, enabled=options.half_precision):
             rendered = module.render(rays, generator)
         loss = nerf_w_loss(rendered, rgb)
-        if rays.depth is not None and options.depth_weight > 0:
-            known = rays.depth > 0
+        if rays.depth is not None:
             error = (rendered.depth - rays.depth).abs() / rays.depth.clamp_min(1e-6)
-            # in the unit of the loss of colour, whose errors are over the least variance
-            weight = options.depth_weight / (2 * 0.03**2)
-            loss = loss + weight * torch.where(known, error.clamp(max=1.0), 0.0).mean() * 0.1
+            known = torch.where(rays.depth > 0, error.clamp(max=1.0), 0.0)
+            loss = loss + options.depth_weight * known.mean()
         optimizer.zero_grad(set_to_none=True)
         torch.autograd.backward(loss)
         optimizer.step()

@@ -30,7 +30,7 @@ def test_poses_without_depth_stay_and_say_so(megloc: Any, finished: Path, tmp_pa
         assert status.refinement.startswith("icp: ") and "depth" in status.refinement
     # the result is one to evaluate and to refine again
     again = megloc(*command(finished, tmp_path / "again")[:5], "--poses", out, "-o", tmp_path / "b")
-    again.refused("no pose refiner is chosen; --by takes: icp, rendering")
+    again.refused("no pose refiner is chosen; --by takes: field, icp, rendering")
 
 
 def test_refiners_work_one_after_another(megloc: Any, finished: Path, tmp_path: Path) -> None:

@@ -19,7 +19,6 @@ from megloc_kapture.nets.radiance import (  # noqa: E402
     importance,
     nerf_w_loss,
     spacings,
-    static_part,
     stratified,
 )
 from megloc_kapture.nets.triplane import TriPlane  # noqa: E402
@@ -75,7 +74,10 @@ def test_without_what_is_transient_it_is_nerf_a() -> None:
     deltas = torch.full_like(t, 0.1)
     assert samples.transient_sigma is not None
     off = replace(samples, transient_sigma=torch.zeros_like(samples.transient_sigma))
-    with_none, with_zero = composite(t, deltas, static_part(samples)), composite(t, deltas, off)
+    with_none, with_zero = (
+        composite(t, deltas, Samples(samples.sigma, samples.rgb)),
+        composite(t, deltas, off),
+    )
     for name in ("rgb", "depth", "opacity", "beta", "weights"):
         torch.testing.assert_close(getattr(with_none, name), getattr(with_zero, name))
     seen = torch.rand(5, 3, dtype=torch.float64)

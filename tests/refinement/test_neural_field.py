@@ -143,7 +143,7 @@ def test_two_lights_and_what_moves_need_their_embeddings() -> None:
         torch.manual_seed(0)
         kept = len(trained) - len(trained[7::8])
         module = TriPlane(kept, unconstrained=unconstrained)
-        options = TrainingOptions(steps=1200, rays_per_step=1024, device="cpu")
+        options = TrainingOptions(steps=600, rays_per_step=1024, device="cpu")
         field, _ = train_field(trained, options, module=module)
         psnr_db.append(float(np.mean([field.held_out_psnr(view) for view in clean])))
         errors.append(depth_error(field, clean))

@@ -29,7 +29,8 @@ _TEXTURE_PX = 256
 
 @dataclass(frozen=True, eq=False)
 class RoomImage:
-    """uint8 (H, W, 3), the depth float32 (H, W) of the room alone, and where something moves."""
+    """uint8 (H, W, 3), the depth float32 (H, W) that a sensor beside it measures, and
+    where something moves."""
 
     image: NDArray[np.uint8]
     depth_m: NDArray[np.float32]
@@ -121,6 +122,7 @@ def render(
         inner = b * b - a * (((origin - centre) ** 2).sum() - ball**2)
         nearest = (-b - np.sqrt(np.maximum(inner, 0))) / a
         hidden = (inner > 0) & (nearest > 0) & (nearest < t)
+        t = np.where(hidden, nearest, t)
         colour[hidden] = rng.uniform(0.05, 0.95, 3) * tint
     shape = camera.height, camera.width
     image = np.clip(colour * 255, 0, 255).round().astype(np.uint8)
