@@ -278,6 +278,4 @@ _STEPS = (
         lambda o, facts: "it needs a field of the map (megloc train-field)",
     ),
 )
-_MISSING = (
-    "depth of map images by multi-view stereo",
-)
+_MISSING = ("depth of map images by multi-view stereo",)

@@ -14,6 +14,7 @@ from corner import write_scene
 
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.tables import read_status
 
 pytest.importorskip("torch")
 
@@ -84,6 +85,22 @@ def test_views_along_a_result(megloc: Any, mapping: Path, field: Path, tmp_path:
     (depth,) = data.records_depth.values()
     assert (data.camera_of(name).width, data.camera_of(name).height) == (80, 60)
     assert written.depth_path(depth).stat().st_size == 4 * 80 * 60
+
+
+def test_poses_are_refined_by_it_or_stay(
+    megloc: Any, finished: Path, field: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "refined"
+    chosen = f'pose_refinement.by=[{{name="field",options={{field="{field}",max_side_px=80}}}}]'
+    done = megloc(
+        *("refine-poses", "-i", finished / "map", "--query", finished / "query"),
+        *("--poses", finished / "localized", "-o", out, "--executor", "inline", "-q"),
+        *("--by", "field", "--set", chosen),
+    )
+    # six steps do not make a field that matches anything
+    assert done.out.startswith("4 poses, 0 accepted by field;"), done.err
+    for status in read_status(out / "status.csv").values():
+        assert status.refinement.startswith("field: query and rendering: ")
 
 
 def test_what_is_refused(megloc: Any, mapping: Path, field: Path, tmp_path: Path) -> None:
