@@ -13,7 +13,6 @@ from megloc_kapture.stages.options import PipelineOptions
 
 RETRIEVAL = frozenset({"netvlad", "delg", "apgem", "openibl"})
 
-_NOT_YET = "not implemented yet"
 _LIFTED = "the points are lifted from the map's depth: map images are not matched with each other"
 
 
@@ -76,8 +75,7 @@ class _Step:
 
 def paper_steps(options: LayeredOptions, facts: DatasetFacts) -> list[PaperStep]:
     """The steps of the paper in its order, and whether a run does them; nothing is loaded."""
-    found = [_explained(step, options, facts) for step in _STEPS]
-    return found + [PaperStep(name, on=False, why=_NOT_YET) for name in _MISSING]
+    return [_explained(step, options, facts) for step in _STEPS]
 
 
 def steps_text(steps: Sequence[PaperStep]) -> str:
@@ -137,6 +135,11 @@ def _not_public(options: PipelineOptions, facts: DatasetFacts) -> str:
     return "the paper's weights are not public; megloc train descriptor makes such"
 
 
+def _no_map_depth(options: PipelineOptions, facts: DatasetFacts) -> str:
+    known = facts.map_depth or options.mvs.mode != "off"
+    return "" if known else "the map images have no depth"
+
+
 def _pairs_by(method: PairingMethod) -> Callable[[PipelineOptions], bool]:
     return lambda options: method in options.mapping_pairs.by
 
@@ -164,7 +167,7 @@ def _not_triangulated(options: PipelineOptions, facts: DatasetFacts) -> str:
 
 
 def _no_lpips_depth(options: PipelineOptions, facts: DatasetFacts) -> str:
-    if facts.map_depth:
+    if not _no_map_depth(options, facts):
         return ""
     return "the paper's indoor strategy; the map images have no depth to make views of"
 
@@ -236,6 +239,12 @@ _STEPS = (
         _no_uncertainty,
     ),
     _Step(
+        "depth of map images by multi-view stereo",
+        "mvs.mode",
+        lambda o: o.mvs.mode != "off",
+        lambda o, facts: "the map images have depth" if facts.map_depth else "",
+    ),
+    _Step(
         "M images retrieved, N kept by local matches",
         "reranking.by",
         lambda o: o.reranking.reranks(),
@@ -269,13 +278,14 @@ _STEPS = (
         "poses refined by rendering",
         "pose_refinement.by",
         _refines_by("rendering"),
-        lambda o, facts: "" if facts.map_depth else "the map images have no depth",
+        _no_map_depth,
     ),
     _Step(
         "rendering by a neural field (NeRF-W)",
         "pose_refinement.by",
         _refines_by("field"),
-        lambda o, facts: "it needs a field of the map (megloc train-field)",
+        lambda o, facts: (
+            "" if _refines_by("field")(o) else "it needs a field of the map (megloc train-field)"
+        ),
     ),
 )
-_MISSING = ("depth of map images by multi-view stereo",)

@@ -36,6 +36,7 @@ EXTRA = {
     *("superpoint_lightglue.pth", "aliked_lightglue.pth"),
     *("best_deeplabv3plus_resnet101_cityscapes_os16.pth", "r50delg_gldv2clean_20200914.tar.gz"),
     *("MegaLoc/model.safetensors", "megaloc.torch", "ResNet50_2048_eigenplaces.pth"),
+    "params_000007.ckpt",
 }
 
 
