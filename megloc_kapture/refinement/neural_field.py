@@ -301,7 +301,7 @@ def train_field(
     small = [_reduced_view(view, options.max_side_px) for view in held_out]
     optimizer = torch.optim.Adam(_groups(module), eps=1e-15, betas=(0.9, 0.99))
     rates = [group["lr"] for group in optimizer.param_groups]
-    shown = max(options.steps // 8, 1)
+    shown = max(options.steps // 5, 1)
     for step in range(options.steps):
         done = step / options.steps
         if options.minutes is not None:

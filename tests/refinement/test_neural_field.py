@@ -70,7 +70,7 @@ def test_a_small_field_learns_the_room_and_the_same_bytes_twice() -> None:
     assert set(psnr) == {"007.png"} and len(field.images) == 7
     # an image of one colour has 14 dB
     assert min(psnr.values()) > 16 and depth_error(field, views(4)) < 0.2
-    assert [step for step, _ in seen] == list(range(10, 80, 10))
+    assert [step for step, _ in seen] == list(range(16, 80, 16))
     assert all(len(values) == 1 for _, values in seen)
     one, other = (train_field(views(5), QUICK)[0].module.state_dict() for _ in range(2))
     assert all(torch.equal(one[name], other[name]) for name in one)
