@@ -16,6 +16,7 @@ from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.dataset_tables import PROTOCOL_FILE, SIDE_TABLES
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.executors import ExecutorKind, open_executor
+from megloc_kapture.values import Camera
 
 if TYPE_CHECKING:
     from megloc_kapture.pipeline.kapture_map import KaptureMap
@@ -49,6 +50,19 @@ def opened_map(path: Path, console: Console) -> Path:
         folder = kapture_of(path, work=Work(executor, console.track))
     console.say(f"{path}: a COLMAP model, as kapture in {folder}")
     return folder
+
+
+def camera_of_text(text: str) -> Camera:
+    """The camera of ``MODEL,WIDTH,HEIGHT,PARAMETERS``; raises OptionError."""
+    try:
+        model, width, height, *params = text.split(",")
+        return Camera(model.strip(), int(width), int(height), tuple(map(float, params)))
+    except (ValueError, DataError) as error:
+        reason = error.message if isinstance(error, DataError) else "not such a list"
+        raise OptionError(
+            f"--camera {text}: {reason}; give MODEL,WIDTH,HEIGHT,PARAMETERS, as in "
+            "SIMPLE_RADIAL,4032,3024,3100,2016,1512,0.02"
+        ) from error
 
 
 def check_consistent(kapture_map: KaptureMap, path: Path, *, force: bool) -> None:

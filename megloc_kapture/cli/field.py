@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from megloc_kapture.cli.common import Common, Force, Input, Linked, Output
+from megloc_kapture.cli.common import Common, Force, Input, Linked, Output, camera_of_text
 from megloc_kapture.errors import DataError, OptionError, OutputError
 from megloc_kapture.io.files import staged_output
 from megloc_kapture.io.images import WRITABLE_SUFFIXES
@@ -50,12 +50,12 @@ class TrainField(Linked, Common):
         from pydantic import ValidationError
 
         from megloc_kapture.io.files import first_problem
-        from megloc_kapture.refinement.neural_field import TrainingOptions
+        from megloc_kapture.refinement.neural_field import FieldTrainingOptions
         from megloc_kapture.stages.neural_field import train_field_of_map
 
         console = self.console()
         try:
-            options = TrainingOptions(
+            options = FieldTrainingOptions(
                 kind=self.kind,
                 steps=self.steps,
                 minutes=self.minutes,
@@ -143,7 +143,6 @@ class Render(Linked, Common):
         import cv2
         import numpy as np
 
-        from megloc_kapture.cli.localize import camera_of_text
         from megloc_kapture.io.files import write_bytes
         from megloc_kapture.io.images import write_image
         from megloc_kapture.stages.neural_field import open_field

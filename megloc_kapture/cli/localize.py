@@ -18,13 +18,14 @@ from megloc_kapture.cli.common import (
     Input,
     Output,
     Reading,
+    camera_of_text,
     check_consistent,
     existing,
     idle_for_types,
     opened_map,
     refuse_idle,
 )
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import OptionError
 from megloc_kapture.io.dataset_tables import METRES
 from megloc_kapture.io.files import staged_output
 from megloc_kapture.io.kapture import KaptureFolder, read_pairs
@@ -38,7 +39,6 @@ from megloc_kapture.pipeline.queries import KaptureQueries
 from megloc_kapture.pipeline.results import Results
 from megloc_kapture.stages.layout import LOCALIZED
 from megloc_kapture.stages.matches import iterate_candidates
-from megloc_kapture.values import Camera
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,19 +136,6 @@ class Localize(Reading, Deciding, Common):
             for name, given in (("--camera", self.camera), ("--every", self.every)):
                 if given is not None:
                     raise OptionError(f"{name} changes nothing: it is of --images")
-
-
-def camera_of_text(text: str) -> Camera:
-    """The camera of ``MODEL,WIDTH,HEIGHT,PARAMETERS``; raises OptionError."""
-    try:
-        model, width, height, *params = text.split(",")
-        return Camera(model.strip(), int(width), int(height), tuple(map(float, params)))
-    except (ValueError, DataError) as error:
-        reason = error.message if isinstance(error, DataError) else "not such a list"
-        raise OptionError(
-            f"--camera {text}: {reason}; give MODEL,WIDTH,HEIGHT,PARAMETERS, as in "
-            "SIMPLE_RADIAL,4032,3024,3100,2016,1512,0.02"
-        ) from error
 
 
 def check_acted_on(

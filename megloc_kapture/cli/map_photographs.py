@@ -7,8 +7,7 @@ from pathlib import Path
 
 import tyro
 
-from megloc_kapture.cli.common import Choosing, Common, Force, Output, Working
-from megloc_kapture.cli.localize import camera_of_text
+from megloc_kapture.cli.common import Choosing, Common, Force, Output, Working, camera_of_text
 from megloc_kapture.io.colmap_mapping import Mapper
 from megloc_kapture.pipeline.executors import available_cores, single_threaded
 from megloc_kapture.pipeline.photograph_maps import (

@@ -216,10 +216,10 @@ def check_image(folder: KaptureFolder, image: str) -> None:
     ------
     DataError : it is not; names its file.
     """
-    check_image_file(folder.image_path(image), folder.read().camera_of(image))
+    check_image_size(folder.image_path(image), folder.read().camera_of(image))
 
 
-def check_image_file(path: Path, camera: Camera) -> None:
+def check_image_size(path: Path, camera: Camera) -> None:
     """As :func:`check_image`, of a file."""
     width, height = image_size(path)
     if (width, height) != (camera.width, camera.height):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ __all__ = [
     "bearing_rays",
     "focal_px",
     "normalized_from_px",
+    "pixel_rays",
     "principal_point_px",
     "project",
     "px_from_cam",
@@ -85,6 +87,16 @@ def bearing_rays(camera: Camera, points_px: NDArray[np.floating[Any]]) -> NDArra
     """Homogeneous rays (x/z, y/z, 1) in the camera frame of pixels (N, 2); float64 (N, 3)."""
     xy = normalized_from_px(camera, points_px)
     return np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
+
+
+@lru_cache(maxsize=8)
+def pixel_rays(camera: Camera) -> NDArray[np.float64]:
+    """Rays (H * W, 3) with z = 1 through the centres of a camera's pixels, row by row; not to be
+    written to. Kept, for images share few cameras, and distortion is slow to undo."""
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    rays = bearing_rays(camera, np.stack([x.ravel(), y.ravel()], axis=1))
+    rays.flags.writeable = False
+    return rays
 
 
 def project(

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.geometry.cameras import bearing_rays, focal_px, px_from_cam
+from megloc_kapture.geometry.cameras import bearing_rays, focal_px, pixel_rays, px_from_cam
 from megloc_kapture.values import ONE_FOCAL_MODELS, Camera, RigidTransform
 
 _NEAR_M = 0.02
@@ -137,7 +137,7 @@ def warp_to_view(
     image = np.zeros((*shape, 3), np.uint8)
     best = np.full(shape, np.inf)
     chosen = np.full(shape, -1, np.int16)
-    rays = _rays(camera)
+    rays = pixel_rays(camera)
     centre = cam_from_world.center()
     for number, (source, (depth, front)) in enumerate(zip(sources, drawn, strict=True)):
         rows = np.flatnonzero(
@@ -164,23 +164,13 @@ def _seen_depth(
 
     return draw_depth_surface(
         source.depth_m,
-        _rays(source.depth_camera),
+        pixel_rays(source.depth_camera),
         cam_from_world @ source.cam_from_world.inverse() @ source.image_from_depth,
         camera,
         max_jump=_MAX_JUMP,
         near_m=_NEAR_M,
         field=_field(camera),
     )
-
-
-@lru_cache(maxsize=8)
-def _rays(camera: Camera) -> Floats:
-    """Rays (H * W, 3) through the centres of a camera's pixels, z = 1; the maps of a scan share
-    few cameras, and distortion is slow to undo."""
-    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    rays = bearing_rays(camera, np.stack([x.ravel(), y.ravel()], axis=1))
-    rays.flags.writeable = False
-    return rays
 
 
 @lru_cache(maxsize=8)

@@ -128,7 +128,9 @@ def lift_with_covariances(
     return points, covariances, valid
 
 
-def sample_depth(depth_m: NDArray[np.float32], pixels: Floats, max_jump: float) -> Floats:
+def sample_depth(
+    depth_m: NDArray[np.float32], pixels: Floats, max_jump: float, *, whole: bool = False
+) -> Floats:
     """Depth at pixels of a depth map, interpolated as :func:`lift_keypoints` does.
 
     Parameters
@@ -136,6 +138,7 @@ def sample_depth(depth_m: NDArray[np.float32], pixels: Floats, max_jump: float) 
     depth_m : float32 (H, W), 0 or less where unknown.
     pixels : float64 (N, 2) of the depth map, COLMAP's pixel origin; may be NaN.
     max_jump : see :class:`LiftingOptions`.
+    whole : all four depths around a pixel must be known, else some of them.
 
     Returns
     -------
@@ -166,7 +169,8 @@ def sample_depth(depth_m: NDArray[np.float32], pixels: Floats, max_jump: float) 
     depth = np.where(there.all(axis=0), smooth, nearest)
     low = np.where(there, corners, np.inf).min(axis=0)
     high = np.where(there, corners, -np.inf).max(axis=0)
-    usable = there.any(axis=0) & (high - low <= max_jump * low)
+    known = there.all(axis=0) if whole else there.any(axis=0)
+    usable = known & (high - low <= max_jump * low)
     result[inside] = np.where(usable, depth, np.nan)
     return result
 

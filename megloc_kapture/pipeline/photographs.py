@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from megloc_kapture.datasets.kapture_folders import check_image_file
+from megloc_kapture.datasets.kapture_folders import check_image_size
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.files import hard_link, link_file, owned_name
 from megloc_kapture.io.images import WRITABLE_SUFFIXES, read_image_rgb, write_image
@@ -154,7 +154,7 @@ class Photographs:
                 path, photo.upright_camera, photo.orientation, photo.make, is_frame, photo.gps
             )
             return
-        check_image_file(path, camera)
+        check_image_size(path, camera)
         self._images[name] = _Image(path, camera, 1, "", is_frame)
 
     def _add_video(self, name: str, path: Path, camera: Camera | None, every: int) -> None:

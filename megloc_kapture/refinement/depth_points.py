@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.geometry.cameras import bearing_rays, project, px_from_cam
+from megloc_kapture.geometry.cameras import bearing_rays, pixel_rays, project, px_from_cam
 from megloc_kapture.plugins import DepthView
 from megloc_kapture.values import Camera, Options, RigidTransform
 
@@ -84,7 +84,7 @@ def depth_cloud(
         trusted = (z > 0) & (z <= options.max_depth_m) & ~_on_edge(depth, sampled, options.max_jump)
     rows = np.arange(depth.size).reshape(depth.shape)[sampled][trusted]
     points = view.image_from_depth.apply(
-        _rays(view.camera)[rows] * z[trusted].astype(np.float64)[:, None]
+        pixel_rays(view.camera)[rows] * z[trusted].astype(np.float64)[:, None]
     )
     if image_camera is None or image_mask is None:
         return points
@@ -116,15 +116,6 @@ def _hidden(points: Floats, camera: Camera, mask: NDArray[np.bool_]) -> NDArray[
     hidden = np.zeros(len(points), bool)
     hidden[inside] = ~mask[row, column]
     return hidden
-
-
-@lru_cache(maxsize=4)
-def _rays(camera: Camera) -> Floats:
-    """Rays (H * W, 3) with z = 1 through the centres of a camera's pixels, row by row."""
-    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    rays = bearing_rays(camera, np.column_stack([x.ravel(), y.ravel()]))
-    rays.flags.writeable = False
-    return rays
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Literal
 
 import cv2
@@ -21,7 +20,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.geometry.cameras import bearing_rays
+from megloc_kapture.geometry.cameras import pixel_rays
 from megloc_kapture.geometry.warping import WarpSource, scaled_camera, warp_to_view
 from megloc_kapture.nets.nerfw import NerfW
 from megloc_kapture.nets.radiance import Rays, Rendered, nerf_w_loss
@@ -41,7 +40,7 @@ _DECAY = 1 / 30
 _FIT_RATE, _FIT_STEPS, _FIT_RAYS, _FIT_OF = 0.1, 20, 512, 2048
 
 
-class TrainingOptions(NetworkOptions):
+class FieldTrainingOptions(NetworkOptions):
     """Options of a field's training."""
 
     kind: Kind = Field(
@@ -130,7 +129,7 @@ class NeuralField:
 
     def rays(self, camera: Camera, cam_from_world: RigidTransform) -> Rays:
         """Rays (H * W,) through the centres of a view's pixels, by rows."""
-        directions = _camera_rays(camera) @ cam_from_world.rotation_matrix()
+        directions = pixel_rays(camera) @ cam_from_world.rotation_matrix()
         origin = (cam_from_world.center() - self.frame.centre) / self.frame.scale
         there = self._tensor(directions / self.frame.scale)
         return Rays(self._tensor(origin).expand_as(there), there, self.frame.near, self.frame.far)
@@ -263,7 +262,7 @@ def reduced(camera: Camera, max_side_px: int) -> Camera:
 
 def train_field(
     views: Sequence[FieldView],
-    options: TrainingOptions | None = None,
+    options: FieldTrainingOptions | None = None,
     *,
     module: NerfW | TriPlane | None = None,
     progress: Callable[[int, float, list[float]], None] | None = None,
@@ -284,7 +283,7 @@ def train_field(
     ------
     DataError : too few images, or one does not fit its camera; no pixel may be used.
     """
-    options = options or TrainingOptions()
+    options = options or FieldTrainingOptions()
     started = time.monotonic()
     held_out = list(views[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY])
     trained = [view for view in views if not any(view is other for other in held_out)]
@@ -336,13 +335,6 @@ def _groups(module: NerfW | TriPlane) -> list[dict[str, object]]:
     return [{"params": planes, "lr": _PLANE_RATE}, {"params": others, "lr": _RATE}]
 
 
-@lru_cache(maxsize=8)
-def _camera_rays(camera: Camera) -> NDArray[np.float64]:
-    """Rays (H * W, 3) through the centres of a camera's pixels, z = 1."""
-    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    return bearing_rays(camera, np.stack([x.ravel(), y.ravel()], axis=1))
-
-
 def _pixels(
     view: FieldView, max_side_px: int
 ) -> tuple[Camera, NDArray[np.uint8], NDArray[np.bool_], Floats | None]:
@@ -355,7 +347,7 @@ def _pixels(
     image = view.image
     if camera is not view.camera:
         image = np.asarray(cv2.resize(image, pixels, interpolation=cv2.INTER_AREA), np.uint8)
-    usable = np.asarray(np.isfinite(_camera_rays(camera)).all(axis=1))
+    usable = np.asarray(np.isfinite(pixel_rays(camera)).all(axis=1))
     if view.mask is not None:
         mask = cv2.resize(view.mask.astype(np.uint8), pixels, interpolation=cv2.INTER_AREA)
         usable = usable & (np.asarray(mask).ravel() > 0)
@@ -390,7 +382,8 @@ class _Pixels:
 
     def __init__(self, views: Sequence[FieldView], max_side_px: int) -> None:
         found = [_pixels(view, max_side_px) for view in views]
-        self._cameras = [camera for camera, *_ in found]
+        self._cameras = list(dict.fromkeys(camera for camera, *_ in found))
+        self._camera_of = np.array([self._cameras.index(camera) for camera, *_ in found])
         self._poses = [view.cam_from_world for view in views]
         self._starts = np.cumsum([0, *(len(rgb) for _, rgb, _, _ in found)])
         self._rgb = np.concatenate([rgb for _, rgb, _, _ in found])
@@ -432,11 +425,11 @@ class _Pixels:
         """Images (N,) of pixels, and their rays (N, 3) in the world."""
         image = np.searchsorted(self._starts, rows, side="right") - 1
         rays = np.empty((len(rows), 3))
-        for camera in dict.fromkeys(self._cameras):
-            ours = np.array([self._cameras[one] == camera for one in range(len(self._cameras))])
-            which = ours[image]
+        camera_of = self._camera_of[image]
+        for number in np.unique(camera_of):
+            which = camera_of == number
             inside = rows[which] - self._starts[image[which]]
-            rays[which] = _camera_rays(camera)[inside]
+            rays[which] = pixel_rays(self._cameras[number])[inside]
         return image, np.einsum("nj,njk->nk", rays, self._rotations[image])
 
     def batch(

@@ -10,12 +10,11 @@ depth records of a sensor ``CAMERA_mvs`` that shares the camera's centre, float3
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +22,7 @@ from pydantic import Field
 
 from megloc_kapture.errors import DataError, MeglocError
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
-from megloc_kapture.io.files import link_images, link_records, remove, write_bytes
+from megloc_kapture.io.files import link_images, link_records, remove
 from megloc_kapture.io.images import write_depth_map
 from megloc_kapture.io.kapture import (
     KaptureData,
@@ -53,16 +52,18 @@ from megloc_kapture.stages.layout import MAP
 from megloc_kapture.stages.local_features import read_frame
 from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.rigs import depth_records
+from megloc_kapture.stages.shared_index import index_map, write_array
 from megloc_kapture.stages.stage import PipelineStage, StageWork
 from megloc_kapture.stages.triangulation import copy_features
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
-from megloc_kapture.values import Options, RigidTransform
+from megloc_kapture.values import Camera, Options, RigidTransform
 
 if TYPE_CHECKING:
     from megloc_kapture.stages.options import PipelineOptions
 
 FOLDER = "mvs"  # of depth maps below records_data, and of what is beside them below sensors
 DEPTH_FILE = "reconstruction/depth.csv"
+_NO_POINTS = np.zeros(0, np.int64)
 _ANCHOR_VIEWS = 2  # that agree with a keypoint's depth, for it to be lifted
 
 Floats = NDArray[np.float64]
@@ -110,7 +111,8 @@ class _Job:
     range_m: tuple[float, float]
     options: DensifyOptions
     estimator: DepthEstimator
-    unseen: Mapping[str, NDArray[np.int64]]  # keypoints without a point, by type
+    # keypoints that have a point, by type; empty where none is lifted
+    seen: Mapping[str, NDArray[np.int32]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,11 +209,13 @@ def _plan(
     data, xyz = source.read(), source.points3d()[:, :3]
     poses = data.poses()
     images = list(poses)
-    row_of = {image: row for row, image in enumerate(images)}
-    observed = list(source.observations().values())
-    points_of = _points_of(observed, row_of, len(images))
+    indices = [index_map(source, local_type) for local_type in source.observations()]
+    points_of = [
+        np.unique(np.concatenate([_NO_POINTS, *(index.observed(image)[1] for index in indices)]))
+        for image in images
+    ]
     counts = [len(points) for points in points_of]
-    point_ids = np.concatenate([np.zeros(0, np.int64), *points_of])
+    point_ids = np.concatenate([_NO_POINTS, *points_of])
     order = np.argsort(point_ids, kind="stable")
     starts = np.zeros(len(xyz) + 1, np.int64)
     np.cumsum(np.bincount(point_ids, minlength=len(xyz)), out=starts[1:])
@@ -243,8 +247,9 @@ def _plan(
             reason = "too few points in sight" if found is None else "no image shares points"
             rows.append(replace(blank, reason=reason))
             continue
-        unseen = _unseen(source, observed, image) if options.mode == "points" else {}
-        jobs.append(_Job(spec, scratch, output, image, sources, found, options, estimator, unseen))
+        lifts = indices if options.mode == "points" else ()
+        seen = {index.local_type: index.observed(image)[0] for index in lifts}
+        jobs.append(_Job(spec, scratch, output, image, sources, found, options, estimator, seen))
         rows.append(replace(blank, sources=sources, near_m=found[0], far_m=found[1]))
     return jobs, rows
 
@@ -252,37 +257,6 @@ def _plan(
 def _session(restrictions: Restrictions, image: str) -> tuple[str, str, str]:
     group = restrictions.groups.get(image)
     return ("", "", "") if group is None else (group.frame, group.location, group.condition)
-
-
-def _points_of(
-    observed: Sequence[Observations], row_of: Mapping[str, int], num_images: int
-) -> list[NDArray[np.int64]]:
-    """Rows of the points that each image with a pose sees, sorted."""
-    parts: list[list[NDArray[np.int64]]] = [[] for _ in range(num_images)]
-    for seen in observed:
-        order = np.argsort(seen.image_ids, kind="stable")
-        ends = np.searchsorted(seen.image_ids[order], np.arange(len(seen.image_names) + 1))
-        for number, name in enumerate(seen.image_names):
-            if name in row_of:
-                some = seen.point_ids[order[ends[number] : ends[number + 1]]]
-                parts[row_of[name]].append(some.astype(np.int64))
-    return [np.unique(np.concatenate([np.zeros(0, np.int64), *some])) for some in parts]
-
-
-def _unseen(
-    source: KaptureFolder, observed: Sequence[Observations], image: str
-) -> dict[str, NDArray[np.int64]]:
-    """Rows of an image's keypoints that observe no point, of the types that have any."""
-    found = {}
-    for seen in observed:
-        reader = source.keypoints(seen.keypoints_type)
-        if image in reader:
-            there = np.ones(len(reader.read(image)), bool)
-            if image in seen.image_names:
-                number = seen.image_names.index(image)
-                there[seen.keypoint_ids[seen.image_ids == number]] = False
-            found[seen.keypoints_type] = np.flatnonzero(there)
-    return found
 
 
 # ------------------------------------------------------------------------------------- images
@@ -293,7 +267,8 @@ def _view(folder: KaptureFolder, image: str, max_size_px: int) -> StereoView:
     """An image and its neighbours are looked at one after another: each is read once or twice."""
     data = folder.read()
     pixels, mask = read_frame(folder, image)
-    pose = data.poses()[image]
+    pose = data.cam_from_world(image)
+    assert pose is not None  # who has none is not looked at
     return stereo_view(pixels, data.camera_of(image), pose, mask, max_size_px)
 
 
@@ -305,9 +280,9 @@ def _estimate(job: _Job) -> str:
         found = job.estimator.estimate(views[0], views[1:], job.range_m)
     except MeglocError as error:
         return str(error)
-    _write_array(_scratch(job, job.image, "depth"), found.depth_m)
-    _write_array(_scratch(job, job.image, "sigma"), found.sigma_m)
-    _write_array(_scratch(job, job.image, "normals"), found.normals)
+    write_array(_scratch(job, job.image, "depth"), found.depth_m)
+    write_array(_scratch(job, job.image, "sigma"), found.sigma_m)
+    write_array(_scratch(job, job.image, "normals"), found.normals)
     return ""
 
 
@@ -328,32 +303,36 @@ def _confirm(job: _Job) -> tuple[float, dict[str, _Lifted]]:
         safe_join(job.out / "sensors" / "records_data", depth_path(job.image)), kept.depth_m
     )
     beside = side_file(job.out, job.image, "sigma")
-    _write_array(beside, kept.sigma_m)
+    write_array(beside, kept.sigma_m)
     normals = np.rint(127 * kept.normals).astype(np.int8)
-    _write_array(side_file(job.out, job.image, "normals"), normals)
+    write_array(side_file(job.out, job.image, "normals"), normals)
     lifted = {}
-    if job.unseen:
+    if job.seen:
         views = agreeing_views(view, kept.depth_m, others, agreement)
         sure = np.where(views >= _ANCHOR_VIEWS, kept.depth_m, np.float32(0))
-        for local_type, ids in job.unseen.items():
-            lifted[local_type] = _lift(folder, job.image, local_type, ids, view, sure, kept.sigma_m)
+        camera = folder.read().camera_of(job.image)
+        for local_type, seen in job.seen.items():
+            reader = folder.keypoints(local_type)
+            if job.image in reader:
+                keypoints = np.asarray(reader.read(job.image))
+                unseen = np.setdiff1d(np.arange(len(keypoints)), seen)
+                lifted[local_type] = _lift(keypoints, unseen, camera, view, sure, kept.sigma_m)
     return float((kept.depth_m > 0).mean()), lifted
 
 
 def _lift(
-    folder: KaptureFolder,
-    image: str,
-    local_type: str,
+    keypoints_px: NDArray[np.floating[Any]],
     ids: NDArray[np.int64],
+    camera: Camera,
     view: StereoView,
     depth_m: NDArray[np.float32],
     sigma_m: NDArray[np.float32],
 ) -> _Lifted:
     points, covariances, valid = lift_with_covariances(
-        folder.keypoints(local_type).read(image)[ids],
+        keypoints_px[ids],
         depth_m,
         sigma_m,
-        folder.read().camera_of(image),
+        camera,
         view.camera,
         LiftingOptions(),
     )
@@ -365,12 +344,6 @@ def _lift(
 
 def _scratch(job: _Job, image: str, kind: str) -> Path:
     return safe_join(job.scratch, f"{image}.{kind}.npy")
-
-
-def _write_array(path: Path, array: NDArray[np.generic]) -> None:
-    buffer = io.BytesIO()
-    np.lib.format.write_array(buffer, np.ascontiguousarray(array), allow_pickle=False)
-    write_bytes(path, buffer.getvalue())
 
 
 # -------------------------------------------------------------------------------------- output

@@ -22,6 +22,7 @@ from megloc_kapture.errors import OptionError
 from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.localization.absolute_pose import absolute_pose
 from megloc_kapture.localization.estimation import AbsolutePoseOptions
+from megloc_kapture.mapping.depth import sample_depth
 from megloc_kapture.plugins import (
     LOCAL_FEATURES,
     MATCHERS,
@@ -170,8 +171,8 @@ class FieldRefiner:
         shown = self._extract(rendering.image, rendering.depth_m > 0, rendering.camera)
         rows, _ = self._matcher.match(query, shown)
         px = shown.keypoints_px[rows[:, 1], :2].astype(np.float64)
-        depth = _depth_at(rendering.depth_m, px)
-        known = depth > 0
+        depth = sample_depth(rendering.depth_m, px, _MAX_JUMP, whole=True)
+        known = np.isfinite(depth)
         in_cam = bearing_rays(rendering.camera, px[known]) * depth[known, None]
         options = AbsolutePoseOptions(max_error_px=_MAX_ERROR_PX)
         found = absolute_pose(
@@ -181,20 +182,3 @@ class FieldRefiner:
             options,
         )
         return found.cam_from_world if found else found
-
-
-def _depth_at(depth_m: NDArray[np.float32], px: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Depth (N,) at pixels (N, 2), bilinear; 0 on edges and where there is none."""
-    if not len(px):
-        return np.zeros(0)
-    height, width = depth_m.shape
-    x, y = np.clip(px[:, 0] - 0.5, 0, width - 1), np.clip(px[:, 1] - 0.5, 0, height - 1)
-    left = np.minimum(x.astype(np.int64), width - 2)
-    top = np.minimum(y.astype(np.int64), height - 2)
-    four = np.stack(
-        [depth_m[top + down, left + right] for down in (0, 1) for right in (0, 1)], axis=1
-    ).astype(np.float64)
-    a, b = x - left, y - top
-    weights = np.stack([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b], axis=1)
-    smooth = (four.min(1) > 0) & (four.max(1) <= (1 + _MAX_JUMP) * four.min(1))
-    return np.where(smooth, (four * weights).sum(1), 0.0)

@@ -21,10 +21,10 @@ from megloc_kapture.io.weights import WeightsFile, describe, read_weights
 from megloc_kapture.nets.runtime import Device, load_strictly, pick_device
 from megloc_kapture.refinement.neural_field import (
     FieldFrame,
+    FieldTrainingOptions,
     FieldView,
     Kind,
     NeuralField,
-    TrainingOptions,
     build_field,
     train_field,
 )
@@ -48,13 +48,13 @@ class FieldManifest(BaseModel):
     frame: FieldFrame
     images: Annotated[list[str], Field(min_length=1)]
     held_out_psnr_db: dict[str, float | None]
-    options: TrainingOptions
+    options: FieldTrainingOptions
 
 
 def train_field_of_map(
     mapping: KaptureFolder,
     output: Path,
-    options: TrainingOptions,
+    options: FieldTrainingOptions,
     *,
     progress: Callable[[int, float, list[float]], None] | None = None,
 ) -> Mapping[str, float]:

@@ -120,9 +120,9 @@ def write_index(index: MapIndex, folder: Path) -> None:
     OutputError : cannot be written.
     """
     for name in _ARRAYS:
-        _write_array(folder / f"{name}.npy", getattr(index, name))
+        write_array(folder / f"{name}.npy", getattr(index, name))
     if index.covariances is not None:
-        _write_array(folder / "covariances.npy", index.covariances)
+        write_array(folder / "covariances.npy", index.covariances)
     names = sorted(index.row_of_image, key=index.row_of_image.__getitem__)
     noise = [None if math.isnan(one) else one for one in (index.noise_rad, index.noise_px)]
     content = {"images": names, "local_type": index.local_type, "noise": noise}
@@ -193,7 +193,8 @@ def shared_index(
         yield folders
 
 
-def _write_array(path: Path, array: NDArray[Any]) -> None:
+def write_array(path: Path, array: NDArray[Any]) -> None:
+    """Write an array as numpy does, atomically; the same array gives the same bytes."""
     with atomic_write(path) as file:
         np.lib.format.write_array(file, np.ascontiguousarray(array), allow_pickle=False)
 

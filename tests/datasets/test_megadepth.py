@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -124,8 +126,9 @@ def test_a_scene_by_its_table(tmp_path: Path) -> None:
     docs = Path(__file__).parent.parent.parent / "docs" / "training.md"
     lines = docs.read_text().split("<!-- plain arrays -->\n```\n")[1].split("```")[0]
     table = root / "scene_info" / "0015.npz"
-    namespace: dict[str, Any] = {}
-    exec(lines.replace("TABLE", repr(str(table))), namespace)
+    script = tmp_path / "plain_arrays.py"
+    script.write_text(lines.replace("TABLE", repr(str(table))))
+    subprocess.run([sys.executable, script], check=True)
     counts = import_megadepth(root, tmp_path / "out", MegaDepthOptions(scenes=("0015",)))
     assert counts == {"scenes": 1, "images": 4, "without_depth": 1}
     check(tmp_path / "out" / "0015")

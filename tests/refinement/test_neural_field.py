@@ -16,16 +16,16 @@ from megloc_kapture.nets.triplane import TriPlane  # noqa: E402
 from megloc_kapture.pipeline.executors import single_threaded  # noqa: E402
 from megloc_kapture.plugins import DepthView  # noqa: E402
 from megloc_kapture.refinement.neural_field import (  # noqa: E402
+    FieldTrainingOptions,
     FieldView,
     NeuralField,
-    TrainingOptions,
     _pixels,
     train_field,
 )
 from megloc_kapture.values import Camera, RigidTransform  # noqa: E402
 
 SMALL = Camera("PINHOLE", 32, 24, (22.0, 22.0, 16.0, 12.0))
-QUICK = TrainingOptions(steps=8, rays_per_step=128, device="cpu")
+QUICK = FieldTrainingOptions(steps=8, rays_per_step=128, device="cpu")
 IDENTITY = RigidTransform.identity()
 
 
@@ -63,7 +63,7 @@ def depth_error(field: NeuralField, tests: list[FieldView]) -> float:
 
 def test_a_small_field_learns_the_room_and_the_same_bytes_twice() -> None:
     seen: list[tuple[int, list[float]]] = []
-    options = TrainingOptions(steps=80, rays_per_step=256, device="cpu")
+    options = FieldTrainingOptions(steps=80, rays_per_step=256, device="cpu")
 
     def progress(step: int, seconds: float, psnr_db: list[float]) -> None:
         seen.append((step, psnr_db))
@@ -145,7 +145,7 @@ def test_two_lights_and_what_moves_need_their_embeddings() -> None:
         torch.manual_seed(0)
         kept = len(trained) - len(trained[7::8])
         module = TriPlane(kept, unconstrained=unconstrained)
-        options = TrainingOptions(steps=1000, rays_per_step=1024, device="cpu")
+        options = FieldTrainingOptions(steps=1000, rays_per_step=1024, device="cpu")
         field, _ = train_field(trained, options, module=module)
         psnr_db.append(float(np.mean([field.held_out_psnr(view) for view in clean])))
         errors.append(depth_error(field, clean))

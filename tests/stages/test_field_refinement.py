@@ -26,7 +26,7 @@ from megloc_kapture.io.kapture import (  # noqa: E402
     write_sensors,  # noqa: E402
 )
 from megloc_kapture.pipeline.executors import single_threaded  # noqa: E402
-from megloc_kapture.refinement.neural_field import FieldRendering, TrainingOptions  # noqa: E402
+from megloc_kapture.refinement.neural_field import FieldRendering, FieldTrainingOptions  # noqa: E402
 from megloc_kapture.stages import neural_field  # noqa: E402
 
 LARGER = Camera("PINHOLE", 320, 240, (220.0, 220.0, 160.0, 120.0))
@@ -126,7 +126,7 @@ def test_a_trained_field_refines_poses(tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
     errors = []
     with single_threaded():
-        options = TrainingOptions(steps=1500, rays_per_step=1024, device="cpu")
+        options = FieldTrainingOptions(steps=1500, rays_per_step=1024, device="cpu")
         neural_field.train_field_of_map(KaptureFolder(tmp_path / "map"), out, options)
         for number, truth in enumerate(room.poses(20, 7)):
             moving = number if number % 4 == 3 else None
