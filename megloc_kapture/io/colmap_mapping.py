@@ -14,6 +14,8 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.colmap import (
@@ -28,7 +30,7 @@ from megloc_kapture.values import Camera, RigidTransform
 
 Mapper = Literal["incremental", "global"]
 MIN_IMAGES = 3
-# fewer are what RANSAC finds in anything
+# fewer are what RANSAC finds in anything; as many inliers COLMAP asks of an image it adds
 _MIN_POINTS = 30
 # matches that move less than this in the median are of one image twice
 _SAME_PX = 0.5
@@ -78,6 +80,8 @@ def reconstruct(
 ) -> list[Model]:
     """Find poses and cameras; models that do not hang together are several, the largest first.
 
+    Images hang together that share 30 points, or are linked by images that do.
+
     In one thread, so that the same photographs and seed give the same model.
 
     Parameters
@@ -125,7 +129,11 @@ def reconstruct(
         run = pycolmap.incremental_mapping if mapper == "incremental" else pycolmap.global_mapping
         made = _options(mapper, cameras, seed, known_cameras)
         found = run(str(database), folder, str(Path(folder) / "result"), made) if seen else {}
-    models = [_model(reconstruction, sensors) for _, reconstruction in sorted(found.items())]
+    models = [
+        model
+        for _, found_one in sorted(found.items())
+        for model in connected_models(found_one, sensors)
+    ]
     models = [m for m in models if len(m.poses) >= MIN_IMAGES and m.num_points >= _MIN_POINTS]
     if not models:
         raise DataError(_why_none(seen))
@@ -158,23 +166,62 @@ def _options(mapper: Mapper, cameras: Sequence[Any], seed: int, known_cameras: b
     return options
 
 
-def _model(reconstruction: Any, sensors: Sequence[str]) -> Model:
+def connected_models(reconstruction: Any, sensors: Sequence[str]) -> list[Model]:
+    """Split what a mapper made into the parts that hang together, each with at least one point.
+
+    Images hang together that share 30 points, or are linked by images that do. A few wrong matches
+    between things that look alike join parts wherever they please: the mappers, above all the
+    global one, do not mind.
+
+    Parameters
+    ----------
+    reconstruction : pycolmap.Reconstruction, in whose cameras' order of ids ``sensors`` are.
+    """
     reconstruction.update_point_3d_errors()  # the global mapper's are of rays
-    poses, cameras = {}, {}
-    for image_id in sorted(reconstruction.reg_image_ids()):
-        image = reconstruction.images[image_id]
-        found = image.cam_from_world()
-        poses[image.name] = RigidTransform.from_matrix(
-            found.rotation.matrix(), np.asarray(found.translation)
-        )
-        camera = Camera.from_colmap(reconstruction.cameras[image.camera_id])
-        cameras[sensors[image.camera_id - 1]] = camera
-    return Model(
-        cameras,
-        poses,
-        reconstruction.num_points3D(),
-        reconstruction.compute_mean_reprojection_error(),
+    points = [point for _, point in sorted(reconstruction.points3D.items())]
+    images = [
+        reconstruction.images[image_id] for image_id in sorted(reconstruction.reg_image_ids())
+    ]
+    if not images or not points:
+        return []
+    row_of = {image.image_id: row for row, image in enumerate(images)}
+    tracks = [sorted({row_of[at.image_id] for at in point.track.elements}) for point in points]
+    seen = csr_array(
+        (
+            np.ones(sum(map(len, tracks)), np.int64),
+            np.concatenate([np.array(track, np.int64) for track in tracks]),
+            np.cumsum([0, *map(len, tracks)]),
+        ),
+        shape=(len(points), len(images)),
     )
+    shared = (seen.T @ seen).toarray()
+    num_parts, part_of = connected_components(shared >= _MIN_POINTS, directed=False)
+    models = []
+    for part in range(num_parts):
+        inside = part_of == part
+        kept = np.flatnonzero(seen @ inside.astype(np.int64) >= 2)
+        if len(kept):
+            model_images = [images[row] for row in np.flatnonzero(inside)]
+            errors_px = [points[row].error for row in kept]
+            models.append(
+                Model(
+                    {
+                        sensors[image.camera_id - 1]: Camera.from_colmap(
+                            reconstruction.cameras[image.camera_id]
+                        )
+                        for image in model_images
+                    },
+                    {image.name: _cam_from_world(image) for image in model_images},
+                    len(kept),
+                    float(np.mean(errors_px)),
+                )
+            )
+    return models
+
+
+def _cam_from_world(image: Any) -> RigidTransform:
+    found = image.cam_from_world()
+    return RigidTransform.from_matrix(found.rotation.matrix(), np.asarray(found.translation))
 
 
 def _why_none(seen: Sequence[tuple[Any, float]]) -> str:

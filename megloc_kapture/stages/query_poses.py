@@ -309,7 +309,7 @@ class LocalizeQueries(PipelineStage):
     """Estimate the poses of the queries from their matches with the map."""
 
     name = "localization"
-    version = 4
+    version = 5
     uses = ("localization", "guided_pyramid.mode", *LOCAL_TYPES)
 
     @property

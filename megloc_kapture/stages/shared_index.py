@@ -91,9 +91,10 @@ def observed_keypoints(
 def with_noise(folder: KaptureFolder, index: MapIndex) -> MapIndex:
     """The index with the median angle and distance between observations and their points.
 
-    Of a sample of the images; it stays as it is where there is none.
+    Of a sample of the images; it stays as it is where there is none, and where all points were
+    lifted from the one keypoint that observes them, which they fit whatever its noise.
     """
-    if not len(index.point_ids) or index.local_type not in folder.types("keypoints"):
+    if index.seen_once[index.point_ids].all() or index.local_type not in folder.types("keypoints"):
         return index
     keypoints, poses = folder.keypoints(index.local_type), folder.read().poses()
     images = [image for image in index.row_of_image if image in keypoints and image in poses]

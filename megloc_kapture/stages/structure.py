@@ -70,6 +70,7 @@ class FindPoses(PipelineStage):
     """Find poses and cameras of matched photographs; of several models the largest is the map's."""
 
     name = "poses"
+    version = 2
     uses = (*LOCAL_TYPES, "query_verification")
     writes = (POSED, f"{SIDE_TABLES}/{WORLD_FILE}", f"{SIDE_TABLES}/{UNREGISTERED_FILE}")
 
@@ -125,18 +126,21 @@ class FindPoses(PipelineStage):
             for image in images
         ]
         counts = read_match_counts(work.path(PHOTOGRAPH_MATCHES), local_type)
-        asked = {
-            (pair.image, pair.other)
-            for pair in counts
+        putative = {(pair.image, pair.other): pair.matches for pair in counts}
+        verified = verified_matches(mapping.matches(local_type), images, putative.keys())
+        verification = self.options.query_verification
+        matches = {}
+        for (i, j), rows in verified.items():
+            first, second = photographs[i], photographs[j]
             if not agree_by_chance(
-                pair.verified,
-                pair.matches,
-                data.camera_of(pair.image),
-                data.camera_of(pair.other),
-                self.options.query_verification.max_error_px,
-            )
-        }
-        matches = verified_matches(mapping.matches(local_type), images, asked)
+                first.keypoints_px[rows[:, 0]],
+                first.camera,
+                second.keypoints_px[rows[:, 1]],
+                second.camera,
+                putative[first.name, second.name],
+                verification,
+            ):
+                matches[i, j] = rows
         structure = self._structure
         try:
             return reconstruct(

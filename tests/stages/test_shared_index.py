@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import shutil
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from megloc_kapture.stages.shared_index import (
     index_map,
     open_index,
     shared_index,
+    with_noise,
     write_index,
 )
 
@@ -177,3 +179,20 @@ def test_the_covariances_of_the_map_are_taken(world: Any, tmp_path: Path) -> Non
     write_point_covariances(folder.root, known[1:])
     with pytest.raises(DataError, match="one row per point"):
         index_map(folder, "rootsift")
+
+
+def test_the_noise_of_the_map_is_that_of_points_which_several_images_observe(world: Any) -> None:
+    """A point that was lifted from its keypoint fits it, which says nothing."""
+    folder = world.map()
+    measured = with_noise(folder, index_map(folder, "rootsift"))
+    assert 0.02 < measured.noise_px < 1
+    assert measured.noise_rad == pytest.approx(measured.noise_px / 300, rel=0.5)
+    once = np.unique(measured.point_ids, return_index=True)[1]
+    images = np.repeat(np.arange(len(measured.row_of_image)), np.diff(measured.offsets))[once]
+    lifted = MapIndex.build(
+        measured.xyz, tuple(measured.row_of_image), images, measured.keypoint_ids[once],
+        measured.point_ids[once],
+    )  # fmt: skip
+    lifted = replace(lifted, local_type="rootsift")
+    assert lifted.seen_once.all()
+    assert np.isnan(with_noise(folder, lifted).noise_px)
