@@ -48,7 +48,7 @@ from megloc_kapture.plugins import (
     StereoView,
     load_plugin,
 )
-from megloc_kapture.stages.densifying import DensifyOptions, densify_map, read_sigma
+from megloc_kapture.stages.densifying import DensifyOptions, densify_map, read_beside
 from megloc_kapture.stages.rigs import depth_records
 from megloc_kapture.values import Camera, RigidTransform
 
@@ -171,7 +171,7 @@ def track_errors(
         if row.image not in records or not len(own):
             continue
         camera, depth = _depth_of(densified, row.image)
-        sigma = read_sigma(densified.root, row.image)
+        sigma = read_beside(densified.root, row.image, "sigma")
         assert sigma is not None
         z = poses[row.image].apply(own)[:, 2]
         found, claimed = _at(depth, sigma, project(camera, poses[row.image], own))
@@ -284,7 +284,7 @@ def sensor_depth(scene: Path, out: Path, estimator: DepthEstimator, name: str) -
         png = scene / "depth_png" / Path(image).with_suffix(".png")
         stored = np.asarray(cv2.imread(str(png), cv2.IMREAD_UNCHANGED), np.float64) / 1000
         truth = cv2.resize(stored, depth.shape[::-1], interpolation=cv2.INTER_NEAREST)
-        sigma = read_sigma(densified.root, image)
+        sigma = read_beside(densified.root, image, "sigma")
         assert sigma is not None
         there = (depth > 0) & (truth > 0)
         ratio = np.maximum(depth[there] / truth[there], truth[there] / depth[there])

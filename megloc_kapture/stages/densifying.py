@@ -359,15 +359,19 @@ def side_file(root: Path, image: str, kind: Literal["sigma", "normals"]) -> Path
     return safe_join(root / "sensors" / FOLDER, f"{image}.{kind}.npy")
 
 
-def read_sigma(root: Path, image: str) -> NDArray[np.float32] | None:
-    """Standard deviation (H, W) of an image's depth by stereo; None without; raises DataError."""
-    path = side_file(root, image, "sigma")
+def read_beside(
+    root: Path, image: str, kind: Literal["sigma", "normals"]
+) -> NDArray[np.float32] | None:
+    """Standard deviations (H, W) or normals (H, W, 3) of an image's depth by stereo, float32, 0
+    where nothing is known; None without; raises DataError."""
+    path = side_file(root, image, kind)
     if not path.is_file():
         return None
     try:
-        return np.asarray(np.load(path, allow_pickle=False), np.float32)
+        found = np.load(path, allow_pickle=False).astype(np.float32)
     except (OSError, ValueError) as error:
         raise DataError(f"no array of numpy: {error}", path=path) from error
+    return np.asarray(found / np.float32(127) if kind == "normals" else found)
 
 
 def _with_depth(data: KaptureData, images: Sequence[str], max_size_px: int) -> KaptureData:

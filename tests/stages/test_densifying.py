@@ -27,7 +27,7 @@ from megloc_kapture.stages.densifying import (
     DEPTH_FILE,
     DensifyOptions,
     densify_map,
-    read_sigma,
+    read_beside,
     side_file,
 )
 from megloc_kapture.stages.fusion import fuse_depth
@@ -67,7 +67,7 @@ def test_kapture_reads_the_depth_and_it_is_right(densified: KaptureFolder) -> No
         assert known.mean() > 0.4
         assert np.mean(np.abs(found - exact)[known] < 0.02 * exact[known]) > 0.95
         assert not found[exact == 0].any() or np.mean(found[exact == 0] > 0) < 0.1
-        sigma = read_sigma(densified.root, image)
+        sigma = read_beside(densified.root, image, "sigma")
         assert sigma is not None and ((sigma > 0) == (found > 0)).all()
         normals = np.load(side_file(densified.root, image, "normals"))
         lengths = np.linalg.norm(normals[found > 0].astype(float), axis=1)

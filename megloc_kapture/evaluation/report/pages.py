@@ -8,6 +8,7 @@ from markupsafe import Markup
 
 from megloc_kapture.evaluation.metrics import ALL
 from megloc_kapture.evaluation.report import figures, tables
+from megloc_kapture.evaluation.report.depth import depth_blocks
 from megloc_kapture.evaluation.report.document import (
     Block,
     Figure,
@@ -60,6 +61,7 @@ from megloc_kapture.values import RigidTransform
 Poses = Mapping[str, RigidTransform]
 
 _BELOW = f"Below each recall: its {INTERVALS.replace('intervals of recall', 'interval')}."
+_DEPTH = "Depth of map images"
 _FROM_ABOVE = "Camera centres from above, each error a red line from the truth to the estimate."
 
 
@@ -168,6 +170,7 @@ def evaluation_page(
     )
     sections += _unless_empty("What refinement changed", refined)
     sections += _unless_empty("What masks hide", mask_blocks(context.masked))
+    sections += _unless_empty(_DEPTH, depth_blocks(context))
     sections += _seconds(context)
     table, num_hidden = query_table(evaluation)
     hidden = (
@@ -275,6 +278,8 @@ def without_truth_page(
         sections += _unless_empty(f"{result.label}: what refinement changed", blocks_of_result)
     for result, context in several:
         sections += _unless_empty(f"{result.label}: what masks hide", mask_blocks(context.masked))
+    # of one map or of several: the first shows what stereo makes of such images
+    sections += _unless_empty(_DEPTH, depth_blocks(contexts[0]) if contexts else ())
     return tuple(sections)
 
 

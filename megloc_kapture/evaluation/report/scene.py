@@ -35,6 +35,8 @@ from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import Camera, RigidTransform
 
 MAX_POINTS, MAX_CAMERAS, MAX_QUERIES = 60_000, 4_000, 2_000
+# points of depth by stereo, and map images that they are read of: 0.2 s each
+MAX_DENSE, _MAX_DENSE_IMAGES = 40_000, 40
 # points that inliers lead to: of all queries, and of one of them
 _MAX_INLIERS, _MAX_INLIERS_OF_ONE = 40_000, 300
 # to find a query's inliers takes 20 ms, of many keypoints more
@@ -58,7 +60,8 @@ class Scene:
     title : of the page.
     origin : float64 (3,), which the coordinates are relative to.
     up : float64 (3,), unit vector.
-    points : float32 (P, 3), and ``colors`` uint8 (P, 3).
+    points : float32 (P, 3), and ``colors`` uint8 (P, 3); the last ``num_dense`` are not the map's
+        own but of depth by stereo.
     cameras : names of map images, and ``camera_frusta`` float32 (C, 5, 3): the centre, then the
         rays through the image's corners (upper left, upper right, lower right, lower left) at
         depth 1, as vectors of the world.
@@ -77,6 +80,7 @@ class Scene:
     up: NDArray[np.float64]
     points: NDArray[np.float32]
     colors: NDArray[np.uint8]
+    num_dense: int
     cameras: tuple[str, ...]
     camera_frusta: NDArray[np.float32]
     queries: tuple[ShownQuery, ...]
@@ -155,12 +159,17 @@ def scene_of(title: str, stored: StoredInliers, queries: Sequence[ShownQuery] = 
     if any(len(own) > most for own in inliers):
         notes.append(f"Of a query's inliers at most {most} are drawn.")
     inliers = [own[spread(len(own), most)] for own in inliers]
+    up = np.cross(view.right, view.up)
+    colors = _colors(points, up, mapping, kept)
+    dense, dense_colors, dense_images = _dense_points(mapping, notes)
+    dense_frames = _positions([frame_of.get(image, "") for image in dense_images], frames)
     return Scene(
         title=title,
         origin=origin,
-        up=np.cross(view.right, view.up),
-        points=(points[:, :3] - origin).astype(np.float32),
-        colors=_colors(points, np.cross(view.right, view.up), mapping, kept),
+        up=up,
+        points=(np.concatenate([points[:, :3], dense]) - origin).astype(np.float32),
+        colors=np.concatenate([colors, dense_colors]),
+        num_dense=len(dense),
         cameras=tuple(names),
         camera_frusta=_frusta(poses, _rays(mapping, names, {}), origin),
         queries=tuple(queries),
@@ -170,7 +179,7 @@ def scene_of(title: str, stored: StoredInliers, queries: Sequence[ShownQuery] = 
         num_inliers=tuple(len(own) for own in inliers),
         radius=max(float(np.linalg.norm(high - low)) / 2, 1e-3),
         frames=tuple(frames),
-        point_frames=point_frames,
+        point_frames=np.concatenate([point_frames, dense_frames]),
         camera_frames=_positions([frame_of[name] for name in names], frames),
         query_frames=_positions([_frame_of(q, context, frame_of) for q in queries], frames),
         notes=tuple(notes),
@@ -186,6 +195,7 @@ def render_view(scene: Scene) -> str:
         "radius": scene.radius,
         "points": _encoded(scene.points),
         "colors": _encoded(scene.colors),
+        "numDense": scene.num_dense,
         "cameras": scene.cameras,
         "cameraFrusta": _encoded(scene.camera_frusta),
         "queries": [
@@ -215,7 +225,8 @@ def render_view(scene: Scene) -> str:
         data=_script_data(data),
         legend=legend(list(scene.queries)),
         counts={
-            "points": len(scene.points),
+            "points": len(scene.points) - scene.num_dense,
+            "dense": scene.num_dense,
             "cameras": len(scene.cameras),
             "queries": len(scene.queries),
             "failed": len(failed),
@@ -292,6 +303,32 @@ def _point_frames(
             of_image = _positions([frame_of.get(name, "") for name in seen.image_names], frames)
             found[seen.point_ids] = of_image[seen.image_ids]
     return found
+
+
+def _dense_points(
+    mapping: KaptureFolder | None, notes: list[str]
+) -> tuple[NDArray[np.float64], NDArray[np.uint8], list[str]]:
+    """Points (N, 3) of depth by stereo with their colours (N, 3) and images; none without any."""
+    from megloc_kapture.mvs.consistency import AgreementOptions  # loads more than others wait for
+    from megloc_kapture.stages.fusion import fused_cloud, stereo_images
+
+    nothing = np.zeros((0, 3)), np.zeros((0, 3), np.uint8), list[str]()
+    if mapping is None:
+        return nothing
+    images = stereo_images(mapping)
+    names = list(images)
+    if len(names) > _MAX_DENSE_IMAGES:
+        notes.append(f"Depth is shown of {_MAX_DENSE_IMAGES} of {len(names)} images.")
+        names = [names[at] for at in spread(len(names), _MAX_DENSE_IMAGES)]
+    # a view without depth is better than none
+    with contextlib.suppress(DataError):
+        chosen = {name: images[name] for name in names}
+        # most surfaces are seen by several images, some by none
+        cloud = fused_cloud(mapping, chosen, AgreementOptions(), max_points=8 * MAX_DENSE)
+        kept = spread(len(cloud.xyz), MAX_DENSE) if len(cloud.xyz) else np.zeros(0, np.int64)
+        colors = np.asarray(np.round(cloud.colours[kept]), np.uint8)
+        return cloud.xyz[kept], colors, [names[int(row)] for row in cloud.image_ids[kept]]
+    return nothing
 
 
 def _colors(
