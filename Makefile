@@ -88,7 +88,7 @@ clean:
 $(STAMP):
 	@python=$$(PYTHON='$(PYTHON)' sh scripts/find_python.sh) && \
 		{ test -x $(BIN)/python || "$$python" -m venv $(VENV); }
-	@echo 'Setting up $(VENV), once: about 2 GB of packages, a few minutes.'
+	@echo 'Setting up $(VENV), once: about 3 GB of packages, a few minutes.'
 	@$(INSTALL) $(if $(TORCH_INDEX),--index-url '$(TORCH_INDEX)') -c constraints.txt torch
 	@$(INSTALL) -c constraints.txt -e '.[cluster,dev,docs,serve]' $(addprefix -e ,$(wildcard twins))
 	@$(INSTALL) -c constraints.txt --no-deps kapture-localization

@@ -68,6 +68,7 @@ _EXTRAS = {
     "onnx": "convert",
     "distributed": "cluster",
     "h5py": "megadepth",
+    "rerun": "rerun",
     **dict.fromkeys(
         ("fastapi", "prometheus_client", "python_multipart", "starlette", "uvicorn"),
         "serve",

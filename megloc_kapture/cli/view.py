@@ -25,6 +25,8 @@ class View(Linked, Common):
     """Kapture folder with the true poses: queries are coloured by their error, and joined to it."""
     output: Output = Path("view.html")
     """File to write."""
+    rerun: Annotated[Path | None, tyro.conf.arg(metavar="FILE.rrd")] = None
+    """Write the same, with the images, for Rerun's viewer as well: `rerun FILE.rrd` shows it."""
     open: bool = False
     """Show it in the browser."""
     force: Force = False
@@ -42,10 +44,14 @@ class View(Linked, Common):
         if self.gt is not None and self.result is None:
             raise OptionError("--gt needs a result to compare with it: megloc view MAP RESULT")
         folder = self.kapture(opened_map(self.map, console))
-        left_out = write_view(self.output, folder, self.result, self.gt, force=self.force)
+        left_out = write_view(
+            self.output, folder, self.result, self.gt, force=self.force, rerun=self.rerun
+        )
         if left_out:
             console.say(left_out)
         console.result(f"view: {self.output}")
+        if self.rerun is not None:
+            console.result(f"recording: {self.rerun}")
         if self.open:
             import webbrowser
 

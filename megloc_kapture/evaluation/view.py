@@ -20,7 +20,8 @@ from megloc_kapture.io.files import write_bytes
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import Camera
 
-_OURS = b'content="megloc view"'
+# what the files begin with, or have near their beginning
+_OURS, _RECORDING = b'content="megloc view"', b"RRF"
 _HEAD_BYTES = 1000
 
 
@@ -32,6 +33,7 @@ def write_view(
     *,
     cameras: Mapping[str, Camera] | None = None,
     force: bool = False,
+    rerun: Path | str | None = None,
 ) -> str:
     """Write a page that shows a map in 3D, and the queries of a result in it.
 
@@ -44,6 +46,8 @@ def write_view(
     result, truth : as in :func:`megloc_kapture.evaluation.evaluate.evaluate`; queries are coloured
         by their error where the truth is known, else by their confidence.
     cameras : of the queries of a result in memory, where they are known.
+    rerun : file (.rrd) to write the same to as a recording of Rerun's viewer, with the images; an
+        existing one is overwritten only where it is a recording, or with ``force``.
 
     Returns
     -------
@@ -53,13 +57,17 @@ def write_view(
     ------
     DataError : map, result or truth are missing or broken, or no camera has a pose.
     OptionError : a truth without a result.
-    OutputError : the file cannot be written, or is another one than a view.
+    OutputError : a file cannot be written, or is another one than a view.
+    ModuleNotFoundError : for ``rerun``, where the extra of that name is not installed.
     """
     from megloc_kapture.evaluation.report.scene import render_view, scene_of
     from megloc_kapture.evaluation.report.shown_queries import StoredInliers, shown_queries
 
     path = Path(path)
-    _check_output(path, force=force)
+    _check_output(path, _OURS, force=force)
+    if rerun is not None:
+        _check_output(Path(rerun), _RECORDING, force=force)
+        from megloc_kapture.evaluation.report.rerun_log import write_recording
     folder = mapping if isinstance(mapping, KaptureFolder) else KaptureFolder(mapping)
     title = folder.root.resolve().name
     context, queries = ResultContext(mapping=folder), []
@@ -74,6 +82,8 @@ def write_view(
     scene = scene_of(title, StoredInliers(context), queries)
     if scene is None:
         raise DataError("no image has a pose, so there is nothing to see", path=folder.root)
+    if rerun is not None:
+        write_recording(Path(rerun), scene, context)
     write_bytes(path, render_view(scene).encode("utf-8"))
     return " ".join(scene.notes)
 
@@ -89,14 +99,14 @@ def _judged(
     return evaluate_results([result], truth, benchmark, mapping=folder.root, labels=labels)[0]
 
 
-def _check_output(path: Path, *, force: bool) -> None:
+def _check_output(path: Path, mark: bytes, *, force: bool) -> None:
     if path.is_dir():
         raise OutputError(f"{path}: is a folder; give the name of a file, such as view.html")
     if force or not path.exists():
         return
     try:
         with open(path, "rb") as file:
-            ours = _OURS in file.read(_HEAD_BYTES)
+            ours = mark in file.read(_HEAD_BYTES)
     except OSError as error:
         raise OutputError(f"{path}: cannot be read: {error.strerror}") from error
     if not ours:
