@@ -259,7 +259,7 @@ def _run(
         _take_over(stage, workspace)
         written = tuple(o for o in stage.writes if (folder / o).exists())
         # before its files have moved: whichever of them have, the journal knows them
-        if kept.states:
+        if kept.num_items:
             hard_link(journal, workspace.items_path(stage.name))
         else:
             workspace.items_path(stage.name).unlink(missing_ok=True)

@@ -6,6 +6,7 @@ that come later get theirs from the same.
 
 from __future__ import annotations
 
+import hashlib
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ from megloc_kapture.features.pca_whitening import PcaWhitening
 from megloc_kapture.features.vlad import VladOptions, Vocabulary, aggregate, train_vlad
 from megloc_kapture.io.files import read_json_model, write_bytes, write_json_model
 from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
+from megloc_kapture.stages.kept_items import feature_inputs
 from megloc_kapture.stages.work import HERE, FolderSpec, Work, ordered_map
 from megloc_kapture.values import Options
 
@@ -99,26 +101,44 @@ def extract_vlad(
     -------
     Counts for the log: images, clusters, dimensions.
     """
-    vocabulary = train_on_map(mapping, local_type, options, work=work)
     type_name = vlad_type(local_type)
     place = output / "global_features" / type_name
-    write_vocabulary(place, vocabulary, local_type, options)
-    config = FeatureConfig(type_name, np.dtype(np.float32), vocabulary.size, metric_type="L2")
+    described = mapping.descriptors(local_type)
+    trained = work.items(
+        f"vocabulary of {type_name}",
+        [type_name],
+        lambda _, digest: [
+            [image, feature_inputs(described, image, digest)]
+            for image in mapping.read().image_names()
+        ],
+    )
+    if type_name not in trained.done:
+        vocabulary = train_on_map(mapping, local_type, options, work=work)
+        files = write_vocabulary(place, vocabulary, local_type, options)
+        content = hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
+        said = [vocabulary.centres.shape[1], vocabulary.size, content]
+        trained.add(type_name, files, said)
+    num_centres, size, content = trained.done[type_name]
+    config = FeatureConfig(type_name, np.dtype(np.float32), size, metric_type="L2")
     run = FolderSpec(mapping).key
-    jobs = []
+    jobs, readers = [], {}
     for folder in folders:
-        read = _Descriptors(FolderSpec(folder), local_type)
-        jobs += [_Job(read, image, place, run) for image in folder.read().image_names()]
+        read, reader = _Descriptors(FolderSpec(folder), local_type), folder.descriptors(local_type)
+        for image in folder.read().image_names():
+            jobs.append(_Job(read, image, place, run))
+            readers[image] = reader
     jobs.sort(key=lambda job: job.image)
+    items = work.items(
+        type_name,
+        list(readers),
+        lambda image, digest: [content, feature_inputs(readers[image], image, digest)],
+    )
+    todo = [job for job in jobs if job.image not in items.done]
     writer = FeatureWriter(output, "global_features", type_name, config, orphan=True)
-    results = work.map(_aggregate, jobs, "VLAD")
-    for job, vector in zip(jobs, results, strict=True):
-        writer.write(job.image, vector)
-    return {
-        "images": len(jobs),
-        "clusters": vocabulary.centres.shape[1],
-        "dimensions": vocabulary.size,
-    }
+    results = work.map(_aggregate, todo, items.label("VLAD"))
+    for job, vector in zip(todo, results, strict=True):
+        items.add(job.image, writer.write(job.image, vector))
+    return {"images": len(jobs), "clusters": num_centres, "dimensions": size}
 
 
 def _aggregate(job: _Job) -> NDArray[np.float32]:
@@ -137,8 +157,8 @@ def _read_once(folder: Path, run: tuple[object, ...]) -> tuple[Vocabulary, VladS
 
 def write_vocabulary(
     folder: Path, vocabulary: Vocabulary, local_type: str, options: VladOptions
-) -> None:
-    """Write what describes images into the folder of a global-features type.
+) -> list[Path]:
+    """Write what describes images into the folder of a global-features type; returns the files.
 
     ``vocabulary.npy`` and ``vlad.json``, and with whitening its mean and projection.
     """
@@ -147,6 +167,8 @@ def write_vocabulary(
         _write_array(folder / MEAN_FILE, vocabulary.whitening.mean)
         _write_array(folder / PROJECTION_FILE, vocabulary.whitening.projection)
     write_json_model(folder / SETTINGS_FILE, VladSettings(local_type=local_type, options=options))
+    whitening = () if vocabulary.whitening is None else (MEAN_FILE, PROJECTION_FILE)
+    return [folder / name for name in (VOCABULARY_FILE, *whitening, SETTINGS_FILE)]
 
 
 def read_vocabulary(folder: Path) -> tuple[Vocabulary, VladSettings] | None:

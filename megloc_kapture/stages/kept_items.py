@@ -18,15 +18,38 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from megloc_kapture.errors import DataError, OutputError
 from megloc_kapture.io.file_states import FileState, state_if_unchanged, state_of
 from megloc_kapture.io.files import hard_link, output_error
+from megloc_kapture.io.kapture import FeatureReader
 from megloc_kapture.io.paths import check_relative
 
 Digest = Callable[[Path], str]
 """Hash of a file's content; raises DataError where it cannot be read."""
 Inputs = Callable[[str, Digest], object]
 """What an item of a name is made of, as plain JSON values."""
+
+
+def feature_inputs(reader: FeatureReader, image: str, digest: Digest) -> list[object]:
+    """What is read of an image's features: how they are stored, and their content."""
+    if image not in reader:
+        return []
+    file = Path(reader.where(image))
+    in_tar = not file.is_file()
+    content = content_of([reader.read(image)]) if in_tar else digest(file)
+    return [reader.config.dtype.name, reader.config.dsize, content]
+
+
+def content_of(arrays: Iterable[NDArray[Any]]) -> str:
+    """A hash of arrays."""
+    digest = hashlib.sha256()
+    for array in arrays:
+        digest.update(f"{array.dtype} {array.shape}".encode())
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()
 
 
 class _Entry(NamedTuple):

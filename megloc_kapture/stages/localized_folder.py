@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
+
+from pydantic import TypeAdapter
 
 from megloc_kapture.io.csv_table import write_csv_table
 from megloc_kapture.io.files import link_images
@@ -20,7 +24,14 @@ from megloc_kapture.io.tables import (
     write_status,
 )
 from megloc_kapture.stages.rigs import poses_through_rig
-from megloc_kapture.values import Failure, Pose, RigidTransform
+from megloc_kapture.values import (
+    Camera,
+    ClusterPose,
+    Failure,
+    Pose,
+    RefinementRow,
+    RigidTransform,
+)
 
 
 def write_localized(
@@ -109,6 +120,32 @@ def write_localized(
         "failed": len(named) - localized,
         "fallbacks": len(poses) - localized,
     }
+
+
+# fields of a pose that JSON gives back as something else
+_PARTS: dict[str, TypeAdapter[Any]] = {
+    "cam_from_world": TypeAdapter(RigidTransform),
+    "camera": TypeAdapter(Camera | None),
+    "candidates": TypeAdapter(tuple[str, ...]),
+    "clusters": TypeAdapter(tuple[ClusterPose, ...]),
+    "refinements": TypeAdapter(tuple[RefinementRow, ...]),
+    "remarks": TypeAdapter(tuple[str, ...]),
+}
+
+
+def plain_result(found: Pose | Failure) -> dict[str, Any]:
+    """A result as JSON values: all that is written of it; no arrays."""
+    if isinstance(found, Pose):
+        found = replace(found, covariance=None, evidence={})
+    return asdict(found)
+
+
+def result_of(plain: Mapping[str, Any]) -> Pose | Failure:
+    """The result that :func:`plain_result` made JSON values of."""
+    if "cam_from_world" not in plain:
+        return TypeAdapter(Failure).validate_python(plain)
+    parts = {name: kind.validate_python(plain[name]) for name, kind in _PARTS.items()}
+    return Pose(**{**plain, **parts})
 
 
 def query_status(image: str, result: Pose | Failure, fallback: Fallback = "none") -> QueryStatus:

@@ -5,7 +5,6 @@ Mapping pairs are verified with their known poses, query pairs by a two-view mod
 
 from __future__ import annotations
 
-import hashlib
 import threading
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
@@ -30,7 +29,7 @@ from megloc_kapture.matching.verification import (
     verify_with_poses,
 )
 from megloc_kapture.plugins import Matcher
-from megloc_kapture.stages.kept_items import Digest
+from megloc_kapture.stages.kept_items import Digest, feature_inputs
 from megloc_kapture.stages.layout import (
     FEATURES,
     LOCAL_FEATURES,
@@ -182,12 +181,9 @@ def _image_inputs(
     folder: KaptureFolder, local_type: str, image: str, digest: Digest, *, posed: bool
 ) -> object:
     """What matches of an image are made of: its features and its camera, with poses its pose."""
-    found: list[object] = [astuple(folder.read().camera_of(image))]
-    for reader in (folder.keypoints(local_type), folder.descriptors(local_type)):
-        file = Path(reader.where(image))
-        in_tar = not file.is_file()
-        content = hashlib.sha256(reader.read(image).data).hexdigest() if in_tar else digest(file)
-        found.append([reader.config.dtype.name, reader.config.dsize, content])
+    camera = astuple(folder.read().camera_of(image))
+    readers = folder.keypoints(local_type), folder.descriptors(local_type)
+    found = [camera, *(feature_inputs(reader, image, digest) for reader in readers)]
     pose = folder.read().cam_from_world(image) if posed else None
     return [*found, pose and astuple(pose)]
 

@@ -9,11 +9,12 @@ belong to the old pixels.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
 from megloc_kapture.errors import DataError, OptionError, OutputError
@@ -50,6 +51,7 @@ from megloc_kapture.stages.image_masks import (
     find_unchanging_regions,
     mask_files,
 )
+from megloc_kapture.stages.kept_items import Digest, content_of
 from megloc_kapture.stages.layout import MAPPING, PREPROCESSED, QUERY
 from megloc_kapture.stages.local_features import read_image_of
 from megloc_kapture.stages.stage import Hashes, PipelineStage, StageWork
@@ -80,14 +82,20 @@ class _Job:
     classes: ClassMasks | None
 
 
-def _process(job: _Job) -> dict[str, float]:
+def _process(job: _Job) -> tuple[list[Path], dict[str, float]]:
     """Write what becomes of one image and its mask.
 
     Returns
     -------
-    The share of its pixels masked by each source of masks, and by ``all`` of them; empty where
-    there is none.
+    The files, links left out; and the share of its pixels masked by each source of masks, and by
+    ``all`` of them, empty where there is none.
     """
+    files: list[Path] = []
+
+    def write(path: Path, pixels: NDArray[np.uint8]) -> None:
+        write_image(path, pixels, jpeg_quality=JPEG_QUALITY)
+        files.append(path)
+
     sensors, camera = job.output / "sensors", job.plan.original
     frame = ProcessedFrame(
         job.image,
@@ -98,7 +106,7 @@ def _process(job: _Job) -> dict[str, float]:
     )
     place = sensors / "records_data" / job.image
     if job.plan.changes_pixels:
-        write_image(place, frame.written, jpeg_quality=JPEG_QUALITY)
+        write(place, frame.written)
     else:
         size = image_size(job.source)
         if size != (camera.width, camera.height):
@@ -109,13 +117,13 @@ def _process(job: _Job) -> dict[str, float]:
         if job.link:
             link_file(job.source, place)
     if frame.labels is not None:
-        write_image(sensors / CLASSES / f"{job.image}.png", frame.labels)
+        write(sensors / CLASSES / f"{job.image}.png", frame.labels)
     if frame.mask is None:
-        return {}
+        return files, {}
     together = frame.mask
-    write_image(sensors / "masks" / f"{job.image}.png", together.astype(np.uint8) * 255)
+    write(sensors / "masks" / f"{job.image}.png", together.astype(np.uint8) * 255)
     masks = {**frame.masks, "all": together}
-    return {source: float((~mask).mean()) for source, mask in masks.items()}
+    return files, {source: float((~mask).mean()) for source, mask in masks.items()}
 
 
 class CameraReport(BaseModel):
@@ -240,10 +248,27 @@ def preprocess_images(
         what = {"classes": list(classes.segmenter.classes), "dynamic": list(classes.dynamic)}
         write_json(output / "sensors" / CLASSES / CLASSES_FILE, what)
 
+    def standing_of(image: str) -> Mapping[str, Mask]:
+        sensor_id = data.record_of(image)[1]
+        return standing.of(sensor_id, image, plans[sensor_id].original)
+
+    def inputs(image: str, digest: Digest) -> object:
+        given = [file and digest(file) for file in astuple(files[image])]
+        drawn = [[source, content_of([mask])] for source, mask in standing_of(image).items()]
+        plan = plans[data.record_of(image)[1]]
+        return [digest(folder.image_path(image)), astuple(plan), given, drawn]
+
+    images = data.image_names()
+    items = work.items(f"images of {folder.root.name}", images, inputs)
+    todo = [image for image in images if image not in items.done]
+    for image in items.done:
+        standing_of(image)  # so that it is known which masks fit none
+        if not (linked or plans[data.record_of(image)[1]].changes_pixels):
+            link_file(folder.image_path(image), output / "sensors" / "records_data" / image)
+
     def jobs() -> Iterator[_Job]:
-        for image in data.image_names():
-            sensor_id = data.record_of(image)[1]
-            plan = plans[sensor_id]
+        for image in todo:
+            plan = plans[data.record_of(image)[1]]
             yield _Job(
                 image=image,
                 source=folder.image_path(image),
@@ -251,16 +276,19 @@ def preprocess_images(
                 plan=plan,
                 link=not (linked or plan.changes_pixels),
                 files=files[image],
-                standing=standing.of(sensor_id, image, plan.original),
+                standing=standing_of(image),
                 classes=classes,
             )
 
+    results = work.map(_process, jobs(), items.label("pre-processing"), len(todo))
+    for image, (written, found) in zip(todo, results, strict=True):
+        items.add(image, written, found)
     shares: dict[str, float] = {}
-    num_images = len(data.records_camera)
+    num_images = len(images)
     num_masked = 0
-    for found in work.map(_process, jobs(), "pre-processing", num_images):
-        num_masked += bool(found)
-        for source, share in found.items():
+    for image in images:
+        num_masked += bool(items.done[image])
+        for source, share in items.done[image].items():
             shares[source] = shares.get(source, 0.0) + share
     remarks += [f"a fixed mask fits no image: {one.camera}" for one in standing.unused()]
     report = PreprocessingReport(

@@ -7,9 +7,10 @@ reads it. The work goes by images, not by pairs.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,6 +38,7 @@ from megloc_kapture.stages.guided_pyramid import (
     RetriedQuery,
     retry_query,
 )
+from megloc_kapture.stages.kept_items import Digest, content_of, feature_inputs
 from megloc_kapture.stages.layout import (
     FEATURES,
     LOCAL_FEATURES,
@@ -45,7 +47,7 @@ from megloc_kapture.stages.layout import (
     QUERY_PAIRS,
     QUERY_PYRAMID,
 )
-from megloc_kapture.stages.local_features import read_frame
+from megloc_kapture.stages.local_features import image_inputs, read_frame
 from megloc_kapture.stages.map_points import matched_images
 from megloc_kapture.stages.matches import MATCHING_OPTIONS, cached_features
 from megloc_kapture.stages.stage import PipelineStage, StageWork
@@ -134,25 +136,52 @@ def pyramid_queries(
     candidates: dict[str, list[str]] = {}
     for image, other in dict.fromkeys((pair.query, pair.map) for pair in pairs):
         candidates.setdefault(image, []).append(other)
+    features = PyramidFeatures(output, query, local_type)
+    stored = query.matches(local_type)
+
+    @cache
+    def side(number: int, image: str, digest: Digest) -> list[object]:
+        folder = (query, mapping)[number]
+        readers = folder.keypoints(types[number]), folder.descriptors(types[number])
+        camera = astuple(folder.read().camera_of(image))
+        return [camera, *(feature_inputs(reader, image, digest) for reader in readers)]
+
+    def inputs(image: str, digest: Digest) -> object:
+        of_pairs = [
+            [other, side(1, other, digest), content_of(stored.read(image, other))]
+            for other in candidates[image]
+        ]
+        return [
+            mask_margin_px,
+            image_inputs(query, image, digest),
+            side(0, image, digest),
+            of_pairs,
+        ]
+
+    items = work.items(local_type, sorted(candidates), inputs)
     jobs = [
         _Job(*specs, *types, method, mask_margin_px, image, tuple(candidates[image]))
         for image in sorted(candidates)
+        if image not in items.done
     ]
-    features = PyramidFeatures(output, query, local_type)
-    tried, extended = RetriedPairs(), 0
+    features.leave(items.done)
     with closing(MatchesWriter(output, larger, orphan=True)) as writer:
-        for job, found in zip(jobs, work.map(_retry, jobs, "guided pyramid"), strict=True):
-            for other, matches, scores in found.matches:
-                writer.write(job.image, other, matches, scores)
-            features.write(job.image, found.added_px, found.added_descriptors)
-            tried.add(found.tried)
-            extended += len(found.added_px) > 0
+        results = work.map(_retry, jobs, items.label("guided pyramid"))
+        for job, found in zip(jobs, results, strict=True):
+            files = [writer.write(job.image, *one) for one in found.matches]
+            files += features.write(job.image, found.added_px, found.added_descriptors)
+            items.add(job.image, files, [len(found.added_px) > 0, vars(found.tried)])
+    tried, extended = RetriedPairs(), 0
+    for image in sorted(candidates):
+        more, of_image = items.done[image]
+        tried.add(RetriedPairs(**of_image))
+        extended += more
     features.write_rest()
     write_csv_table(table_path(output, local_type), COLUMNS, tried.rows)
     return {
         "images_extracted_again": len({row[0] for row in tried.rows}),
         "images_extended": extended,
-        "pairs": sum(len(job.candidates) for job in jobs),
+        "pairs": sum(map(len, candidates.values())),
         **tried.counts(),
     }
 
@@ -197,11 +226,16 @@ class PyramidFeatures:
         ]
         self._folders = [feature_folder(output, kind, name, orphan=True) for kind in kinds]
 
+    def leave(self, images: Iterable[str]) -> None:
+        """Let images be that have been written before."""
+        done = set(images)
+        self._left = [image for image in self._left if image not in done]
+
     def write(
         self, image: str, added_px: NDArray[np.float32], added_descriptors: NDArray[Any]
-    ) -> None:
-        """Write an image's features, with those added to it; raises OutputError."""
-        added = (added_px, added_descriptors)
+    ) -> list[Path]:
+        """Write an image's features, with those added to it; the files. Raises OutputError."""
+        added, files = (added_px, added_descriptors), []
         self._left.remove(image)
         for source, writer, folder, more in zip(
             self._sources, self._writers, self._folders, added, strict=True
@@ -210,8 +244,10 @@ class PyramidFeatures:
             stored = Path(source.where(image))
             if len(more) == 0 and stored.is_file():  # else it is a member of a tar
                 hard_link(stored, place)
+                files.append(place)
                 continue
-            writer.write(image, np.concatenate([source.read(image), more]))
+            files += writer.write(image, np.concatenate([source.read(image), more]))
+        return files
 
     def write_rest(self) -> None:
         """Write the features of the images that nothing is added to; raises OutputError."""

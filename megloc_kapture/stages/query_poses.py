@@ -7,9 +7,9 @@ gives a pose, a ranker says which is right, and that one is refined with its own
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import astuple, dataclass, replace
+from functools import cache, lru_cache, partial
 from itertools import chain
 from pathlib import Path
 
@@ -39,6 +39,7 @@ from megloc_kapture.plugins import (
     RankingScene,
     load_plugin,
 )
+from megloc_kapture.stages.kept_items import Digest, content_of, feature_inputs
 from megloc_kapture.stages.layout import (
     FEATURES,
     LOCAL_FEATURES,
@@ -48,11 +49,12 @@ from megloc_kapture.stages.layout import (
     QUERY_PAIRS,
     TIMING,
 )
-from megloc_kapture.stages.localized_folder import write_localized
+from megloc_kapture.stages.local_features import mask_path
+from megloc_kapture.stages.localized_folder import plain_result, result_of, write_localized
 from megloc_kapture.stages.matches import iterate_candidates
 from megloc_kapture.stages.ranking_scene import KaptureScene
 from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
-from megloc_kapture.stages.rigs import Unit, query_units
+from megloc_kapture.stages.rigs import Unit, depth_records, query_units
 from megloc_kapture.stages.shared_index import index_map, open_index, shared_index, with_noise
 from megloc_kapture.stages.stage import LOCAL_TYPES, PipelineStage, StageWork
 from megloc_kapture.stages.unreadable import unreadable_queries
@@ -275,9 +277,30 @@ def localize_from_matches(
     units = query_units(query.read(), rigs=options.rigs)
     read = {name: index_map(map_folder, type_in_map(map_folder, name)) for name in local_types}
     measured = {name: with_noise(map_folder, index) for name, index in read.items()}
+    unit_of = {"\0".join(image for image, _ in unit): unit for unit in units}
+    of_query, of_map = _files_of(query), _files_of(map_folder)
+    points_of = cache(partial(_map_inputs, map_folder))
+
+    def inputs(name: str, digest: Digest) -> object:
+        found: list[object] = [points_of(digest)]
+        for image, cam_from_rig in unit_of[name]:
+            own = candidates.get(image, ())
+            found += [astuple(cam_from_rig), astuple(query.read().camera_of(image))]
+            found += [of_query(image, digest), [restrictions.frame(other) for other in own]]
+            found.append([[other, of_map(other, digest)] for other in own])
+            for local_type in local_types:
+                reader = matches.matches(local_type)
+                pairs = [(image, other) for other in own if (image, other) in reader]
+                found.append(feature_inputs(query.keypoints(local_type), image, digest))
+                found.append([[pair[1], content_of(reader.read(*pair))] for pair in pairs])
+        return found
+
+    items = work.items("poses", list(unit_of), inputs)
     with shared_index(measured, scratch) as indices:
         jobs = []
-        for unit in units:
+        for name, unit in unit_of.items():
+            if name in items.done:
+                continue
             own = tuple(candidates.get(image, ()) for image, _ in unit)
             together = tuple(interleave(own))
             jobs.append(
@@ -294,8 +317,40 @@ def localize_from_matches(
                     ranker=ranker,
                 )
             )
-        for results in work.map(_localize, jobs, "localizing"):
+        kept = dict(items.done)
+        fresh = iter(work.map(_localize, jobs, items.label("localizing")))
+        for name in unit_of:
+            if name in kept:
+                yield from ((image, result_of(found)) for image, found in kept[name])
+                continue
+            results = next(fresh)
+            items.add(name, (), [[image, plain_result(found)] for image, found in results])
             yield from results
+        for _ in fresh:  # lets a progress bar see its end
+            pass
+
+
+def _map_inputs(mapping: KaptureFolder, digest: Digest) -> list[list[str]]:
+    """What every query reads of the map: points, observations, cameras, poses."""
+    root = mapping.root
+    files = [*(root / "reconstruction").rglob("*"), *(root / "sensors").glob("*.txt")]
+    return [[str(f.relative_to(root)), digest(f)] for f in sorted(files) if f.is_file()]
+
+
+def _files_of(folder: KaptureFolder) -> Callable[[str, Digest], list[str | None]]:
+    """What a ranker may look at: an image's file, its mask and its depth."""
+    names, records = set(folder.read().image_names()), depth_records(folder.read())
+
+    @cache
+    def of_image(image: str, digest: Digest) -> list[str | None]:
+        if image not in names:
+            return []
+        files = [folder.image_path(image), mask_path(folder, image)]
+        if image in records:
+            files.append(folder.depth_path(records[image].path))
+        return [digest(file) if file.is_file() else None for file in files]
+
+    return of_image
 
 
 def type_in_map(map_folder: KaptureFolder, local_type: str) -> str:
