@@ -7,11 +7,11 @@ leave them no view in common are not tried.
 
 from __future__ import annotations
 
-import tempfile
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,13 +21,14 @@ from numpy.typing import DTypeLike, NDArray
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.image_variants import ImageVariant
 from megloc_kapture.io.csv_table import write_csv_table
-from megloc_kapture.io.files import output_error
+from megloc_kapture.io.files import remove, write_bytes
 from megloc_kapture.io.kapture import (
     FeatureReader,
     ImagePair,
     KaptureFolder,
     MatchesWriter,
 )
+from megloc_kapture.io.paths import safe_join
 from megloc_kapture.mapping.pairs import views_can_overlap
 from megloc_kapture.matching.guided_pyramid import (
     GuidedPyramidOptions,
@@ -50,6 +51,7 @@ from megloc_kapture.stages.guided_pyramid import (
     described,
     match_image_again,
 )
+from megloc_kapture.stages.kept_items import Digest, feature_inputs
 from megloc_kapture.stages.layout import (
     FEATURES,
     LOCAL_FEATURES,
@@ -57,7 +59,7 @@ from megloc_kapture.stages.layout import (
     MAPPING_PAIRS,
     MAPPING_PYRAMID,
 )
-from megloc_kapture.stages.local_features import read_frame
+from megloc_kapture.stages.local_features import image_inputs, read_frame
 from megloc_kapture.stages.matches import (
     MATCHING_OPTIONS,
     Features,
@@ -131,17 +133,35 @@ def pyramid_mapping(
         _Job(spec, local_type, method, mask_margin_px, image, *map(tuple, others[image]))
         for image in sorted(others)
     ]
+
+    @cache
+    def side(image: str, digest: Digest) -> list[object]:
+        readers = keypoints, mapping.descriptors(local_type)
+        pose = mapping.read().cam_from_world(image)
+        known = [astuple(data.camera_of(image)), pose and astuple(pose)]
+        return [known, *(feature_inputs(reader, image, digest) for reader in readers)]
+
+    def inputs(image: str, digest: Digest) -> object:
+        beside = [[other, side(other, digest)] for names in others[image] for other in names]
+        frame = [mask_margin_px, image_inputs(mapping, image, digest)]
+        return [frame, side(image, digest), len(others[image][0]), beside]
+
     features = PyramidFeatures(output, mapping, local_type)
     keypoints = mapping.keypoints(local_type)
     added: dict[str, _Added] = defaultdict(_Added)
     tried, hard_pairs = RetriedPairs(), set(hard)
-    with (
-        MatchSpool(output, keypoints, mapping.descriptors(local_type)) as spool,
-        closing(MatchesWriter(output, pyramid_type(local_type), orphan=True)) as writer,
-    ):
+    spool = MatchSpool(output / ".variants", keypoints, mapping.descriptors(local_type))
+    items = work.items(f"variants of {local_type}", [job.image for job in jobs], inputs)
+    todo = [job for job in jobs if job.image not in items.done]
+    results = work.map(_match_again, todo, items.label("guided pyramid"))
+    for job, matched in zip(todo, results, strict=True):
+        file, found = spool.write(job.image, matched.found)
+        told = [found, matched.num_variants, described(matched.skipped), matched.seconds]
+        items.add(job.image, [file], told)
+    with closing(MatchesWriter(output, pyramid_type(local_type), orphan=True)) as writer:
         again = _AllMatched()
-        for job, found in zip(jobs, work.map(_match_again, jobs, "guided pyramid"), strict=True):
-            again.put(job, found, spool)
+        for job in jobs:
+            again.put(job, *items.done[job.image])
         tried.seconds = again.seconds
         for pair in named:
             matches, scores = stored.read(*pair)
@@ -154,6 +174,7 @@ def pyramid_mapping(
             if own.px is not None:
                 features.write(image, own.px, spool.descriptors(own.descriptors_at))
         features.write_rest()
+    remove(spool.folder)  # a run that is stopped leaves it to the next
     write_csv_table(table_path(output, local_type), COLUMNS, tried.rows)
     return {
         "images_extracted_again": len(jobs),
@@ -212,7 +233,7 @@ class _Added:
     """What was added to an image: keypoints (A, C), and where their descriptors are spooled."""
 
     px: NDArray[np.float32] | None = None
-    descriptors_at: list[int] = field(default_factory=list)
+    descriptors_at: list[tuple[str, int]] = field(default_factory=list)
 
 
 @dataclass(eq=False)
@@ -224,13 +245,22 @@ class _AllMatched:
     skipped: dict[str, str] = field(default_factory=dict)
     seconds: float = 0.0
 
-    def put(self, job: _Job, matched: MatchedVariants, spool: MatchSpool) -> None:
-        """Keep what the variants of one image came to."""
-        self.seconds += matched.seconds
-        self.skipped[job.image] = described(matched.skipped)
+    def put(
+        self,
+        job: _Job,
+        found: Sequence[Sequence[Sequence[Any]]],
+        num_variants: Sequence[int],
+        skipped: str,
+        seconds: float,
+    ) -> None:
+        """Keep what the variants of one image came to; ``found`` as :meth:`MatchSpool.write`."""
+        self.seconds += seconds
+        self.skipped[job.image] = skipped
         others = (*job.others, *job.only_scaled)
-        for other, found, count in zip(others, matched.found, matched.num_variants, strict=True):
-            self.found[job.image, other] = [spool.put(matches) for matches in found]
+        for other, places, count in zip(others, found, num_variants, strict=True):
+            self.found[job.image, other] = [
+                Spooled(ImageVariant(*variant), *rest) for variant, *rest in places
+            ]
             self.num_variants[job.image, other] = count
 
     def of_pair(self, pair: _Pair) -> list[tuple[str, Spooled]]:
@@ -254,14 +284,16 @@ class _AllMatched:
         if options.mode == "off":
             raise ValueError("only pairs that are tried again are combined")
         places = self.of_pair(pair)
-        tried = [TriedVariant(0 if image == pair[0] else 1, spool.get(at)) for image, at in places]
+        tried = [
+            TriedVariant(0 if image == pair[0] else 1, spool.get(image, at)) for image, at in places
+        ]
         first, second = (KeypointUnion(keypoints.read(one), added[one].px) for one in pair)
         combined = combine(base, tried, options.mode, (first, second))
         for image, union, new in zip(pair, (first, second), combined.added, strict=True):
             if len(new):
                 added[image].px = union.added()
                 added[image].descriptors_at += [
-                    places[number][1].descriptor_at(match, spool.row_bytes)
+                    (places[number][0], places[number][1].descriptor_at(match, spool.row_bytes))
                     for number, match in new.tolist()
                 ]
         return combined
@@ -300,67 +332,68 @@ class Spooled:
 class MatchSpool:
     """Variants' matches on disk until all are there: a large map's are too many for memory.
 
-    A file without a name below ``folder``, gone when it is closed. Use as a context manager.
+    A file per image below ``folder``.
     """
 
     def __init__(self, folder: Path, keypoints: FeatureReader, descriptors: FeatureReader) -> None:
+        self.folder = folder
         self._columns = keypoints.config.dsize
         self._values = descriptors.config.dsize
         self._descriptor_type = descriptors.config.dtype
         self.row_bytes = descriptors.config.row_bytes
-        self._folder = folder
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - closed by __exit__
-        except OSError as error:
-            raise output_error(folder, error) from error
-        self._end = 0
 
-    def __enter__(self) -> MatchSpool:
-        return self
+    def write(
+        self, image: str, found: Sequence[Sequence[VariantMatches]]
+    ) -> tuple[Path, list[list[Any]]]:
+        """Keep the matches of an image's variants with each of the others.
 
-    def __exit__(self, *_: object) -> None:
-        self._file.close()
+        Returns
+        -------
+        The file, and for ``found`` the fields of :class:`Spooled`, as plain values.
 
-    def put(self, matches: VariantMatches) -> Spooled:
-        """Keep the matches of a variant; raises OutputError where the disk is full."""
-        parts = (
-            np.ascontiguousarray(matches.keypoints_px, np.float32),
-            np.ascontiguousarray(matches.other_rows, np.int64),
-            np.ascontiguousarray(matches.scores, np.float32),
-            np.ascontiguousarray(matches.descriptors, self._descriptor_type),
-        )
-        places = []
-        for part in parts:
-            places.append(self._end)
-            try:
-                self._end += self._file.write(part.tobytes())
-            except OSError as error:
-                raise output_error(self._folder, error) from error
-        return Spooled(matches.variant, len(matches), *places)
+        Raises
+        ------
+        OutputError : the disk is full.
+        """
+        path, content = safe_join(self.folder, f"{image}.variants"), bytearray()
+        told: list[list[Any]] = []
+        for of_other in found:
+            told.append([])
+            for matches in of_other:
+                places = []
+                for part, kind in (
+                    (matches.keypoints_px, np.float32),
+                    (matches.other_rows, np.int64),
+                    (matches.scores, np.float32),
+                    (matches.descriptors, self._descriptor_type),
+                ):
+                    places.append(len(content))
+                    content += np.ascontiguousarray(part, kind).tobytes()
+                told[-1].append([astuple(matches.variant), len(matches), *places])
+        write_bytes(path, bytes(content))
+        return path, told
 
-    def get(self, place: Spooled) -> VariantMatches:
+    def get(self, image: str, place: Spooled) -> VariantMatches:
         """The matches that were put there, without their descriptors."""
         return VariantMatches(
             place.variant,
-            self._read(place.keypoints_at, (place.count, self._columns), np.float32),
+            self._read(image, place.keypoints_at, (place.count, self._columns), np.float32),
             np.zeros((place.count, 0), self._descriptor_type),
-            self._read(place.rows_at, (place.count,), np.int64),
-            self._read(place.scores_at, (place.count,), np.float32),
+            self._read(image, place.rows_at, (place.count,), np.int64),
+            self._read(image, place.scores_at, (place.count,), np.float32),
         )
 
-    def descriptors(self, places: list[int]) -> NDArray[Any]:
-        """Descriptors (N, D) by where they begin."""
+    def descriptors(self, places: list[tuple[str, int]]) -> NDArray[Any]:
+        """Descriptors (N, D) by the image whose variant they are of, and where they begin."""
         found = np.empty((len(places), self._values), self._descriptor_type)
-        for row, at in enumerate(places):
-            found[row] = self._read(at, (self._values,), self._descriptor_type)
+        for row, (image, at) in enumerate(places):
+            found[row] = self._read(image, at, (self._values,), self._descriptor_type)
         return found
 
-    def _read(self, at: int, shape: tuple[int, ...], kind: DTypeLike) -> NDArray[Any]:
-        self._file.seek(at)
-        dtype = np.dtype(kind)
-        content = self._file.read(int(np.prod(shape)) * dtype.itemsize)
-        return np.frombuffer(content, dtype).reshape(shape)
+    def _read(self, image: str, at: int, shape: tuple[int, ...], kind: DTypeLike) -> NDArray[Any]:
+        path = safe_join(self.folder, f"{image}.variants")
+        count = int(np.prod(shape))
+        return np.fromfile(path, np.dtype(kind), count=count, offset=at).reshape(shape)
 
 
 class PyramidMapping(PipelineStage):

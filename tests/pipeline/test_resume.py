@@ -71,7 +71,17 @@ thumbnail = patches.plugins:Thumbnail
 [megloc_kapture.matchers]
 nearest = patches.plugins:Nearest
 """
-OPTIONS = ["local_features=corners", "global_features=thumbnail", "matching=nearest"]
+OPTIONS = ("local_features=corners", "global_features=thumbnail", "matching=nearest")
+EVERY_STAGE = (
+    *("local_features=corners", "matching=nearest", "global_features.vlad.options.num_clusters=8"),
+    *("preprocessing.max_size_px=320",),
+    *(
+        "guided_pyramid.mode=all",
+        "guided_pyramid.min_matches=1000",
+        "guided_pyramid.rotations_deg=[0]",
+    ),
+    "localization.min_confidence=0",
+)
 
 
 @pytest.fixture
@@ -109,6 +119,8 @@ class Runs:
 
     scene: Path
     root: Path
+    options: tuple[str, ...] = OPTIONS
+    last: str = "query_matches"
     told: dict[str, tuple[int, str]] = field(default_factory=dict)
     """Items that were done and their label, by the stage's first word."""
 
@@ -130,9 +142,9 @@ class Runs:
                 yield item
 
         workspace = Workspace(self.root)
-        options = options_of_preset(assignments=OPTIONS)
+        options = options_of_preset(assignments=self.options)
         run = Run(choose_dataset("kapture", self.scene), "classic", options, workspace)
-        how = {"last": "query_matches", **how}
+        how = {"last": self.last, **how}
         with workspace.lock():
             reports = run_plan(plan_evaluation(run), workspace, Work(executor, track), **how)
         assert list(workspace.path(".partial").iterdir()) == []
@@ -153,7 +165,7 @@ def contents(root: Path) -> dict[str, bytes]:
     """All that stages wrote, by path."""
     files = (path for path in sorted(root.rglob("*")) if path.is_file() and not path.is_symlink())
     named = {path.relative_to(root).as_posix(): path for path in files}
-    hidden = ("stages/", "megloc/", ".")
+    hidden = ("stages/", "megloc/", "timing.csv", ".")
     return {name: path.read_bytes() for name, path in named.items() if not name.startswith(hidden)}
 
 
@@ -170,7 +182,7 @@ def undisturbed(runs: Runs, tmp_path: Path) -> Callable[[], dict[str, bytes]]:
     def fresh() -> dict[str, bytes]:
         root = tmp_path / "undisturbed"
         shutil.rmtree(root, ignore_errors=True)
-        Runs(runs.scene, root).run()
+        Runs(runs.scene, root, runs.options, runs.last).run()
         return contents(root)
 
     return fresh
@@ -249,6 +261,53 @@ def test_a_pose_that_verifies_matches_counts(runs: Runs) -> None:
     reports = runs.run(last="mapping_matches")
     assert reports["local_features"].kept_items == "11 of 11 kept"
     assert reports["mapping_matches"].kept_items == "15 of 21 kept"
+
+
+@pytest.fixture
+def whole(runs: Runs) -> Runs:
+    """Runs of all stages up to the poses."""
+    runs.options, runs.last = EVERY_STAGE, "localization"
+    return runs
+
+
+def test_images_vectors_pyramids_and_poses_go_on_inside_their_stages(
+    whole: Runs, undisturbed: Callable[[], dict[str, bytes]]
+) -> None:
+    whole.stopped("pre-processing", 3)
+    whole.stopped("VLAD", 4)
+    assert whole.told["pre-processing"][1] == "pre-processing"  # that of the queries
+    whole.stopped("guided", 3)
+    assert whole.told["VLAD"] == (7, "VLAD, 4 of 11 kept")
+    whole.run(last="query_matches")
+    assert whole.told["guided"] == (4, "guided pyramid, 3 of 7 kept")
+    whole.stopped("guided", 2)
+    whole.stopped("localizing", 1)
+    assert whole.told["guided"] == (2, "guided pyramid, 2 of 4 kept")
+    reports = whole.run()
+    assert whole.told["localizing"] == (3, "localizing, 1 of 4 kept")
+    assert reports["localization"].kept_items == "1 of 4 kept"
+    assert whole.output() == undisturbed()
+
+
+def test_one_changed_query_is_localized_anew_and_no_other(
+    whole: Runs, undisturbed: Callable[[], dict[str, bytes]]
+) -> None:
+    whole.run()
+    name = sorted((whole.scene / "query/sensors/records_data").iterdir())[1].name
+    paint(whole.scene, f"query/sensors/records_data/{name}")
+    reports = whole.run()
+    kept = {name: report.kept_items for name, report in reports.items() if report.kept_items}
+    assert kept == {
+        "preprocess": "10 of 11 kept",
+        "local_features": "10 of 11 kept",
+        "global_features": "11 of 12 kept",  # the vocabulary is one
+        "mapping_matches": "21 of 21 kept",
+        "query_matches": "21 of 28 kept",
+        "query_pyramid": "3 of 4 kept",
+        "localization": "3 of 4 kept",
+    }
+    assert whole.told["localizing"] == (1, "localizing, 3 of 4 kept")
+    assert whole.output() == undisturbed()
 
 
 def test_a_new_mask_and_another_camera_count(runs: Runs) -> None:

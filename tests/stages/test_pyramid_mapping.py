@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from megloc_kapture.io.kapture import (
 )
 from megloc_kapture.io.kapture.features import FeatureReader, feature_folder
 from megloc_kapture.matching.guided_pyramid import VariantMatches
-from megloc_kapture.stages.pyramid_mapping import MatchSpool
+from megloc_kapture.stages.pyramid_mapping import MatchSpool, Spooled
 from megloc_kapture.stages.pyramid_queries import PyramidFeatures
 from megloc_kapture.values import Camera
 
@@ -71,21 +72,23 @@ def test_what_is_spooled_comes_back(tmp_path: Path) -> None:
         )
         for count in (3, 0, 5)
     ]
-    with MatchSpool(tmp_path / "new", *readers(toy(tmp_path / "toy"))) as spool:
-        places = [spool.put(matches) for matches in many]
-        for matches, place in reversed(list(zip(many, places, strict=True))):
-            found = spool.get(place)
-            assert found.variant == matches.variant and len(found) == len(matches)
-            np.testing.assert_array_equal(found.keypoints_px, matches.keypoints_px)
-            np.testing.assert_array_equal(found.other_rows, matches.other_rows)
-            np.testing.assert_array_equal(found.scores, matches.scores)
-        asked = [(2, 4), (0, 1), (2, 0)]
-        found = spool.descriptors(
-            [places[number].descriptor_at(match, spool.row_bytes) for number, match in asked]
-        )
-        expected = [many[number].descriptors[match] for number, match in asked]
-        np.testing.assert_array_equal(found, expected)
-    assert list((tmp_path / "new").iterdir()) == []  # nothing of it stays
+    spool = MatchSpool(tmp_path / "new", *readers(toy(tmp_path / "toy")))
+    file, told = spool.write("a/1.png", [many[:1], [], many[1:]])
+    assert file.is_relative_to(tmp_path / "new") and [len(one) for one in told] == [1, 0, 2]
+    # as a journal keeps them
+    plain = [place for one in json.loads(json.dumps(told)) for place in one]
+    places = [Spooled(ImageVariant(*variant), *rest) for variant, *rest in plain]
+    for matches, place in reversed(list(zip(many, places, strict=True))):
+        found = spool.get("a/1.png", place)
+        assert found.variant == matches.variant and len(found) == len(matches)
+        np.testing.assert_array_equal(found.keypoints_px, matches.keypoints_px)
+        np.testing.assert_array_equal(found.other_rows, matches.other_rows)
+        np.testing.assert_array_equal(found.scores, matches.scores)
+    asked = [(2, 4), (0, 1), (2, 0)]
+    at = [places[number].descriptor_at(match, spool.row_bytes) for number, match in asked]
+    found = spool.descriptors([("a/1.png", one) for one in at])
+    expected = [many[number].descriptors[match] for number, match in asked]
+    np.testing.assert_array_equal(found, expected)
 
 
 @pytest.mark.parametrize("tar", [False, True])
@@ -117,7 +120,7 @@ def test_what_was_added_comes_behind_and_the_source_stays_as_it_is(tmp_path: Pat
 def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="file"):
-        MatchSpool(tmp_path / "file", *readers(toy(tmp_path / "toy")))
+        MatchSpool(tmp_path / "file", *readers(toy(tmp_path / "toy"))).write("a.png", [])
 
 
 def test_an_image_with_fewer_descriptors_than_keypoints_is_named(tmp_path: Path) -> None:
