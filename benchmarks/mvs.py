@@ -34,7 +34,7 @@ import megloc_kapture as megloc
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.geometry.warping import WarpSource, warp_to_view
 from megloc_kapture.io.files import link_records
-from megloc_kapture.io.images import read_depth_map, read_image_rgb
+from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
 from megloc_kapture.io.tables import read_depth_rows
 from megloc_kapture.mvs.consistency import AgreementOptions, confirmed
@@ -49,6 +49,7 @@ from megloc_kapture.plugins import (
     load_plugin,
 )
 from megloc_kapture.stages.densifying import DensifyOptions, densify_map, read_beside
+from megloc_kapture.stages.fusion import read_stereo_depth
 from megloc_kapture.stages.rigs import depth_records
 from megloc_kapture.values import Camera, RigidTransform
 
@@ -170,7 +171,7 @@ def track_errors(
         own = xyz[[p for p in seen.get(row.image, ()) if viewers[p] - used]]
         if row.image not in records or not len(own):
             continue
-        camera, depth = _depth_of(densified, row.image)
+        camera, depth = depth_of(densified, row.image)
         sigma = read_beside(densified.root, row.image, "sigma")
         assert sigma is not None
         z = poses[row.image].apply(own)[:, 2]
@@ -205,11 +206,10 @@ def _at(
     return np.where(known, found, np.nan), np.where(known, sigma[row, column], np.nan)
 
 
-def _depth_of(folder: KaptureFolder, image: str) -> tuple[Camera, NDArray[np.float32]]:
+def depth_of(folder: KaptureFolder, image: str) -> tuple[Camera, NDArray[np.float32]]:
+    """The camera and the depth (H, W) of an image."""
     record = depth_records(folder.read())[image]
-    camera = record.camera
-    path = folder.depth_path(record.path)
-    return camera, read_depth_map(path, width=camera.width, height=camera.height)
+    return record.camera, read_stereo_depth(folder, record)
 
 
 def rephotography(densified: KaptureFolder, scene: Path) -> tuple[float, float]:
@@ -219,7 +219,7 @@ def rephotography(densified: KaptureFolder, scene: Path) -> tuple[float, float]:
     images = sorted(depth_records(data))
     sources = {}
     for image in images:
-        camera, depth = _depth_of(densified, image)
+        camera, depth = depth_of(densified, image)
         pixels = read_image_rgb(densified.image_path(image))
         view = stereo_view(pixels, data.camera_of(image), poses[image], None, _SIZE)
         sources[image] = WarpSource(view.image, camera, poses[image], depth, camera)
@@ -258,7 +258,7 @@ def _zncc(
 def photographs(scene: Path, out: Path, estimator: DepthEstimator, name: str) -> dict[str, float]:
     """Strecha's scenes."""
     xyz, seen = tracks(scene, out)
-    densified, row = _densified(scene / "mapping", out, estimator, name)
+    densified, row = densified_map(scene / "mapping", out, estimator, name)
     errors, claimed = track_errors(densified, xyz, seen)
     known = np.isfinite(errors)
     errors, claimed = np.abs(errors), claimed
@@ -277,10 +277,10 @@ def photographs(scene: Path, out: Path, estimator: DepthEstimator, name: str) ->
 
 def sensor_depth(scene: Path, out: Path, estimator: DepthEstimator, name: str) -> dict[str, float]:
     """A scene whose depth_png/ has the sensor's depth of each image."""
-    densified, row = _densified(scene / "mapping", out, estimator, name)
+    densified, row = densified_map(scene / "mapping", out, estimator, name)
     both, within, below, ratios = [], [], [], []
     for image in sorted(depth_records(densified.read())):
-        _, depth = _depth_of(densified, image)
+        _, depth = depth_of(densified, image)
         png = scene / "depth_png" / Path(image).with_suffix(".png")
         stored = np.asarray(cv2.imread(str(png), cv2.IMREAD_UNCHANGED), np.float64) / 1000
         truth = cv2.resize(stored, depth.shape[::-1], interpolation=cv2.INTER_NEAREST)
@@ -343,9 +343,10 @@ def motorcycle(estimator: DepthEstimator) -> dict[str, float]:
     }
 
 
-def _densified(
+def densified_map(
     mapping: Path, out: Path, estimator: DepthEstimator, name: str
 ) -> tuple[KaptureFolder, dict[str, float]]:
+    """A map of the images with depth, below ``out``, and the first figures of its row."""
     megloc.build_map(mapping, workspace=out / "map")
     target = out / name
     shutil.rmtree(target, ignore_errors=True)
