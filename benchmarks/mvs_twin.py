@@ -65,7 +65,8 @@ def measure(world: Path, out: Path, name: str) -> str:
         camera, depth = depth_of(densified, image)
         record, pose = records[image], data.poses()[image]
         stored = read_stereo_depth(exact, record)
-        truth = cv2.resize(stored, depth.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        nearest = cv2.resize(stored, depth.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        truth = np.asarray(nearest, np.float32)
         grey = cv2.cvtColor(read_image_rgb(exact.image_path(image)), cv2.COLOR_RGB2GRAY)
         small = cv2.resize(grey, depth.shape[::-1], interpolation=cv2.INTER_AREA)
         grid = np.stack(np.meshgrid(*map(np.arange, depth.shape[::-1])), axis=-1) + 0.5
@@ -79,7 +80,9 @@ def measure(world: Path, out: Path, name: str) -> str:
         for number, rows in enumerate(parts):
             mine = of == number
             rows.append(np.stack([depth[mine], truth[mine], sigma[mine]]).astype(np.float64))
-    lines = [("class", "share", "filled", "within 1 %", "within 3 %", "median", "below 1 sigma")]
+    lines: list[tuple[str, ...]] = [
+        ("class", "share", "filled", "within 1 %", "within 3 %", "median", "below 1 sigma")
+    ]
     for label, rows in zip(CLASSES, parts, strict=True):
         depth_m, truth_m, sigma_m = np.concatenate(rows, axis=1)
         known = depth_m > 0

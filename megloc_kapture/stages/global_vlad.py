@@ -7,7 +7,6 @@ that come later get theirs from the same.
 from __future__ import annotations
 
 import hashlib
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -20,9 +19,10 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError
 from megloc_kapture.features.pca_whitening import PcaWhitening
 from megloc_kapture.features.vlad import VladOptions, Vocabulary, aggregate, train_vlad
-from megloc_kapture.io.files import read_json_model, write_bytes, write_json_model
+from megloc_kapture.io.files import read_json_model, write_json_model
 from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
 from megloc_kapture.stages.kept_items import feature_inputs
+from megloc_kapture.stages.shared_index import write_array
 from megloc_kapture.stages.work import HERE, FolderSpec, Work, ordered_map
 from megloc_kapture.values import Options
 
@@ -162,10 +162,10 @@ def write_vocabulary(
 
     ``vocabulary.npy`` and ``vlad.json``, and with whitening its mean and projection.
     """
-    _write_array(folder / VOCABULARY_FILE, vocabulary.centres)
+    write_array(folder / VOCABULARY_FILE, vocabulary.centres)
     if vocabulary.whitening is not None:
-        _write_array(folder / MEAN_FILE, vocabulary.whitening.mean)
-        _write_array(folder / PROJECTION_FILE, vocabulary.whitening.projection)
+        write_array(folder / MEAN_FILE, vocabulary.whitening.mean)
+        write_array(folder / PROJECTION_FILE, vocabulary.whitening.projection)
     write_json_model(folder / SETTINGS_FILE, VladSettings(local_type=local_type, options=options))
     whitening = () if vocabulary.whitening is None else (MEAN_FILE, PROJECTION_FILE)
     return [folder / name for name in (VOCABULARY_FILE, *whitening, SETTINGS_FILE)]
@@ -198,12 +198,6 @@ def read_vocabulary(folder: Path) -> tuple[Vocabulary, VladSettings] | None:
             path=folder / PROJECTION_FILE,
         )
     return Vocabulary(centres, PcaWhitening(mean, projection)), settings
-
-
-def _write_array(path: Path, array: NDArray[np.float32]) -> None:
-    buffer = io.BytesIO()
-    np.save(buffer, array, allow_pickle=False)
-    write_bytes(path, buffer.getvalue())
 
 
 def _read_array(path: Path, what: str) -> NDArray[np.float32]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +21,7 @@ from megloc_kapture.values import Camera, RigidTransform
 # images that are put in, of map and queries each: about 20 kB
 MAX_IMAGES = 200
 _WIDTH = 480
+_Image = tuple[KaptureFolder | None, str] | None
 _GREY, _WHITE = "#8fa6bf", "#ffffff"
 
 
@@ -55,26 +55,23 @@ def write_recording(path: Path, scene: Scene, context: ResultContext) -> None:
         raise OutputError(f"{path}: cannot be written: {error}") from error
     x, y, z = scene.origin.tolist()
     log(["origin"], rr.TextDocument(f"coordinates are relative to {x!r} {y!r} {z!r}"))
-    for name, rows in (("points", slice(0, _own(scene))), ("depth", slice(_own(scene), None))):
+    own = len(scene.points) - scene.num_dense
+    for name, rows in (("points", slice(0, own)), ("depth", slice(own, None))):
         if len(scene.points[rows]):
             log(["map", name], rr.Points3D(scene.points[rows], colors=scene.colors[rows]))
     size = 0.04 * scene.radius
 
     def camera(
-        where: list[str],
-        pose: RigidTransform,
-        of: Camera | None,
-        color: str,
-        image: Callable[[], Path] | None,
+        where: list[str], pose: RigidTransform, of: Camera | None, color: str, image: _Image
     ) -> None:
-        world_from_cam = pose.rotation_matrix().T
         center = pose.center() - scene.origin
-        log(where, rr.Transform3D(translation=center, mat3x3=world_from_cam))
+        log(where, rr.Transform3D(translation=center, mat3x3=pose.rotation_matrix().T))
         of = of or Camera.pinhole(4, 3, 4)  # as in the view where it is not known
         scale, pixels = 1.0, None
         with contextlib.suppress(DataError):  # a frustum without its image is better than none
-            if image is not None:
-                pixels, scale = shrunk(read_image_rgb(image()), width=_WIDTH, height=_WIDTH)
+            if image is not None and image[0] is not None:
+                read = read_image_rgb(image[0].image_path(image[1]))
+                pixels, scale = shrunk(read, width=_WIDTH, height=_WIDTH)
         log(
             where,
             rr.Pinhole(
@@ -91,9 +88,9 @@ def write_recording(path: Path, scene: Scene, context: ResultContext) -> None:
     poses = context.map_poses()
     with_image = {scene.cameras[at] for at in spread(len(scene.cameras), MAX_IMAGES)}
     for name in scene.cameras:
-        path_of = _path(context.mapping, name) if name in with_image else None
+        image = (context.mapping, name) if name in with_image else None
         of = _camera(context.mapping, name)
-        camera(["map", "cameras", name], poses[name], of, _GREY, path_of)
+        camera(["map", "cameras", name], poses[name], of, _GREY, image)
     first = 0
     for row, (query, number) in enumerate(zip(scene.queries, scene.num_inliers, strict=True)):
         where = ["queries", query.name]
@@ -102,8 +99,8 @@ def write_recording(path: Path, scene: Scene, context: ResultContext) -> None:
         if query.truth is not None:
             camera([*where, "truth"], query.truth, of, _WHITE, None)
         if query.estimated is not None:
-            path_of = _path(context.queries, query.image) if row < MAX_IMAGES else None
-            camera([*where, "estimate"], query.estimated, of, query.color, path_of)
+            image = (context.queries, query.image) if row < MAX_IMAGES else None
+            camera([*where, "estimate"], query.estimated, of, query.color, image)
             ends = scene.inliers[first : first + number]
             starts = np.broadcast_to(scene.frusta[row, 0], ends.shape)
             color = int(f"{query.color[1:]}40", 16)
@@ -114,15 +111,7 @@ def write_recording(path: Path, scene: Scene, context: ResultContext) -> None:
     stream.disconnect()
 
 
-def _own(scene: Scene) -> int:
-    return len(scene.points) - scene.num_dense
-
-
 def _camera(folder: KaptureFolder | None, image: str) -> Camera | None:
     with contextlib.suppress(DataError):
         return None if folder is None else folder.read().camera_of(image)
     return None
-
-
-def _path(folder: KaptureFolder | None, image: str) -> Callable[[], Path] | None:
-    return None if folder is None else lambda: folder.image_path(image)
