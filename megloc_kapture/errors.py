@@ -67,6 +67,7 @@ _EXTRAS = {
     "kornia": "kornia",
     "onnx": "convert",
     "distributed": "cluster",
+    "faiss": "faiss",
     "h5py": "megadepth",
     "rerun": "rerun",
     **dict.fromkeys(

@@ -1,6 +1,6 @@
 """Retrieval from kapture's files: ours, the bare matrix product and kapture-localization's tool.
 
-    .venv/bin/python benchmarks/speed/retrieval.py [--million]
+    .venv/bin/python benchmarks/speed/retrieval.py [--million] [--short-list 200000 [...]]
 
 The top 50 of 1,000 queries in 10,000 images of 4096 dimensions, from the vectors in the page cache:
 in one tar, and as one file per image. The product has its vectors in memory and knows no order; it
@@ -8,7 +8,9 @@ is what no search can do without. All run in turn in this process, several times
 threads. Two lengths are measured of ours and of kapture-localization: the search alone, from the
 opening of the vectors to the ranking, and the whole tool, from the kapture folders to the pairs
 file. The pairs of all are compared. ``--million`` searches a million vectors that are made block by
-block, in a process of its own, and prints the memory that took.
+block, in a process of its own, and prints the memory that took. ``--short-list`` searches so many
+vectors of a mixture, kept in a file, exactly and by product quantisation with short lists, and
+prints the share of the exact ``top-k`` that is found: nothing else is measured then.
 """
 
 from __future__ import annotations
@@ -47,7 +49,9 @@ from megloc_kapture.io.kapture import (
     write_sensors,
 )
 from megloc_kapture.io.kapture.vectors import KaptureVectors
+from megloc_kapture.retrieval.fusion import FusionOptions
 from megloc_kapture.retrieval.search import rank_by_similarity
+from megloc_kapture.retrieval.short_list import QuantizedRows, rank_short_lists
 from megloc_kapture.values import Camera, RigidTransform
 
 TYPE = "generated"
@@ -302,6 +306,63 @@ def million(options: argparse.Namespace) -> None:
     print(json.dumps({"seconds": spent, "gib": memory, "found": found}))
 
 
+# -------------------------------------------------------------------------------- short lists
+
+PER_CENTRE = 200  # rows of a mixture's component
+LENGTHS = (100, 300, 1000)
+
+
+def mixture(path: Path, count: int, queries: int, dimension: int) -> tuple[Vectors, Vectors]:
+    """Unit rows (count, dimension) in a file, and queries, around the same centres."""
+    centres = random_vectors([3], max(1, count // PER_CENTRE), dimension)
+    random = np.random.default_rng(4)
+
+    def drawn(number: int, seed: int) -> Vectors:
+        noise = random_vectors([5, seed], number, dimension)
+        # cosine 0.5 to 0.8 to the centre: components overlap, as views of neighbouring places do
+        share = random.uniform(0.5, 0.8, (number, 1)).astype(np.float32)
+        near = centres[random.integers(0, len(centres), number)]
+        return (share * near + np.sqrt(1 - share**2) * noise).astype(np.float32)
+
+    rows = np.memmap(path, np.float32, "w+", shape=(count, dimension))
+    for start in range(0, count, 10_000):
+        stop = min(start + 10_000, count)
+        found = drawn(stop - start, start)
+        rows[start:stop] = found / np.linalg.norm(found, axis=1, keepdims=True)
+    return rows, drawn(queries, count)
+
+
+def short_lists(count: int, options: argparse.Namespace) -> bool:
+    """Print recall of the exact ranking, processor seconds and memory; whether 0.99 is reached."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "rows"
+        rows, queries = mixture(path, count, options.queries, options.dimension)
+        start = time.process_time()
+        exact, _ = rank_by_similarity(queries, rows, options.top_k)
+        table_rows = [("", "cpu ms/query", "recall", "bytes/row")]
+        spent = time.process_time() - start
+        per_query = 1000 / len(queries)
+        table_rows.append(("exact", f"{per_query * spent:.1f}", "", f"{4 * options.dimension}"))
+        start = time.process_time()
+        codes = [QuantizedRows(rows)]
+        built = time.process_time() - start
+        for length in LENGTHS:
+            start = time.process_time()
+            found, _ = rank_short_lists(
+                [queries], [rows], codes, options.top_k, length, fusion=FusionOptions()
+            )
+            spent = time.process_time() - start
+            same = [len(set(a) & set(b)) for a, b in zip(exact, found, strict=True)]
+            recall = float(np.mean(same)) / options.top_k
+            name = f"short list of {length}"
+            size = f"{options.dimension // 32}"
+            table_rows.append((name, f"{per_query * spent:.1f}", f"{recall:.4f}", size))
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 << 20)
+    print(f"{count} x {options.dimension}, codes made in {built:.0f} s, {memory:.2f} GiB at most")
+    print(table(table_rows))
+    return recall >= 0.99
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--images", type=int, default=10_000)
@@ -312,11 +373,14 @@ def main() -> int:
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "megloc-bench")
     parser.add_argument("--million", action="store_true", help="search generated vectors as well")
     parser.add_argument("--million-images", type=int, default=MILLION)
+    parser.add_argument("--short-list", type=int, nargs="+", metavar="IMAGES", default=[])
     parser.add_argument("--only-million", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.only_million:
         million(options)
         return 0
+    if options.short_list:
+        return 0 if all([short_lists(count, options) for count in options.short_list]) else 1
     load = os.getloadavg()[0]
     print(
         f"{options.queries} queries in {options.images} images x {options.dimension}, "

@@ -79,6 +79,7 @@ class MapRetrieval:
         self._map, self._options, self._types = kapture_map, options, types
         self._preprocessor = preprocessor
         self._vectors: dict[str, NDArray[np.float32]] = {}
+        self._ranking: dict[tuple[str, ...], Candidates] = {}
         self._extractors: dict[str, GlobalFeatureExtractor] = {}
         self._vocabularies: dict[str, tuple[Vocabulary, VladSettings]] = {}
         self._lock = threading.RLock()
@@ -98,22 +99,26 @@ class MapRetrieval:
         PluginError, MissingWeightsError : an image network cannot be used.
         """
         compared = self._compared(image.query.global_features)
-        databases = [self._of_map(one) for one in compared]
         vectors = [self._of_query(one, image, features) for one in compared]
-        names, weights = zip(*((one.name, one.weight) for one in compared), strict=True)
         rows = [_unit(np.asarray(v, np.float32).reshape(1, -1)) for v in vectors]
         members = np.array(sorted({self._positions[name] for name in permitted}), np.int64)
-        candidates = Candidates(
-            lambda positions: [
-                # the whole map is by far the most frequent pool: no copy of it
-                database if len(positions) == len(database) else database[positions]
-                for database in databases
-            ],
-            [self._map.poses[name] for name in self._map.images],
-            Retrieval(names, weights, self._options.fusion),
-        )
-        index, _ = candidates.of(rows, members, self._options.query_pairs)
+        index, _ = self._candidates(compared).of(rows, members, self._options.query_pairs)
         return [self._map.images[i] for i in index[0] if i >= 0]
+
+    def _candidates(self, compared: Sequence[_Compared]) -> Candidates:
+        databases = [self._of_map(one) for one in compared]
+        names, weights = zip(*((one.name, one.weight) for one in compared), strict=True)
+        if names not in self._ranking:
+            self._ranking[names] = Candidates(
+                lambda positions: [
+                    # the whole map is by far the most frequent pool: no copy of it
+                    database if len(positions) == len(database) else database[positions]
+                    for database in databases
+                ],
+                [self._map.poses[name] for name in self._map.images],
+                Retrieval(names, weights, self._options.fusion),
+            )
+        return self._ranking[names]
 
     def is_at_hand(self, brought: Collection[str]) -> bool:
         """Whether queries that bring these global features are ranked by what is there.

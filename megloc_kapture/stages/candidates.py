@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,8 @@ from megloc_kapture.io.kapture import FeatureReader, KaptureFolder
 from megloc_kapture.io.kapture.vectors import KaptureVectors
 from megloc_kapture.retrieval.fusion import FusionOptions
 from megloc_kapture.retrieval.reranking import DiversityOptions, diversify
-from megloc_kapture.retrieval.search import rank_fused
+from megloc_kapture.retrieval.search import Found, rank_fused
+from megloc_kapture.retrieval.short_list import QuantizedRows, ShortListOptions, rank_short_lists
 from megloc_kapture.retrieval.vectors import VectorSource, as_blocks, common_length
 from megloc_kapture.values import Options, RigidTransform
 
@@ -33,6 +34,7 @@ class QueryPairsOptions(Options):
     diversity: DiversityOptions | None = Field(
         default=None, description="few views of one place; none: as similar as they are"
     )
+    short_list: ShortListOptions = ShortListOptions()
 
     def idle(self) -> dict[str, str]:
         if self.by == "retrieval":
@@ -59,25 +61,34 @@ class Retrieval:
         return [folder.global_features(name) for name in self.types]
 
     def rank(
-        self, queries: Sequence[VectorSource], database: Sequence[VectorSource], top_k: int
+        self,
+        queries: Sequence[VectorSource],
+        database: Sequence[VectorSource],
+        top_k: int,
+        *,
+        codes: Sequence[QuantizedRows] = (),
+        length: int = 0,
     ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """The most similar rows of the database: indices and scores (Q, at most ``top_k``).
 
         Parameters
         ----------
         queries, database : of each type, unit rows; neither is held in memory as a whole.
+        codes : of the database, of each type: only short lists by them, of this length, are
+            compared exactly; none: all rows are.
         """
+        how: dict[str, Any] = {"fusion": self.fusion, "weights": self.weights or None}
+
+        def ranked(rows: Sequence[NDArray[np.float32]]) -> Found:
+            if codes:
+                return rank_short_lists(rows, database, codes, top_k, length, **how)
+            return rank_fused(rows, database, top_k, **how)
+
         sources = [as_blocks(source) for source in queries]
         total, width = common_length(sources), sum(source.dimension for source in sources)
         step = max(1, _QUERY_ELEMENTS // max(width, 1))
         found = [
-            rank_fused(
-                [source.read(start, min(start + step, total)) for source in sources],
-                database,
-                top_k,
-                fusion=self.fusion,
-                weights=self.weights or None,
-            )
+            ranked([source.read(start, min(start + step, total)) for source in sources])
             for start in range(0, total, step) or (0,)
         ]
         indices, scores = zip(*found, strict=True)
@@ -117,6 +128,7 @@ class Candidates:
         retrieval: Retrieval,
     ) -> None:
         self._database, self._poses, self._retrieval = database, poses, retrieval
+        self._coded = (np.zeros(0, np.int64), list[QuantizedRows]())  # what was coded last
 
     def of(
         self,
@@ -133,10 +145,22 @@ class Candidates:
         """
         few = options.diversity is None
         wanted = options.top_k if few else options.top_k * _POOL
-        index, scores = self._retrieval.rank(queries, self._database(permitted), wanted)
+        database = self._database(permitted)
+        how = options.short_list
+        codes = self._codes(permitted, database) if len(permitted) > how.above else []
+        index, scores = self._retrieval.rank(
+            queries, database, wanted, codes=codes, length=how.length
+        )
         if options.diversity is not None:
             index, scores = self._spread(index, scores, permitted, options.top_k, options.diversity)
         return np.where(index >= 0, permitted[np.maximum(index, 0)], -1), scores
+
+    def _codes(
+        self, permitted: NDArray[np.int64], database: Sequence[VectorSource]
+    ) -> list[QuantizedRows]:
+        if not np.array_equal(self._coded[0], permitted):
+            self._coded = (permitted, [QuantizedRows(source) for source in database])
+        return self._coded[1]
 
     def _spread(
         self,

@@ -64,6 +64,7 @@ class Case:
 
 
 OF_MAPS = "nothing here uses it"
+TOO_FEW = "map images are too few for product quantisation"
 OF_FOLDERS = "are for folders of images"
 PYRAMID = ("guided_pyramid.mode=all", "guided_pyramid.min_matches=200")
 
@@ -134,6 +135,10 @@ CASES: dict[str, Case] = {
     ),
     "query_pairs.by": Case('"exhaustive"', "pairs/query.txt"),
     "query_pairs.top_k": Case("2", "pairs/query.txt"),
+    "query_pairs.short_list.above": Case("2", refused=TOO_FEW, localize=TOO_FEW),
+    "query_pairs.short_list.length": Case(
+        "2", context=("query_pairs.short_list.above=2",), refused=TOO_FEW, localize=TOO_FEW
+    ),
     "query_pairs.diversity.max_per_place": Case(
         "1",
         "pairs/query.txt",

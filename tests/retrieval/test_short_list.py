@@ -1,0 +1,83 @@
+"""Product quantisation with exact re-scoring, beside exact search."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from megloc_kapture.errors import OptionError
+from megloc_kapture.retrieval.fusion import FusionOptions
+from megloc_kapture.retrieval.search import rank_fused
+from megloc_kapture.retrieval.short_list import QuantizedRows, rank_short_lists
+from megloc_kapture.stages.candidates import Candidates, QueryPairsOptions, Retrieval
+from megloc_kapture.values import RigidTransform
+
+TOP = 10
+
+
+def unit(rows: NDArray[np.floating]) -> NDArray[np.float32]:
+    return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True), np.float32)
+
+
+def planted(seed: int, dimension: int = 64) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """20 queries, and 3,000 rows of which each query has 30 near itself."""
+    random = np.random.default_rng(seed)
+    queries = unit(random.normal(size=(20, dimension)))
+    rows = random.normal(size=(3000, dimension))
+    near = np.repeat(queries, 30, axis=0) * dimension**0.5 + 0.8 * rows[:600]
+    return queries, unit(random.permutation(np.concatenate([near, rows[600:]])))
+
+
+@pytest.fixture
+def quantized() -> type[QuantizedRows]:
+    """The codes, where FAISS is installed."""
+    pytest.importorskip("faiss")
+    return QuantizedRows
+
+
+@pytest.mark.parametrize("method", ["ghm", "early", "borda"])
+def test_rankings_are_those_of_exact_search(quantized: type[QuantizedRows], method: str) -> None:
+    fusion = FusionOptions(method=method)  # type: ignore[arg-type]
+    queries, database = zip(planted(0), planted(1, 48), strict=True)
+    codes = [quantized(rows) for rows in database]
+    exact, exact_scores = rank_fused(queries, database, TOP, fusion=fusion)
+    # all rows of the list: what every method must rank as the exact search does
+    found, scores = rank_short_lists(queries, database, codes, TOP, 3000, fusion=fusion)
+    np.testing.assert_array_equal(found, exact)
+    np.testing.assert_allclose(scores, exact_scores, rtol=1e-5)
+
+
+def test_a_short_list_holds_planted_neighbours(quantized: type[QuantizedRows]) -> None:
+    queries, rows = planted(2)
+    exact, _ = rank_fused([queries], [rows], TOP, fusion=FusionOptions())
+    codes = [quantized(rows)]
+    found, scores = rank_short_lists([queries], [rows], codes, TOP, 150, fusion=FusionOptions())
+    np.testing.assert_array_equal(found, exact)
+    assert (np.diff(scores) <= 0).all()
+    coarse = codes[0].nearest(queries, TOP)  # it is the exact scores that make it right
+    assert np.mean([len(set(a) & set(b)) for a, b in zip(coarse, exact, strict=True)]) < TOP
+
+
+def test_more_images_than_the_option_are_searched_so(quantized: type[QuantizedRows]) -> None:
+    queries, rows = planted(3)
+    here = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    candidates = Candidates(lambda members: [rows[members]], [here] * 3000, Retrieval(("a",)))
+    members = np.arange(100, 2900)
+    exact = candidates.of([queries], members, QueryPairsOptions(top_k=TOP))[0]
+    few = {"above": 2799, "length": TOP}
+    options = QueryPairsOptions.model_validate({"top_k": TOP, "short_list": few})
+    found = candidates.of([queries], members, options)[0]
+    assert (found != exact).any()  # so short a list lacks some
+    assert np.mean([len(set(a) & set(b)) for a, b in zip(found, exact, strict=True)]) > TOP / 4
+    few["length"] = 2800
+    options = QueryPairsOptions.model_validate({"top_k": TOP, "short_list": few})
+    np.testing.assert_array_equal(candidates.of([queries], members, options)[0], exact)
+
+
+def test_without_faiss_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "faiss", None)
+    with pytest.raises(OptionError, match=r"faiss is not installed: .*megloc-kapture\[faiss\]"):
+        QuantizedRows(planted(0)[1])
