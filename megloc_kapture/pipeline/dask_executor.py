@@ -24,6 +24,7 @@ from signal import SIGINT
 from typing import Any
 
 from distributed import Client, KilledWorker, LocalCluster, Worker, WorkerPlugin
+from distributed.client import ClosedClientError
 from distributed.comm.core import CommClosedError
 
 from megloc_kapture.errors import MeglocError, OptionError
@@ -41,6 +42,15 @@ _CONNECT_S = 10.0
 # a worker that died is no fault of the item it was at; one that kills ten is
 _ALLOWED_FAILURES = 10
 _ITEMS_PER_WORKER = 4
+# what dask does by the clock, 50 times a second in each process unless told otherwise: 8 % of a
+# core for two workers that wait, 1 % so
+_QUIET = {
+    "distributed.admin.tick.interval": "1s",
+    "distributed.admin.system-monitor.interval": "10s",
+    "distributed.scheduler.active-memory-manager.start": False,
+    "distributed.scheduler.work-stealing-interval": "1s",
+    "distributed.worker.profile.enabled": False,
+}
 
 
 @contextmanager
@@ -65,7 +75,7 @@ def dask_executor(workers: int, scheduler: str | None, shared: Path) -> Iterator
         try:
             client.register_plugin(plugin, name="megloc")
             yield _ClusterExecutor(client)
-        except (CancelledError, CommClosedError) as error:
+        except (CancelledError, CommClosedError, ClosedClientError) as error:
             raise MeglocError(
                 f"the scheduler {scheduler or 'of the local cluster'} has gone; what is finished "
                 "is kept, run the same again to go on"
@@ -81,7 +91,8 @@ def dask_executor(workers: int, scheduler: str | None, shared: Path) -> Iterator
             raise MeglocError("the workers have no megloc_kapture: install it there") from error
         finally:
             plugin.token.unlink(missing_ok=True)
-            with suppress(CommClosedError, OSError, TimeoutError):
+            # a client that has given its scheduler up has None instead
+            with suppress(CommClosedError, OSError, TimeoutError, AttributeError):
                 client.unregister_worker_plugin("megloc")
 
 
@@ -94,7 +105,7 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Client]:
     settings = {
         "distributed.scheduler.allowed-failures": _ALLOWED_FAILURES,
         "distributed.comm.timeouts.connect": f"{_CONNECT_S} s",
-        "distributed.worker.profile.enabled": False,
+        **_QUIET,
     }
     with dask.config.set(settings):
         if scheduler is not None:

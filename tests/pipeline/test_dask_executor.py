@@ -8,13 +8,14 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 from distributed import Client
 from threadpoolctl import threadpool_info
@@ -23,9 +24,13 @@ import megloc_kapture as megloc
 from megloc_kapture.errors import DataError, MeglocError, OptionError
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline import dask_executor
-from megloc_kapture.pipeline.executors import open_executor
+from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
+from megloc_kapture.pipeline.executors import open_executor, single_threaded
+from megloc_kapture.pipeline.plan import run_plan
 from megloc_kapture.pipeline.queries import KaptureQueries
-from megloc_kapture.stages.work import ordered_map
+from megloc_kapture.pipeline.run import choose_run
+from megloc_kapture.pipeline.workspace import Workspace
+from megloc_kapture.stages.work import Item, Track, Work, ordered_map, untracked
 from megloc_kapture.values import Pose
 
 
@@ -225,3 +230,90 @@ def test_images_are_localized_on_a_cluster_as_here(
         assert isinstance(one, Pose) and isinstance(other, Pose)
         assert one.cam_from_world.matrix().tobytes() == other.cam_from_world.matrix().tobytes()
         assert (one.name, one.confidence) == (other.name, other.confidence)
+
+
+def run_whole(scene: Path, root: Path, address: str | None, track: Track = untracked) -> None:
+    """What ``megloc eval`` runs: in this process, or on the cluster of an address."""
+    few = {"local_features.options.max_keypoints": 400}
+    choice, opened = choose_run("kapture", scene, assignments=few), Workspace(root)
+    kind = "dask" if address else "inline"
+    with (
+        opened.lock(),
+        single_threaded(),
+        open_executor(kind, scheduler=address, shared=root) as executor,  # type: ignore[arg-type]
+    ):
+        run_plan(plan_evaluation(choice.run_in(opened)), opened, Work(executor, track))
+
+
+class At:
+    """Calls a function each time that so many results of a run have arrived."""
+
+    def __init__(self, moments: Iterable[int], action: Callable[[], None]) -> None:
+        self.results, self._moments, self._action = 0, set(moments), action
+
+    def __call__(self, items: Iterable[Item], total: int, label: str) -> Iterator[Item]:
+        for item in items:
+            yield item
+            self.results += 1
+            if self.results in self._moments:
+                self._action()
+
+
+def worker_pids(cluster: Cluster) -> list[int]:
+    """The processes that do the work; their parents only start them again."""
+    found = []
+    for nanny in cluster.workers:
+        for child in psutil.Process(nanny.pid).children(recursive=True):
+            with suppress(psutil.Error):  # it has just died
+                found += [child.pid] if "spawn_main" in "".join(child.cmdline()) else []
+    return found
+
+
+@pytest.fixture(scope="module")
+def inline(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, bytes], int]:
+    """The files of a whole run in this process, and the number of results that it waits for."""
+    root, counter = tmp_path_factory.mktemp("inline") / "workspace", At((), lambda: None)
+    run_whole(scene, root, None, counter)
+    return contents(root), counter.results
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [2, 4])
+def test_workers_killed_at_ten_moments_change_no_byte(
+    number: int, inline: tuple[dict[str, bytes], int], scene: Path, tmp_path: Path
+) -> None:
+    here, results = inline
+    random = np.random.default_rng(number)
+    killed = []
+    with running(tmp_path, number) as found:
+
+        def kill() -> None:
+            pids: list[int] = []
+            while not pids:  # all may be about to be started again
+                time.sleep(0.01)
+                pids = worker_pids(found)
+            killed.append(int(random.choice(pids)))
+            with suppress(ProcessLookupError):
+                os.kill(killed[-1], signal.SIGKILL)
+
+        moments = random.choice(np.arange(1, results), 10, replace=False).tolist()
+        run_whole(scene, tmp_path / "workspace", found.address, At(moments, kill))
+    assert len(killed) == 10
+    assert contents(tmp_path / "workspace") == here
+
+
+@pytest.mark.slow
+def test_a_run_goes_on_after_its_scheduler_was_killed(
+    inline: tuple[dict[str, bytes], int], scene: Path, tmp_path: Path
+) -> None:
+    here, results = inline
+    root = tmp_path / "workspace"
+    # what was done before is not done again, so each must come early enough for the next
+    for moment in np.random.default_rng(0).integers(1, results // 4, 3).tolist():
+        with running(tmp_path, 2) as found:
+            track = At([moment], lambda: with_children(found.scheduler.pid))  # noqa: B023
+            with pytest.raises(MeglocError, match=r"has gone; .*to go on$"):
+                run_whole(scene, root, found.address, track)
+    with running(tmp_path, 2) as found:
+        run_whole(scene, root, found.address)
+    assert contents(root) == here
