@@ -7,7 +7,7 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 from uuid import uuid4
 
 import numpy as np
@@ -38,14 +38,19 @@ from megloc_kapture.pipeline.queries import (
 from megloc_kapture.stages.matches import FeatureCache, Features, VerifiedMatches
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.pose_refinement import MapRefiners
-from megloc_kapture.stages.query_poses import localize_unit, localize_views
+from megloc_kapture.stages.query_poses import (
+    Solved,
+    among_first,
+    in_turn,
+    localize_unit,
+    localize_views,
+)
 from megloc_kapture.stages.ranking_scene import KaptureScene
 from megloc_kapture.stages.reranking import counted, rerank
 from megloc_kapture.stages.unreadable import unreadable_image
 from megloc_kapture.stages.work import ordered_map
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
-Solved = TypeVar("Solved")
 _ALONE = RigidTransform.identity()
 # the options that localizing uses; the others are of maps that are made
 LOCALIZING = (
@@ -265,22 +270,36 @@ class Localizer:
         images: Sequence[QueryImage],
         scene: KaptureScene,
     ) -> tuple[Solved, list[_Matched]]:
-        """What ``solve`` makes of the matches of all cameras, and these."""
-        matched = [
-            self._match(image, cam_from_rig)
+        """What ``solve`` makes of the matches of all cameras, and these.
+
+        What orders candidates by their matches, and guided pyramids, need all matches at first;
+        else no more candidates are matched than are taken.
+        """
+        asked = [
+            self._asked(image, cam_from_rig)
             for image, (_, cam_from_rig) in zip(images, unit, strict=True)
         ]
-        candidates = interleave([one.candidates for one in matched])
-        solved = solve(
-            [one.view for one in matched],
-            candidates,
-            [self.map.restrictions.frame(name) for name in candidates],
-            self.options.localization,
-            centers=self._centers,
-            ranker=self._ranker,
-            scene=scene,
-        )
-        return solved, matched
+        whole = self.options.reranking.reranks() or self.options.matches_again()
+        matched = [self._match(one, len(one.ranked) if whole else 0) for one in asked]
+
+        def localize(count: int) -> Solved:
+            if not whole:
+                matched[:] = [self._match(one, count) for one in asked]
+            first = [one.candidates[:count] for one in matched]
+            candidates = interleave(first)
+            return solve(
+                [among_first(one.view, own) for one, own in zip(matched, first, strict=True)],
+                candidates,
+                [self.map.restrictions.frame(name) for name in candidates],
+                self.options.localization,
+                centers=self._centers,
+                ranker=self._ranker,
+                scene=scene,
+            )
+
+        lists = [one.candidates for one in matched] if whole else [one.ranked for one in asked]
+        longest = max(map(len, lists), default=0)
+        return in_turn(localize, longest, self.options.localization), matched
 
     def _scene(self, images: Iterable[QueryImage]) -> KaptureScene:
         return KaptureScene(self.map.folder, QueryImages(images), map_camera=self.map.camera)
@@ -289,35 +308,39 @@ class Localizer:
     def _centers(self) -> dict[str, NDArray[np.float64]]:
         return {image: pose.center() for image, pose in self.map.poses.items()}
 
-    def _match(self, image: QueryImage, cam_from_rig: RigidTransform) -> _Matched:
+    def _asked(self, image: QueryImage, cam_from_rig: RigidTransform) -> _Asked:
         clock = Clock()
         features = [local.of_query(image) for local in self.types]
         clock.lap("extraction")
         ranked = self._candidates(image, features)
         clock.lap("retrieval")
-        of_types, kept = self._matched(features, ranked)
+        return _Asked(image, cam_from_rig, features, ranked, [[] for _ in self.types], clock)
+
+    def _match(self, asked: _Asked, count: int) -> _Matched:
+        """Matches with the best ``count`` candidates; what is matched already stays."""
+        asked.clock.start()
+        features, ranked = asked.features, asked.ranked[:count]
+        for local, own, found in zip(self.types, features, asked.of_types, strict=True):
+            found += local.match(own, ranked[len(found) :])
+        kept = self._kept(asked.of_types)
         typed, left_out = [], []
-        for local, own, found in zip(self.types, features, of_types, strict=True):
+        for local, own, found in zip(self.types, features, asked.of_types, strict=True):
             named: list[ImageMatches] = [
                 (ranked[at], found[at].matches, found[at].scores) for at in kept
             ]
-            keypoints_px, named, remark = local.match_again(own, named, image)
+            keypoints_px, named, remark = local.match_again(own, named, asked.image)
             left_out += [remark] if remark else []
             typed.append(TypedMatches(local.points.index, keypoints_px, named))
-        clock.lap("matching")
-        view = QueryView(image.query.name, image.camera, tuple(typed), cam_from_rig)
-        return _Matched(view, [ranked[at] for at in kept], tuple(left_out), clock.seconds)
+        asked.clock.lap("matching")
+        image = asked.image
+        view = QueryView(image.query.name, image.camera, tuple(typed), asked.cam_from_rig)
+        candidates = [ranked[at] for at in kept]
+        return _Matched(view, candidates, tuple(left_out), dict(asked.clock.seconds))
 
-    def _matched(
-        self, features: Sequence[Features], ranked: Sequence[str]
-    ) -> tuple[list[list[VerifiedMatches]], list[int]]:
-        """Matches of each type with each map image, and the positions of those that stay."""
-        of_types = [
-            local.match(own, ranked) for local, own in zip(self.types, features, strict=True)
-        ]
+    def _kept(self, of_types: Sequence[Sequence[VerifiedMatches]]) -> list[int]:
+        """Positions of the candidates that reranking leaves, best first."""
         how = self.options.reranking
-        kept, _ = rerank([[counted(one, how.by) for one in own] for own in of_types], how)
-        return of_types, kept
+        return rerank([[counted(one, how.by) for one in own] for own in of_types], how)[0]
 
     def _candidates(self, image: QueryImage, features: Sequence[Features]) -> list[str]:
         """The map images to match a query with, best first where they can be ranked."""
@@ -328,9 +351,9 @@ class Localizer:
         options = self.options.query_pairs
         if options.by == "exhaustive" or not permitted:
             return permitted
-        if len(permitted) <= options.top_k and not self._retrieval.is_at_hand(
-            query.global_features
-        ):
+        all_taken = len(permitted) <= options.top_k
+        in_order = self.options.localization.sure_confidence is not None
+        if all_taken and not in_order and not self._retrieval.is_at_hand(query.global_features):
             return permitted
         return self._retrieval.rank(image, features, permitted)
 
@@ -341,7 +364,8 @@ class Localizer:
         found = self._retrieval.rank(image, features, self._permitted(query))
         if not self.options.reranking.reranks():
             return found
-        return [found[at] for at in self._matched(features, found)[1]]
+        matched = [local.match(f, found) for local, f in zip(self.types, features, strict=True)]
+        return [found[at] for at in self._kept(matched)]
 
     def _permitted(self, query: Query) -> list[str]:
         if query.prior is None:
@@ -373,6 +397,18 @@ class Localizer:
         if options.by == "exhaustive" or len(self.map.images) <= options.top_k:
             return f"all {len(self.map.images)} map images"
         return self._retrieval.describe(global_types)
+
+
+@dataclass(frozen=True, eq=False)
+class _Asked:
+    """One camera with its features and its candidates, best first; the first of these matched."""
+
+    image: QueryImage
+    cam_from_rig: RigidTransform
+    features: list[Features]
+    ranked: list[str]
+    of_types: list[list[VerifiedMatches]]
+    clock: Clock
 
 
 @dataclass(frozen=True, eq=False)

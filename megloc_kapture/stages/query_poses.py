@@ -12,6 +12,7 @@ from dataclasses import astuple, dataclass, replace
 from functools import cache, lru_cache, partial
 from itertools import chain
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +62,8 @@ from megloc_kapture.stages.unreadable import unreadable_queries
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
 from megloc_kapture.values import Failure, Options, Pose, RigidTransform
 
+_FIRST_TURN = 5  # candidates; every turn has twice as many as the one before
+
 
 class LocalizationOptions(Options):
     """How a query's pose is found from its matches."""
@@ -76,6 +79,13 @@ class LocalizationOptions(Options):
         ge=0,
         le=1,
         description="a pose that is less likely to be right is a failure; 0: none is",
+    )
+    sure_confidence: float | None = Field(
+        default=None,
+        gt=0,
+        le=1,
+        description="candidates are taken in turn, best first, and no more once the pose is as "
+        "likely to be right as this; none: all are taken",
     )
     rigs: bool = Field(default=False, description="one pose for all cameras of a rig's moment")
     fallback: Fallback = Field(
@@ -179,6 +189,40 @@ def localize_unit(
     return [localize([QueryView(v.name, v.camera, v.matches)]).result for v in views]
 
 
+Solved = TypeVar("Solved", ClusterLocalization, list[Pose | Failure])
+
+
+def in_turn(
+    solve: Callable[[int], Solved], num_candidates: int, options: LocalizationOptions
+) -> Solved:
+    """What ``solve`` makes of the best few candidates where that is sure, else of all.
+
+    Parameters
+    ----------
+    solve : localizes with so many of the candidates, best first.
+    """
+    sure, few = options.sure_confidence, _FIRST_TURN
+    while sure is not None and few < num_candidates:
+        solved = solve(few)
+        results = solved if isinstance(solved, list) else [solved.result]
+        if all(isinstance(r, Pose) and (r.confidence or 0.0) >= sure for r in results):
+            return solved
+        few *= 2
+    return solve(num_candidates)
+
+
+def among_first(view: QueryView, candidates: Sequence[str]) -> QueryView:
+    """A view with its matches with these map images only."""
+    members = set(candidates)
+    return replace(
+        view,
+        matches=tuple(
+            replace(typed, matches=[one for one in typed.matches if one[0] in members])
+            for typed in view.matches
+        ),
+    )
+
+
 def _indices_of(views: Sequence[QueryView]) -> list[MapIndex]:
     by_identity = {id(typed.index): typed.index for view in views for typed in view.matches}
     return list(by_identity.values())
@@ -194,17 +238,24 @@ def _localize(job: _Job) -> list[tuple[str, Pose | Failure]]:
         for image in job.candidates
         if (pose := mapping.read().cam_from_world(image)) is not None
     }
-    posed = [pair for pair in zip(job.candidates, job.frames, strict=True) if pair[0] in centers]
-    candidates, frames = [image for image, _ in posed], [frame for _, frame in posed]
-    results = localize_unit(
-        views,
-        candidates,
-        frames,
-        job.options,
-        centers=centers,
-        ranker=job.ranker,
-        scene=KaptureScene(mapping, query),
-    )
+    frame_of = dict(zip(job.candidates, job.frames, strict=True))
+    own_candidates = [[image for image in own if image in centers] for own in job.own_candidates]
+    scene = KaptureScene(mapping, query)
+
+    def localize(count: int) -> list[Pose | Failure]:
+        first = [own[:count] for own in own_candidates]
+        candidates = interleave(first)
+        return localize_unit(
+            list(map(among_first, views, first)),
+            candidates,
+            [frame_of[image] for image in candidates],
+            job.options,
+            centers=centers,
+            ranker=job.ranker,
+            scene=scene,
+        )
+
+    results = in_turn(localize, max(map(len, own_candidates), default=0), job.options)
     return [
         (image, _for_writing(result, reading))
         for (image, _), result in zip(job.unit, results, strict=True)

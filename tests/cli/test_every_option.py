@@ -254,6 +254,7 @@ CASES: dict[str, Case] = {
     "localization.pose.confidence": Case("0.0001", context=HASTY),
     "localization.pose.seed": Case("9", context=HASTY),
     "localization.min_confidence": Case("1.0"),
+    "localization.sure_confidence": Case("0.5"),
     "localization.rigs": Case("true", scene="with_rig"),
     "localization.fallback": Case('"retrieval"', context=("localization.pose.min_inliers=100000",)),
     "pose_refinement.by": Case(

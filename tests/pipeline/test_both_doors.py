@@ -112,6 +112,8 @@ def with_rig(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
             pytest.param((*FEW, *more), id=name, marks=pytest.mark.slow)
             for name, more in {
                 "retrieval": ["query_pairs.top_k=4"],
+                "in turn": ["localization.sure_confidence=0.5"],
+                "turns of all": ["localization.sure_confidence=1.0", "reranking.by=matches"],
                 "resized": ["preprocessing.max_size_px=240", "query_pairs.top_k=4"],
                 "matches": [*TWO_TYPES, "reranking.by=matches", "reranking.keep=3"],
                 "pyramid": [

@@ -221,6 +221,31 @@ def test_given_candidates_are_all_taken_in_their_order(
     assert found[1].candidates == tuple(chosen)
 
 
+def test_candidates_in_turn_end_where_the_pose_is_sure(
+    workspace: Path, queries: list[Query], localizer: Localizer, truth: KaptureData
+) -> None:
+    opened = KaptureMap.open(workspace / "map")
+    assert len(opened.images) > 5
+    for query in queries:
+        every = localizer.localize_query(query)
+        assert isinstance(every, Pose) and every.confidence is not None
+        for sure, taken in ((0.6, 5), (1.0, len(opened.images))):
+            changed = options_of_preset(
+                "classic",
+                assignments=[
+                    "local_features.options.max_keypoints=800",
+                    f"localization.sure_confidence={sure}",
+                ],
+            )
+            one = Localizer(opened, options=changed)
+            found = one.localize_query(query)
+            ranked = one.ranked(query)
+            assert set(found.candidates) <= set(ranked[:taken])
+            assert errors(found, truth.cam_from_world(query.name)) < (0.05, 1.0)
+            if sure == 1.0:  # never so sure
+                assert same(found, every)
+
+
 # ------------------------------------------------------------------ many
 
 
