@@ -15,7 +15,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import CancelledError, Executor, Future
+from concurrent.futures import CancelledError, Executor, Future, InvalidStateError
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import metadata
@@ -42,6 +42,7 @@ _CONNECT_S = 10.0
 # a worker that died is no fault of the item it was at; one that kills ten is
 _ALLOWED_FAILURES = 10
 _ITEMS_PER_WORKER = 4
+_WATCH_S = 0.5
 # what dask does by the clock, 50 times a second in each process unless told otherwise: 8 % of a
 # core for two workers that wait, 1 % so
 _QUIET = {
@@ -74,7 +75,11 @@ def dask_executor(workers: int, scheduler: str | None, shared: Path) -> Iterator
         plugin = _Preparation.of_this_process(shared, elsewhere=scheduler is not None)
         try:
             client.register_plugin(plugin, name="megloc")
-            yield _ClusterExecutor(client)
+            executor = _ClusterExecutor(client)
+            try:
+                yield executor
+            finally:
+                executor.over.set()
         except (CancelledError, CommClosedError, ClosedClientError) as error:
             raise MeglocError(
                 f"the scheduler {scheduler or 'of the local cluster'} has gone; what is finished "
@@ -128,7 +133,11 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Client]:
                     memory_limit=0,  # memory is the system's to give, as to other processes
                     silence_logs=logging.CRITICAL,
                 )
-            with cluster, Client(cluster, set_as_default=False) as client:
+            with (
+                cluster,
+                # results need not pass through the scheduler
+                Client(cluster, set_as_default=False, direct_to_workers=True) as client,
+            ):
                 yield client
         finally:
             shutil.rmtree(folder, ignore_errors=True)
@@ -140,17 +149,33 @@ class _ClusterExecutor(Executor):
     Attributes
     ----------
     window : items that keep all workers busy.
+    over : set where nothing is waited for any more.
     """
 
     def __init__(self, client: Client) -> None:
+        self.over = threading.Event()
         self._executor = client.get_executor(pure=False)
+        self._client = client
+        self._waiting: set[Future[Any]] = set()
+        threading.Thread(target=self._watch, daemon=True).start()
         threads = sum(one["nthreads"] for one in client.scheduler_info(-1)["workers"].values())
         self.window = _ITEMS_PER_WORKER * max(threads, 1)
 
     def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """A future of the result, which a worker computes with one thread per matrix product."""
         found: Future[Any] = self._executor.submit(_single_threaded, function, *args, **kwargs)
+        self._waiting.add(found)
+        found.add_done_callback(self._waiting.discard)
         return found
+
+    def _watch(self) -> None:
+        """End futures of a scheduler that has gone: dask forgets what is asked while it reconnects,
+        and who waits for that would wait for ever."""
+        while not self.over.wait(_WATCH_S):
+            if self._client.status == "closed":
+                for future in list(self._waiting):
+                    with suppress(InvalidStateError):
+                        future.set_exception(CommClosedError("the scheduler has gone"))
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Wait for what is under way, or cancel it."""
