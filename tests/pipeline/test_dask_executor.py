@@ -147,7 +147,11 @@ def test_what_an_item_raises_arrives_as_it_is(cluster: Cluster) -> None:
     ],
 )
 def test_a_worker_that_differs_is_refused_before_it_works(
-    cluster: Cluster, change: dict[str, Any], words: str, monkeypatch: pytest.MonkeyPatch
+    cluster: Cluster,
+    change: dict[str, Any],
+    words: str,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
     made = dask_executor._Preparation.of_this_process
 
@@ -159,7 +163,7 @@ def test_a_worker_that_differs_is_refused_before_it_works(
     monkeypatch.setattr(dask_executor._Preparation, "of_this_process", differing)
     with (
         pytest.raises(MeglocError, match=words),
-        open_executor("dask", scheduler=cluster.address),
+        open_executor("dask", scheduler=cluster.address, shared=tmp_path),
     ):
         pytest.fail("it was not refused")
 
