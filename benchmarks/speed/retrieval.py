@@ -349,7 +349,7 @@ def short_lists(count: int, options: argparse.Namespace) -> bool:
         for length in LENGTHS:
             start = time.process_time()
             found, _ = rank_short_lists(
-                [queries], [rows], codes, options.top_k, length, fusion=FusionOptions()
+                [queries], [rows], codes, options.top_k, length=length, fusion=FusionOptions()
             )
             spent = time.process_time() - start
             same = [len(set(a) & set(b)) for a, b in zip(exact, found, strict=True)]

@@ -15,30 +15,16 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from megloc_kapture.errors import OptionError, missing_extra
 from megloc_kapture.retrieval.fusion import FusionOptions
 from megloc_kapture.retrieval.search import Found, rank_fused
 from megloc_kapture.retrieval.vectors import VectorBlocks, VectorSource, as_blocks
-from megloc_kapture.values import Options
 
 _SUBVECTOR = 16  # values that share a code of 4 bits, one of 16 centroids
 _SAMPLE = 16 * 39  # fewer rows than 39 for each centroid FAISS calls too few
+_LENGTH = 1000  # rows of a query whose exact similarity is found
 _BLOCK_ELEMENTS = 1 << 25  # of rows held at once: 128 MiB of float32
-
-
-class ShortListOptions(Options):
-    """When rows are searched by product quantisation, and what of its ranking is looked at."""
-
-    above: int = Field(
-        default=1_000_000,
-        gt=0,
-        description="more map images than that are searched by product quantisation (FAISS)",
-    )
-    length: int = Field(
-        default=1000, gt=0, description="map images of a query whose exact similarity is then found"
-    )
 
 
 class QuantizedRows:
@@ -58,7 +44,7 @@ class QuantizedRows:
         if len(rows) < _SAMPLE:
             raise OptionError(
                 f"{len(rows)} map images are too few for product quantisation, which needs "
-                f"{_SAMPLE}: query_pairs.short_list.above"
+                f"{_SAMPLE}: query_pairs.quantized_above"
             )
         wanted = max(1, rows.dimension // _SUBVECTOR)
         parts = next(n for n in range(wanted, 0, -1) if rows.dimension % n == 0)
@@ -80,8 +66,8 @@ def rank_short_lists(
     database: Sequence[VectorSource],
     codes: Sequence[QuantizedRows],
     top_k: int,
-    length: int,
     *,
+    length: int = _LENGTH,
     fusion: FusionOptions,
     weights: Sequence[float] | None = None,
 ) -> Found:

@@ -16,7 +16,7 @@ from megloc_kapture.io.kapture.vectors import KaptureVectors
 from megloc_kapture.retrieval.fusion import FusionOptions
 from megloc_kapture.retrieval.reranking import DiversityOptions, diversify
 from megloc_kapture.retrieval.search import Found, rank_fused
-from megloc_kapture.retrieval.short_list import QuantizedRows, ShortListOptions, rank_short_lists
+from megloc_kapture.retrieval.short_list import QuantizedRows, rank_short_lists
 from megloc_kapture.retrieval.vectors import VectorSource, as_blocks, common_length
 from megloc_kapture.values import Options, RigidTransform
 
@@ -34,7 +34,12 @@ class QueryPairsOptions(Options):
     diversity: DiversityOptions | None = Field(
         default=None, description="few views of one place; none: as similar as they are"
     )
-    short_list: ShortListOptions = ShortListOptions()
+    quantized_above: int = Field(
+        default=1_000_000,
+        gt=0,
+        description="more map images than that are searched by product quantisation (FAISS), the "
+        "1000 best of them exactly",
+    )
 
     def idle(self) -> dict[str, str]:
         if self.by == "retrieval":
@@ -67,21 +72,20 @@ class Retrieval:
         top_k: int,
         *,
         codes: Sequence[QuantizedRows] = (),
-        length: int = 0,
     ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """The most similar rows of the database: indices and scores (Q, at most ``top_k``).
 
         Parameters
         ----------
         queries, database : of each type, unit rows; neither is held in memory as a whole.
-        codes : of the database, of each type: only short lists by them, of this length, are
-            compared exactly; none: all rows are.
+        codes : of the database, of each type: only short lists by them are compared
+            exactly; none: all rows are.
         """
         how: dict[str, Any] = {"fusion": self.fusion, "weights": self.weights or None}
 
         def ranked(rows: Sequence[NDArray[np.float32]]) -> Found:
             if codes:
-                return rank_short_lists(rows, database, codes, top_k, length, **how)
+                return rank_short_lists(rows, database, codes, top_k, **how)
             return rank_fused(rows, database, top_k, **how)
 
         sources = [as_blocks(source) for source in queries]
@@ -146,11 +150,9 @@ class Candidates:
         few = options.diversity is None
         wanted = options.top_k if few else options.top_k * _POOL
         database = self._database(permitted)
-        how = options.short_list
-        codes = self._codes(permitted, database) if len(permitted) > how.above else []
-        index, scores = self._retrieval.rank(
-            queries, database, wanted, codes=codes, length=how.length
-        )
+        many = len(permitted) > options.quantized_above
+        codes = self._codes(permitted, database) if many else []
+        index, scores = self._retrieval.rank(queries, database, wanted, codes=codes)
         if options.diversity is not None:
             index, scores = self._spread(index, scores, permitted, options.top_k, options.diversity)
         return np.where(index >= 0, permitted[np.maximum(index, 0)], -1), scores

@@ -135,10 +135,7 @@ CASES: dict[str, Case] = {
     ),
     "query_pairs.by": Case('"exhaustive"', "pairs/query.txt"),
     "query_pairs.top_k": Case("2", "pairs/query.txt"),
-    "query_pairs.short_list.above": Case("2", refused=TOO_FEW, localize=TOO_FEW),
-    "query_pairs.short_list.length": Case(
-        "2", context=("query_pairs.short_list.above=2",), refused=TOO_FEW, localize=TOO_FEW
-    ),
+    "query_pairs.quantized_above": Case("2", refused=TOO_FEW, localize=TOO_FEW),
     "query_pairs.diversity.max_per_place": Case(
         "1",
         "pairs/query.txt",

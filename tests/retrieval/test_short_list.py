@@ -45,7 +45,7 @@ def test_rankings_are_those_of_exact_search(quantized: type[QuantizedRows], meth
     codes = [quantized(rows) for rows in database]
     exact, exact_scores = rank_fused(queries, database, TOP, fusion=fusion)
     # all rows of the list: what every method must rank as the exact search does
-    found, scores = rank_short_lists(queries, database, codes, TOP, 3000, fusion=fusion)
+    found, scores = rank_short_lists(queries, database, codes, TOP, length=3000, fusion=fusion)
     np.testing.assert_array_equal(found, exact)
     np.testing.assert_allclose(scores, exact_scores, rtol=1e-5)
 
@@ -54,27 +54,32 @@ def test_a_short_list_holds_planted_neighbours(quantized: type[QuantizedRows]) -
     queries, rows = planted(2)
     exact, _ = rank_fused([queries], [rows], TOP, fusion=FusionOptions())
     codes = [quantized(rows)]
-    found, scores = rank_short_lists([queries], [rows], codes, TOP, 150, fusion=FusionOptions())
+    found, scores = rank_short_lists(
+        [queries], [rows], codes, TOP, length=150, fusion=FusionOptions()
+    )
     np.testing.assert_array_equal(found, exact)
     assert (np.diff(scores) <= 0).all()
     coarse = codes[0].nearest(queries, TOP)  # it is the exact scores that make it right
     assert np.mean([len(set(a) & set(b)) for a, b in zip(coarse, exact, strict=True)]) < TOP
 
 
-def test_more_images_than_the_option_are_searched_so(quantized: type[QuantizedRows]) -> None:
+@pytest.mark.usefixtures("quantized")
+def test_more_images_than_the_option_are_searched_so(monkeypatch: pytest.MonkeyPatch) -> None:
     queries, rows = planted(3)
     here = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     candidates = Candidates(lambda members: [rows[members]], [here] * 3000, Retrieval(("a",)))
     members = np.arange(100, 2900)
-    exact = candidates.of([queries], members, QueryPairsOptions(top_k=TOP))[0]
-    few = {"above": 2799, "length": TOP}
-    options = QueryPairsOptions.model_validate({"top_k": TOP, "short_list": few})
-    found = candidates.of([queries], members, options)[0]
-    assert (found != exact).any()  # so short a list lacks some
-    assert np.mean([len(set(a) & set(b)) for a, b in zip(found, exact, strict=True)]) > TOP / 4
-    few["length"] = 2800
-    options = QueryPairsOptions.model_validate({"top_k": TOP, "short_list": few})
-    np.testing.assert_array_equal(candidates.of([queries], members, options)[0], exact)
+    quantized_found, exact = (
+        candidates.of([queries], members, QueryPairsOptions(top_k=TOP, quantized_above=above))
+        for above in (2799, 2800)
+    )
+    np.testing.assert_array_equal(quantized_found[0], exact[0])
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "faiss", None)
+        candidates.of([queries], members, QueryPairsOptions(top_k=TOP, quantized_above=2800))
+        candidates.of([queries], members, QueryPairsOptions(top_k=TOP, quantized_above=2799))
+        with pytest.raises(OptionError, match="faiss"):  # other images need other codes
+            candidates.of([queries], members[1:], QueryPairsOptions(quantized_above=2798))
 
 
 def test_without_faiss_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
