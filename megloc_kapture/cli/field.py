@@ -24,7 +24,8 @@ _MILLIMETRES = 1000.0
 
 @dataclass(frozen=True, kw_only=True)
 class TrainField(Linked, Common):
-    """Train a neural field (NeRF-W) on the images of a map, to render views and refine poses."""
+    """Train a neural field (NeRF-W) on the images of a map, to render views and refine poses.
+    It goes on where it was interrupted."""
 
     input: Input
     """Kapture map: images with poses; masks and depth maps are used where there are any."""
@@ -38,20 +39,24 @@ class TrainField(Linked, Common):
     """End after so many at the latest; only without are the bytes the same twice."""
     max_side: int = 320
     """Longer side of the images that are trained on, px; larger ones are reduced."""
+    held_out_every: int = 8
+    """Of so many images one is held out, to measure PSNR; 0: all are trained on."""
+    lights: Literal["image", "folder"] = "image"
+    """An appearance for each image, or one for each folder of images, where that is a session."""
     seed: int = 0
     """Of everything that is drawn."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """auto: a GPU where there is one."""
     force: Force = False
-    """Write into a folder that has other things in it."""
+    """Write into a folder that has other things in it; begin again."""
 
     def run(self) -> int:
         """Run it."""
         from pydantic import ValidationError
 
-        from megloc_kapture.io.files import first_problem
-        from megloc_kapture.refinement.neural_field import FieldTrainingOptions
-        from megloc_kapture.stages.neural_field import train_field_of_map
+        from megloc_kapture.io.files import claim_folder, first_problem, remove
+        from megloc_kapture.refinement.field_training import FieldTrainingOptions
+        from megloc_kapture.stages.neural_field import STATE_FILE, train_field_of_map
 
         console = self.console()
         try:
@@ -60,6 +65,8 @@ class TrainField(Linked, Common):
                 steps=self.steps,
                 minutes=self.minutes,
                 max_side_px=self.max_side,
+                held_out_every=self.held_out_every,
+                lights=self.lights,
                 seed=self.seed,
                 device=self.device,
             )
@@ -73,11 +80,17 @@ class TrainField(Linked, Common):
                 + (f", held-out images {held_out} dB" if held_out else "")
             )
 
-        with (
-            single_threaded(),
-            staged_output(self.output, kind=FIELD, force=self.force) as out,
-        ):
-            psnr_db = train_field_of_map(self.kapture(self.input), out, options, progress=progress)
+        mapping, state = self.kapture(self.input), self.output / STATE_FILE
+        claim = claim_folder(self.output, kind=FIELD, force=self.force)
+        try:
+            if self.force:
+                remove(state)
+            with single_threaded():
+                psnr_db = train_field_of_map(mapping, self.output, options, progress=progress)
+        except BaseException:
+            if not state.exists():
+                claim.undo()
+            raise
         mean = f"{sum(psnr_db.values()) / len(psnr_db):.1f} dB" if psnr_db else "none held out"
         console.result(f"{self.output}: PSNR of {len(psnr_db)} held-out images: {mean}")
         return 0

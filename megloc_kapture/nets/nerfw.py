@@ -100,14 +100,15 @@ class NerfW(nn.Module):
 
     Parameters
     ----------
-    num_images : rows of the embeddings.
+    num_images, num_lights : rows of the transient and of the appearance embedding; as many of the
+        second as of the first unless given.
     """
 
-    def __init__(self, num_images: int) -> None:
+    def __init__(self, num_images: int, num_lights: int | None = None) -> None:
         super().__init__()
         self.nerf_coarse = NerfMlp()
         self.nerf_fine = NerfMlp(_APPEARANCE, _TRANSIENT)
-        self.embedding_a = nn.Embedding(num_images, _APPEARANCE)
+        self.embedding_a = nn.Embedding(num_lights or num_images, _APPEARANCE)
         self.embedding_t = nn.Embedding(num_images, _TRANSIENT)
 
     @property

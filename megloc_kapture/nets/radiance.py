@@ -15,6 +15,7 @@ from torch import nn
 
 _DEPTH_SPREAD = 0.03  # of samples about a known depth, share of it
 _EPSILON = 1e-10
+_BETA_MIN = 0.03  # uncertainty of a ray that meets nothing transient
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,16 +94,13 @@ class RadianceField(Protocol):
         ...
 
 
-def composite(
-    t: torch.Tensor, deltas: torch.Tensor, samples: Samples, *, beta_min: float = 0.03
-) -> Rendered:
+def composite(t: torch.Tensor, deltas: torch.Tensor, samples: Samples) -> Rendered:
     """Composite samples along rays: NeRF's eq. 3, with a transient part NeRF-W's eqs. 8 to 10.
 
     Parameters
     ----------
     t : (N, S), where the samples are, ascending.
     deltas : (N, S), length of the piece of the ray that each stands for, in the unit of 1/density.
-    beta_min : uncertainty of a ray that meets nothing transient.
     """
     total = samples.sigma
     if samples.transient_sigma is not None:
@@ -112,7 +110,7 @@ def composite(
     static = transmitted * -torch.expm1(-samples.sigma * deltas)
     weights = transmitted * -torch.expm1(-total * deltas)
     rgb = (static[..., None] * samples.rgb).sum(1)
-    beta = torch.full_like(t[:, 0], beta_min)
+    beta = torch.full_like(t[:, 0], _BETA_MIN)
     density = t.new_zeros(())
     if samples.transient_sigma is not None:
         assert samples.transient_rgb is not None and samples.transient_beta is not None

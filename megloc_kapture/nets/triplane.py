@@ -28,8 +28,9 @@ _CHANNELS = 12
 _GEOMETRY, _HIDDEN = 15, 64
 _APPEARANCE, _TRANSIENT = 8, 16
 _DIRECTION_FREQUENCIES, _POINT_FREQUENCIES = 2, 3
-# samples of a ray: to look where something is, then spread evenly, then where it is
-_LOOKING, _SPREAD, _THERE = 32, 8, 16
+# samples of a ray: to look where something is, in training and in rendering, where coarse ones
+# miss what training has made thin; then spread evenly, then where it is
+_LOOKING, _CLOSELY, _SPREAD, _THERE = 32, 96, 8, 16
 _REACH = 1.25  # beyond 1 space is contracted, to this at infinity
 _MAX_LOG_DENSITY = 12.0
 _AXES = ((0, 1), (0, 2), (1, 2))
@@ -42,12 +43,15 @@ class TriPlane(nn.Module):
 
     Parameters
     ----------
-    num_images : rows of the embeddings.
+    num_images, num_lights : rows of the transient and of the appearance embedding; as many of the
+        second as of the first unless given.
     unconstrained : the images differ in light and show what moves; without, one appearance and
         nothing transient.
     """
 
-    def __init__(self, num_images: int, *, unconstrained: bool = True) -> None:
+    def __init__(
+        self, num_images: int, num_lights: int | None = None, *, unconstrained: bool = True
+    ) -> None:
         super().__init__()
         self.planes = nn.ParameterList(
             nn.Parameter(torch.empty(3, _CHANNELS, size, size).uniform_(0.1, 0.5))
@@ -60,7 +64,7 @@ class TriPlane(nn.Module):
         self.appearance: nn.Embedding | None = None
         self.transient: nn.Embedding | None = None
         if unconstrained:
-            self.appearance = nn.Embedding(num_images, appearance)
+            self.appearance = nn.Embedding(num_lights or num_images, appearance)
             self.transient = nn.Embedding(num_images, transient)
             for embedding in (self.appearance, self.transient):
                 nn.init.normal_(embedding.weight, std=0.1)
@@ -121,7 +125,7 @@ class TriPlane(nn.Module):
             unknown = torch.nonzero(depth <= 0)[:, 0]
         if len(unknown):
             some = Rays(rays.origins[unknown], rays.directions[unknown], rays.near, rays.far)
-            t = stratified(some, _LOOKING, generator)
+            t = stratified(some, _LOOKING if generator else _CLOSELY, generator)
             points = some.origins[:, None] + t[..., None] * some.directions[:, None]
             sigma = self.density(points)[0]
             passed = torch.cumsum(sigma * spacings(t, some), dim=1)

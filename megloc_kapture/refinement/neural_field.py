@@ -1,16 +1,14 @@
 """A map as a radiance field: trained on posed images, it renders colour and depth anywhere.
 
-Trained with the loss of NeRF-W (:func:`~megloc_kapture.nets.radiance.nerf_w_loss`) on random pixels
-of all images but every eighth, which are held out; where an image has depth, the field's own is
-drawn to it. As NeRF-W judges, the appearance of a held-out image is fitted on its left half, and
-the error taken on its right.
+:mod:`~megloc_kapture.refinement.field_training` trains it. As NeRF-W judges, the appearance of an
+image that was held out is fitted on its left half, and the error taken on its right.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import PurePosixPath
 from typing import Literal
 
 import cv2
@@ -23,43 +21,17 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import pixel_rays
 from megloc_kapture.geometry.warping import WarpSource, scaled_camera, warp_to_view
 from megloc_kapture.nets.nerfw import NerfW
-from megloc_kapture.nets.radiance import Rays, Rendered, nerf_w_loss
-from megloc_kapture.nets.runtime import NetworkOptions, pick_device
+from megloc_kapture.nets.radiance import Rays, Rendered
 from megloc_kapture.nets.triplane import TriPlane
 from megloc_kapture.plugins import DepthView
 from megloc_kapture.values import Camera, Options, RigidTransform
 
 Kind = Literal["triplane", "nerfw"]
+Lights = Literal["image", "folder"]
 Floats = NDArray[np.float32]
-HELD_OUT_EVERY = 8
 _CHUNK = 8192  # rays that are rendered at once
-# Adam's rates at the beginning; at the end a thirtieth
-_PLANE_RATE, _RATE, _NERF_RATE = 2e-2, 5e-3, 5e-4
-_DECAY = 1 / 30
 # of an appearance: Adam's rate, its steps, the rays of each, and those that are drawn of
 _FIT_RATE, _FIT_STEPS, _FIT_RAYS, _FIT_OF = 0.1, 20, 512, 2048
-
-
-class FieldTrainingOptions(NetworkOptions):
-    """Options of a field's training."""
-
-    kind: Kind = Field(
-        default="triplane", description="triplane: minutes on a processor; nerfw: needs a GPU"
-    )
-    steps: int = Field(default=4000, gt=0, description="of the training")
-    minutes: float | None = Field(
-        default=None,
-        gt=0,
-        description="end the training after so many at the latest; without, the same bytes twice",
-    )
-    rays_per_step: int = Field(default=2048, gt=0, description="random pixels of all images")
-    max_side_px: int = Field(
-        default=320, ge=16, description="longer side of an image; larger ones are reduced"
-    )
-    depth_weight: float = Field(
-        default=5.5, ge=0, description="of the relative error of depth in NeRF-W's loss"
-    )
-    seed: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +49,13 @@ class FieldView:
     cam_from_world: RigidTransform
     mask: NDArray[np.bool_] | None = None
     depth: DepthView | None = None
+
+    def as_source(self) -> WarpSource:
+        """The view to be warped; one that has depth. Raises DataError where sizes do not fit."""
+        assert self.depth is not None
+        depth, pose = self.depth, self.cam_from_world
+        own = depth.depth_m, depth.camera, depth.image_from_depth
+        return WarpSource(self.image, self.camera, pose, *own, self.mask)
 
 
 class FieldFrame(Options):
@@ -109,9 +88,21 @@ class FieldRendering:
     camera: Camera
 
 
-def build_field(kind: Kind, num_images: int) -> NerfW | TriPlane:
-    """An untrained field, its parameters drawn by torch's own generator."""
-    return NerfW(num_images) if kind == "nerfw" else TriPlane(num_images)
+def build_field(kind: Kind, num_images: int, num_lights: int) -> NerfW | TriPlane:
+    """An untrained field, its parameters drawn by torch's own generator.
+
+    Parameters
+    ----------
+    num_images, num_lights : rows of the transient and of the appearance embedding.
+    """
+    return (NerfW if kind == "nerfw" else TriPlane)(num_images, num_lights)
+
+
+def light_rows(images: Sequence[str], lights: Lights) -> list[int]:
+    """Row of the appearance embedding of each image: its own, or that of its folder."""
+    names = [image if lights == "image" else str(PurePosixPath(image).parent) for image in images]
+    row_of = {name: row for row, name in enumerate(dict.fromkeys(names))}
+    return [row_of[name] for name in names]
 
 
 class NeuralField:
@@ -120,12 +111,20 @@ class NeuralField:
     Parameters
     ----------
     module : in the mode and on the device that it is used in.
-    images : names, in the order of the embeddings' rows.
+    images : names, in the order of the transient embedding's rows.
+    light_rows : of the appearance embedding, of each image.
     """
 
-    def __init__(self, module: NerfW | TriPlane, frame: FieldFrame, images: Sequence[str]) -> None:
+    def __init__(
+        self,
+        module: NerfW | TriPlane,
+        frame: FieldFrame,
+        images: Sequence[str],
+        light_rows: Sequence[int],
+    ) -> None:
         self.module, self.frame, self.images = module, frame, tuple(images)
         self.device = next(module.parameters()).device
+        self.light_rows = torch.tensor(light_rows, device=self.device)
 
     def rays(self, camera: Camera, cam_from_world: RigidTransform) -> Rays:
         """Rays (H * W,) through the centres of a view's pixels, by rows."""
@@ -144,7 +143,9 @@ class NeuralField:
         if image not in self.images:
             raise DataError(f"the field was not trained on an image {image!r}")
         embedding = self.module.appearance
-        return None if embedding is None else embedding.weight[self.images.index(image)].detach()
+        if embedding is None:
+            return None
+        return embedding.weight[self.light_rows[self.images.index(image)]].detach()
 
     @torch.no_grad()
     def render(
@@ -210,7 +211,7 @@ class NeuralField:
 
     def fitted_appearance(self, view: FieldView, max_side_px: int) -> torch.Tensor | None:
         """Embedding (A,) of a view's light, of an image reduced to that longer side."""
-        camera, rgb, usable, _ = _pixels(view, max_side_px)
+        camera, rgb, usable, _ = pixels_of(view, max_side_px)
         rows = torch.from_numpy(np.flatnonzero(usable)).to(self.device)
         if not len(rows):
             return None
@@ -219,7 +220,7 @@ class NeuralField:
 
     def held_out_psnr(self, view: FieldView) -> float:
         """PSNR in dB on the right half of an image, its appearance fitted on the left one."""
-        camera, rgb, usable, _ = _pixels(view, max(view.camera.width, view.camera.height))
+        camera, rgb, usable, _ = pixels_of(view, max(view.camera.width, view.camera.height))
         rays = self.rays(camera, view.cam_from_world)
         left = np.arange(camera.width * camera.height) % camera.width < camera.width // 2
         seen = self._tensor(rgb.astype(np.float32) / 255)
@@ -260,82 +261,7 @@ def reduced(camera: Camera, max_side_px: int) -> Camera:
     return camera if longer <= max_side_px else scaled_camera(camera, max_side_px / longer)
 
 
-def train_field(
-    views: Sequence[FieldView],
-    options: FieldTrainingOptions | None = None,
-    *,
-    module: NerfW | TriPlane | None = None,
-    progress: Callable[[int, float, list[float]], None] | None = None,
-) -> tuple[NeuralField, dict[str, float]]:
-    """Train a field.
-
-    Parameters
-    ----------
-    views : at least two, in order; every eighth is held out where there are eight or more.
-    module : of as many images as are trained on; built as the options say unless given.
-    progress : is given the step, the seconds, and the held-out PSNR in dB of each, now and then.
-
-    Returns
-    -------
-    The field, and PSNR in dB of each held-out image by name.
-
-    Raises
-    ------
-    DataError : too few images, or one does not fit its camera; no pixel may be used.
-    """
-    options = options or FieldTrainingOptions()
-    started = time.monotonic()
-    held_out = list(views[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY])
-    trained = [view for view in views if not any(view is other for other in held_out)]
-    if len(trained) < 2:
-        raise DataError(f"{len(views)} images with poses and pixels are too few for a field")
-    data = _Pixels(trained, options.max_side_px)
-    device = pick_device(options.device)
-    generator = torch.Generator().manual_seed(options.seed)
-    if module is None:
-        with torch.random.fork_rng([]):
-            torch.manual_seed(options.seed)
-            module = build_field(options.kind, len(trained))
-    field = NeuralField(module.to(device), data.frame(), [view.name for view in trained])
-    small = [_reduced_view(view, options.max_side_px) for view in held_out]
-    optimizer = torch.optim.Adam(_groups(module), eps=1e-15, betas=(0.9, 0.99))
-    rates = [group["lr"] for group in optimizer.param_groups]
-    shown = max(options.steps // 5, 1)
-    for step in range(options.steps):
-        done = step / options.steps
-        if options.minutes is not None:
-            done = max(done, (time.monotonic() - started) / 60 / options.minutes)
-        if done >= 1:
-            break
-        for group, rate in zip(optimizer.param_groups, rates, strict=True):
-            group["lr"] = rate * _DECAY**done * min(1.0, (step + 1) / 50)
-        rays, rgb = data.batch(field, options.rays_per_step, generator)
-        with torch.autocast(device.type, torch.bfloat16, enabled=options.half_precision):
-            rendered = module.render(rays, generator)
-        loss = nerf_w_loss(rendered, rgb)
-        if rays.depth is not None:
-            error = (rendered.depth - rays.depth).abs() / rays.depth.clamp_min(1e-6)
-            known = torch.where(rays.depth > 0, error.clamp(max=1.0), 0.0)
-            loss = loss + options.depth_weight * known.mean()
-        optimizer.zero_grad(set_to_none=True)
-        torch.autograd.backward(loss)
-        optimizer.step()
-        if progress is not None and (step + 1) % shown == 0 and step + 1 < options.steps:
-            scores = [field.held_out_psnr(view) for view in small[:2]]
-            progress(step + 1, time.monotonic() - started, scores)
-    module.requires_grad_(False)
-    return field, {view.name: field.held_out_psnr(view) for view in small}
-
-
-def _groups(module: NerfW | TriPlane) -> list[dict[str, object]]:
-    if isinstance(module, NerfW):
-        return [{"params": list(module.parameters()), "lr": _NERF_RATE}]
-    planes = list(module.planes)
-    others = [value for name, value in module.named_parameters() if not name.startswith("planes")]
-    return [{"params": planes, "lr": _PLANE_RATE}, {"params": others, "lr": _RATE}]
-
-
-def _pixels(
+def pixels_of(
     view: FieldView, max_side_px: int
 ) -> tuple[Camera, NDArray[np.uint8], NDArray[np.bool_], Floats | None]:
     """Reduced camera, colours (N, 3), usable pixels (N,) and depths (N,) of a view."""
@@ -353,15 +279,7 @@ def _pixels(
         usable = usable & (np.asarray(mask).ravel() > 0)
     depth = None
     if view.depth is not None:
-        one = view.depth
-        source = WarpSource(
-            view.image,
-            view.camera,
-            view.cam_from_world,
-            one.depth_m,
-            one.camera,
-            one.image_from_depth,
-        )
+        source = replace(view, mask=None).as_source()
         warped = warp_to_view(
             [source], view.camera, view.cam_from_world, scale=camera.width / view.camera.width
         )
@@ -369,90 +287,9 @@ def _pixels(
     return camera, image.reshape(-1, 3), usable, depth
 
 
-def _reduced_view(view: FieldView, max_side_px: int) -> FieldView:
-    camera, rgb, usable, _ = _pixels(view, max_side_px)
+def reduced_view(view: FieldView, max_side_px: int) -> FieldView:
+    """A view without depth, reduced to a longer side; raises DataError as :func:`pixels_of`."""
+    camera, rgb, usable, _ = pixels_of(view, max_side_px)
     shape = camera.height, camera.width
-    return FieldView(
-        view.name, rgb.reshape(*shape, 3), camera, view.cam_from_world, usable.reshape(shape)
-    )
-
-
-class _Pixels:
-    """All pixels that are trained on, as one table."""
-
-    def __init__(self, views: Sequence[FieldView], max_side_px: int) -> None:
-        found = [_pixels(view, max_side_px) for view in views]
-        self._cameras = list(dict.fromkeys(camera for camera, *_ in found))
-        self._camera_of = np.array([self._cameras.index(camera) for camera, *_ in found])
-        self._poses = [view.cam_from_world for view in views]
-        self._starts = np.cumsum([0, *(len(rgb) for _, rgb, _, _ in found)])
-        self._rgb = np.concatenate([rgb for _, rgb, _, _ in found])
-        self._usable = np.flatnonzero(np.concatenate([usable for _, _, usable, _ in found]))
-        if not len(self._usable):
-            raise DataError("masks leave no pixel to train on")
-        self._depth = None
-        if any(depth is not None for *_, depth in found):
-            self._depth = np.concatenate(
-                [
-                    np.zeros(len(rgb), np.float32) if depth is None else depth
-                    for _, rgb, _, depth in found
-                ]
-            )
-        self._rotations = np.stack([pose.rotation_matrix() for pose in self._poses])
-        self._centres = np.stack([pose.center() for pose in self._poses])
-
-    def frame(self) -> FieldFrame:
-        """The frame about the cameras and what their depth shows; without, about the cameras."""
-        low, high = self._centres.min(0), self._centres.max(0)
-        spread = float(max((high - low).max(), 1e-6))
-        near, far = 0.02 * spread, 20 * spread
-        if self._depth is not None and (known := self._depth[self._depth > 0]).size:
-            near, far = 0.5 * np.quantile(known, 0.01), 1.5 * np.quantile(known, 0.99)
-            rows = self._usable[self._depth[self._usable] > 0]
-            rows = rows[:: max(1, len(rows) // 20000)]
-            image, rays = self._lines(rows)
-            points = self._centres[image] + rays * self._depth[rows, None]
-            low = np.minimum(low, np.quantile(points, 0.005, axis=0))
-            high = np.maximum(high, np.quantile(points, 0.995, axis=0))
-        else:
-            low, high = low - spread, high + spread
-        centre = 0.5 * (low + high)
-        scale = 0.5 * float((high - low).max())
-        x, y, z = centre.tolist()
-        return FieldFrame(centre=(x, y, z), scale=scale, near=float(near), far=float(far))
-
-    def _lines(self, rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Images (N,) of pixels, and their rays (N, 3) in the world."""
-        image = np.searchsorted(self._starts, rows, side="right") - 1
-        rays = np.empty((len(rows), 3))
-        camera_of = self._camera_of[image]
-        for number in np.unique(camera_of):
-            which = camera_of == number
-            inside = rows[which] - self._starts[image[which]]
-            rays[which] = pixel_rays(self._cameras[number])[inside]
-        return image, np.einsum("nj,njk->nk", rays, self._rotations[image])
-
-    def batch(
-        self, field: NeuralField, count: int, generator: torch.Generator
-    ) -> tuple[Rays, torch.Tensor]:
-        """Random rays with their embeddings, and the colours (N, 3) that are seen there."""
-        drawn = torch.randint(len(self._usable), (count,), generator=generator).numpy()
-        rows = self._usable[drawn]
-        image, directions = self._lines(rows)
-        frame, device = field.frame, field.device
-
-        def tensor(values: NDArray[np.floating]) -> torch.Tensor:
-            return torch.from_numpy(np.asarray(values, np.float32)).to(device)
-
-        index = torch.from_numpy(image).to(device)
-        module = field.module
-        rays = Rays(
-            tensor((self._centres[image] - frame.centre) / frame.scale),
-            tensor(directions / frame.scale),
-            frame.near,
-            frame.far,
-            None if module.appearance is None else module.appearance(index),
-            None if module.transient is None else module.transient(index),
-            None if self._depth is None else tensor(self._depth[rows]),
-        )
-        return rays, tensor(self._rgb[rows].astype(np.float32) / 255)
+    image, mask = rgb.reshape(*shape, 3), usable.reshape(shape)
+    return FieldView(view.name, image, camera, view.cam_from_world, mask)

@@ -17,6 +17,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -121,6 +122,13 @@ class LevelProblem:
         """The same of at most so many points, still evenly spread."""
         step = max(1, -(-len(self.chosen.points) // most))
         return self.subset(np.arange(0, len(self.chosen.points), step)) if step > 1 else self
+
+    def within(self, mask: NDArray[np.bool_]) -> LevelProblem:
+        """The same on some pixels of the query, bool (H, W)."""
+        size = self.level.valid.shape[1::-1]
+        seen = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+        level = replace(self.level, valid=self.level.valid & seen)
+        return LevelProblem(self.chosen, level, self.camera, self._near, num_groups=self.num_groups)
 
     def rows(self, at: Alignment) -> Float64:
         """Residuals and derivatives, (N, C, 8), as ``photometric_kernels.evaluate`` has them."""

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError
 from megloc_kapture.refinement.depth_points import DepthPoints
 
-Appearance = Literal["normalised", "intensity", "gradients"]
+Appearance = Literal["normalised", "colours", "intensity", "gradients"]
 FeatureMaps = Callable[[NDArray[np.uint8]], NDArray[np.floating[Any]]]
 _BLUR_PX = 0.8  # before each halving, and of the values: bilinear reading needs smooth ones
 _WINDOW_PX = 17  # in which contrast is normalised
@@ -86,8 +86,8 @@ def build_pyramid(
     levels : at most; none is smaller than 16 px.
     max_side_px : longer side of the finest level; larger images are reduced.
     appearance : ``intensity`` is brightness in [0, 1]; ``normalised`` is brightness of zero mean
-        and unit deviation in a window about each pixel; ``gradients`` is the magnitude of the
-        gradient of brightness.
+        and unit deviation in a window about each pixel, ``colours`` the same of red, green and
+        blue; ``gradients`` is the magnitude of the gradient of brightness.
     features : compare these maps of the image instead; masked pixels are shown to it in the mean
         colour of the others.
 
@@ -103,8 +103,8 @@ def build_pyramid(
         values = _feature_values(image, used, features)
         used = _resized(used, values.shape[1], values.shape[0])
     else:
-        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        values = (grey.astype(np.float32) * np.float32(1 / 255))[..., None]
+        seen = image if appearance == "colours" else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        values = (seen.astype(np.float32) * np.float32(1 / 255)).reshape(height, width, -1)
     values = values * used[..., None]
     longer = max(values.shape[:2])
     if longer > max_side_px:
@@ -119,8 +119,8 @@ def build_pyramid(
             known[..., None], values / np.where(known, smooth_used, 1.0)[..., None], 0.0
         ).astype(np.float32)
         valid = used > _HALF
-        if features is None and appearance == "normalised":
-            mean = _normalised(mean, used)
+        if features is None and appearance in ("normalised", "colours"):
+            mean = np.concatenate([_normalised(each, used) for each in np.moveaxis(mean, 2, 0)], 2)
         elif features is None and appearance == "gradients":
             mean, valid = _gradient_magnitude(mean, valid)
         result.append(Level(np.ascontiguousarray(mean), valid, w / width, h / height))
@@ -156,9 +156,8 @@ def _box_mean(values: Float32) -> Float32:
     return np.asarray(cv2.blur(values, (_WINDOW_PX, _WINDOW_PX)), np.float32)
 
 
-def _normalised(values: Float32, used: Float32) -> Float32:
-    """Values (h, w, 1) with zero mean and unit deviation in the window about each pixel."""
-    plane = values[..., 0]
+def _normalised(plane: Float32, used: Float32) -> Float32:
+    """Values (h, w, 1) of a plane (h, w): zero mean, unit deviation in the window of a pixel."""
     share = np.maximum(_box_mean(used), np.float32(1e-3))
     mean = _box_mean(plane * used) / share
     centred = np.asarray(plane - mean, np.float32)

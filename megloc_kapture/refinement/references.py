@@ -87,7 +87,8 @@ class RenderingOptions(Options):
     appearance: Appearance = Field(
         default="normalised",
         description="what is compared: brightness of locally normalised contrast (day and night), "
-        "plain brightness (intensity), or magnitudes of its gradient (gradients)",
+        "the same of each colour (colours), plain brightness (intensity), or magnitudes of its "
+        "gradient (gradients)",
     )
     max_references: int = Field(
         default=4,

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -105,19 +106,22 @@ def judge_by_rendering(
     start: RigidTransform,
     found: RigidTransform,
     options: RenderingOptions,
+    *,
+    judged: NDArray[np.bool_] | None = None,
 ) -> PoseRefinement:
     """Judge a pose that was found by other means, aligned at the finest level, as above.
 
     Parameters
     ----------
     start, found : the old ``cam_from_world`` and the one that may replace it.
+    judged : bool (H, W), pixels of the query by which it is accepted or not; all unless given.
 
     Raises
     ------
     DataError : as above.
     """
     with ThreadPoolExecutor(2) as threads:
-        return _Refining(query, references, options, None, threads).judge(start, found)
+        return _Refining(query, references, options, None, threads).judge(start, found, judged)
 
 
 def displacement_by_rendering(
@@ -197,12 +201,17 @@ class _Refining:
             return _uncovered(start, overlap)
         return self._decide(start, overlap, self._align(0, start, sight))
 
-    def judge(self, start: RigidTransform, pose: RigidTransform) -> PoseRefinement:
+    def judge(
+        self, start: RigidTransform, pose: RigidTransform, judged: NDArray[np.bool_] | None
+    ) -> PoseRefinement:
         """See :func:`judge_by_rendering`."""
         sight, overlap = self._visibility(pose)
         if sight is None:
             return _uncovered(start, overlap)
-        return self._decide(start, overlap, self._align(0, pose, sight))
+        found = self._align(0, pose, sight)
+        if found is not None and judged is not None:
+            found = replace(found, problem=found.problem.within(judged))
+        return self._decide(start, overlap, found)
 
     def _visibility(self, start: RigidTransform) -> tuple[Visibility | None, float]:
         """Visibility of the references, if it is enough, and the share of the query covered."""

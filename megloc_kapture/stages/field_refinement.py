@@ -3,8 +3,9 @@
 Render, match, solve: colour and depth are rendered at the initial pose, local features of query and
 rendering matched, lifted by the rendered depth, and the pose solved (as GS-CPR, Liu et al., ICLR
 2025, does with splats). Renderings from there are aligned with the query as map images are by
-``rendering``, and the pose is accepted by its rules. Descending on colours from the initial pose is
-slower and heals less.
+``rendering``, and the pose is accepted by its rules. The query's light is fitted on every other
+square of it, and the others are what its pose is accepted by. Descending on colours from the
+initial pose is slower and heals less.
 """
 
 from __future__ import annotations
@@ -44,6 +45,8 @@ from megloc_kapture.refinement.rendering import judge_by_rendering
 from megloc_kapture.values import Camera, Failure, ImageFeatures, Options, RigidTransform
 
 if TYPE_CHECKING:
+    import torch
+
     from megloc_kapture.refinement.neural_field import FieldRendering
 
 # of the pose that was solved, each by a rendering from where the last one led
@@ -127,26 +130,34 @@ class FieldRefiner:
 
         field = open_field(Path(self.options.field))
         image, mask = scene.query_image(query), scene.query_mask(query)
-        view = FieldView(query, image, camera, cam_from_world, mask)
-        light = field.fitted_appearance(view, self.options.max_side_px)
+        fitted = _checkers(image.shape[:2])
+        used = fitted if mask is None else fitted & mask
         side = self.options.max_side_px
+
+        def light_at(pose: RigidTransform) -> torch.Tensor | None:
+            return field.fitted_appearance(FieldView(query, image, camera, pose, used), side)
+
+        light = light_at(cam_from_world)
         first = field.render(camera, cam_from_world, appearance=light, max_side_px=side)
         solved = self._solve(self._extract(image, mask, first.camera), first, cam_from_world)
         if isinstance(solved, Failure):
             return PoseRefinement(cam_from_world, f"query and rendering: {solved.reason}")
         seen = RenderingQuery(image, camera, mask)
         options = RenderingOptions(
+            appearance="colours",
             max_side_px=side,
             levels=1,
             max_translation_m=self.options.max_translation_m,
             max_rotation_deg=self.options.max_rotation_deg,
         )
-        pose = solved
+        pose, light = solved, light_at(solved)
         for _ in range(_ALIGNMENTS):
             shown = field.render(camera, pose, appearance=light, max_side_px=side)
             depth = DepthView(shown.camera, shown.depth_m, RigidTransform.identity())
             reference = RenderingReference(shown.image, shown.camera, pose, depth)
-            judged = judge_by_rendering(seen, [reference], cam_from_world, pose, options)
+            judged = judge_by_rendering(
+                seen, [reference], cam_from_world, pose, options, judged=~fitted
+            )
             if not judged.accepted:
                 break
             pose = judged.cam_from_world
@@ -182,3 +193,10 @@ class FieldRefiner:
             options,
         )
         return found.cam_from_world if found else found
+
+
+def _checkers(shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Every other of the squares, ten along the longer side, into which an image is divided."""
+    height, width = shape
+    squares = [np.arange(side) * 10 // max(shape) for side in (height, width)]
+    return np.asarray((squares[0][:, None] + squares[1]) % 2 == 0)

@@ -7,30 +7,37 @@ tensors; nothing in either can run.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.files import read_json_model, write_bytes, write_json_model
+from megloc_kapture.io.files import (
+    read_content,
+    read_json_model,
+    remove,
+    write_bytes,
+    write_json_model,
+)
 from megloc_kapture.io.images import write_depth_map, write_image
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.io.weights import WeightsFile, describe, read_weights
 from megloc_kapture.nets.runtime import Device, load_strictly, pick_device
+from megloc_kapture.refinement.field_training import FieldTrainer, FieldTrainingOptions
 from megloc_kapture.refinement.neural_field import (
     FieldFrame,
-    FieldTrainingOptions,
     FieldView,
     Kind,
     NeuralField,
     build_field,
-    train_field,
+    light_rows,
 )
 from megloc_kapture.stages.ranking_scene import KaptureScene
 
 FIELD_FILE, MANIFEST_FILE = "field.safetensors", "field.json"
+STATE_FILE = "field.state.pt"  # while it is trained
 
 
 class FieldManifest(BaseModel):
@@ -38,7 +45,7 @@ class FieldManifest(BaseModel):
 
     Attributes
     ----------
-    images : those trained on, in the order of the embeddings.
+    images : those trained on, in the order of the transient embeddings.
     held_out_psnr_db : of each held-out image.
     """
 
@@ -60,10 +67,12 @@ def train_field_of_map(
 ) -> Mapping[str, float]:
     """Train a field on the images of a map that have poses, and write it into a folder.
 
+    Where an interrupted training of the same has left its state there, it goes on from it.
+
     Parameters
     ----------
     mapping : kapture with images and poses; masks and depth are used where they are.
-    progress : see :func:`~megloc_kapture.refinement.neural_field.train_field`.
+    progress : see :meth:`~megloc_kapture.refinement.field_training.FieldTrainer.train`.
 
     Returns
     -------
@@ -71,11 +80,15 @@ def train_field_of_map(
 
     Raises
     ------
-    DataError : too few images, or one, its mask or its depth cannot be read.
+    DataError : too few images, or one, its mask or its depth cannot be read; the state is damaged
+        or of another training.
     """
     from safetensors.torch import save
 
-    field, psnr = train_field(views_of(mapping), options, progress=progress)
+    trainer, state = FieldTrainer(views_of(mapping), options), output / STATE_FILE
+    if state.is_file():
+        trainer.resume(read_content(state), state)
+    field, psnr = trainer.train(progress=progress, keep=partial(write_bytes, state))
     module = field.module.cpu()
     tensors = {name: value.contiguous() for name, value in module.state_dict().items()}
     write_bytes(output / FIELD_FILE, save(tensors))
@@ -88,6 +101,7 @@ def train_field_of_map(
         options=options,
     )
     write_json_model(output / MANIFEST_FILE, manifest)
+    remove(state)
     return psnr
 
 
@@ -127,10 +141,11 @@ def weights_file(folder: Path) -> WeightsFile:
 @lru_cache(maxsize=2)
 def _opened(file: WeightsFile, device: Device) -> NeuralField:
     manifest = read_json_model(file.path.with_name(MANIFEST_FILE), FieldManifest)
-    module = build_field(manifest.kind, len(manifest.images))
+    rows = light_rows(manifest.images, manifest.options.lights)
+    module = build_field(manifest.kind, len(manifest.images), max(rows) + 1)
     load_strictly(module, read_weights(file), str(file.path))
     module.requires_grad_(False)
-    return NeuralField(module.to(pick_device(device)), manifest.frame, manifest.images)
+    return NeuralField(module.to(pick_device(device)), manifest.frame, manifest.images, rows)
 
 
 def render_along(

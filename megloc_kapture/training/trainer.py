@@ -7,7 +7,6 @@ training that was interrupted are, byte for byte, those of one that was not.
 
 from __future__ import annotations
 
-import io
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -22,11 +21,12 @@ import torch
 from pydantic import Field
 from torch import distributed
 
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import OptionError
 from megloc_kapture.io.files import read_content
 from megloc_kapture.io.weights import find_weights, read_weights
 from megloc_kapture.nets.runtime import NetworkOptions, pick_device
 from megloc_kapture.nets.superglue import SuperGlueNet, superglue
+from megloc_kapture.nets.training_state import load_state, state_bytes
 from megloc_kapture.plugins import (
     LOCAL_FEATURES,
     LocalFeatureExtractor,
@@ -119,15 +119,7 @@ class TrainingState:
 
     def tensors(self, model: PairModel, optimizer: torch.optim.Optimizer) -> bytes:
         """The state with networks and optimizer, as a file."""
-        stream = io.BytesIO()
-        content = {
-            "step": self.step,
-            "rows": self.rows,
-            "model": model.state_dict(),
-            "optimizer": optimizer.state_dict(),
-        }
-        torch.save(content, stream)
-        return stream.getvalue()
+        return state_bytes(model, optimizer, {"step": self.step, "rows": self.rows})
 
     @classmethod
     def resume(
@@ -141,19 +133,8 @@ class TrainingState:
         """
         if not path.is_file():
             return cls(0, [])
-        try:
-            content = torch.load(
-                io.BytesIO(read_content(path)), map_location="cpu", weights_only=True
-            )
-            model.load_state_dict(content["model"])
-            optimizer.load_state_dict(content["optimizer"])
-            return cls(int(content["step"]), [list(map(float, row)) for row in content["rows"]])
-        except DataError:
-            raise
-        except Exception as error:  # torch raises many kinds on damaged files
-            raise DataError(
-                "not the state of this training, or damaged; -f begins again", path=path
-            ) from error
+        content = load_state(read_content(path), path, model, optimizer)
+        return cls(content["step"], [list(map(float, row)) for row in content["rows"]])
 
 
 @dataclass(frozen=True)

@@ -54,6 +54,38 @@ def test_the_same_bytes_twice(megloc: Any, mapping: Path, field: Path, tmp_path:
     assert len(json.loads((field / "field.json").read_text())["images"]) == 7
 
 
+def test_an_interrupted_training_goes_on(
+    megloc: Any, mapping: Path, field: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from megloc_kapture.refinement import field_training
+
+    monkeypatch.setattr(field_training, "_KEEP_EVERY", 2)
+    learn, out = field_training.FieldTrainer._learn, tmp_path / "out"
+    command = ("train-field", "-i", mapping, "-o", out, *QUICK)
+
+    def killed(trainer: Any, generator: Any) -> None:
+        if trainer._step == 5:
+            raise KeyboardInterrupt
+        learn(trainer, generator)
+
+    monkeypatch.setattr(field_training.FieldTrainer, "_learn", killed)
+    megloc(*command)
+    assert [path.name for path in out.iterdir() if path.name[0] != "."] == ["field.state.pt"]
+    megloc("render", out, "--along", mapping, "-o", tmp_path / "x").refused(
+        "train-field writes one"
+    )
+    monkeypatch.setattr(field_training.FieldTrainer, "_learn", learn)
+    megloc(*command, "--seed", "1").refused("of other options or images; -f begins again")
+    steps: list[int] = []
+    monkeypatch.setattr(
+        field_training.FieldTrainer, "_learn", lambda t, g: (steps.append(t._step), learn(t, g))
+    )
+    assert megloc(*command).status == 0 and steps == [4, 5]
+    for name in ("field.json", "field.safetensors"):
+        assert (out / name).read_bytes() == (field / name).read_bytes()
+    assert not (out / "field.state.pt").exists()
+
+
 def test_a_view_in_colour_and_depth(
     megloc: Any, mapping: Path, field: Path, tmp_path: Path
 ) -> None:

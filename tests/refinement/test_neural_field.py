@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,12 +17,17 @@ from megloc_kapture.errors import DataError  # noqa: E402
 from megloc_kapture.nets.triplane import TriPlane  # noqa: E402
 from megloc_kapture.pipeline.executors import single_threaded  # noqa: E402
 from megloc_kapture.plugins import DepthView  # noqa: E402
-from megloc_kapture.refinement.neural_field import (  # noqa: E402
+from megloc_kapture.refinement import field_training  # noqa: E402
+from megloc_kapture.refinement.field_training import (  # noqa: E402
+    FieldTrainer,
     FieldTrainingOptions,
+    train_field,
+)
+from megloc_kapture.refinement.neural_field import (  # noqa: E402
     FieldView,
     NeuralField,
-    _pixels,
-    train_field,
+    light_rows,
+    pixels_of,
 )
 from megloc_kapture.values import Camera, RigidTransform  # noqa: E402
 
@@ -80,6 +87,38 @@ def test_a_small_field_learns_the_room_and_the_same_bytes_twice() -> None:
     assert not torch.equal(changed.module.state_dict()["planes.0"], one["planes.0"])
 
 
+def test_interrupted_and_resumed_is_uninterrupted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(field_training, "_KEEP_EVERY", 3)
+    path, states = Path("field.state.pt"), list[bytes]()
+    whole, _ = FieldTrainer(views(5), QUICK).train(keep=states.append)
+    assert len(states) == 2  # after three steps and after six of eight
+    trainer = FieldTrainer(views(5), QUICK)
+    trainer.resume(states[0], path)
+    resumed, _ = trainer.train(keep=states.append)
+    expected = whole.module.state_dict()
+    assert all(torch.equal(expected[n], v) for n, v in resumed.module.state_dict().items())
+    for given in (views(5, seed=2), views(4)):
+        with pytest.raises(DataError, match=r"state\.pt: .* -f begins again"):
+            FieldTrainer(given, QUICK).resume(states[0], path)
+    with pytest.raises(DataError, match=r"state\.pt: not the state .* or damaged"):
+        trainer.resume(states[0][:-100], path)
+
+
+def test_images_of_a_folder_may_share_their_light() -> None:
+    given = [replace(v, name=f"{n % 2}/{v.name}") for n, v in enumerate(views(6))]
+    options = QUICK.model_copy(update={"lights": "folder", "held_out_every": 2})
+    field, psnr = train_field(given, options)
+    assert field.images == ("0/000.png", "0/002.png", "0/004.png") and len(psnr) == 3
+    assert field.module.appearance is not None and len(field.module.appearance.weight) == 1
+    field, psnr = train_field(given, options.model_copy(update={"held_out_every": 0}))
+    assert len(field.images) == 6 and not psnr
+    assert field.module.transient is not None and len(field.module.transient.weight) == 6
+    lights = {name: field.appearance_of(name) for name in field.images}
+    assert torch.equal(lights["0/000.png"], lights["0/004.png"])
+    assert not torch.equal(lights["0/000.png"], lights["1/001.png"])
+    assert light_rows(["b/1", "a/1", "b/2", "c"], "folder") == [0, 1, 0, 2]
+
+
 def test_masked_pixels_change_nothing() -> None:
     plain = views(4)
     mask = np.ones((24, 32), bool)
@@ -111,7 +150,7 @@ def test_depth_of_another_camera_is_brought_to_the_image() -> None:
             FieldView(view.name, view.image, view.camera, view.cam_from_world, None, depth)
         )
     for view, other in zip(plain, moved, strict=True):
-        own, brought = _pixels(view, 32)[3], _pixels(other, 32)[3]
+        own, brought = pixels_of(view, 32)[3], pixels_of(other, 32)[3]
         assert own is not None and brought is not None
         both = (own > 0) & (brought > 0)
         assert both.mean() > 0.75

@@ -12,7 +12,7 @@ from megloc_kapture.refinement.pyramid import (
     build_pyramid,
 )
 
-APPEARANCES: tuple[Appearance, ...] = ("normalised", "intensity", "gradients")
+APPEARANCES: tuple[Appearance, ...] = ("normalised", "colours", "intensity", "gradients")
 
 
 def picture(seed: int = 0, width: int = 200, height: int = 150) -> NDArray[np.uint8]:
@@ -24,7 +24,9 @@ def picture(seed: int = 0, width: int = 200, height: int = 150) -> NDArray[np.ui
 @pytest.mark.parametrize("appearance", APPEARANCES)
 def test_levels_halve_and_know_their_scale(appearance: Appearance) -> None:
     levels = build_pyramid(picture(), levels=3, max_side_px=100, appearance=appearance)
-    assert [level.values.shape for level in levels] == [(75, 100, 1), (37, 50, 1), (18, 25, 1)]
+    channels = 3 if appearance == "colours" else 1
+    sizes = [(75, 100), (37, 50), (18, 25)]
+    assert [level.values.shape for level in levels] == [(*size, channels) for size in sizes]
     assert [level.scale_x for level in levels] == [0.5, 0.25, 0.125]
     assert levels[1].scale_y == 37 / 150
     assert all(level.values.dtype == np.float32 for level in levels)
@@ -64,6 +66,15 @@ def test_a_full_mask_changes_nothing(appearance: Appearance) -> None:
     with_mask = build_pyramid(picture(), full, appearance=appearance)
     for a, b in zip(with_mask, build_pyramid(picture(), appearance=appearance), strict=True):
         np.testing.assert_allclose(a.values, b.values, atol=1e-6)
+
+
+def test_colours_are_normalised_each_as_brightness_is() -> None:
+    image = picture()
+    found = build_pyramid(image, levels=2, appearance="colours")
+    for channel in range(3):
+        grey = build_pyramid(np.repeat(image[..., channel : channel + 1], 3, axis=2), levels=2)
+        for a, b in zip(found, grey, strict=True):
+            np.testing.assert_allclose(a.values[..., channel], b.values[..., 0], atol=1e-5)
 
 
 def test_normalised_values_do_not_depend_on_exposure() -> None:

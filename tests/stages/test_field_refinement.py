@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import OptionError
 from megloc_kapture.geometry.poses import movement
-from megloc_kapture.plugins import POSE_REFINERS, PoseRefinement, load_plugin
+from megloc_kapture.plugins import POSE_REFINERS, DepthView, PoseRefinement, load_plugin
 from megloc_kapture.values import Camera, RigidTransform
 
 pytest.importorskip("torch")
@@ -26,9 +26,17 @@ from megloc_kapture.io.kapture import (  # noqa: E402
     write_sensors,  # noqa: E402
 )
 from megloc_kapture.pipeline.executors import single_threaded  # noqa: E402
-from megloc_kapture.refinement.neural_field import FieldRendering, FieldTrainingOptions  # noqa: E402
+from megloc_kapture.refinement.field_training import FieldTrainingOptions  # noqa: E402
+from megloc_kapture.refinement.neural_field import FieldRendering  # noqa: E402
+from megloc_kapture.refinement.references import (  # noqa: E402
+    RenderingOptions,
+    RenderingQuery,
+    RenderingReference,
+)
+from megloc_kapture.refinement.rendering import judge_by_rendering  # noqa: E402
 from megloc_kapture.stages import neural_field  # noqa: E402
 
+IDENTITY = RigidTransform.identity()
 LARGER = Camera("PINHOLE", 320, 240, (220.0, 220.0, 160.0, 120.0))
 
 
@@ -97,6 +105,36 @@ def test_what_does_not_look_alike_stays_where_it_is(monkeypatch: pytest.MonkeyPa
     seen = room.render(truth, camera=LARGER).image
     same = refined("exact", LARGER, seen, truth)
     assert not same.accepted and same.cam_from_world == truth
+
+
+def test_light_is_fitted_on_one_half_and_the_pose_judged_by_the_other(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    fitted: list[NDArray[np.bool_]] = []
+
+    class Spied(ExactField):
+        def fitted_appearance(self, view: Any, *_: Any) -> None:
+            fitted.append(view.mask)
+
+    monkeypatch.setattr(neural_field, "open_field", lambda *_: Spied())
+    truth = room.poses(1, 4)[0]
+    start = perturbed(truth, 0.1, 2.0, np.random.default_rng(0))
+    seen = room.render(truth, camera=LARGER)
+    image, depth = seen.image, seen.depth_m
+    whole = refined("exact", LARGER, image, start)
+    half = fitted[0]
+    assert whole.accepted and half.mean() == pytest.approx(0.5, abs=0.05)
+    reference = RenderingReference(image, LARGER, truth, DepthView(LARGER, depth, IDENTITY))
+    options = RenderingOptions(levels=1)
+    noise = np.random.default_rng(0).integers(0, 255, image.shape, np.uint8)
+    query = RenderingQuery(np.where(half[..., None], noise, image), LARGER)
+    by_one, by_other, by_all = (
+        judge_by_rendering(query, [reference], start, truth, options, judged=which)
+        for which in (~half, half, None)
+    )
+    assert by_one.accepted and not by_other.accepted, (by_one, by_other)
+    assert by_other.measures["correlation_after"] < 0.2 < by_one.measures["correlation_after"]
+    assert by_one.measures["points"] < 0.6 * by_all.measures["points"]
 
 
 def test_a_field_is_needed() -> None:

@@ -1,0 +1,301 @@
+"""Training of a neural field on the posed images of a map.
+
+With the loss of NeRF-W (:func:`~megloc_kapture.nets.radiance.nerf_w_loss`) on random pixels of all
+images but those held out; where an image has depth, the field's own is drawn to it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import Field
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.geometry.cameras import pixel_rays
+from megloc_kapture.nets.nerfw import NerfW
+from megloc_kapture.nets.radiance import Rays, nerf_w_loss
+from megloc_kapture.nets.runtime import NetworkOptions, pick_device
+from megloc_kapture.nets.training_state import load_state, state_bytes
+from megloc_kapture.nets.triplane import TriPlane
+from megloc_kapture.refinement.neural_field import (
+    FieldFrame,
+    FieldView,
+    Kind,
+    Lights,
+    NeuralField,
+    build_field,
+    light_rows,
+    pixels_of,
+    reduced_view,
+)
+
+# Adam's rates at the beginning; at the end a thirtieth
+_PLANE_RATE, _RATE, _NERF_RATE = 2e-2, 5e-3, 5e-4
+_DECAY = 1 / 30
+_KEEP_EVERY = 200  # steps
+
+
+class FieldTrainingOptions(NetworkOptions):
+    """Options of a field's training."""
+
+    kind: Kind = Field(
+        default="triplane", description="triplane: minutes on a processor; nerfw: needs a GPU"
+    )
+    steps: int = Field(default=4000, gt=0, description="of the training")
+    minutes: float | None = Field(
+        default=None,
+        gt=0,
+        description="end the training after so many at the latest; without, the same bytes twice",
+    )
+    rays_per_step: int = Field(default=2048, gt=0, description="random pixels of all images")
+    max_side_px: int = Field(
+        default=320, ge=16, description="longer side of an image; larger ones are reduced"
+    )
+    depth_weight: float = Field(
+        default=5.5, ge=0, description="of the relative error of depth in NeRF-W's loss"
+    )
+    held_out_every: int = Field(
+        default=8, ge=0, description="of so many images one is held out; 0: none"
+    )
+    lights: Lights = Field(
+        default="image", description="an appearance for each image, or for each folder of images"
+    )
+    seed: int = Field(default=0, ge=0)
+
+
+class FieldTrainer:
+    """A field, what it learns from, and its optimizer.
+
+    The random numbers of a step depend on the seed and the step alone, so that an interrupted
+    training goes on to the bytes of one that was not.
+
+    Parameters
+    ----------
+    views : at least two, in order; of eight or more some are held out, as the options say.
+    module : of as many images as are trained on; built as the options say unless given.
+
+    Raises
+    ------
+    DataError : too few images, or one does not fit its camera; no pixel may be used.
+    """
+
+    def __init__(
+        self,
+        views: Sequence[FieldView],
+        options: FieldTrainingOptions,
+        module: NerfW | TriPlane | None = None,
+    ) -> None:
+        self.options = options
+        every = options.held_out_every
+        held_out = list(views[every - 1 :: every]) if every else []
+        names = {view.name for view in held_out}
+        trained = [view for view in views if view.name not in names]
+        if len(trained) < 2:
+            raise DataError(f"{len(views)} images with poses and pixels are too few for a field")
+        images = [view.name for view in trained]
+        rows = light_rows(images, options.lights)
+        if module is None:
+            with torch.random.fork_rng([]):
+                torch.manual_seed(options.seed)
+                module = build_field(options.kind, len(images), max(rows) + 1)
+        self._data = _Pixels(trained, options.max_side_px)
+        module = module.to(pick_device(options.device))
+        self._field = NeuralField(module, self._data.frame(), images, rows)
+        self._held_out = [reduced_view(view, options.max_side_px) for view in held_out]
+        self._optimizer = torch.optim.Adam(_groups(module), eps=1e-15, betas=(0.9, 0.99))
+        self._rates = [float(group["lr"]) for group in self._optimizer.param_groups]
+        self._step, self._seconds = 0, 0.0
+
+    def resume(self, state: bytes, path: Path) -> None:
+        """Go on from what :meth:`train` gave to ``keep``.
+
+        Raises
+        ------
+        DataError : it is damaged, or of other options or images; names the path.
+        """
+        found = load_state(state, path, self._field.module, self._optimizer)
+        if found.get("training") != self._fingerprint:
+            raise DataError("is of other options or images; -f begins again", path=path)
+        self._step, self._seconds = found["step"], float(found["seconds"])
+
+    @cached_property
+    def _fingerprint(self) -> str:
+        options = self.options.model_dump_json(exclude={"minutes"})
+        content = f"{options} {self._field.images}".encode() + self._data.digest()
+        return hashlib.sha256(content).hexdigest()
+
+    def train(
+        self,
+        *,
+        progress: Callable[[int, float, list[float]], None] | None = None,
+        keep: Callable[[bytes], None] | None = None,
+    ) -> tuple[NeuralField, dict[str, float]]:
+        """Train to the last step.
+
+        Parameters
+        ----------
+        progress : is given the step, the seconds, and the held-out PSNR in dB of two, now and then.
+        keep : is given the state, more often.
+
+        Returns
+        -------
+        The field, and PSNR in dB of each held-out image by name.
+        """
+        options, field = self.options, self._field
+        started = time.monotonic() - self._seconds
+        shown = max(options.steps // 5, 1)
+        generator = torch.Generator()
+        for step in range(self._step, options.steps):
+            done, self._seconds = step / options.steps, time.monotonic() - started
+            if options.minutes is not None:
+                done = max(done, self._seconds / 60 / options.minutes)
+            if done >= 1:
+                break
+            for group, rate in zip(self._optimizer.param_groups, self._rates, strict=True):
+                group["lr"] = rate * _DECAY**done * min(1.0, (step + 1) / 50)
+            seeds = np.random.SeedSequence([options.seed, step])
+            generator.manual_seed(int(seeds.generate_state(1, np.uint64)[0]))
+            self._learn(generator)
+            self._step = step + 1
+            if self._step == options.steps:
+                break
+            if keep is not None and self._step % _KEEP_EVERY == 0:
+                where = {"step": self._step, "seconds": self._seconds}
+                more = {**where, "training": self._fingerprint}
+                keep(state_bytes(field.module, self._optimizer, more))
+            if progress is not None and self._step % shown == 0:
+                scores = [field.held_out_psnr(view) for view in self._held_out[:2]]
+                progress(self._step, self._seconds, scores)
+        field.module.requires_grad_(False)
+        return field, {view.name: field.held_out_psnr(view) for view in self._held_out}
+
+    def _learn(self, generator: torch.Generator) -> None:
+        """One step."""
+        options, module, device = self.options, self._field.module, self._field.device
+        rays, rgb = self._data.batch(self._field, options.rays_per_step, generator)
+        with torch.autocast(device.type, torch.bfloat16, enabled=options.half_precision):
+            rendered = module.render(rays, generator)
+        loss = nerf_w_loss(rendered, rgb)
+        if (depth := rays.depth) is not None:
+            error = (rendered.depth - depth).abs() / depth.clamp_min(1e-6)
+            known = torch.where(depth > 0, error.clamp(max=1.0), 0.0)
+            loss = loss + options.depth_weight * known.mean()
+        self._optimizer.zero_grad(set_to_none=True)
+        torch.autograd.backward(loss)
+        self._optimizer.step()
+
+
+def train_field(
+    views: Sequence[FieldView],
+    options: FieldTrainingOptions | None = None,
+    *,
+    module: NerfW | TriPlane | None = None,
+    progress: Callable[[int, float, list[float]], None] | None = None,
+) -> tuple[NeuralField, dict[str, float]]:
+    """Train a field at once; see :class:`FieldTrainer` for parameters, results and errors."""
+    trainer = FieldTrainer(views, options or FieldTrainingOptions(), module)
+    return trainer.train(progress=progress)
+
+
+def _groups(module: NerfW | TriPlane) -> list[dict[str, object]]:
+    if isinstance(module, NerfW):
+        return [{"params": list(module.parameters()), "lr": _NERF_RATE}]
+    planes = list(module.planes)
+    others = [value for name, value in module.named_parameters() if not name.startswith("planes")]
+    return [{"params": planes, "lr": _PLANE_RATE}, {"params": others, "lr": _RATE}]
+
+
+class _Pixels:
+    """All pixels that are trained on, as one table."""
+
+    def __init__(self, views: Sequence[FieldView], max_side_px: int) -> None:
+        found = [pixels_of(view, max_side_px) for view in views]
+        self._cameras = list(dict.fromkeys(camera for camera, *_ in found))
+        self._camera_of = np.array([self._cameras.index(camera) for camera, *_ in found])
+        self._poses = [view.cam_from_world for view in views]
+        self._starts = np.cumsum([0, *(len(rgb) for _, rgb, _, _ in found)])
+        self._rgb = np.concatenate([rgb for _, rgb, _, _ in found])
+        self._usable = np.flatnonzero(np.concatenate([usable for _, _, usable, _ in found]))
+        if not len(self._usable):
+            raise DataError("masks leave no pixel to train on")
+        self._depth = None
+        if any(depth is not None for *_, depth in found):
+            self._depth = np.concatenate(
+                [
+                    np.zeros(len(rgb), np.float32) if depth is None else depth
+                    for _, rgb, _, depth in found
+                ]
+            )
+        self._rotations = np.stack([pose.rotation_matrix() for pose in self._poses])
+        self._centres = np.stack([pose.center() for pose in self._poses])
+
+    def digest(self) -> bytes:
+        """Of all that is learned from."""
+        found = hashlib.sha256(repr(self._cameras).encode())
+        poses = self._camera_of, self._rotations, self._centres
+        for array in (self._rgb, self._usable, self._depth, *poses):
+            found.update(b"" if array is None else array.tobytes())
+        return found.digest()
+
+    def frame(self) -> FieldFrame:
+        """The frame about the cameras and what their depth shows; without, about the cameras."""
+        low, high = self._centres.min(0), self._centres.max(0)
+        spread = float(max((high - low).max(), 1e-6))
+        near, far = 0.02 * spread, 20 * spread
+        if self._depth is not None and (known := self._depth[self._depth > 0]).size:
+            near, far = 0.5 * np.quantile(known, 0.01), 1.5 * np.quantile(known, 0.99)
+            rows = self._usable[self._depth[self._usable] > 0]
+            rows = rows[:: max(1, len(rows) // 20000)]
+            image, rays = self._lines(rows)
+            points = self._centres[image] + rays * self._depth[rows, None]
+            low = np.minimum(low, np.quantile(points, 0.005, axis=0))
+            high = np.maximum(high, np.quantile(points, 0.995, axis=0))
+        else:
+            low, high = low - spread, high + spread
+        centre = 0.5 * (low + high)
+        scale = 0.5 * float((high - low).max())
+        x, y, z = centre.tolist()
+        return FieldFrame(centre=(x, y, z), scale=scale, near=float(near), far=float(far))
+
+    def _lines(self, rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Images (N,) of pixels, and their rays (N, 3) in the world."""
+        image = np.searchsorted(self._starts, rows, side="right") - 1
+        rays = np.empty((len(rows), 3))
+        camera_of = self._camera_of[image]
+        for number in np.unique(camera_of):
+            which = camera_of == number
+            inside = rows[which] - self._starts[image[which]]
+            rays[which] = pixel_rays(self._cameras[number])[inside]
+        return image, np.einsum("nj,njk->nk", rays, self._rotations[image])
+
+    def batch(
+        self, field: NeuralField, count: int, generator: torch.Generator
+    ) -> tuple[Rays, torch.Tensor]:
+        """Random rays with their embeddings, and the colours (N, 3) that are seen there."""
+        drawn = torch.randint(len(self._usable), (count,), generator=generator).numpy()
+        rows = self._usable[drawn]
+        image, directions = self._lines(rows)
+        frame, device = field.frame, field.device
+
+        def tensor(values: NDArray[np.floating]) -> torch.Tensor:
+            return torch.from_numpy(np.asarray(values, np.float32)).to(device)
+
+        index = torch.from_numpy(image).to(device)
+        module = field.module
+        rays = Rays(
+            tensor((self._centres[image] - frame.centre) / frame.scale),
+            tensor(directions / frame.scale),
+            frame.near,
+            frame.far,
+            None if module.appearance is None else module.appearance(field.light_rows[index]),
+            None if module.transient is None else module.transient(index),
+            None if self._depth is None else tensor(self._depth[rows]),
+        )
+        return rays, tensor(self._rgb[rows].astype(np.float32) / 255)
