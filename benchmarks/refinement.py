@@ -85,22 +85,26 @@ def measure(
     thresholds = Thresholds.read(evaluation)
     same = {"chain": NONE, "seed": seed, "accepted": False, "seconds": 0.0}
     parts = [errors_of(evaluation).assign(**same)]
-    for chain in chains:
-        found, report = workspace / f"refined-{chain}-{seed}", workspace / f"report-{chain}-{seed}"
-        steps = [part for step in chain.split(",") for part in ("--by", step)]
-        folders = ("-i", workspace / "map", "--query", workspace / "query")
-        inputs = [str(part) for part in (*folders, "--poses", workspace / "localized")]
-        started = time.perf_counter()
-        megloc("refine-poses", *inputs, *steps, "--set", REGARDLESS, "-o", str(found), "-f")
-        seconds = time.perf_counter() - started
-        truth = ("--gt", str(workspace / "query_gt"), "--side-tables", str(workspace / "megloc"))
-        megloc("evaluate", "-i", str(found), *truth, "-o", str(report), "-f")
-        rows = read_refinement(found / REFINEMENT_FILE)
-        accepted = {row.image for row in rows if row.accepted}
-        errors = errors_of(report).assign(chain=chain, seed=seed)
-        per_query = seconds / max(len({row.image for row in rows}), 1)
-        parts.append(errors.assign(accepted=errors["query"].isin(accepted), seconds=per_query))
+    parts += [refined(chain, seed, workspace, REGARDLESS) for chain in chains]
     return pd.concat(parts), thresholds
+
+
+def refined(chain: str, seed: int, workspace: Path, setting: str) -> pd.DataFrame:
+    """Errors of a run's queries behind a chain of refiners, with an option of theirs."""
+    found, report = workspace / f"refined-{chain}-{seed}", workspace / f"report-{chain}-{seed}"
+    steps = [part for step in chain.split(",") for part in ("--by", step)]
+    folders = ("-i", workspace / "map", "--query", workspace / "query")
+    inputs = [str(part) for part in (*folders, "--poses", workspace / "localized")]
+    started = time.perf_counter()
+    megloc("refine-poses", *inputs, *steps, "--set", setting, "-o", str(found), "-f")
+    seconds = time.perf_counter() - started
+    truth = ("--gt", str(workspace / "query_gt"), "--side-tables", str(workspace / "megloc"))
+    megloc("evaluate", "-i", str(found), *truth, "-o", str(report), "-f")
+    rows = read_refinement(found / REFINEMENT_FILE)
+    accepted = {row.image for row in rows if row.accepted}
+    errors = errors_of(report).assign(chain=chain, seed=seed)
+    per_query = seconds / max(len({row.image for row in rows}), 1)
+    return errors.assign(accepted=errors["query"].isin(accepted), seconds=per_query)
 
 
 def comparison(name: str, errors: pd.DataFrame, thresholds: Thresholds) -> str:
