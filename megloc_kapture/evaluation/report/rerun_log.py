@@ -46,7 +46,7 @@ def write_recording(path: Path, scene: Scene, context: ResultContext) -> None:
     stream = rr.RecordingStream("megloc", recording_id=scene.title, send_properties=False)
 
     def log(where: list[str], *what: Any) -> None:
-        stream.log(where, *what, static=True)
+        stream.log([*where], *what, static=True)
 
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
