@@ -77,6 +77,7 @@ def overfitted(chosen: TrainingOptions, walk: Path) -> list[list[float]]:
     return [before, state.rows[-1][3:]]
 
 
+@pytest.mark.slow
 def test_a_matcher_learns_eight_pairs_by_heart(files: dict[str, str], walk: Path) -> None:
     chosen = options(
         files, steps=300, check_every=300, pairs_per_step=4, learning_rate=1e-3, held_out_pairs=8
