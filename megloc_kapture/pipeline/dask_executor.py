@@ -96,8 +96,8 @@ def dask_executor(workers: int, scheduler: str | None, shared: Path) -> Iterator
             raise MeglocError("the workers have no megloc_kapture: install it there") from error
         finally:
             plugin.token.unlink(missing_ok=True)
-            # a client that has given its scheduler up has None instead
-            with suppress(CommClosedError, OSError, TimeoutError, AttributeError):
+            # a client that has given its scheduler up has no scheduler, or a closed pool
+            with suppress(CommClosedError, OSError, TimeoutError, AttributeError, RuntimeError):
                 client.unregister_worker_plugin("megloc")
 
 
