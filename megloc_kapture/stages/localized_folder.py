@@ -144,6 +144,11 @@ def result_of(plain: Mapping[str, Any]) -> Pose | Failure:
     """The result that :func:`plain_result` made JSON values of."""
     if "cam_from_world" not in plain:
         return TypeAdapter(Failure).validate_python(plain)
+    return pose_of(plain)
+
+
+def pose_of(plain: Mapping[str, Any]) -> Pose:
+    """The pose that :func:`plain_result` made JSON values of."""
     parts = {name: kind.validate_python(plain[name]) for name, kind in _PARTS.items()}
     return Pose(**{**plain, **parts})
 

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import shutil
 import threading
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from dataclasses import asdict, astuple, dataclass, fields, replace
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pydantic import Field
+import numpy as np
+from pydantic import Field, TypeAdapter
 
 from megloc_kapture.errors import OptionError, PluginError
 from megloc_kapture.geometry.poses import movement
@@ -48,7 +51,10 @@ from megloc_kapture.refinement.consistency import (
     spread_names,
 )
 from megloc_kapture.refinement.references import ReferenceImages
+from megloc_kapture.stages.kept_items import Digest
 from megloc_kapture.stages.layout import LOCALIZED, MAP, REFINEMENT_TIMING, UNREFINED_POSES
+from megloc_kapture.stages.localized_folder import plain_result, pose_of
+from megloc_kapture.stages.query_poses import files_of, map_inputs
 from megloc_kapture.stages.ranking_scene import KaptureScene
 from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.stage import PipelineStage, StageWork
@@ -92,6 +98,17 @@ class PoseRefinementOptions(Options):
         return [load_plugin(POSE_REFINERS, one.name, one.options) for one in self.by]
 
 
+def _map_content(mapping: KaptureFolder, digest: Digest) -> str:
+    """A hash of a whole map: a refiner may look at any image, whatever its references are."""
+    of_image = files_of(mapping)
+    images = [[name, of_image(name, digest)] for name in sorted(mapping.read().image_names())]
+    content = json.dumps([map_inputs(mapping, digest), images])
+    return hashlib.sha256(content.encode()).hexdigest()
+
+
+_VERDICTS: TypeAdapter[list[Consistency | None]] = TypeAdapter(list[Consistency | None])
+
+
 class MapRefiners:
     """The pose refiners of a map: the images they use, and the frames they are trusted in.
 
@@ -121,6 +138,7 @@ class MapRefiners:
         self._mapping, self._restrictions, self._options = mapping, restrictions, options
         self._verdicts: dict[str, list[Consistency | None]] = {}
         self._lock = threading.Lock()
+        self.map_content = cache(partial(_map_content, mapping))
 
     @cached_property
     def _by_frame(self) -> dict[str, ReferenceImages]:
@@ -144,14 +162,23 @@ class MapRefiners:
         ------
         DataError : an image or a depth map cannot be read.
         """
+
+        def inputs(frame: str, digest: Digest) -> object:
+            return [self.map_content(digest), self._by_frame[frame].names]
+
         with self._lock:
-            for frame in sorted({self._frame(pose) for pose in poses} - set(self._verdicts)):
-                self._verdicts[frame] = [
-                    self._judge(refiner, self._by_frame[frame], work)
-                    if isinstance(refiner, HoldsOut) and refiner.require_consistent_map
-                    else None
-                    for refiner in self.refiners
-                ]
+            frames = sorted({self._frame(pose) for pose in poses} - set(self._verdicts))
+            items = work.items("consistency", frames, inputs)
+            for frame in frames:
+                if frame not in items.done:
+                    verdicts = [
+                        self._judge(refiner, self._by_frame[frame], work)
+                        if isinstance(refiner, HoldsOut) and refiner.require_consistent_map
+                        else None
+                        for refiner in self.refiners
+                    ]
+                    items.add(frame, (), _VERDICTS.dump_python(verdicts))
+                self._verdicts[frame] = _VERDICTS.validate_python(items.done[frame])
 
     def _judge(self, refiner: HoldsOut, images: ReferenceImages, work: Work) -> Consistency:
         jobs = (_HeldOut(self.map, refiner, image, images) for image in spread_names(images.names))
@@ -259,12 +286,26 @@ def refine_poses(
         if row.status == "localized" and (pose := data.cam_from_world(image)) is not None
     }
     refiners.test(poses.values(), work=work)
+    uses = {image: refiners.uses(pose) for image, pose in poses.items()}
+    of_query = files_of(query)
+
+    def inputs(image: str, digest: Digest) -> object:
+        camera = query.read().camera_of(image)
+        own = (asdict(poses[image]), astuple(camera), of_query(image, digest), uses[image])
+        return [refiners.map_content(digest), *own]
+
+    items = work.items("refined", list(poses), inputs)
     jobs = [
-        _Job(refiners.map, query_spec, image, pose, *refiners.uses(pose), refiners.refiners)
+        _Job(refiners.map, query_spec, image, pose, *uses[image], refiners.refiners)
         for image, pose in poses.items()
+        if image not in items.done
     ]
-    results = work.map(_refine, jobs, "refining")
-    found = {job.image: refined for job, refined in zip(jobs, results, strict=True)}
+    found = {image: pose_of(plain) for image, plain in items.done.items()}
+    results = work.map(_refine, jobs, items.label("refining"))
+    for job, refined in zip(jobs, results, strict=True):
+        found[job.image] = refined
+        items.add(job.image, (), plain_result(refined))
+    found = {image: found[image] for image in poses}
     _write(output, data, localized, statuses, found)
     tested = refiners.tested()
     if tested:
@@ -366,9 +407,11 @@ def refine_pose(
             refined = refiner.refine(image, camera, before, references, scene)
         rows.append(_row(refiner, image, before, refined))
         if refined.accepted:
-            pose = replace(
-                pose, cam_from_world=refined.cam_from_world, covariance=refined.covariance
-            )
+            after = refined.cam_from_world
+            w, x, y, z = map(float, after.quat_wxyz)  # a plugin may count in another precision
+            t_x, t_y, t_z = map(float, after.translation)
+            after = RigidTransform((w, x, y, z), (t_x, t_y, t_z))
+            pose = replace(pose, cam_from_world=after, covariance=refined.covariance)
         seconds[refiner.name] = time.perf_counter() - started
     return replace(pose, refinements=tuple(rows), seconds=seconds)
 

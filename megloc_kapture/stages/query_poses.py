@@ -329,8 +329,8 @@ def localize_from_matches(
     read = {name: index_map(map_folder, type_in_map(map_folder, name)) for name in local_types}
     measured = {name: with_noise(map_folder, index) for name, index in read.items()}
     unit_of = {"\0".join(image for image, _ in unit): unit for unit in units}
-    of_query, of_map = _files_of(query), _files_of(map_folder)
-    points_of = cache(partial(_map_inputs, map_folder))
+    of_query, of_map = files_of(query), files_of(map_folder)
+    points_of = cache(partial(map_inputs, map_folder))
 
     def inputs(name: str, digest: Digest) -> object:
         found: list[object] = [points_of(digest)]
@@ -381,14 +381,14 @@ def localize_from_matches(
             pass
 
 
-def _map_inputs(mapping: KaptureFolder, digest: Digest) -> list[list[str]]:
+def map_inputs(mapping: KaptureFolder, digest: Digest) -> list[list[str]]:
     """What every query reads of the map: points, observations, cameras, poses."""
     root = mapping.root
     files = [*(root / "reconstruction").rglob("*"), *(root / "sensors").glob("*.txt")]
     return [[str(f.relative_to(root)), digest(f)] for f in sorted(files) if f.is_file()]
 
 
-def _files_of(folder: KaptureFolder) -> Callable[[str, Digest], list[str | None]]:
+def files_of(folder: KaptureFolder) -> Callable[[str, Digest], list[str | None]]:
     """What a ranker may look at: an image's file, its mask and its depth."""
     names, records = set(folder.read().image_names()), depth_records(folder.read())
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pandas as pd
 import pytest
 
 from megloc_kapture.pipeline.datasets import choose_dataset
@@ -27,7 +28,8 @@ from megloc_kapture.stages.work import Work
 PLUGINS = '''
 import cv2
 import numpy as np
-from megloc_kapture.values import LocalFeatures
+from megloc_kapture.plugins import PoseRefinement
+from megloc_kapture.values import LocalFeatures, RigidTransform
 
 
 class Corners:
@@ -62,6 +64,17 @@ class Nearest:
         there, back = distances.argmin(axis=1), distances.argmin(axis=0)
         rows = np.flatnonzero(back[there] == np.arange(len(there)))
         return np.stack([rows, there[rows]], axis=1), np.ones(len(rows), np.float32)
+
+
+class Nudge:
+    """A pose that is moved by what the images look like."""
+
+    name = "nudge"
+
+    def refine(self, query, camera, cam_from_world, references, scene):
+        brightness = [scene.query_image(query).mean(), scene.map_image(references[0]).mean()]
+        moved = RigidTransform((1.0, 0.0, 0.0, 0.0), (*np.float32(brightness) / 1000, 0.0))
+        return PoseRefinement(moved @ cam_from_world, "", {"brightness": brightness[0]})
 '''
 ENTRIES = """
 [megloc_kapture.local_features]
@@ -70,6 +83,8 @@ corners = patches.plugins:Corners
 thumbnail = patches.plugins:Thumbnail
 [megloc_kapture.matchers]
 nearest = patches.plugins:Nearest
+[megloc_kapture.pose_refiners]
+nudge = patches.plugins:Nudge
 """
 OPTIONS = ("local_features=corners", "global_features=thumbnail", "matching=nearest")
 EVERY_STAGE = (
@@ -82,6 +97,7 @@ EVERY_STAGE = (
     ),
     "localization.min_confidence=0",
 )
+REFINED = ('pose_refinement.by=["nudge","rendering"]', "localization.min_confidence=0")
 
 
 @pytest.fixture
@@ -165,7 +181,7 @@ def contents(root: Path) -> dict[str, bytes]:
     """All that stages wrote, by path."""
     files = (path for path in sorted(root.rglob("*")) if path.is_file() and not path.is_symlink())
     named = {path.relative_to(root).as_posix(): path for path in files}
-    hidden = ("stages/", "megloc/", "timing.csv", ".")
+    hidden = ("stages/", "megloc/", "timing", ".")
     return {name: path.read_bytes() for name, path in named.items() if not name.startswith(hidden)}
 
 
@@ -308,6 +324,27 @@ def test_one_changed_query_is_localized_anew_and_no_other(
     }
     assert whole.told["localizing"] == (1, "localizing, 3 of 4 kept")
     assert whole.output() == undisturbed()
+
+
+def test_refinement_of_poses_goes_on_inside_its_stage(
+    whole: Runs, undisturbed: Callable[[], dict[str, bytes]]
+) -> None:
+    whole.options, whole.last = (*OPTIONS, *REFINED), "refine_poses"
+    whole.stopped("refining", 2)
+    reports = whole.run()
+    assert whole.told["refining"] == (2, "refining, 2 of 4 kept")
+    assert reports["refine_poses"].kept_items == "3 of 5 kept"  # and the map's consistency
+    table = pd.read_csv(whole.root / "localized" / "refinement.csv")
+    assert sorted(table["moved_m"] > 0) == [False] * 4 + [True] * 4  # rendering wants depth
+    assert whole.output() == undisturbed()
+    name = sorted((whole.scene / "query/sensors/records_data").iterdir())[1].name
+    paint(whole.scene, f"query/sensors/records_data/{name}")
+    whole.run()
+    assert whole.told["refining"] == (1, "refining, 3 of 4 kept")
+    assert whole.output() == undisturbed()
+    # a map image that no query needs may be looked at all the same
+    paint(whole.scene, CHANGED)
+    assert "kept" not in whole.run()["refine_poses"].kept_items
 
 
 def test_a_new_mask_and_another_camera_count(runs: Runs) -> None:
