@@ -9,13 +9,16 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import zip_longest
 
 import numpy as np
 from numpy.typing import NDArray
 
+from megloc_kapture.geometry.cameras import focal_px
 from megloc_kapture.geometry.poses import cross_matrix
 from megloc_kapture.localization.absolute_pose import refine_pose
+from megloc_kapture.localization.alignment import displacements_px
 from megloc_kapture.localization.confidence import MatchSources, with_confidence
 from megloc_kapture.localization.estimation import (
     AbsolutePoseOptions,
@@ -38,7 +41,7 @@ from megloc_kapture.localization.map_index import (
     observed_matches,
 )
 from megloc_kapture.localization.ranking import poses_agree
-from megloc_kapture.plugins import HypothesisView, PoseHypothesis
+from megloc_kapture.plugins import HypothesisView, PoseHypothesis, RankingScene
 from megloc_kapture.values import Camera, ClusterPose, Failure, Pose, RigidTransform
 
 ImageMatches = tuple[str, NDArray[np.int64], NDArray[np.floating]]
@@ -100,6 +103,7 @@ def localize_in_clusters(
     frames: Sequence[str] | None = None,
     centers: Mapping[str, NDArray[np.float64]] | None = None,
     min_confidence: float | None = None,
+    scene: RankingScene | None = None,
 ) -> ClusterLocalization:
     """Localize a query in each cluster by itself, rank the poses, and refine the best.
 
@@ -115,6 +119,7 @@ def localize_in_clusters(
     frames : the coordinate frame of each cluster; clusters of different ones are never joined.
     centers : of the map images, (3,) each; needed for ``min_confidence``.
     min_confidence : a pose of less is a failure; None: poses have no confidence.
+    scene : looked at where the confidence is in doubt; None: nothing is.
 
     Returns
     -------
@@ -171,7 +176,11 @@ def localize_in_clusters(
             result = refine_pose(problem, estimate, options)
         clock.lap("refinement")
         if min_confidence is not None and isinstance(result, Pose):
-            sources = _sources(views, attempts[best].found, ranked[best].images, centers or {})
+            found = attempts[best].found
+            sources = _sources(views, found, ranked[best].images, centers or {})
+            if scene is not None:
+                seen = partial(_displacements_rad, problem, views, found, scene)
+                sources = replace(sources, displacements_rad=seen)
             result = with_confidence(problem, result, sources, options.max_error_px, min_confidence)
             if isinstance(result, Pose) and result.camera is None:
                 remark = focal_remark(problem, result)
@@ -332,6 +341,35 @@ def _sources(
         seen=seen,
         local_types={own.index.local_type for view in views for own in view.matches},
     )
+
+
+def _displacements_rad(
+    problem: PoseProblem,
+    views: Sequence[QueryView],
+    found: Sequence[Sequence[Correspondences]],
+    scene: RankingScene,
+    pose: Pose,
+) -> NDArray[np.float64]:
+    """See :attr:`MatchSources.displacements_rad`; of each match the first image that says so."""
+    assert pose.inliers is not None  # it was estimated here
+    angles = [np.zeros(0)]
+    inliers = split_by_view(problem.views, pose.inliers)
+    for query, view, of_types, kept in zip(views, problem.views, found, inliers, strict=True):
+        shown_by = [
+            typed.matches[row][0]
+            for typed, own in zip(query.matches, of_types, strict=True)
+            for row in own.image_rows[np.cumsum(own.support) - own.support].tolist()
+        ]
+        found_px = displacements_px(
+            query.name,
+            view.camera,
+            view.cam_from_rig @ pose.cam_from_world,
+            view.points_world[kept],
+            [shown_by[row] for row in np.flatnonzero(kept)],
+            scene,
+        )
+        angles.append(found_px / focal_px(view.camera))
+    return np.concatenate(angles)
 
 
 def _hypothesis(

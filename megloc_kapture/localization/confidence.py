@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib import resources
@@ -70,6 +70,8 @@ class MatchSources:
         and its point, and their distance in pixels; NaN where that is not known.
     seen : of each view the points (K, 3) that the map images of the cluster observe.
     local_types : keypoints types of the matches.
+    displacements_rad : of a pose the angles by which the scene stands elsewhere in the query than
+        the pose says, by the looks of its map images; empty where that cannot be told.
     """
 
     support: NDArray[np.int64]
@@ -79,6 +81,7 @@ class MatchSources:
     noise: NDArray[np.float64]
     seen: Sequence[NDArray[np.float64]]
     local_types: Collection[str] = ()
+    displacements_rad: Callable[[Pose], NDArray[np.float64]] | None = None
 
 
 def evidence_of(
@@ -112,7 +115,7 @@ def evidence_of(
         "agreement": math.log(count / (num - count + 1.0)),
         "matched_share": math.log(count / max(matchable, count)),
         "residual": math.log(max(float(np.median(errors_px[inliers])), 0.1) / max_error_px),
-        "misfit": _misfit(problem, errors_px, inliers, sources),
+        "misfit": _misfit(problem, errors_px, pose, inliers, sources),
         "deviation": math.log(
             max(center_deviation(pose.covariance) / float(np.median(distances)), 1e-5)
         ),
@@ -194,15 +197,18 @@ def _log_choose(n: int | NDArray[np.int64], k: int | NDArray[np.int64]) -> NDArr
 def _misfit(
     problem: PoseProblem,
     errors_px: NDArray[np.float64],
+    pose: Pose,
     inliers: NDArray[np.bool_],
     sources: MatchSources,
 ) -> float:
     """How much many inliers contradict the pose together.
 
     The scene in a mirror, or its like elsewhere, has hundreds of inliers that fit nearly; noise of
-    so many is known from the map's own images, and a larger error is of the pose. It is the
-    logarithm of the inliers' median angular error over that of the map's observations, beyond what
-    an image of the scene may have, times that of their number; 0 where the map's is not known.
+    so many is known from the map's own images, and a larger error is of the pose, or of keypoints
+    that are found elsewhere on the same things at night, which what surrounds them tells. It is the
+    logarithm of the inliers' median angular error, or of that of their surroundings where it is
+    smaller, over that of the map's observations, beyond what an image of the scene may have, times
+    that of their number; 0 where the map's is not known.
     """
     lengths = np.diff(problem.starts)
     focals = np.repeat([focal_px(view.camera) for view in problem.views], lengths)[inliers]
@@ -213,8 +219,12 @@ def _misfit(
     ratios = (errors_px[inliers] / focals / own)[np.isfinite(own)]
     if len(ratios) <= _FEW:
         return 0.0
-    excess = math.log(max(float(np.median(ratios)) / _USUAL_RATIO, 1.0))
-    return excess * math.log(len(ratios) / _FEW)
+    ratio = float(np.median(ratios))
+    if ratio > _USUAL_RATIO and sources.displacements_rad is not None:
+        displaced = sources.displacements_rad(pose)
+        if len(displaced) > _FEW:
+            ratio = min(ratio, float(np.median(displaced)) / float(np.nanmedian(own)))
+    return math.log(max(ratio / _USUAL_RATIO, 1.0)) * math.log(len(ratios) / _FEW)
 
 
 def _num_visible(

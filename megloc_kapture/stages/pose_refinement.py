@@ -13,7 +13,6 @@ from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
 from pydantic import Field, TypeAdapter
 
 from megloc_kapture.errors import OptionError, PluginError

@@ -157,6 +157,7 @@ def localize_views(
         frames=[frame_of[cluster[0]] for cluster in clusters],
         centers=centers,
         min_confidence=options.min_confidence,
+        scene=scene,
     )
     result = replace(found.result, seconds={**seconds, **found.result.seconds})
     return replace(found, result=result)
@@ -415,7 +416,7 @@ class LocalizeQueries(PipelineStage):
     """Estimate the poses of the queries from their matches with the map."""
 
     name = "localization"
-    version = 5
+    version = 6
     uses = ("localization", "guided_pyramid.mode", *LOCAL_TYPES)
 
     @property

@@ -145,6 +145,26 @@ def test_misfit_of_a_map_that_is_better_than_the_query() -> None:
     assert found == pytest.approx(expected, rel=0.1)
 
 
+def test_what_surrounds_keypoints_excuses_their_errors() -> None:
+    problem, pose, sources = scene(200, 0, noise_px=3.0)
+    exact = replace(sources, noise=np.tile([0.3 / 500, 0.3], (200, 1)))
+
+    def misfit(displaced_px: float, count: int) -> float:
+        asked = replace(exact, displacements_rad=lambda _: np.full(count, displaced_px / 500))
+        return evidence_of(problem, pose, asked, ERROR_PX)["misfit"]
+
+    by_keypoints = evidence_of(problem, pose, exact, ERROR_PX)["misfit"]
+    assert misfit(0.5, 100) == 0.0
+    assert misfit(2.0, 100) == pytest.approx(math.log(2.0 / 0.3 / 3.3) * math.log(10))
+    # what is displaced by more than the keypoints speaks no more against it, and few say nothing
+    assert misfit(6.0, 100) == misfit(0.5, 20) == by_keypoints
+
+    def never(_: Pose) -> NDArray[np.float64]:
+        raise AssertionError("asked without a doubt")
+
+    evidence_of(problem, pose, replace(sources, displacements_rad=never), ERROR_PX)
+
+
 def test_keypoints_of_a_small_image_are_as_good_in_pixels() -> None:
     problem, pose, sources = scene(200, 0, noise_px=0.5)
     # the map's images are four times as large: as good in pixels, four times so in angles
