@@ -9,7 +9,7 @@ threads. Two lengths are measured of ours and of kapture-localization: the searc
 opening of the vectors to the ranking, and the whole tool, from the kapture folders to the pairs
 file. The pairs of all are compared. ``--million`` searches a million vectors that are made block by
 block, in a process of its own, and prints the memory that took. ``--short-list`` searches so many
-vectors of a mixture, kept in a file, exactly and by product quantisation with short lists, and
+vectors of a mixture, kept in a tar, exactly and by product quantisation with short lists, and
 prints the share of the exact ``top-k`` that is found: nothing else is measured then.
 """
 
@@ -26,15 +26,16 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from kloc_tools import tool_scripts
 from numpy.typing import NDArray
-from timing import table
+from timing import peak_gib, table
 
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.kapture import (
@@ -73,7 +74,14 @@ def random_vectors(
     return rows
 
 
-def generate(folder: Path, names: Sequence[str], vectors: Vectors, *, tar: bool) -> None:
+def generate(
+    folder: Path,
+    names: Sequence[str],
+    vectors: Iterable[Vectors],
+    dimension: int,
+    *,
+    tar: bool,
+) -> None:
     """A kapture folder with global features; nothing is done where there is one."""
     if (folder / "complete").exists():
         return
@@ -82,7 +90,7 @@ def generate(folder: Path, names: Sequence[str], vectors: Vectors, *, tar: bool)
         data.records_camera[timestamp, "camera"] = name
         data.trajectories[timestamp, "camera"] = HERE
     write_sensors(folder, data)
-    config = FeatureConfig(TYPE, np.dtype("float32"), vectors.shape[1], None, "L2")
+    config = FeatureConfig(TYPE, np.dtype("float32"), dimension, None, "L2")
     with FeatureWriter(folder, "global_features", TYPE, config, tar=tar) as writer:
         for name, vector in zip(names, vectors, strict=True):
             if name not in writer:
@@ -211,8 +219,8 @@ def measure(options: argparse.Namespace) -> bool:
     installed = True
     for form, tar in forms.items():
         mapping, query = root / form / "map", root / form / "query"
-        generate(mapping, names, vectors, tar=tar)
-        generate(query, query_names, queries, tar=tar)
+        generate(mapping, names, vectors, options.dimension, tar=tar)
+        generate(query, query_names, queries, options.dimension, tar=tar)
         ours = Ours(mapping, query, options.top_k)
         works[f"ours, {form}, search"] = ours.search
         works[f"ours, {form}, whole tool"] = partial(ours.tool, folder / f"ours_{form}.txt")
@@ -312,55 +320,76 @@ PER_CENTRE = 200  # rows of a mixture's component
 LENGTHS = (100, 300, 1000)
 
 
-def mixture(path: Path, count: int, queries: int, dimension: int) -> tuple[Vectors, Vectors]:
-    """Unit rows (count, dimension) in a file, and queries, around the same centres."""
-    centres = random_vectors([3], max(1, count // PER_CENTRE), dimension)
-    random = np.random.default_rng(4)
+class Mixture:
+    """Unit rows around centres on a walk, as descriptors of images along a drive.
 
-    def drawn(number: int, seed: int) -> Vectors:
-        noise = random_vectors([5, seed], number, dimension)
-        # cosine 0.5 to 0.8 to the centre: components overlap, as views of neighbouring places do
+    A row's cosine with its centre is 0.5 to 0.8, that of neighbouring centres 0.9: what is
+    nearest to a query stands out from some thousand rows by little.
+    """
+
+    def __init__(self, count: int, dimension: int) -> None:
+        self.count = count
+        self.centres = random_vectors([3], max(1, count // PER_CENTRE), dimension)
+        for before, centre in pairwise(self.centres):
+            centre *= np.sqrt(1 - 0.9**2)
+            centre += 0.9 * before
+            centre /= np.linalg.norm(centre)
+
+    def drawn(self, number: int, seed: int) -> Vectors:
+        random = np.random.default_rng([4, seed])
         share = random.uniform(0.5, 0.8, (number, 1)).astype(np.float32)
-        near = centres[random.integers(0, len(centres), number)]
-        return (share * near + np.sqrt(1 - share**2) * noise).astype(np.float32)
+        rows = random_vectors([5, seed], number, self.centres.shape[1])
+        rows *= np.sqrt(1 - share**2)
+        rows += share * self.centres[random.integers(0, len(self.centres), number)]
+        rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+        return rows
 
-    rows = np.memmap(path, np.float32, "w+", shape=(count, dimension))
-    for start in range(0, count, 10_000):
-        stop = min(start + 10_000, count)
-        found = drawn(stop - start, start)
-        rows[start:stop] = found / np.linalg.norm(found, axis=1, keepdims=True)
-    return rows, drawn(queries, count)
+    def rows(self) -> Iterator[Vectors]:
+        for start in range(0, self.count, 10_000):
+            yield from self.drawn(min(10_000, self.count - start), start)
 
 
 def short_lists(count: int, options: argparse.Namespace) -> bool:
-    """Print recall of the exact ranking, processor seconds and memory; whether 0.99 is reached."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "rows"
-        rows, queries = mixture(path, count, options.queries, options.dimension)
-        start = time.process_time()
-        exact, _ = rank_by_similarity(queries, rows, options.top_k)
-        table_rows = [("", "cpu ms/query", "recall", "bytes/row")]
-        spent = time.process_time() - start
-        per_query = 1000 / len(queries)
-        table_rows.append(("exact", f"{per_query * spent:.1f}", "", f"{4 * options.dimension}"))
-        start = time.process_time()
-        codes = [QuantizedRows(rows)]
-        built = time.process_time() - start
-        for length in LENGTHS:
-            start = time.process_time()
-            found, _ = rank_short_lists(
-                [queries], [rows], codes, options.top_k, length=length, fusion=FusionOptions()
-            )
-            spent = time.process_time() - start
-            same = [len(set(a) & set(b)) for a, b in zip(exact, found, strict=True)]
-            recall = float(np.mean(same)) / options.top_k
-            name = f"short list of {length}"
-            size = f"{options.dimension // 32}"
-            table_rows.append((name, f"{per_query * spent:.1f}", f"{recall:.4f}", size))
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 << 20)
-    print(f"{count} x {options.dimension}, codes made in {built:.0f} s, {memory:.2f} GiB at most")
-    print(table(table_rows))
-    return recall >= 0.99
+    """Print recall of the exact ranking, seconds and memory; whether 0.99 is reached."""
+    made = Mixture(count, options.dimension)
+    folder = options.cache / f"mixture_{count}_{options.dimension}"
+    names = [f"map/{k // 1000:04d}/{k % 1000:03d}.jpg" for k in range(count)]
+    generate(folder, names, made.rows(), options.dimension, tar=True)
+    queries = made.drawn(options.queries, count)
+    del made
+    rows_of: list[tuple[str, ...]] = [
+        ("", "seconds", "cpu s", "cpu ms/query", "peak GiB", "recall")
+    ]
+
+    def step(name: str, work: Callable[[], Any], per: int = 0) -> Any:
+        peak_gib(reset=True)
+        clock, start = time.perf_counter(), time.process_time()
+        found = work()
+        clock, spent = time.perf_counter() - clock, time.process_time() - start
+        each = f"{1000 * spent / per:.1f}" if per else ""
+        rows_of.append((name, f"{clock:.0f}", f"{spent:.0f}", each, f"{peak_gib():.2f}"))
+        return found
+
+    def recall(found: NDArray[np.int64]) -> float:
+        same = [len(set(a) & set(b)) for a, b in zip(exact, found, strict=True)]
+        return float(np.mean(same)) / options.top_k
+
+    def opened() -> KaptureVectors:
+        mapping = KaptureFolder(folder)
+        return KaptureVectors(mapping.global_features(TYPE), sorted(mapping.read().poses()))
+
+    rows = step("open kapture folder and tar", opened)
+    search = partial(rank_by_similarity, queries, rows, options.top_k)
+    exact, _ = step("exact", search, len(queries))
+    codes = [step("codes made", lambda: QuantizedRows(rows))]
+    for length in LENGTHS:
+        among = partial(rank_short_lists, [queries], [rows], codes, options.top_k)
+        among = partial(among, length=length, fusion=FusionOptions())
+        found, _ = step(f"short lists of {length}", among, len(queries))
+        rows_of[-1] = (*rows_of[-1], f"{recall(found):.4f}")
+    print(f"{count} x {options.dimension} in a tar, {len(queries)} queries")
+    print(table([(*row, "")[:6] for row in rows_of]))
+    return recall(found) >= 0.99
 
 
 def main() -> int:

@@ -30,7 +30,7 @@ os.environ["OMP_NUM_THREADS"] = "1"
 import numpy as np  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
 from street import CAMERA, Street, in_view, make_street, random_pose  # noqa: E402
-from timing import table  # noqa: E402
+from timing import peak_gib, table  # noqa: E402
 
 from megloc_kapture.geometry.cameras import project  # noqa: E402
 from megloc_kapture.io.colmap import TriangulationOptions  # noqa: E402
@@ -136,14 +136,6 @@ def _global(pose: RigidTransform) -> Floats:
     rng = np.random.default_rng(6)
     frequencies, phases = rng.normal(0, 0.3, GLOBAL), rng.uniform(0, 2 * np.pi, GLOBAL)
     return _unit(np.cos(frequencies * pose.center()[0] + phases))
-
-
-def peak_gib(*, reset: bool = False) -> float:
-    """Most memory since it was reset (Linux)."""
-    if reset:
-        Path("/proc/self/clear_refs").write_text("5")
-    status = Path("/proc/self/status").read_text()
-    return int(status.partition("VmHWM:")[2].split()[0]) / (1 << 20)
 
 
 def run(world: World) -> tuple[dict[str, tuple[float, float]], float]:

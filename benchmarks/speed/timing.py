@@ -37,6 +37,14 @@ def timed_command(
     return Timed(name, wall_s, cpu_s)
 
 
+def peak_gib(*, reset: bool = False) -> float:
+    """Most memory since it was reset (Linux)."""
+    if reset:
+        Path("/proc/self/clear_refs").write_text("5")
+    status = Path("/proc/self/status").read_text()
+    return int(status.partition("VmHWM:")[2].split()[0]) / (1 << 20)
+
+
 def table(rows: Sequence[Sequence[str]]) -> str:
     """Rows of text as aligned columns, the first to the left and the others to the right."""
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
