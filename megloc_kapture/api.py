@@ -20,17 +20,13 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError, OptionError, suggestion
+from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.report.renderers import REPORT_HTML
 from megloc_kapture.evaluation.report.reports import RECALL_JSON
-from megloc_kapture.features.image_bound import extract_bounded
 from megloc_kapture.io.colmap_mapping import Mapper
-from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.photos import guessed_camera, photo_of, read_photo, turned_upright
-from megloc_kapture.localization.absolute_pose import absolute_pose
-from megloc_kapture.localization.estimation import AbsolutePoseOptions
 from megloc_kapture.pipeline.colmap_maps import kapture_of
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation, plan_map
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
@@ -43,17 +39,16 @@ from megloc_kapture.pipeline.photograph_maps import (
 )
 from megloc_kapture.pipeline.photographs import Photographs
 from megloc_kapture.pipeline.plan import run_plan
-from megloc_kapture.pipeline.presets import options_of_preset, options_with
+from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.queries import Query
 from megloc_kapture.pipeline.results import Results
 from megloc_kapture.pipeline.run import choose_run
 from megloc_kapture.pipeline.workspace import Workspace
-from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS, load_plugin
 from megloc_kapture.stages.layout import EVALUATION, LOCALIZED, MAP
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.stage import Stage
 from megloc_kapture.stages.work import Work
-from megloc_kapture.values import Camera, Failure, ImageFeatures, Pose
+from megloc_kapture.values import Camera, Failure, Pose
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -98,15 +93,17 @@ class Map:
         path: Path | str,
         result: Path | str | Results | None = None,
         truth: Path | str | None = None,
+        *,
+        rendered: Path | str | None = None,
     ) -> None:
         """Write a page that shows the map in 3D, and the queries of a result in it; see
         :func:`megloc_kapture.evaluation.view.write_view`."""
         from megloc_kapture.evaluation.view import write_view
 
         if isinstance(result, Results):
-            result.view(path, truth)
+            result.view(path, truth, rendered=rendered)
         else:
-            write_view(path, self.kapture_map.folder, result, truth)
+            write_view(path, self.kapture_map.folder, result, truth, rendered=rendered)
 
     @overload
     def localize(
@@ -435,109 +432,3 @@ def run(
         chosen = choice.run_in(opened)
         run_plan(plan_evaluation(chosen), opened, Work(executor, num_threads=workers))
     return FinishedRun(opened.root, chosen.submission_below(opened.root), choice.options)
-
-
-def extract(features: str, image: Path | str | NDArray[np.uint8], **options: Any) -> ImageFeatures:
-    """Local features of an image, by the name of their extractor.
-
-    Parameters
-    ----------
-    image : path of an image file, or uint8 (H, W, 3) RGB.
-    options : the extractor's.
-
-    Raises
-    ------
-    PluginError, MissingWeightsError : there is no such extractor, or it cannot be made.
-    """
-    pixels = image if isinstance(image, np.ndarray) else read_image_rgb(Path(image))
-    found = extract_bounded(load_plugin(LOCAL_FEATURES, features, options), pixels)
-    height, width = pixels.shape[:2]
-    return ImageFeatures(found.keypoints_px, found.descriptors, width, height)
-
-
-def match(
-    matcher: str, first: ImageFeatures, second: ImageFeatures, **options: Any
-) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Matches of two images by the name of a matcher: int64 (K, 2) rows, and scores (K,).
-
-    Raises
-    ------
-    PluginError, MissingWeightsError : there is no such matcher, or it cannot be made.
-    """
-    found: tuple[NDArray[np.int64], NDArray[np.float32]]
-    found = load_plugin(MATCHERS, matcher, options).match(first, second)
-    return found
-
-
-def solve_pose(
-    points_px: NDArray[Any],
-    points_world: NDArray[Any],
-    camera: Camera,
-    *,
-    max_error_px: float = 12.0,
-    min_inliers: int = 12,
-    seed: int = 0,
-) -> Pose | Failure:
-    """The pose of one image from 2D-3D matches: LO-RANSAC, then refinement with covariance.
-
-    Parameters
-    ----------
-    points_px : (N, 2), first pixel's centre at (0.5, 0.5).
-    points_world : (N, 3).
-    max_error_px : reprojection error of an inlier.
-
-    Raises
-    ------
-    DataError : the arrays do not have these shapes.
-    """
-    options = AbsolutePoseOptions(max_error_px=max_error_px, min_inliers=min_inliers, seed=seed)
-    return absolute_pose(points_px, np.asarray(points_world, np.float64), camera, options)
-
-
-def train(
-    task: str,
-    output: Path | str,
-    *,
-    kaptures: Sequence[Path | str] = (),
-    photographs: Sequence[Path | str] = (),
-    held_out: Sequence[Path | str] = (),
-    features: str = "superpoint",
-    set: Changes | None = None,
-    licences: Mapping[str, str] | None = None,
-    threads: int = 1,
-    force: bool = False,
-) -> dict[str, float]:
-    """Train SuperGlue or descriptors as ``megloc train`` does; goes on where it was interrupted.
-
-    Parameters
-    ----------
-    task : "matcher" or "descriptor".
-    output : the file to write, ``X.safetensors``; others beside it, see
-        :func:`megloc_kapture.training.train.train`.
-    kaptures, held_out : kapture folders with poses and depth, to train on and to evaluate on.
-    photographs : folders of images, trained on under random homographies.
-    features : the extractor whose features are matched, or whose detector is frozen.
-    set : options, ``{"steps": 20000}``.
-    licences : of the folders, by their paths as they are given; for the manifest.
-
-    Returns
-    -------
-    The last row of the curves by column.
-
-    Raises
-    ------
-    MeglocError : options, data, weights or the output cannot be used.
-    """
-    from megloc_kapture.training.train import TASKS, TrainingData
-    from megloc_kapture.training.train import train as run_training
-
-    if task not in TASKS:
-        raise OptionError(f"unknown task {task!r}; {suggestion(task, TASKS)}")
-    options = options_with(TASKS[task], set or {}, {"features.name": features})
-    data = TrainingData(
-        [KaptureFolder(path) for path in kaptures],
-        [Path(path) for path in photographs],
-        [KaptureFolder(path) for path in held_out],
-        {Path(path): licence for path, licence in (licences or {}).items()},
-    )
-    return run_training(options, data, Path(output), force=force, threads=threads)

@@ -1,4 +1,4 @@
-"""The protocols of plugins, and how a plugin is found by name.
+"""The protocols of plugins; ``plugin_loading.py`` finds a plugin by its name.
 
 A plugin is a class registered under one of the entry-point groups below; our own are registered
 in the same way. A class may carry ``Options``, a frozen pydantic model its constructor takes, and
@@ -9,21 +9,15 @@ must be picklable.
 
 from __future__ import annotations
 
-import hashlib
-import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cache
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
-from megloc_kapture.errors import MeglocError, PluginError, missing_extra, suggestion
 from megloc_kapture.values import (
     Camera,
     ImageFeatures,
@@ -59,7 +53,11 @@ class PluginChoice(Options):
 
 @runtime_checkable
 class LocalFeatureExtractor(Protocol):
-    """Group ``megloc_kapture.local_features``: image to local features."""
+    """Group ``megloc_kapture.local_features``: image to local features.
+
+    An extractor that is faster on several images at once may have ``extract_many(images, masks)``,
+    the features of images of one size, as a list in their order.
+    """
 
     name: str
     """The kapture type name its features are stored under."""
@@ -98,7 +96,8 @@ class Matcher(Protocol):
     def match(
         self, a: ImageFeatures, b: ImageFeatures
     ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """Matches int64 (K, 2), rows of a and b, each row at most once, and scores (K,)."""
+        """Matches int64 (K, 2), rows of a and b, each row at most once, and scores (K,): the surest
+        matches have the greatest, with which verification begins."""
         ...
 
 
@@ -413,7 +412,7 @@ class StageOfAPlan(Protocol):
         ...
 
 
-_PROTOCOLS: dict[str, type] = {
+PROTOCOLS: dict[str, type] = {
     LOCAL_FEATURES: LocalFeatureExtractor,
     GLOBAL_FEATURES: GlobalFeatureExtractor,
     MATCHERS: Matcher,
@@ -426,107 +425,3 @@ _PROTOCOLS: dict[str, type] = {
     RENDERED_DATASETS: RenderedDataset,
     STAGES: StageOfAPlan,
 }
-
-
-def plugin_names(group: str) -> list[str]:
-    """Names registered under a group, sorted."""
-    return sorted({entry.name for entry in entry_points(group=group)})
-
-
-def load_plugin(group: str, name: str, options: dict[str, Any] | None = None) -> Any:
-    """Make the plugin ``name`` of ``group``, with its options.
-
-    Raises
-    ------
-    PluginError : no such plugin, it cannot be imported, does not fulfil the group's protocol, or
-        refuses its options; says which and why.
-    """
-    kind = plugin_class(group, name)
-    model = getattr(kind, "Options", None)
-    try:
-        if model is None:
-            if options:
-                raise ValueError(f"it takes no options, got {sorted(options)}")
-            return kind()
-        return kind(model(**(options or {})))
-    except MeglocError:
-        raise
-    except ValidationError as error:
-        first = error.errors()[0]
-        option = ".".join(str(part) for part in first["loc"])
-        raise PluginError(
-            f"plugin {name!r} refuses its options: {option}: {first['msg']}"
-        ) from error
-    except Exception as error:  # whatever a foreign constructor raises
-        reason = " ".join(str(error).split())
-        raise PluginError(f"plugin {name!r} refuses its options: {reason}") from error
-
-
-def plugin_class(group: str, name: str) -> Any:
-    """The class registered as ``name`` in ``group``.
-
-    Raises
-    ------
-    PluginError : none, it cannot be imported, or it does not fulfil the group's protocol.
-    """
-    found = [entry for entry in entry_points(group=group) if entry.name == name]
-    if not found:
-        known = suggestion(name, plugin_names(group), listed="registered: ")
-        raise PluginError(f"no plugin {name!r} in {group}; {known}")
-    origins = {entry.value for entry in found}
-    if len(origins) > 1:
-        raise PluginError(f"plugin {name!r} of {group} is registered twice: {sorted(origins)}")
-    try:
-        kind = found[0].load()
-    except Exception as error:  # whatever a foreign module raises while it is imported
-        reason = missing_extra(error) or error
-        raise PluginError(
-            f"plugin {name!r} ({found[0].value}) cannot be loaded: {reason}"
-        ) from error
-    protocol = _PROTOCOLS[group]
-    missing = [member for member in _members(protocol) if not hasattr(kind, member)]
-    if not isinstance(kind, type) or missing:
-        what = "is no class" if not isinstance(kind, type) else f"lacks {', '.join(missing)}"
-        raise PluginError(
-            f"plugin {name!r} ({found[0].value}) does not fulfil {protocol.__name__}: it {what}"
-        )
-    return kind
-
-
-@cache
-def code_of(kind: type) -> str:
-    """Version of the package that registers a class, and hash of the code that defines it.
-
-    Of our own classes that is their module; of others all modules of their package.
-    """
-    module = sys.modules.get(kind.__module__)
-    source = getattr(module, "__file__", None)
-    files = [] if source is None else [Path(source)]
-    top = getattr(sys.modules.get(kind.__module__.partition(".")[0]), "__file__", None) or ""
-    if files and not is_ours(kind) and Path(top).name == "__init__.py":
-        files = sorted({*files, *Path(top).parent.rglob("*.py")})
-    digest = hashlib.sha256()
-    for file in files:
-        with suppress(OSError):
-            digest.update(file.read_bytes())
-    value = f"{kind.__module__}:{kind.__qualname__}"
-    registered = [entry.dist for entry in entry_points().select(value=value) if entry.dist]
-    return f"{registered[0].version if registered else ''} {digest.hexdigest()}".strip()
-
-
-def is_ours(kind: type) -> bool:
-    """Whether a class is of this package."""
-    return kind.__module__.partition(".")[0] == __name__.partition(".")[0]
-
-
-def weights_of(plugin: object) -> dict[str, str]:
-    """File name to sha256 of the weights a plugin uses; none where it has none."""
-    weights = getattr(plugin, "weights", None)
-    return dict(weights()) if callable(weights) else {}
-
-
-def _members(protocol: type) -> list[str]:
-    names = set(getattr(protocol, "__annotations__", {})) | {
-        name for name, value in vars(protocol).items() if callable(value)
-    }
-    return sorted(name for name in names if not name.startswith("_"))

@@ -6,11 +6,11 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from megloc_kapture.errors import DataError
 
@@ -33,6 +33,9 @@ CAMERA_MODEL_NUM_PARAMS: dict[str, int] = {
 ONE_FOCAL_MODELS = frozenset(
     {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
 )
+
+Device = Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
+"""Where a network computes: auto (a GPU where there is one), cpu, cuda, or cuda:N."""
 
 
 class Options(BaseModel):

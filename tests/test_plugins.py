@@ -12,7 +12,8 @@ import pytest
 from megloc_kapture.errors import PluginError
 from megloc_kapture.features.rootsift import RootSift
 from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
-from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS, load_plugin, plugin_names
+from megloc_kapture.plugin_loading import load_plugin, plugin_names
+from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS
 from megloc_kapture.values import LocalFeatures
 
 MODULE = """

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.io.colmap import normalized_from_px, px_from_cam
+from megloc_kapture.io.colmap_cameras import normalized_from_px, px_from_cam
 from megloc_kapture.values import ONE_FOCAL_MODELS, Camera, RigidTransform
 
 __all__ = [

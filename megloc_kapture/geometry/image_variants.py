@@ -82,22 +82,6 @@ class ImageVariant:
         )
         return np.ascontiguousarray(np.rot90(count == 0, self.rotation_deg // 90))
 
-    def px_in_variant(
-        self, px: NDArray[np.floating[Any]], width: int, height: int
-    ) -> NDArray[np.float64]:
-        """Pixels (N, 2) of an image of this size, in its variant; float64 (N, 2)."""
-        scaled = self.scaled_size(width, height)
-        x, y = np.asarray(px, dtype=np.float64).T * (
-            np.array(scaled)[:, None] / np.array([[width], [height]])
-        )
-        turned = {
-            0: (x, y),
-            90: (y, scaled[0] - x),
-            180: (scaled[0] - x, scaled[1] - y),
-            270: (scaled[1] - y, x),
-        }
-        return np.stack(turned[self.rotation_deg], axis=1)
-
     def px_in_original(
         self, px: NDArray[np.floating[Any]], width: int, height: int
     ) -> NDArray[np.float64]:

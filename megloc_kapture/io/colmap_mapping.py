@@ -21,11 +21,11 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.io.colmap import (
     NEVER,
     database_folder,
-    load_pycolmap,
     numbered_cameras,
     quiet_stderr,
     write_database,
 )
+from megloc_kapture.io.colmap_cameras import load_pycolmap
 from megloc_kapture.values import Camera, RigidTransform
 
 Mapper = Literal["incremental", "global"]

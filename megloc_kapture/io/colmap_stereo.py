@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.colmap import MapImage, load_pycolmap, write_model
+from megloc_kapture.io.colmap import MapImage, write_model
+from megloc_kapture.io.colmap_cameras import load_pycolmap
 from megloc_kapture.io.files import write_bytes
 from megloc_kapture.io.images import write_image
 

@@ -1,4 +1,4 @@
-"""Files: read whole, written atomically, linked, kept as JSON; output folders and their claims.
+"""Files: read whole, written atomically, linked, kept as JSON.
 
 A file is written beside its final path under a name that no reader lists and then renamed over it:
 a killed run or a full disk leaves the old state or the new one. There is no fsync: after a power
@@ -10,8 +10,6 @@ are linked, never copied or changed.
 from __future__ import annotations
 
 import contextlib
-import ctypes
-import errno
 import hashlib
 import json
 import os
@@ -19,9 +17,7 @@ import re
 import secrets
 import shutil
 import socket
-import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, BinaryIO, NoReturn, TypeVar
@@ -30,7 +26,6 @@ from pydantic import BaseModel, ValidationError
 
 from megloc_kapture.errors import DataError, OutputError
 
-MARKER = ".megloc"
 _MAX_JSON_BYTES = 1 << 28
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
@@ -124,6 +119,13 @@ def clear_leftovers(folder: Path) -> None:
                 remove(Path(folder) / name)
 
 
+def clear_temporary(folder: Path) -> None:
+    """Remove what processes that died while they wrote have left below a folder; none may write
+    there any more. Raises OSError."""
+    for path in list(Path(folder).rglob(".megloc-*.tmp")):
+        remove(path)
+
+
 def remove(path: Path) -> None:
     """Remove a file, a link or a whole folder, where there is one; raises OSError."""
     if path.is_dir() and not path.is_symlink():
@@ -162,10 +164,12 @@ def atomic_write(path: Path | str) -> Iterator[BinaryIO]:
     ------
     OutputError : the file cannot be written (disk full, permission, ...); names ``path``.
     """
-    path = Path(path)
-    temporary = path.parent / temporary_name()
+    # plain text: a stage writes a file for each of its pairs, and a Path takes as long as writing
+    folder = os.path.dirname(path)
+    temporary = os.path.join(folder, temporary_name())
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        if folder and not os.path.isdir(folder):
+            os.makedirs(folder, exist_ok=True)
         try:
             # mode "x" and not mkstemp, whose files are closed to everybody else
             with open(temporary, "xb") as file:
@@ -173,10 +177,10 @@ def atomic_write(path: Path | str) -> Iterator[BinaryIO]:
             os.replace(temporary, path)
         except BaseException:
             with contextlib.suppress(OSError):
-                temporary.unlink(missing_ok=True)
+                os.unlink(temporary)
             raise
     except OSError as error:
-        if error.filename is not None and not _concerns(error, path, temporary):
+        if error.filename is not None and not _concerns(error, Path(path), Path(temporary)):
             raise  # not from writing: the block met it while reading something else
         raise output_error(path, error) from error
 
@@ -193,57 +197,6 @@ def write_bytes(path: Path | str, content: bytes) -> None:
         file.write(content)
 
 
-def replace_directory(new: Path, path: Path) -> None:
-    """Replace folder ``path``, which need not exist, by folder ``new``.
-
-    Both must be on one file system. On Linux the two are exchanged in one step, so that a run
-    killed here leaves either the old or the new folder at ``path``; what was there before is
-    then removed. A run killed during that removal leaves a rest at ``new``'s old name.
-
-    Raises
-    ------
-    OutputError : ``path`` is a file or a link (a user's link is not ours to replace), or the
-        file system refuses; names ``path``.
-    """
-    new, path = Path(new), Path(path)
-    if path.is_symlink() or (path.exists() and not path.is_dir()):
-        raise OutputError(f"{path}: is a link or a file, not a folder; move it away first")
-    try:
-        if not path.exists():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            os.rename(new, path)
-            return
-        if _exchange(new, path):
-            shutil.rmtree(new)
-            return
-        old = path.with_name(temporary_name())
-        os.rename(path, old)
-        os.rename(new, path)
-        shutil.rmtree(old)
-    except OSError as error:
-        raise output_error(path, error) from error
-
-
-def _exchange(first: Path, second: Path) -> bool:
-    """Swap two paths in one step; False where the system has no such call."""
-    if not sys.platform.startswith("linux"):
-        return False
-    try:
-        renameat2 = ctypes.CDLL(None, use_errno=True).renameat2
-    except (OSError, AttributeError):
-        return False
-    at_fdcwd, rename_exchange = -100, 2
-    done = renameat2(
-        at_fdcwd, os.fsencode(first), at_fdcwd, os.fsencode(second), ctypes.c_uint(rename_exchange)
-    )
-    if done == 0:
-        return True
-    code = ctypes.get_errno()
-    if code in (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP):
-        return False
-    raise OSError(code, os.strerror(code), os.fspath(second))
-
-
 # ------------------------------------------------------------------------------------ folders
 
 
@@ -251,127 +204,6 @@ def user_cache() -> Path:
     """The folder of what is kept for a user between commands; it need not be there."""
     cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(cache) / "megloc-kapture"
-
-
-@dataclass(frozen=True)
-class Claim:
-    """A folder that was made ours, and what it was before.
-
-    Attributes
-    ----------
-    made : the folders that had to be made for it, innermost first.
-    old_mark : content of the mark that stood there; None: there was none.
-    """
-
-    folder: Path
-    made: tuple[Path, ...]
-    old_mark: bytes | None
-
-    def undo(self) -> None:
-        """Take back the mark and the folders that were made; what has been written stays."""
-        mark = self.folder / MARKER
-        with contextlib.suppress(OSError, OutputError):
-            if self.old_mark is None:
-                mark.unlink(missing_ok=True)
-            elif mark.read_bytes() != self.old_mark:
-                write_bytes(mark, self.old_mark)
-        for folder in self.made:
-            with contextlib.suppress(OSError):
-                folder.rmdir()
-
-
-def claim_folder(folder: Path, *, kind: str, force: bool = False) -> Claim:
-    """Make a folder ours, or refuse it.
-
-    A folder is ours when it is new, empty, or carries our mark with the same kind. With
-    ``force`` any folder will do; what stands in it and is not written anew stays.
-
-    Parameters
-    ----------
-    kind : what the folder is for, one word; written into the mark.
-
-    Raises
-    ------
-    OutputError : the folder is somebody else's, or cannot be made; it is as it was.
-    """
-    folder = Path(folder)
-    mark = folder / MARKER
-    content = f"{kind}\n".encode()
-    try:
-        made = tuple(path for path in (folder, *folder.parents) if not path.exists())
-        if not made and not folder.is_dir():
-            raise OutputError(f"{folder}: is a file, a folder is needed")
-        old_mark = mark.read_bytes() if mark.is_file() else None
-        if not made and old_mark != content and not force and any(folder.iterdir()):
-            raise OutputError(
-                f"{folder}: is not empty and not a {kind} of megloc; give an empty folder, "
-                "or -f to write into it all the same"
-            )
-    except OSError as error:
-        raise output_error(folder, error) from error
-    claim = Claim(folder, made, old_mark)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if old_mark != content:
-            write_bytes(mark, content)
-    except OSError as error:
-        claim.undo()
-        raise output_error(folder, error) from error
-    except OutputError:
-        claim.undo()
-        raise
-    return claim
-
-
-@contextlib.contextmanager
-def staged_output(folder: Path, *, kind: str, force: bool = False) -> Iterator[Path]:
-    """A folder to write a command's output to; it gets to ``folder`` only when the block ends well.
-
-    Files that are written anew replace old ones, one by one; others stay. When the
-    block raises, ``folder`` is as it was, and gone if it was not there. What killed runs have left
-    in it is cleared.
-
-    Raises
-    ------
-    OutputError : see :func:`claim_folder`.
-    """
-    folder = Path(folder)
-    claim = claim_folder(folder, kind=kind, force=force)
-    clear_leftovers(folder)
-    staging = folder / temporary_name()
-    try:
-        try:
-            staging.mkdir()
-            yield staging
-            _merge(staging, folder)
-        finally:
-            shutil.rmtree(staging, ignore_errors=True)
-    except OSError as error:
-        claim.undo()
-        # an error that names no file comes from writing: the disk is full, or a quota met
-        if error.filename is not None and not _lies_in(error.filename, folder):
-            raise
-        raise output_error(folder, error) from error
-    except BaseException:
-        claim.undo()
-        raise
-
-
-def _lies_in(name: str | bytes | int, folder: Path) -> bool:
-    if isinstance(name, int):
-        return False
-    return Path(os.path.abspath(os.fsdecode(name))).is_relative_to(os.path.abspath(folder))
-
-
-def _merge(source: Path, target: Path) -> None:
-    for entry in sorted(source.iterdir()):
-        path = target / entry.name
-        if entry.is_dir() and not entry.is_symlink() and path.is_dir() and not path.is_symlink():
-            _merge(entry, path)
-        else:
-            if path.is_symlink():
-                path.unlink()
-            os.replace(entry, path)
 
 
 # -------------------------------------------------------- links; OutputError where one cannot be

@@ -7,6 +7,7 @@ to something below the folder they belong to.
 from __future__ import annotations
 
 import os
+from functools import lru_cache
 from pathlib import Path
 
 from megloc_kapture.errors import DataError, OutputError
@@ -25,6 +26,7 @@ def has_control_characters(text: str) -> bool:
     return any(ord(c) < 32 or ord(c) == 127 or 0xD800 <= ord(c) <= 0xDFFF for c in text)
 
 
+@lru_cache(maxsize=1 << 12)  # the text alone decides, and the same names come in a row
 def check_relative(text: str) -> str:
     """Return ``text`` if it is a plain relative path (``a/b.jpg``), else raise.
 

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.colmap import focal_from_exif
+from megloc_kapture.io.colmap_cameras import focal_from_exif
 from megloc_kapture.io.images import WRITABLE_SUFFIXES, check_image_file
 from megloc_kapture.values import Camera
 

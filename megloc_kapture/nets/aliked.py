@@ -68,13 +68,13 @@ class AlikedNet(nn.Module):
         )
         self.desc_head = DescriptorHead(self.descriptor_size, sizes.positions)
 
-    def forward(self, image: torch.Tensor) -> AlikedMaps:
-        """The maps of one RGB image, (1, 3, H, W) in [0, 1]."""
-        height, width = image.shape[2:]
+    def forward(self, images: torch.Tensor) -> list[AlikedMaps]:
+        """The maps of RGB images, (B, 3, H, W) in [0, 1]."""
+        height, width = images.shape[2:]
         extra_y, extra_x = -height % _MULTIPLE, -width % _MULTIPLE
         top, left = extra_y // 2, extra_x // 2
         margins = (left, extra_x - left, top, extra_y - top)
-        padded = functional.pad(image, margins, mode="replicate")
+        padded = functional.pad(images, margins, mode="replicate")
         level1 = self.block1(padded.contiguous(memory_format=torch.channels_last))
         level2 = self.block2(functional.avg_pool2d(level1, 2))
         level3 = self.block3(functional.avg_pool2d(level2, 4))
@@ -87,15 +87,14 @@ class AlikedNet(nn.Module):
                 (self.conv4, level4),
             )
         ]
-        fine = _level(level1)
-        scores = torch.sigmoid(self._score_logits(fine, coarse)[0, 0].float())
-        return AlikedMaps(
-            self,
-            scores[top : top + height, left : left + width],
-            (top, left),
-            fine,
-            [_level(features) for features in coarse],
-        )
+        found = []
+        for k in range(len(images)):
+            own = [level[k : k + 1] for level in coarse]
+            fine = _level(level1[k : k + 1])
+            scores = torch.sigmoid(self._score_logits(fine, own)[0, 0].float())
+            scores = scores[top : top + height, left : left + width]
+            found.append(AlikedMaps(self, scores, (top, left), fine, [_level(one) for one in own]))
+        return found
 
     def _score_logits(self, fine: _Level, coarse: list[torch.Tensor]) -> torch.Tensor:
         # the first layer's weights, apart for the channels of each level

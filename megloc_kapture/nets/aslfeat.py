@@ -74,13 +74,15 @@ class AslFeatNet(nn.Module):
         self.deform_param = nn.ModuleDict({name: _Deformation(128) for name in _DEFORMABLE})
         self.tower = nn.ModuleDict({name: _Scale() for name in _SCORED})
 
-    def forward(self, image: torch.Tensor) -> AslFeatMaps:
-        """The maps of one gray image, (1, 1, H, W) in 0 to 255, of at least 11 pixels a side."""
-        height, width = image.shape[2:]
-        variance, mean = torch.var_mean(image, correction=0)
-        x = (image - mean) * torch.rsqrt(variance + 1e-5)
-        x = x.contiguous(memory_format=torch.channels_last)
-        scores = image.new_zeros(height, width)
+    def forward(self, images: torch.Tensor) -> list[AslFeatMaps]:
+        """The maps of gray images, (B, 1, H, W) in 0 to 255, of at least 11 pixels a side."""
+        height, width = images.shape[2:]
+        normalised = []
+        for image in torch.split(images, 1):
+            variance, mean = torch.var_mean(image, correction=0)
+            normalised.append((image - mean) * torch.rsqrt(variance + 1e-5))
+        x = torch.cat(normalised).contiguous(memory_format=torch.channels_last)
+        scores = images.new_zeros(len(images), height, width)
         x = self.conv0.normalised(x)
         for scored, strided in (("conv1", self.conv2), ("conv3", self.conv4)):
             conv: _Conv = getattr(self, scored)
@@ -91,7 +93,8 @@ class AslFeatNet(nn.Module):
         x = self.conv5.normalised(x)
         for name in _DEFORMABLE:
             x = self._deformable(name, x)
-        return AslFeatMaps(scores + self._scores("conv6", x, (height, width)), x[0])
+        scores = scores + self._scores("conv6", x, (height, width))
+        return [AslFeatMaps(*own) for own in zip(scores, x, strict=True)]
 
     def _deformable(self, name: str, x: torch.Tensor) -> torch.Tensor:
         conv: _Conv = getattr(self, name)
@@ -104,7 +107,12 @@ class AslFeatNet(nn.Module):
     def _scores(self, name: str, features: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
         dilation, weight = _SCORED[name]
         scale = self.get_buffer(f"tower.{name}.instance_max")
-        return weight * resize_as_tensorflow_1(peakiness(features[0], dilation, scale), size)
+        return torch.stack(
+            [
+                weight * resize_as_tensorflow_1(peakiness(own, dilation, scale), size)
+                for own in features
+            ]
+        )
 
 
 class _Norm(nn.Module):

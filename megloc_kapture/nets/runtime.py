@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from typing import Literal
+from contextlib import contextmanager, nullcontext
+from functools import cache
+from threading import RLock
 
 import cv2
 import numpy as np
@@ -14,30 +15,32 @@ from pydantic import Field
 from torch import nn
 
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.values import Options
+from megloc_kapture.values import Device, Options
 
-Device = Literal["auto", "cpu", "cuda"]
+_computing = RLock()
 _NAMED = 5  # keys of each kind that a message names
 
 
 class NetworkOptions(Options):
     """Options that every network has."""
 
-    device: Device = Field(default="auto", description="auto: a GPU where there is one")
+    device: Device = Field(default="auto", description="auto, cpu, cuda or cuda:N")
     half_precision: bool = Field(
         default=False, description="float16 on a GPU, bfloat16 on a processor; keypoints never"
     )
 
 
+@cache
 def pick_device(device: Device) -> torch.device:
-    """The device that is meant; raises OptionError where a GPU is asked for and there is none."""
-    if device == "cpu":
+    """The device that is meant; raises OptionError for a GPU that is not there."""
+    count = torch.cuda.device_count() if device != "cpu" and torch.cuda.is_available() else 0
+    if device == "cpu" or (device == "auto" and not count):
         return torch.device("cpu")
-    if torch.cuda.is_available():
-        return torch.device("cuda")
-    if device == "cuda":
-        raise OptionError("device=cuda: this machine has no GPU that torch can use; take auto")
-    return torch.device("cpu")
+    if not count:
+        raise OptionError(f"device={device}: this machine has no GPU that torch can use; take auto")
+    if int(device.partition(":")[2] or 0) >= count:
+        raise OptionError(f"device={device}: this machine has {count} GPUs, the first is cuda:0")
+    return torch.device("cuda" if device == "auto" else device)
 
 
 @contextmanager
@@ -47,18 +50,24 @@ def inference(device: torch.device, half_precision: bool = False) -> Iterator[No
     float32 stays float32 on a GPU: convolutions and products in TF32 would move keypoints.
     """
     half = torch.float16 if device.type == "cuda" else torch.bfloat16
-    convolutions = torch.backends.cudnn.allow_tf32
-    products = torch.backends.cuda.matmul.allow_tf32
-    torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = False
-    try:
-        with (
-            torch.inference_mode(),
-            torch.autocast(device.type, dtype=half, enabled=half_precision),
-        ):
+    exact = _without_tf32() if device.type == "cuda" else nullcontext()
+    autocast = torch.autocast(device.type, dtype=half, enabled=half_precision)
+    with exact, torch.inference_mode(), autocast:
+        yield
+
+
+@contextmanager
+def _without_tf32() -> Iterator[None]:
+    """That is a setting of the process, so of its threads one computes at a time."""
+    with _computing:
+        convolutions = torch.backends.cudnn.allow_tf32
+        products = torch.backends.cuda.matmul.allow_tf32
+        torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = False
+        try:
             yield
-    finally:
-        torch.backends.cudnn.allow_tf32 = convolutions
-        torch.backends.cuda.matmul.allow_tf32 = products
+        finally:
+            torch.backends.cudnn.allow_tf32 = convolutions
+            torch.backends.cuda.matmul.allow_tf32 = products
 
 
 def image_tensor(image: NDArray[np.uint8], device: torch.device) -> torch.Tensor:
@@ -123,7 +132,17 @@ def load_strictly(
         raise DataError(
             f"this file does not fit {type(module).__name__}; {'; '.join(wrong)}", path=where
         )
-    module.load_state_dict(dict(tensors), strict=False)
+    if not any(getattr(tensor, "is_shared_file", False) for tensor in tensors.values()):
+        module.load_state_dict(dict(tensors), strict=False)
+        return
+    # the parameters are the file's own memory, which all processes that read it have once
+    own = {
+        key: value
+        if getattr(value, "is_shared_file", False) and value.dtype == expected[key].dtype
+        else torch.empty(value.shape, dtype=expected[key].dtype).copy_(value)
+        for key, value in tensors.items()
+    }
+    module.load_state_dict(own, strict=False, assign=True)
 
 
 def _some(keys: Sequence[str]) -> str:

@@ -21,10 +21,10 @@ from megloc_kapture.io.colmap import (
     MapImage,
     TriangulatedPoints,
     TriangulationOptions,
-    px_from_cam,
     triangulate,
     write_feature_database,
 )
+from megloc_kapture.io.colmap_cameras import px_from_cam
 from megloc_kapture.values import Camera, RigidTransform
 
 import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py

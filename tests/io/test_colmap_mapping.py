@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from megloc_kapture.geometry.cameras import px_from_cam
-from megloc_kapture.io.colmap import MapImage, load_pycolmap, write_model
+from megloc_kapture.io.colmap import MapImage, write_model
+from megloc_kapture.io.colmap_cameras import load_pycolmap
 from megloc_kapture.io.colmap_mapping import connected_models
 from megloc_kapture.values import Camera, RigidTransform
 

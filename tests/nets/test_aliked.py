@@ -66,7 +66,7 @@ def texture(height: int, width: int, seed: int = 0) -> torch.Tensor:
 
 def dense_features(net: AlikedNet, image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Score map (H, W) and all features (D, H, W)."""
-    maps = net(image)
+    maps = net(image)[0]
     height, width = maps.scores.shape
     rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     features = maps.features_at(rows.reshape(-1), columns.reshape(-1))
@@ -132,7 +132,7 @@ def test_descriptors_are_kornias_everywhere(shared_data: Path, variant: str) -> 
         features, _ = theirs.extract_dense_map(image)
         normalised = xy / torch.tensor([127.0, 95.0]) * 2 - 1
         expected = theirs.desc_head(features, [normalised])[0][0]
-        found = net.desc_head(net(image), xy)
+        found = net.desc_head(net(image)[0], xy)
     assert (found - expected).abs().max() < 2e-5
     assert (found.norm(dim=1) - 1).abs().max() < 1e-5
 
@@ -142,9 +142,9 @@ def test_half_precision_stays_near() -> None:
     net = aliked_from(tensors, "t16")
     image = texture(64, 96)
     with torch.inference_mode():
-        full = net(image).scores
+        full = net(image)[0].scores
         with torch.autocast("cpu", dtype=torch.bfloat16):
-            half = net(image).scores
+            half = net(image)[0].scores
     assert half.dtype == torch.float32
     assert 0 < (full - half).abs().max() < 0.1
 

@@ -11,7 +11,8 @@ import numpy as np
 
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.plugins import MATCHERS, LocalFeatureExtractor, load_plugin
+from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugins import MATCHERS, LocalFeatureExtractor
 from megloc_kapture.values import ImageFeatures
 
 import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py

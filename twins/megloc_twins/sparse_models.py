@@ -19,14 +19,8 @@ from numpy.typing import NDArray
 
 from megloc_kapture.datasets.formats.sparse_points import SparsePoints
 from megloc_kapture.features.colmap_sift import ColmapSift
-from megloc_kapture.io.colmap import (
-    DatabaseFeatures,
-    MapImage,
-    normalized_from_px,
-    px_from_cam,
-    triangulate,
-    write_feature_database,
-)
+from megloc_kapture.io.colmap import DatabaseFeatures, MapImage, triangulate, write_feature_database
+from megloc_kapture.io.colmap_cameras import normalized_from_px, px_from_cam
 from megloc_kapture.io.images import read_image_rgb, write_image
 from megloc_kapture.matching.nearest_neighbours import NearestNeighbourOptions, match_nearest
 from megloc_kapture.stages.work import Work

@@ -19,7 +19,8 @@ from scipy.spatial.transform import Rotation
 from megloc_kapture.datasets.official import write_official
 from megloc_kapture.io.images import image_size
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.plugins import DATASETS, load_plugin
+from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugins import DATASETS
 from megloc_kapture.stages.work import Work
 
 LAYOUTS = ("aachen", "robotcar", "4seasons", "inloc")

@@ -54,8 +54,8 @@ class FolderBlobs:
         if not isinstance(name, str):
             return False
         try:
-            return safe_join(self._folder, name).is_file()
-        except (DataError, OSError):
+            return os.path.isfile(f"{self._folder}/{check_relative(name)}")
+        except DataError:
             return False
 
     def size(self, name: str) -> int:
@@ -116,7 +116,12 @@ class FolderBlobs:
             return None
 
     def _checked(self, name: str) -> Path:
-        return check_no_escape(self._roots, safe_join(self._folder, name))
+        path, below = safe_join(self._folder, name), str(self._folder)
+        for part in name.split("/"):  # following no links takes a fraction of the time
+            below = f"{below}/{part}"
+            if os.path.islink(below):
+                return check_no_escape(self._roots, path)
+        return path
 
     def _walk(self, folder: Path | str, prefix: str) -> Iterator[str]:
         try:

@@ -76,6 +76,11 @@ class MatchesReader:
             return False
         return self._find(str(pair[0]), str(pair[1])) is not None
 
+    def length(self, a: str, b: str) -> int:
+        """Number of matches of a pair, from the size of its file alone; 0 where there is none."""
+        found = self._find(a, b)
+        return 0 if found is None else found[0].size(found[1]) // _ROW_BYTES
+
     def read(self, a: str, b: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Matches of a pair in either order.
 

@@ -46,6 +46,10 @@ class KaptureVectors:
         """Length D of a vector."""
         return self._reader.config.dsize
 
+    def part(self, start: int, stop: int) -> KaptureVectors:
+        """Those of the images ``start`` to ``stop``."""
+        return KaptureVectors(self._reader, self._images[start:stop])
+
     def read(
         self, start: int, stop: int, out: NDArray[np.float32] | None = None
     ) -> NDArray[np.float32]:

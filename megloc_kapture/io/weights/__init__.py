@@ -20,6 +20,7 @@ from megloc_kapture.io.weights.folder import (
     sha256_of,
     weights_folder,
 )
+from megloc_kapture.io.weights.shared import share_weights
 
 __all__ = [
     "FOLDER_VARIABLE",
@@ -38,6 +39,7 @@ __all__ = [
     "how_to_get",
     "prove",
     "read_weights",
+    "share_weights",
     "sha256_of",
     "weights_folder",
 ]

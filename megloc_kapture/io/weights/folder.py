@@ -12,7 +12,7 @@ import os
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,6 +27,7 @@ from megloc_kapture.io.weights.registry import (
     lookup,
     registry,
 )
+from megloc_kapture.io.weights.shared import shared_tensors
 
 if TYPE_CHECKING:
     import torch
@@ -196,13 +197,18 @@ def sha256_of(file: WeightsFile) -> str:
 def read_weights(file: WeightsFile) -> dict[str, torch.Tensor]:
     """All tensors of a checkpoint by name, on the processor; no code of the file is run.
 
-    Every file is read once, and what is loaded is what the checksum was taken of.
+    Every file is read once, and what is loaded is what the checksum was taken of. Processes that
+    :func:`share_weights` are the first of them to read it or have the tensors that the first read.
 
     Raises
     ------
     DataError : it cannot be read, is damaged, holds objects that are never loaded, or its sha256
         is not the one that the registry knows; names the file.
     """
+    return shared_tensors(file, partial(_read, file))
+
+
+def _read(file: WeightsFile) -> dict[str, torch.Tensor]:
     try:
         contents = {part: part.read_bytes() for part in file.parts()}
     except OSError as error:

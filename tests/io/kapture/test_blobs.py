@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import pickle
+import re
 import subprocess
 import sys
 import tarfile
@@ -196,7 +197,8 @@ def test_a_negative_size_does_not_loop(tmp_path: Path, start: int) -> None:
         timeout=60,
         check=True,
     )
-    assert "broken member header" in run.stdout
+    # tarfile says it since Python 3.14 itself, in words of its own
+    assert re.search(r"x\.tar: .*(broken|invalid offset)", run.stdout)
 
 
 def test_readers_work_in_threads_and_other_processes(tmp_path: Path) -> None:

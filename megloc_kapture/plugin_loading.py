@@ -1,0 +1,130 @@
+"""How a plugin is found by its name, made with its options, and what its results depend on."""
+
+from __future__ import annotations
+
+import hashlib
+import sys
+from contextlib import suppress
+from functools import cache
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from megloc_kapture.errors import MeglocError, PluginError, missing_extra, suggestion
+from megloc_kapture.plugins import PROTOCOLS
+from megloc_kapture.values import Options
+
+
+def plugin_names(group: str) -> list[str]:
+    """Names registered under a group, sorted."""
+    return sorted({entry.name for entry in entry_points(group=group)})
+
+
+def load_plugin(group: str, name: str, options: dict[str, Any] | None = None) -> Any:
+    """Make the plugin ``name`` of ``group``, with its options.
+
+    Raises
+    ------
+    PluginError : no such plugin, it cannot be imported, does not fulfil the group's protocol, or
+        refuses its options; says which and why.
+    """
+    kind = plugin_class(group, name)
+    model = getattr(kind, "Options", None)
+    try:
+        if model is None:
+            if options:
+                raise ValueError(f"it takes no options, got {sorted(options)}")
+            return kind()
+        return kind(model(**(options or {})))
+    except MeglocError:
+        raise
+    except ValidationError as error:
+        first = error.errors()[0]
+        option = ".".join(str(part) for part in first["loc"])
+        raise PluginError(
+            f"plugin {name!r} refuses its options: {option}: {first['msg']}"
+        ) from error
+    except Exception as error:  # whatever a foreign constructor raises
+        reason = " ".join(str(error).split())
+        raise PluginError(f"plugin {name!r} refuses its options: {reason}") from error
+
+
+def plugin_class(group: str, name: str) -> Any:
+    """The class registered as ``name`` in ``group``.
+
+    Raises
+    ------
+    PluginError : none, it cannot be imported, or it does not fulfil the group's protocol.
+    """
+    found = [entry for entry in entry_points(group=group) if entry.name == name]
+    if not found:
+        known = suggestion(name, plugin_names(group), listed="registered: ")
+        raise PluginError(f"no plugin {name!r} in {group}; {known}")
+    origins = {entry.value for entry in found}
+    if len(origins) > 1:
+        raise PluginError(f"plugin {name!r} of {group} is registered twice: {sorted(origins)}")
+    try:
+        kind = found[0].load()
+    except Exception as error:  # whatever a foreign module raises while it is imported
+        reason = missing_extra(error) or error
+        raise PluginError(
+            f"plugin {name!r} ({found[0].value}) cannot be loaded: {reason}"
+        ) from error
+    protocol = PROTOCOLS[group]
+    missing = [member for member in _members(protocol) if not hasattr(kind, member)]
+    if not isinstance(kind, type) or missing:
+        what = "is no class" if not isinstance(kind, type) else f"lacks {', '.join(missing)}"
+        raise PluginError(
+            f"plugin {name!r} ({found[0].value}) does not fulfil {protocol.__name__}: it {what}"
+        )
+    return kind
+
+
+@cache
+def option_models(name: str) -> tuple[type[Options], ...]:
+    """The models of the options of plugins of that name, of any group; raises PluginError."""
+    named = entry_points().select(name=name)
+    groups = sorted({one.group for one in named} & PROTOCOLS.keys())
+    models = [getattr(plugin_class(group, name), "Options", None) for group in groups]
+    return tuple(model for model in models if model is not None)
+
+
+@cache
+def code_of(kind: type) -> str:
+    """Version of the package that registers a class, and hash of the code that defines it.
+
+    Of our own classes that is their module; of others all modules of their package.
+    """
+    module = sys.modules.get(kind.__module__)
+    source = getattr(module, "__file__", None)
+    files = [] if source is None else [Path(source)]
+    top = getattr(sys.modules.get(kind.__module__.partition(".")[0]), "__file__", None) or ""
+    if files and not is_ours(kind) and Path(top).name == "__init__.py":
+        files = sorted({*files, *Path(top).parent.rglob("*.py")})
+    digest = hashlib.sha256()
+    for file in files:
+        with suppress(OSError):
+            digest.update(file.read_bytes())
+    value = f"{kind.__module__}:{kind.__qualname__}"
+    registered = [entry.dist for entry in entry_points().select(value=value) if entry.dist]
+    return f"{registered[0].version if registered else ''} {digest.hexdigest()}".strip()
+
+
+def is_ours(kind: type) -> bool:
+    """Whether a class is of this package."""
+    return kind.__module__.partition(".")[0] == __name__.partition(".")[0]
+
+
+def weights_of(plugin: object) -> dict[str, str]:
+    """File name to sha256 of the weights a plugin uses; none where it has none."""
+    weights = getattr(plugin, "weights", None)
+    return dict(weights()) if callable(weights) else {}
+
+
+def _members(protocol: type) -> list[str]:
+    names = set(getattr(protocol, "__annotations__", {})) | {
+        name for name, value in vars(protocol).items() if callable(value)
+    }
+    return sorted(name for name in names if not name.startswith("_"))
