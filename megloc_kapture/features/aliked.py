@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -10,13 +9,11 @@ import torch
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.features.image_bound import BoundedOptions
-from megloc_kapture.io.weights import WeightsFile, find_weights, read_weights, sha256_of
-from megloc_kapture.nets.aliked import AlikedNet, aliked_from
-from megloc_kapture.nets.runtime import NetworkOptions, image_tensor, inference, pick_device
+from megloc_kapture.features.network import Images, LocalNetwork, LocalNetworkOptions, Masks
+from megloc_kapture.nets.aliked import AlikedMaps, AlikedNet, aliked_from
+from megloc_kapture.nets.runtime import image_tensor, inference
 from megloc_kapture.nets.sampling import read_bilinear
 from megloc_kapture.nets.score_maps import (
-    select_keypoints,
     select_pixels,
     soft_argmax,
     suppress_non_maxima,
@@ -26,7 +23,7 @@ from megloc_kapture.values import LocalFeatures
 _TEMPERATURE = 0.1  # of the sub-pixel position, the one the network was trained with
 
 
-class AlikedOptions(NetworkOptions, BoundedOptions):
+class AlikedOptions(LocalNetworkOptions):
     """Options of ALIKED."""
 
     weights: str = Field(
@@ -35,77 +32,51 @@ class AlikedOptions(NetworkOptions, BoundedOptions):
     )
     nms_radius: int = Field(default=2, gt=0, description="pixels")
     threshold: float = Field(default=0.2, ge=0, lt=1, description="scores kept are larger")
-    max_keypoints: int = Field(default=1500, gt=0, description="best scores kept")
 
 
-class Aliked:
+class Aliked(LocalNetwork[AlikedOptions]):
     """ALIKED keypoints (x, y, score) with descriptors of unit length, float32 (N, 64 or 128)."""
 
     name = "aliked"
-    descriptor_dtype = "float32"
-    metric = "L2"
     Options = AlikedOptions
 
     def __init__(self, options: AlikedOptions | None = None) -> None:
-        self.options = options or AlikedOptions()
-        self._weights = find_weights(self.options.weights)
+        super().__init__(options)
         # the type's name carries the model: descriptors of different ones do not match
         self.name = Path(self._weights.name).stem
 
     @property
     def descriptor_size(self) -> int:
         """64 or 128, of the checkpoint."""
-        return _network(self._weights, pick_device(self.options.device)).descriptor_size
+        return int(self.network(aliked_from)[0].descriptor_size)
 
-    def weights(self) -> dict[str, str]:
-        """sha256 of the checkpoint by its file's name."""
-        return {self._weights.path.name: sha256_of(self._weights)}
-
-    def extract(
-        self, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
-    ) -> LocalFeatures:
-        """Extract from an RGB image.
-
-        Parameters
-        ----------
-        image : uint8 (H, W, 3), RGB.
-        mask : bool (H, W) or None; keypoints on False pixels are dropped before the best are
-            selected.
-        """
-        options = self.options
-        device = pick_device(options.device)
-        net = _network(self._weights, device)
-        with inference(device, options.half_precision):
-            maps = net(image_tensor(image, device))
+    def extract_many(self, images: Images, masks: Masks) -> list[LocalFeatures]:
+        net, device = self.network(aliked_from)
+        with inference(device, self.options.half_precision):
+            found = net(torch.cat([image_tensor(image, device) for image in images]))
         with inference(device):
-            scores = maps.scores
-            found = select_pixels(
-                suppress_non_maxima(scores, options.nms_radius),
-                threshold=options.threshold,
-                border=options.nms_radius,
-            )
-            xy = soft_argmax(scores, found.xy, options.nms_radius, _TEMPERATURE)
-            height, width = scores.shape
-            read = read_bilinear(scores.reshape(-1, 1), xy[:, 1], xy[:, 0], (height, width))
-            # the network puts the centre of the first pixel at (0, 0), COLMAP at (0.5, 0.5)
-            xy_px = xy.cpu().numpy() + np.float32(0.5)
-            score = read[:, 0].cpu().numpy()
-            rows, num_masked = select_keypoints(
-                xy_px,
-                score,
-                size=(height, width),
-                mask=mask,
-                max_keypoints=options.max_keypoints,
-            )
-            descriptors = net.desc_head(maps, xy[torch.from_numpy(rows).to(device)])
-        return LocalFeatures(
-            np.column_stack([xy_px[rows], score[rows]]),
-            score[rows],
-            descriptors.cpu().numpy(),
-            num_masked,
+            return [self._selected(net, *each) for each in zip(found, masks, strict=True)]
+
+    def _selected(
+        self, net: AlikedNet, maps: AlikedMaps, mask: NDArray[np.bool_] | None
+    ) -> LocalFeatures:
+        """The best keypoints of one image, and their descriptors."""
+        options, scores = self.options, maps.scores
+        found = select_pixels(
+            suppress_non_maxima(scores, options.nms_radius),
+            threshold=options.threshold,
+            border=options.nms_radius,
         )
-
-
-@lru_cache(maxsize=2)
-def _network(weights: WeightsFile, device: torch.device) -> AlikedNet:
-    return aliked_from(read_weights(weights), str(weights.path)).to(device)
+        xy = soft_argmax(scores, found.xy, options.nms_radius, _TEMPERATURE)
+        height, width = scores.shape
+        read = read_bilinear(scores.reshape(-1, 1), xy[:, 1], xy[:, 0], (height, width))
+        # the network puts the centre of the first pixel at (0, 0), COLMAP at (0.5, 0.5)
+        xy_px = xy.cpu().numpy() + np.float32(0.5)
+        score = read[:, 0].cpu().numpy()
+        return self._best(
+            np.column_stack([xy_px, score]),
+            score,
+            lambda rows: net.desc_head(maps, xy[rows.to(xy.device)]),
+            scores.shape,
+            mask,
+        )

@@ -9,10 +9,9 @@ and Masone, CVPR Workshops 2025).
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar, TypeVar
 
 import numpy as np
 import torch
@@ -22,8 +21,9 @@ from pydantic import Field
 from torch import nn
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.weights import WeightsFile, find_weights, read_weights, sha256_of
+from megloc_kapture.features.network import Images
 from megloc_kapture.nets.apgem import apgem_from, whitening_from
+from megloc_kapture.nets.checkpointed import Checkpointed
 from megloc_kapture.nets.delg import delg_from, describe
 from megloc_kapture.nets.dinov2 import PATCH_PX
 from megloc_kapture.nets.eigenplaces import eigenplaces_from
@@ -33,11 +33,9 @@ from megloc_kapture.nets.runtime import (
     NetworkOptions,
     image_tensor,
     inference,
-    pick_device,
     sized_tensor,
 )
 
-Images = Sequence[NDArray[np.uint8]]
 Tensors = Mapping[str, torch.Tensor]
 
 _OPENIBL_WIDTH_PX, _OPENIBL_HEIGHT_PX = 640, 480
@@ -50,29 +48,23 @@ class GlobalNetworkOptions(NetworkOptions):
     weights: str
 
 
-class GlobalNetwork(ABC):
+GlobalOptions = TypeVar("GlobalOptions", bound=GlobalNetworkOptions)
+
+
+class GlobalNetwork(Checkpointed[GlobalOptions], ABC):
     """Global features by a network with a checkpoint.
 
     The type's name carries the model as well as the method, since vectors of different ones cannot
     be compared.
-
-    Raises
-    ------
-    MissingWeightsError : the checkpoint is not there.
     """
 
     name: str
     method: ClassVar[str]
 
-    def __init__(self, options: GlobalNetworkOptions) -> None:
-        self._device_name = options.device
-        self._weights = find_weights(options.weights)
+    def __init__(self, options: GlobalOptions | None = None) -> None:
+        super().__init__(options)
         stem = Path(self._weights.name.removesuffix(".gz")).stem
         self.name = stem if self.method in stem else f"{self.method}-{stem}"
-
-    def weights(self) -> dict[str, str]:
-        """sha256 of the checkpoint by its file's name."""
-        return {self._weights.path.name: sha256_of(self._weights)}
 
     def describe(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
         """The vector of an RGB image, uint8 (H, W, 3): float32 (D,), unit length.
@@ -84,33 +76,12 @@ class GlobalNetwork(ABC):
         """
         return self.describe_many([image])[0]
 
-    def describe_many(self, images: Images) -> NDArray[np.float32]:
-        """The vectors of images of one size, float32 (B, D), in their order.
-
-        On a GPU they are one batch, and as one by one but for rounding. On a processor, where a
-        batch gains nothing, each runs alone, and has to the last bit what it has without the
-        others. Raises as :meth:`describe`.
-        """
-        if pick_device(self._device_name).type == "cuda":
-            return self._vectors(images)
-        return np.concatenate([self._vectors([image]) for image in images])
-
     @abstractmethod
-    def _vectors(self, images: Images) -> NDArray[np.float32]:
-        """The vectors of images of one size, float32 (B, D), of one batch."""
+    def describe_many(self, images: Images) -> NDArray[np.float32]:
+        """The vectors of images of one size, float32 (B, D), in their order, of one batch.
 
-    def _network(self, load: Callable[..., nn.Module], *arguments: Any) -> tuple[Any, torch.device]:
-        """The network that ``load`` makes of the checkpoint, and the device it is on."""
-        device = pick_device(self._device_name)
-        return _network(load, self._weights, device, *arguments), device
-
-
-# a run may use all of these features
-@lru_cache(maxsize=8)
-def _network(
-    load: Callable[..., nn.Module], weights: WeightsFile, device: torch.device, *arguments: Any
-) -> nn.Module:
-    return load(read_weights(weights), str(weights.path), *arguments).to(device)
+        As one by one but for rounding. Raises as :meth:`describe`.
+        """
 
 
 class NetVladOptions(GlobalNetworkOptions):
@@ -124,18 +95,14 @@ class NetVladOptions(GlobalNetworkOptions):
     )
 
 
-class NetVlad(GlobalNetwork):
+class NetVlad(GlobalNetwork[NetVladOptions]):
     """NetVLAD on VGG-16 with its whitening: one vector of unit length, float32 (4096,)."""
 
     name = method = "netvlad"
     Options = NetVladOptions
 
-    def __init__(self, options: NetVladOptions | None = None) -> None:
-        self.options = options or NetVladOptions()
-        super().__init__(self.options)
-
-    def _vectors(self, images: Images) -> NDArray[np.float32]:
-        network, device = self._network(netvlad)
+    def describe_many(self, images: Images) -> NDArray[np.float32]:
+        network, device = self.network(netvlad)
         planes = [sized_tensor(image, self.options.max_size_px, device) for image in images]
         return netvlad_vectors(network, planes, self.options.half_precision)
 
@@ -182,18 +149,14 @@ class OpenIblOptions(GlobalNetworkOptions):
     )
 
 
-class OpenIbl(GlobalNetwork):
+class OpenIbl(GlobalNetwork[OpenIblOptions]):
     """OpenIBL's VGG-16 with NetVLAD and PCA: one vector of unit length, float32 (4096,)."""
 
     name = method = "openibl"
     Options = OpenIblOptions
 
-    def __init__(self, options: OpenIblOptions | None = None) -> None:
-        self.options = options or OpenIblOptions()
-        super().__init__(self.options)
-
-    def _vectors(self, images: Images) -> NDArray[np.float32]:
-        network, device = self._network(openibl)
+    def describe_many(self, images: Images) -> NDArray[np.float32]:
+        network, device = self.network(openibl)
         planes = [self._resized(image, device) for image in images]
         return netvlad_vectors(network, planes, self.options.half_precision)
 
@@ -236,7 +199,7 @@ class ApGemOptions(GlobalNetworkOptions):
     )
 
 
-class ApGem(GlobalNetwork):
+class ApGem(GlobalNetwork[ApGemOptions]):
     """AP-GeM vectors of unit length, float32 (2048,).
 
     The name tells the checkpoint and, with one, the whitening and its power: vectors of different
@@ -247,14 +210,13 @@ class ApGem(GlobalNetwork):
     Options = ApGemOptions
 
     def __init__(self, options: ApGemOptions | None = None) -> None:
-        self.options = options or ApGemOptions()
-        super().__init__(self.options)
+        super().__init__(options)
         if self.options.whitening:
             self.name += f"-{self.options.whitening}-{self.options.whitening_power:g}"
 
-    def _vectors(self, images: Images) -> NDArray[np.float32]:
+    def describe_many(self, images: Images) -> NDArray[np.float32]:
         options = self.options
-        (net, *whitening), device = self._network(
+        (net, *whitening), device = self.network(
             _apgem_with_whitening, options.whitening, options.whitening_power
         )
         batch = torch.cat([sized_tensor(image, options.max_size_px, device) for image in images])
@@ -294,19 +256,15 @@ class DelgOptions(GlobalNetworkOptions):
     )
 
 
-class Delg(GlobalNetwork):
+class Delg(GlobalNetwork[DelgOptions]):
     """DELG vectors of unit length, float32 (2048,)."""
 
     name = method = "delg"
     Options = DelgOptions
 
-    def __init__(self, options: DelgOptions | None = None) -> None:
-        self.options = options or DelgOptions()
-        super().__init__(self.options)
-
-    def _vectors(self, images: Images) -> NDArray[np.float32]:
+    def describe_many(self, images: Images) -> NDArray[np.float32]:
         options = self.options
-        net, device = self._network(delg_from)
+        net, device = self.network(delg_from)
         sized = np.stack([_with_longer_side(image, options.max_size_px) for image in images])
         batch = torch.from_numpy(sized).to(device).permute(0, 3, 1, 2).float()
         with inference(device, options.half_precision):
@@ -339,28 +297,18 @@ class EigenPlacesOptions(GlobalNetworkOptions):
     )
 
 
-class EigenPlaces(GlobalNetwork):
+class EigenPlaces(GlobalNetwork[EigenPlacesOptions]):
     """EigenPlaces' vector of an image, float32 (D,), unit length; D is 2048 or the checkpoint's."""
 
     name = method = "eigenplaces"
     Options = EigenPlacesOptions
 
-    def __init__(self, options: EigenPlacesOptions | None = None) -> None:
-        self.options = options or EigenPlacesOptions()
-        super().__init__(self.options)
-
-    def _vectors(self, images: Images) -> NDArray[np.float32]:
+    def describe_many(self, images: Images) -> NDArray[np.float32]:
         options = self.options
-        network, device = self._network(_eigenplaces_channels_last)
+        network, device = self.network(eigenplaces_from, channels_last=True)
         batch = torch.cat([sized_tensor(image, options.max_size_px, device) for image in images])
         with inference(device, options.half_precision):
             return network(batch).cpu().numpy()
-
-
-def _eigenplaces_channels_last(tensors: Tensors, where: str) -> nn.Module:
-    """The network with channels last, which is faster on a processor."""
-    network = eigenplaces_from(tensors, where)
-    return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
 
 class MegaLocOptions(GlobalNetworkOptions):
@@ -375,7 +323,7 @@ class MegaLocOptions(GlobalNetworkOptions):
     )
 
 
-class MegaLoc(GlobalNetwork):
+class MegaLoc(GlobalNetwork[MegaLocOptions]):
     """MegaLoc's vector of an image, float32 (8448,), unit length.
 
     The image is scaled to a square, its shape is not kept: so the paper evaluates.
@@ -385,14 +333,13 @@ class MegaLoc(GlobalNetwork):
     Options = MegaLocOptions
 
     def __init__(self, options: MegaLocOptions | None = None) -> None:
-        self.options = options or MegaLocOptions()
-        super().__init__(self.options)
+        super().__init__(options)
         if self.options.size_px != _MEGALOC_SIZE_PX:
             self.name += f"-{self.options.size_px}px"
 
-    def _vectors(self, images: Images) -> NDArray[np.float32]:
+    def describe_many(self, images: Images) -> NDArray[np.float32]:
         options = self.options
-        network, device = self._network(megaloc_from)
+        network, device = self.network(megaloc_from)
         with inference(device):
             batch = [squared(image_tensor(image, device), options.size_px) for image in images]
         with inference(device, options.half_precision):

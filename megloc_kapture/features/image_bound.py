@@ -7,8 +7,9 @@ image is reduced first, and its keypoints are scaled back.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,6 +18,8 @@ from pydantic import Field
 
 from megloc_kapture.values import LocalFeatures, Options
 
+Frame = tuple[NDArray[np.uint8], NDArray[np.bool_] | None]
+"""An image, RGB (H, W, 3), and its mask (H, W), True = use, or None."""
 DEFAULT_MEGAPIXELS = 8.0
 
 
@@ -30,12 +33,6 @@ class BoundedOptions(Options):
         description="a larger image is reduced to this before its features are extracted, and its "
         "keypoints are scaled back; memory grows with it",
     )
-
-
-class _Extractor(Protocol):
-    def extract(
-        self, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
-    ) -> LocalFeatures: ...
 
 
 def bounded_size(width: int, height: int, max_megapixels: float) -> tuple[int, int]:
@@ -63,25 +60,44 @@ def max_megapixels_of(extractor: object) -> float:
     return float(getattr(options, "max_megapixels", DEFAULT_MEGAPIXELS))
 
 
-def extract_bounded(
-    extractor: _Extractor, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
-) -> LocalFeatures:
-    """Extract from an image, reduced where it is larger than the extractor's bound.
+def extract_bounded(extractor: Any, frames: Sequence[Frame]) -> list[LocalFeatures]:
+    """Extract from images of one size, reduced where they are larger than the extractor's bound.
 
-    x and y of the keypoints are those in the image as given; other columns, as a scale, are those
-    of the reduced one. A pixel of a reduced mask is used where all that it covers is.
+    x and y of the keypoints are those in the images as given; other columns, as a scale, are those
+    of the reduced ones. A pixel of a reduced mask is used where all that it covers is.
+
+    Parameters
+    ----------
+    extractor : a plugin of local features, that has ``extract_many`` where images are several.
     """
-    small = bounded_image(image, max_megapixels_of(extractor))
-    if small is image:
-        return extractor.extract(image, mask)
-    height, width = small.shape[:2]
-    if mask is not None:
-        ignored = (~mask).astype(np.uint8) * 255
-        mask = cv2.resize(ignored, (width, height), interpolation=cv2.INTER_AREA) == 0
-    found = extractor.extract(small, mask)
-    if not isinstance(found, LocalFeatures):
-        return found  # whoever checks plugins says so
-    keypoints_px = found.keypoints_px.copy()
+    bound = max_megapixels_of(extractor)
+    small = [_reduced(*frame, bound) for frame in frames]
+    several = len(frames) > 1
+    found = (
+        extractor.extract_many(*zip(*small, strict=True))
+        if several
+        else [extractor.extract(*small[0])]
+    )
+    (height, width), (own_height, own_width) = small[0][0].shape[:2], frames[0][0].shape[:2]
     # the first pixel's centre is (0.5, 0.5): sizes scale as a whole
-    keypoints_px[:, :2] *= np.array([image.shape[1] / width, image.shape[0] / height], np.float32)
-    return replace(found, keypoints_px=keypoints_px)
+    ratio = np.array([own_width / width, own_height / height], np.float32)
+    return found if small[0][0] is frames[0][0] else [_scaled(each, ratio) for each in found]
+
+
+def _reduced(
+    image: NDArray[np.uint8], mask: NDArray[np.bool_] | None, max_megapixels: float
+) -> Frame:
+    small = bounded_image(image, max_megapixels)
+    if mask is None or small is image:
+        return small, mask
+    ignored = (~mask).astype(np.uint8) * 255
+    size = small.shape[1], small.shape[0]
+    return small, np.asarray(cv2.resize(ignored, size, interpolation=cv2.INTER_AREA) == 0)
+
+
+def _scaled(features: LocalFeatures, ratio: NDArray[np.float32]) -> LocalFeatures:
+    if not isinstance(features, LocalFeatures):
+        return features  # whoever checks plugins says so
+    keypoints_px = features.keypoints_px.copy()
+    keypoints_px[:, :2] *= ratio
+    return replace(features, keypoints_px=keypoints_px)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -11,24 +10,22 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from torch.nn import functional
 
-from megloc_kapture.features.image_bound import BoundedOptions
-from megloc_kapture.io.weights import WeightsFile, find_weights, read_weights, sha256_of
+from megloc_kapture.features.network import Images, Level, LocalNetwork, LocalNetworkOptions, Masks
 from megloc_kapture.nets.r2d2 import (
     DESCRIPTOR_SIZE,
     R2D2Maps,
-    R2D2Network,
     load_r2d2,
     pyramid_levels,
 )
-from megloc_kapture.nets.runtime import NetworkOptions, image_tensor, inference, pick_device
-from megloc_kapture.nets.score_maps import select_keypoints, window_maximum
+from megloc_kapture.nets.runtime import image_tensor, inference
+from megloc_kapture.nets.score_maps import window_maximum
 from megloc_kapture.values import LocalFeatures
 
 _DEFAULT_WEIGHTS = "r2d2_WASF_N16"
 _PATCH_PX = 32.0  # the scale of a keypoint found at the image's own size, as the authors write it
 
 
-class R2D2Options(NetworkOptions, BoundedOptions):
+class R2D2Options(LocalNetworkOptions):
     """Options of R2D2; the authors' but for the number of keypoints."""
 
     weights: str = Field(default=_DEFAULT_WEIGHTS, description="name in the registry, or a file")
@@ -46,74 +43,47 @@ class R2D2Options(NetworkOptions, BoundedOptions):
         return self
 
 
-class R2D2:
+class R2D2(LocalNetwork[R2D2Options]):
     """The extractor ``r2d2``: keypoints (N, 3) = x, y, scale; descriptors float32 (N, 128).
 
-    Other weights than the default make another type of features, named after their file.
+    Keypoints of all levels of a pyramid; a score is reliability times repeatability. Other weights
+    than the default make another type of features, named after their file.
     """
 
     name = "r2d2"
     descriptor_size = DESCRIPTOR_SIZE
-    descriptor_dtype = "float32"
-    metric = "L2"
     Options = R2D2Options
 
     def __init__(self, options: R2D2Options | None = None) -> None:
-        self.options = options or R2D2Options()
-        self._file = find_weights(self.options.weights)
+        super().__init__(options)
         if self.options.weights != _DEFAULT_WEIGHTS:
             self.name = f"r2d2_{Path(self.options.weights).stem.removeprefix('r2d2_')}"
 
-    def weights(self) -> dict[str, str]:
-        """sha256 of the checkpoint by its file name."""
-        return {self._file.path.name: sha256_of(self._file)}
-
-    def extract(
-        self, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
-    ) -> LocalFeatures:
-        """Extract from an RGB image, uint8 (H, W, 3); none on False pixels of the mask (H, W).
-
-        Keypoints of all levels of a pyramid; a score is reliability times repeatability.
-
-        Raises
-        ------
-        DataError : the checkpoint does not fit.
-        OptionError : the device is not there.
-        """
+    def extract_many(self, images: Images, masks: Masks) -> list[LocalFeatures]:
         options = self.options
-        device = pick_device(options.device)
-        network = _network(self._file, device)
-        height, width = image.shape[:2]
-        keypoints, scores, descriptors = [], [], []
+        # twice as fast on a processor as with channels first
+        network, device = self.network(load_r2d2, channels_last=True)
+        found: list[list[Level]] = [[] for _ in images]
         with inference(device, options.half_precision):
             levels = pyramid_levels(
-                image_tensor(image, device), min_size=options.min_size, max_size=options.max_size
+                torch.cat([image_tensor(image, device) for image in images]),
+                min_size=options.min_size,
+                max_size=options.max_size,
             )
             for level in levels:
                 maps = network(level.contiguous(memory_format=torch.channels_last))
-                yx = _maxima(maps, options)
-                at = 0, slice(None), yx[:, 0], yx[:, 1]
-                descriptors.append(functional.normalize(maps.features[at].float(), dim=0).T)
-                found = maps.reliability[at] * maps.repeatability[at]
-                scores.append(found[0].cpu().numpy())
-                keypoints.append(_in_image_pixels(yx.cpu().numpy(), level.shape[-2:], image))
-        xys, score = np.concatenate(keypoints), np.concatenate(scores)
-        rows, num_masked = select_keypoints(
-            xys[:, :2],
-            score,
-            size=(height, width),
-            mask=mask,
-            max_keypoints=options.max_keypoints,
-        )
-        chosen = torch.cat(descriptors)[torch.from_numpy(rows).to(device)]
-        return LocalFeatures(xys[rows], score[rows], chosen.cpu().numpy(), num_masked)
-
-
-@lru_cache(maxsize=2)
-def _network(file: WeightsFile, device: torch.device) -> R2D2Network:
-    network = load_r2d2(read_weights(file), str(file.path))
-    # twice as fast on a processor as with channels first
-    return network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+                for k, image in enumerate(images):
+                    own = R2D2Maps(*(values[k : k + 1] for values in maps))
+                    yx = _maxima(own, options)
+                    at = 0, slice(None), yx[:, 0], yx[:, 1]
+                    scores = own.reliability[at] * own.repeatability[at]
+                    xys = _in_image_pixels(yx.cpu().numpy(), level.shape[-2:], image)
+                    descriptors = functional.normalize(own.features[at].float(), dim=0).T
+                    found[k].append((xys, scores[0].cpu().numpy(), descriptors))
+        return [
+            self._best_of_levels(levels, image.shape, mask)
+            for levels, image, mask in zip(found, images, masks, strict=True)
+        ]
 
 
 def _maxima(maps: R2D2Maps, options: R2D2Options) -> torch.Tensor:

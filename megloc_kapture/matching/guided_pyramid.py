@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
 from typing import Any, Literal
 
@@ -189,12 +190,25 @@ class PairVerifier:
 
     Attributes
     ----------
-    verify : which matches (K, 2) of a variant, rows of it and of the other image, are right.
+    verify : which matches (K, 2) of a variant, rows of it and of the other image, best first,
+        are right.
     agree : what remains of several variants' verified matches that need not agree.
     """
 
     verify: Callable[[VariantFeatures, NDArray[np.int64]], NDArray[np.bool_]]
     agree: Callable[[list[VariantMatches]], list[VariantMatches]] = as_they_are
+
+
+def verify_best_first(
+    verify: Callable[[NDArray[np.int64]], NDArray[np.bool_]],
+    matches: NDArray[np.int64],
+    scores: NDArray[np.floating[Any]],
+) -> NDArray[np.bool_]:
+    """The mask (N,) that ``verify`` gives of matches (N, 2) that it gets by falling scores (N,)."""
+    order = np.argsort(-scores, kind="stable")
+    good = np.zeros(len(matches), dtype=bool)
+    good[order] = verify(matches[order])
+    return good
 
 
 def extract_variants(
@@ -282,7 +296,8 @@ def match_variants(
         for into, judgement, (matches, scores) in zip(found, judgements, matched, strict=True):
             if len(matches) == 0:
                 continue
-            good = judgement.verify(variant, matches)
+            verify = partial(judgement.verify, variant)
+            good = verify_best_first(verify, matches, scores)
             if good.any():
                 rows = matches[good]
                 into.append(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -12,7 +12,8 @@ from pydantic import Field
 from torch.nn.utils.rnn import pad_sequence
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.weights import WeightsFile, find_weights, read_weights, sha256_of
+from megloc_kapture.io.weights import WeightsFile
+from megloc_kapture.nets.checkpointed import Checkpointed
 from megloc_kapture.nets.lightglue import (
     KeypointBatch,
     LightGlueNetwork,
@@ -23,11 +24,10 @@ from megloc_kapture.nets.lightglue import (
     renamed_blocks,
     require_kornia,
 )
-from megloc_kapture.nets.runtime import NetworkOptions, inference, pick_device
+from megloc_kapture.nets.runtime import NetworkOptions, inference
 from megloc_kapture.values import ImageFeatures
 
 Matches = tuple[NDArray[np.int64], NDArray[np.float32]]
-Loader = Callable[[Mapping[str, torch.Tensor], str], LightGlueNetwork]
 _SHAPE = LightGlueShape(width=256, num_heads=4)
 
 
@@ -38,13 +38,11 @@ class PairNetworkOptions(NetworkOptions):
     threshold: float = Field(default=0.1, ge=0, lt=1, description="probability of a match")
 
 
-class PairNetwork:
-    """A matcher that is a network of LightGlue's kind.
+PairOptions = TypeVar("PairOptions", bound=PairNetworkOptions)
 
-    Parameters
-    ----------
-    options : of the matcher.
-    load : makes the network of a checkpoint's tensors and the file's name.
+
+class PairNetwork(Checkpointed[PairOptions]):
+    """A matcher that is a network of LightGlue's kind.
 
     Raises
     ------
@@ -52,54 +50,43 @@ class PairNetwork:
     MissingWeightsError : the checkpoint is not there.
     """
 
-    def __init__(self, options: PairNetworkOptions, load: Loader) -> None:
-        require_kornia()
-        self.options = options
-        self._load = load
-        self._file = find_weights(options.weights)
+    _load: Any  # of a checkpoint's tensors and the file's name
 
-    def weights(self) -> dict[str, str]:
-        """sha256 of the checkpoint by its file name."""
-        return {self._file.path.name: sha256_of(self._file)}
+    def __init__(self, options: PairOptions | None = None) -> None:
+        require_kornia()
+        super().__init__(options)
 
     def match(self, a: ImageFeatures, b: ImageFeatures) -> Matches:
         """Matches int64 (K, 2), rows of a and b, sorted by a, and their probabilities (K,)."""
         return self.match_many(a, [b])[0]
 
     def match_many(self, a: ImageFeatures, others: Sequence[ImageFeatures]) -> list[Matches]:
-        """The matches of one image with each of several, in their order.
+        """The matches of one image with each of several, in their order, of one batch.
 
-        On a GPU all pairs are one batch. On a processor, where a batch gains nothing, each pair
-        runs alone, and has to the last bit what it has without the others.
+        Pairs are padded to the keypoints of the largest; what is padding is masked out of
+        attention and assignment, so that scores are as one by one but for rounding.
 
         Raises
         ------
         DataError : the checkpoint does not fit, or the descriptors do not fit it.
         OptionError : the device is not there.
         """
-        device = pick_device(self.options.device)
-        network = _network(self._load, self._file, device)
+        network, device = self.network(self._load)
         for image in (a, *others):
-            _check(image, network.descriptor_size, self._file)
+            _check(image, network.descriptor_size, self._weights)
         none: Matches = (np.zeros((0, 2), np.int64), np.zeros(0, np.float32))
         found = [none for _ in others]
         rows = [at for at, b in enumerate(others) if len(a.keypoints_px) and len(b.keypoints_px)]
-        batches = [rows] if rows and device.type == "cuda" else [[row] for row in rows]
+        if not rows:
+            return found
         with inference(device, self.options.half_precision):
-            for batch in batches:
-                assignment = network(
-                    _batch([a] * len(batch), device),
-                    _batch([others[row] for row in batch], device),
-                )
-                matched = mutual_matches(assignment, self.options.threshold)
-                for row, (matches, scores) in zip(batch, matched, strict=True):
-                    found[row] = matches.cpu().numpy(), scores.cpu().numpy()
+            assignment = network(
+                _batch([a] * len(rows), device), _batch([others[row] for row in rows], device)
+            )
+            matched = mutual_matches(assignment, self.options.threshold)
+            for row, (matches, scores) in zip(rows, matched, strict=True):
+                found[row] = matches.cpu().numpy(), scores.cpu().numpy()
         return found
-
-
-@lru_cache(maxsize=2)
-def _network(load: Loader, file: WeightsFile, device: torch.device) -> LightGlueNetwork:
-    return load(read_weights(file), str(file.path)).to(device)
 
 
 def _check(image: ImageFeatures, expected: int, file: WeightsFile) -> None:
@@ -146,17 +133,15 @@ class LightGlueOptions(PairNetworkOptions):
     )
 
 
-class LightGlue(PairNetwork):
+def _load_lightglue(tensors: Mapping[str, torch.Tensor], where: str) -> LightGlueNetwork:
+    return load_lightglue(renamed_blocks(tensors), where, _SHAPE)
+
+
+class LightGlue(PairNetwork[LightGlueOptions]):
     """The matcher ``lightglue``, for SuperPoint's features or ALIKED's; needs kornia."""
 
     Options = LightGlueOptions
-
-    def __init__(self, options: LightGlueOptions | None = None) -> None:
-        super().__init__(options or LightGlueOptions(), _load_lightglue)
-
-
-def _load_lightglue(tensors: Mapping[str, torch.Tensor], where: str) -> LightGlueNetwork:
-    return load_lightglue(renamed_blocks(tensors), where, _SHAPE)
+    _load = staticmethod(_load_lightglue)
 
 
 class LighterGlueOptions(PairNetworkOptions):
@@ -165,10 +150,8 @@ class LighterGlueOptions(PairNetworkOptions):
     weights: str = Field(default="xfeat-lighterglue", description="name in the registry, or a file")
 
 
-class LighterGlue(PairNetwork):
+class LighterGlue(PairNetwork[LighterGlueOptions]):
     """The matcher ``lighterglue`` for features of type ``xfeat``; needs kornia."""
 
     Options = LighterGlueOptions
-
-    def __init__(self, options: LighterGlueOptions | None = None) -> None:
-        super().__init__(options or LighterGlueOptions(), load_lighterglue)
+    _load = staticmethod(load_lighterglue)

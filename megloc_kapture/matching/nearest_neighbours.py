@@ -47,7 +47,10 @@ def match_nearest(
     Returns
     -------
     matches : int64 (K, 2), rows of a and b, sorted by a; ties go to the smaller index.
-    similarities : float32 (K,), inner products.
+    scores : float32 (K,), how distinctive: 1 less the squared distance to the best over that to the
+        second best (Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 2004,
+        section 7.1), at most 1; 0 without a second. It tells right matches from wrong ones better
+        than the similarity itself (docs/experiments/matching.md).
 
     Raises
     ------
@@ -60,27 +63,32 @@ def match_nearest(
         return np.zeros((0, 2), np.int64), np.zeros(0, np.float32)
     if a.shape[1] != b.shape[1]:
         raise DataError(f"descriptors have {a.shape[1]} and {b.shape[1]} dimensions")
-    best, similarity, column_best, second = _search(a, b, with_second=options.max_ratio is not None)
+    best, similarity, column_best, second = _search(a, b, mutual=options.mutual)
     keep = np.ones(len(a), dtype=bool)
-    if options.max_ratio is not None and len(b) > 1:
-        to_best, to_second = _squared_distance(a, b, best), _squared_distance(a, b, second)
-        keep &= to_best <= options.max_ratio**2 * to_second
     if options.min_similarity is not None:
         keep &= similarity >= options.min_similarity
     if options.mutual:
         keep &= similarity >= column_best[best]
     rows = np.flatnonzero(keep)
+    to_best, to_second = (_squared_distance(a[rows], b[of[rows]]) for of in (best, second))
+    if options.max_ratio is not None and len(b) > 1:
+        clear = to_best <= options.max_ratio**2 * to_second
+        rows, to_best, to_second = rows[clear], to_best[clear], to_second[clear]
     if options.mutual:
         # two rows with exactly the best value of one column: the first one has it
-        _, first = np.unique(best[rows], return_index=True)
-        rows = rows[np.sort(first)]
-    return np.stack([rows, best[rows]], axis=1), similarity[rows]
+        first = np.sort(np.unique(best[rows], return_index=True)[1])
+        rows, to_best, to_second = rows[first], to_best[first], to_second[first]
+    ratio = np.divide(to_best, to_second, out=np.ones(len(rows)), where=to_second > 0)
+    return np.stack([rows, best[rows]], axis=1), (1 - ratio).astype(np.float32)
 
 
 def _search(
-    a: NDArray[np.float32], b: NDArray[np.float32], *, with_second: bool
+    a: NDArray[np.float32], b: NDArray[np.float32], *, mutual: bool
 ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32], NDArray[np.int64]]:
-    """Best column and its value per row, best value per column, second-best column per row."""
+    """Best column and its value per row, best value per column, second-best column per row.
+
+    Where ``mutual``, the second best only of rows that can still be their column's best.
+    """
     best = np.empty(len(a), dtype=np.int64)
     similarity = np.empty(len(a), dtype=np.float32)
     second = np.zeros(len(a), dtype=np.int64)
@@ -95,17 +103,16 @@ def _search(
         best[start:stop] = index
         similarity[start:stop] = block[rows, index]
         np.maximum(column_best, block.max(axis=0), out=column_best)
-        if with_second and len(b) > 1:
-            block[rows, index] = -np.inf
-            second[start:stop] = block.argmax(axis=1)
+        if len(b) > 1:
+            rows = np.flatnonzero(similarity[start:stop] >= column_best[index]) if mutual else rows
+            block[rows, index[rows]] = -np.inf
+            second[start + rows] = block[rows].argmax(axis=1)
     return best, similarity, column_best, second
 
 
-def _squared_distance(
-    a: NDArray[np.float32], b: NDArray[np.float32], partner: NDArray[np.int64]
-) -> NDArray[np.float64]:
-    """Squared distance of each row of a to its partner in b, (N,); right for any length of rows."""
-    difference = a - b[partner]
+def _squared_distance(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Squared distance of each row of a to that of b, (N,); right for any length of rows."""
+    difference = a - b
     return np.asarray(np.einsum("nd,nd->n", difference, difference), dtype=np.float64)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 
 import numpy as np
 import torch
@@ -11,11 +10,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.weights import WeightsFile, find_weights, read_weights, sha256_of
-from megloc_kapture.nets.runtime import NetworkOptions, inference, pick_device
+from megloc_kapture.nets.checkpointed import Checkpointed
+from megloc_kapture.nets.runtime import NetworkOptions, inference
 from megloc_kapture.nets.superglue import (
     ImageKeypoints,
-    SuperGlueNet,
     mutual_matches,
     normalise_keypoints,
     superglue,
@@ -23,9 +21,6 @@ from megloc_kapture.nets.superglue import (
 from megloc_kapture.values import ImageFeatures
 
 Matches = tuple[NDArray[np.int64], NDArray[np.float32]]
-
-# one after the other is fastest on a processor, where a pair fills all cores
-_PAIRS_AT_ONCE = {"cpu": 1, "cuda": 8}
 
 
 class SuperGlueOptions(NetworkOptions):
@@ -39,7 +34,7 @@ class SuperGlueOptions(NetworkOptions):
     sinkhorn_iterations: int = Field(default=100, gt=0)
 
 
-class SuperGlue:
+class SuperGlue(Checkpointed[SuperGlueOptions]):
     """The matcher plugin ``superglue``.
 
     Takes keypoints whose third column is the detector's score, and descriptors of the size that
@@ -47,14 +42,6 @@ class SuperGlue:
     """
 
     Options = SuperGlueOptions
-
-    def __init__(self, options: SuperGlueOptions | None = None) -> None:
-        self.options = options or SuperGlueOptions()
-        self._weights = find_weights(self.options.weights)
-
-    def weights(self) -> dict[str, str]:
-        """sha256 of the checkpoint by its file's name."""
-        return {self._weights.path.name: sha256_of(self._weights)}
 
     def match(self, a: ImageFeatures, b: ImageFeatures) -> Matches:
         """Match two images.
@@ -71,10 +58,9 @@ class SuperGlue:
         return self.match_many(a, [b])[0]
 
     def match_many(self, a: ImageFeatures, others: Sequence[ImageFeatures]) -> list[Matches]:
-        """Match one image with each of several; see :meth:`match`."""
+        """Match one image with each of several, in one batch; see :meth:`match`."""
         options = self.options
-        device = pick_device(options.device)
-        net = _network(self._weights, device)
+        net, device = self.network(superglue)
         found: list[Matches] = [
             (np.zeros((0, 2), np.int64), np.zeros(0, np.float32)) for _ in others
         ]
@@ -84,11 +70,10 @@ class SuperGlue:
                 for image in (a, *others)
             )
             usable = [k for k, b in enumerate(sides) if len(side.scores) and len(b.scores)]
-            at_once = _PAIRS_AT_ONCE[device.type]
-            for start in range(0, len(usable), at_once):
-                chunk = usable[start : start + at_once]
-                assignments = net([(side, sides[k]) for k in chunk], options.sinkhorn_iterations)
-                for k, assignment in zip(chunk, assignments, strict=True):
+            if usable:
+                pairs = [(side, sides[k]) for k in usable]
+                assignments = net(pairs, options.sinkhorn_iterations)
+                for k, assignment in zip(usable, assignments, strict=True):
                     matches, scores = mutual_matches(assignment, options.match_threshold)
                     found[k] = matches.cpu().numpy(), scores.cpu().numpy()
         return found
@@ -131,8 +116,3 @@ def network_input(
         torch.from_numpy(scores.copy()).to(device),
         torch.from_numpy(np.array(descriptors, order="C")).to(device),
     )
-
-
-@lru_cache(maxsize=2)
-def _network(weights: WeightsFile, device: torch.device) -> SuperGlueNet:
-    return superglue(read_weights(weights), str(weights.path)).eval().to(device)

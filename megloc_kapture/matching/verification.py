@@ -4,7 +4,8 @@ Known poses (mapping pairs): the essential matrix is given, so verification is o
 Sampson distance and a test that the rays meet in front of both cameras; no sampling. The distance
 is in pixels of the images as they were taken: how far both measurements together have to move, to
 first order, until their rays meet. Unknown pose (query pairs): LO-RANSAC of the relative pose by
-poselib.
+poselib, whose samples are of the best matches first (Chum and Matas, "Matching with PROSAC", CVPR
+2005), and of all matches alike by the last iteration: then scores that say nothing do no harm.
 
 With rays r = (x, y, 1), the epipolar constraint is C = r_b . E r_a. Its derivatives with respect to
 the four measured coordinates follow from those of C with respect to x and y and from the inverse of
@@ -48,8 +49,8 @@ class TwoViewOptions(Options):
         default=4.0, gt=0, description="distance from the epipolar line of an inlier"
     )
     min_matches: int = Field(default=15, ge=5, description="a pair with fewer inliers has none")
-    max_iterations: int = Field(default=1000, gt=0, description="RANSAC's")
-    min_iterations: int = Field(default=100, gt=0, description="RANSAC's")
+    max_iterations: int = Field(default=100, gt=0, description="RANSAC's")
+    min_iterations: int = Field(default=20, gt=0, description="RANSAC's")
     confidence: float = Field(
         default=0.999, gt=0, lt=1, description="RANSAC stops when it is as sure of its best model"
     )
@@ -176,7 +177,8 @@ def verify_two_view(
 
     Parameters
     ----------
-    keypoints_a_px, keypoints_b_px : (N, 2) matched keypoints.
+    keypoints_a_px, keypoints_b_px : (N, 2) matched keypoints, the best matches first, see
+        :func:`~.guided_pyramid.verify_best_first`; in any other order it takes more iterations.
 
     Returns
     -------
@@ -210,8 +212,11 @@ def verify_two_view(
             "min_iterations": options.min_iterations,
             "max_iterations": options.max_iterations,
             "success_prob": options.confidence,
+            "progressive_sampling": True,
+            "max_prosac_iterations": options.max_iterations,
             "seed": options.seed,
         },
+        {"max_iterations": 0},  # of the pose, which is not asked for; inliers are known before
     )
     inliers = np.asarray(info["inliers"], dtype=bool)
     if len(inliers) != usable.sum() or inliers.sum() < options.min_matches:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from collections.abc import Mapping
 
 import cv2
 import numpy as np
@@ -10,14 +10,13 @@ import torch
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.io.weights import WeightsFile, find_weights, read_weights, sha256_of
+from megloc_kapture.nets.checkpointed import Checkpointed
 from megloc_kapture.nets.deeplabv3plus import DeepLabV3Plus, backbone_of, most_likely
 from megloc_kapture.nets.runtime import (
     NetworkOptions,
     image_tensor,
     inference,
     load_strictly,
-    pick_device,
 )
 
 # by train id, as cityscapesScripts numbers them
@@ -61,21 +60,13 @@ class DeepLabOptions(NetworkOptions):
     )
 
 
-class DeepLab:
+class DeepLab(Checkpointed[DeepLabOptions]):
     """Cityscapes' 19 classes of an image, at the image's own size."""
 
     name = "deeplabv3plus"
     classes = CITYSCAPES_CLASSES
     dynamic = CITYSCAPES_DYNAMIC
     Options = DeepLabOptions
-
-    def __init__(self, options: DeepLabOptions | None = None) -> None:
-        self.options = options or DeepLabOptions()
-        self._weights = find_weights(self.options.weights)
-
-    def weights(self) -> dict[str, str]:
-        """The checkpoint's name and sha256."""
-        return {self._weights.name: sha256_of(self._weights)}
 
     def segment(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Labels uint8 (H, W), indices into ``classes``, of an RGB image, uint8 (H, W, 3).
@@ -90,17 +81,13 @@ class DeepLab:
         if scale < 1:
             size = (max(round(width * scale), 1), max(round(height * scale), 1))
             image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-        device = pick_device(self.options.device)
-        network = _network(self._weights, device)
+        network, device = self.network(_deeplab)
         with inference(device, self.options.half_precision):
             logits = network(image_tensor(image, device))[0].float()
             return most_likely(logits, height, width).cpu().numpy()
 
 
-@lru_cache(maxsize=2)
-def _network(weights: WeightsFile, device: torch.device) -> DeepLabV3Plus:
-    tensors = read_weights(weights)
-    where = str(weights.path)
+def _deeplab(tensors: Mapping[str, torch.Tensor], where: str) -> DeepLabV3Plus:
     network = DeepLabV3Plus(backbone_of(tensors, where), num_classes=len(CITYSCAPES_CLASSES))
     load_strictly(network, tensors, where)
-    return network.eval().to(device)
+    return network.eval()

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import OptionError
 from megloc_kapture.geometry.cameras import bearing_rays, normalized_from_px, px_from_cam
-from megloc_kapture.io.colmap import undistorted_pinhole
+from megloc_kapture.io.colmap_cameras import undistorted_pinhole
 from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, ONE_FOCAL_MODELS, Camera
 
 # a point may leave the image by rounding

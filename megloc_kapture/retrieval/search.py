@@ -7,6 +7,7 @@ what the search needs does not grow with the database.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -103,29 +104,81 @@ def rank_fused(
     DataError : different dimensions or numbers of rows, or values that are not finite.
     OptionError : weights that cannot be used, or other features than those of the queries.
     """
-    check_features(len(queries), len(database))
-    normalized_weights(weights, len(queries))  # refused before anything is read
-    if len(queries) == 1:
-        return rank_by_similarity(queries[0], database[0], top_k, permitted=permitted)
-    if fusion.method == "early":
-        together = concatenate([np.asarray(rows, np.float32) for rows in queries], weights)
-        joined = ConcatenatedBlocks(database, weights)
-        return rank_by_similarity(together, joined, top_k, permitted=permitted)
-    if not fusion.fuses_ranks():
-        (found,) = _search(
-            queries, database, [top_k], lambda ms: [fuse(ms, fusion, weights)], permitted
-        )
-        return found
-    # a turn of the round gives one image at most, so longer lists would change nothing
-    length = top_k if fusion.method == "round_robin" else max(top_k, fusion.list_length)
-    lists = _search(queries, database, [length] * len(queries), lambda ms: ms, permitted)
-    rankings = [indices for indices, _ in lists]
-    top_k = min(top_k, rankings[0].shape[1])
-    if fusion.method == "round_robin":
-        return round_robin(rankings, top_k)
-    if fusion.method == "borda":
-        return borda(rankings, top_k, weights)
-    return reciprocal_rank(rankings, top_k, weights, constant=fusion.rank_constant)
+    search = FusedSearch(top_k, fusion, weights)
+    return search.ranking([search.lists(queries, database, permitted)])
+
+
+@dataclass(frozen=True)
+class FusedSearch:
+    """What :func:`rank_fused` does, part by part of a database.
+
+    Attributes
+    ----------
+    top_k, fusion, weights : as of that function.
+    """
+
+    top_k: int
+    fusion: FusionOptions
+    weights: Sequence[float] | None = None
+
+    def lists(
+        self,
+        queries: Sequence[NDArray[np.floating[Any]]],
+        database: Sequence[VectorSource],
+        permitted: Permitted = None,
+    ) -> list[Found]:
+        """What is kept of a part: a ranking, or of methods that fuse ranks one per feature.
+
+        Raises
+        ------
+        DataError, OptionError : as of :func:`rank_fused`.
+        """
+        check_features(len(queries), len(database))
+        normalized_weights(self.weights, len(queries))  # refused before anything is read
+        if len(queries) == 1:
+            return [rank_by_similarity(queries[0], database[0], self.top_k, permitted=permitted)]
+        if self.fusion.method == "early":
+            rows = [np.asarray(rows, np.float32) for rows in queries]
+            joined = ConcatenatedBlocks(database, self.weights)
+            together = concatenate(rows, self.weights)
+            return [rank_by_similarity(together, joined, self.top_k, permitted=permitted)]
+
+        def fused(matrices: Matrices) -> Matrices:
+            return [fuse(matrices, self.fusion, self.weights)]
+
+        if not self.fusion.fuses_ranks():
+            return _search(queries, database, [self.top_k], fused, permitted)
+        lengths = [self._list_length()] * len(queries)
+        return _search(queries, database, lengths, lambda matrices: matrices, permitted)
+
+    def ranking(self, parts: Sequence[Sequence[Found]]) -> Found:
+        """The ranking of the whole, from the lists of its parts, whose rows are the whole's."""
+        lists = [_merged(found, self._list_length()) for found in zip(*parts, strict=True)]
+        if len(lists) == 1:
+            indices, scores = lists[0]
+            return indices[:, : self.top_k], scores[:, : self.top_k]
+        rankings = [indices for indices, _ in lists]
+        top_k = min(self.top_k, rankings[0].shape[1])
+        if self.fusion.method == "round_robin":
+            return round_robin(rankings, top_k)
+        if self.fusion.method == "borda":
+            return borda(rankings, top_k, self.weights)
+        return reciprocal_rank(rankings, top_k, self.weights, constant=self.fusion.rank_constant)
+
+    def _list_length(self) -> int:
+        # a turn of the round gives one image at most, so longer lists would change nothing
+        if self.fusion.method == "round_robin" or not self.fusion.fuses_ranks():
+            return self.top_k
+        return max(self.top_k, self.fusion.list_length)
+
+
+def _merged(parts: Sequence[Found], length: int) -> Found:
+    """The best of the parts' rankings (Q, K), best first; of equal ones the earlier part's."""
+    if len(parts) == 1:
+        return parts[0]
+    indices, scores = (np.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True))
+    best = np.argsort(-scores, axis=1, kind="stable")[:, :length]
+    return np.take_along_axis(indices, best, axis=1), np.take_along_axis(scores, best, axis=1)
 
 
 Matrices = Sequence[NDArray[np.floating[Any]]]

@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import OptionError, missing_extra
-from megloc_kapture.retrieval.fusion import FusionOptions
-from megloc_kapture.retrieval.search import Found, rank_fused
+from megloc_kapture.retrieval.search import Found, FusedSearch
 from megloc_kapture.retrieval.vectors import VectorBlocks, VectorSource, as_blocks
 
 _SUBVECTOR = 16  # values that share a code of 4 bits, one of 16 centroids
@@ -61,41 +60,45 @@ class QuantizedRows:
         return found
 
 
-def rank_short_lists(
+def short_lists(
+    search: FusedSearch,
     queries: Sequence[NDArray[np.floating[Any]]],
     database: Sequence[VectorSource],
     codes: Sequence[QuantizedRows],
-    top_k: int,
     *,
     length: int = _LENGTH,
-    fusion: FusionOptions,
-    weights: Sequence[float] | None = None,
-) -> Found:
-    """As :func:`~.search.rank_fused`, among the short lists of each query.
+) -> list[Found]:
+    """As :meth:`~.search.FusedSearch.lists`, among the short lists of each query.
 
     Parameters
     ----------
     codes : of the database, by feature; each feature has a short list of its own.
-    length : of a short list; at least ``top_k`` are taken.
+    length : of a short list; at least ``search.top_k`` are taken.
     """
     sources = [as_blocks(source) for source in database]
-    top_k = min(top_k, len(sources[0]))
-    length = min(max(length, top_k), len(sources[0]))
+    length = min(max(length, search.top_k), len(sources[0]))
     asked = [np.asarray(rows, np.float32) for rows in queries]
-    lists = np.concatenate(
+    if not len(asked[0]):
+        return search.lists(asked, sources)
+    near = np.concatenate(
         [own.nearest(rows, length) for own, rows in zip(codes, asked, strict=True)], axis=1
     )
-    found = np.full((len(lists), top_k), -1, np.int64)
-    scores = np.full((len(lists), top_k), -np.inf, np.float32)
-    for at, near in enumerate(lists):
-        rows = np.unique(near[near >= 0])  # rising: equal scores keep the database's order
+    of_queries = []
+    for at, candidates in enumerate(near):
+        rows = np.unique(candidates[candidates >= 0])  # equal scores keep the database's order
         of_rows = [_picked(source, rows) for source in sources]
-        of_query = [own[at : at + 1] for own in asked]
-        (best,), (own_scores,) = rank_fused(
-            of_query, of_rows, top_k, fusion=fusion, weights=weights
-        )
-        found[at, : len(best)] = np.where(best >= 0, rows[best], -1)
-        scores[at, : len(best)] = own_scores
+        found = search.lists([own[at : at + 1] for own in asked], of_rows)
+        of_queries.append([(np.where(i >= 0, rows[i], -1), scores) for i, scores in found])
+    return [_stacked(one) for one in zip(*of_queries, strict=True)]
+
+
+def _stacked(rankings: Sequence[Found]) -> Found:
+    """Rankings of a query each as one of all; where one is shorter, -1 and -inf."""
+    width = max(indices.shape[1] for indices, _ in rankings)
+    found = np.full((len(rankings), width), -1, np.int64)
+    scores = np.full((len(rankings), width), -np.inf, np.float32)
+    for at, (indices, own) in enumerate(rankings):
+        found[at, : indices.shape[1]], scores[at, : indices.shape[1]] = indices[0], own[0]
     return found, scores
 
 

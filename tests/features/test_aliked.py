@@ -88,13 +88,13 @@ def test_a_peak_of_the_score_map_lies_at_its_pixels_centre(monkeypatch: pytest.M
     maps = SimpleNamespace(scores=scores)
 
     class Net:
-        def __call__(self, image: torch.Tensor) -> SimpleNamespace:
-            return maps
+        def __call__(self, image: torch.Tensor) -> list[SimpleNamespace]:
+            return [maps]
 
         def desc_head(self, _: object, xy: torch.Tensor) -> torch.Tensor:
             return torch.ones(len(xy), 128)
 
-    monkeypatch.setattr(aliked, "_network", lambda *_: Net())
+    monkeypatch.setattr(aliked.Aliked, "network", lambda *_: (Net(), torch.device("cpu")))
     found = extractor().extract(np.zeros((40, 50, 3), np.uint8))
     # the one at x = 1 is within two pixels of the border, the last one is too weak
     np.testing.assert_allclose(
@@ -253,9 +253,9 @@ def test_a_file_of_another_network_is_refused(tmp_path: Path) -> None:
 def test_colour_is_rgb_not_bgr(photograph: Image) -> None:
     planes = torch.from_numpy(photograph.transpose(2, 0, 1).copy())[None] / 255
     found = extractor()
-    net = aliked._network(found._weights, torch.device("cpu"))
+    net, _ = found.network(aliked.aliked_from)
     with torch.inference_mode():
-        expected, swapped = net(planes).scores, net(planes.flip(1)).scores
+        expected, swapped = net(planes)[0].scores, net(planes.flip(1))[0].scores
     best = found.extract(photograph).keypoints_px[0]
     column, row = np.floor(best[:2]).astype(int)
     patch = np.s_[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]

@@ -81,7 +81,8 @@ def on_maps(
     height, width = scores.shape
     if features is None:
         features = torch.ones(128, -(-height // 4), -(-width // 4))
-    monkeypatch.setattr(aslfeat, "_network", lambda *_: lambda _: AslFeatMaps(scores, features))
+    given = (lambda _: [AslFeatMaps(scores, features)]), torch.device("cpu")
+    monkeypatch.setattr(aslfeat.AslFeat, "network", lambda *_: given)
     image = np.zeros((height, width, 3), np.uint8)
     image[0] = 255  # an image without any contrast is not looked at
     return with_options(checkpoint, **options).extract(image)
@@ -231,11 +232,11 @@ def test_keypoints_of_small_scales_lie_where_they_are_in_the_image(
     monkeypatch: pytest.MonkeyPatch, checkpoint: Path
 ) -> None:
     # the network marks the brightest pixel of what it is given: a spot is found on every scale
-    def net(gray: torch.Tensor) -> AslFeatMaps:
+    def net(gray: torch.Tensor) -> list[AslFeatMaps]:
         features = torch.ones(128, -(-gray.shape[2] // 4), -(-gray.shape[3] // 4))
-        return AslFeatMaps(gray[0, 0] / 255, features)
+        return [AslFeatMaps(gray[0, 0] / 255, features)]
 
-    monkeypatch.setattr(aslfeat, "_network", lambda *_: net)
+    monkeypatch.setattr(aslfeat.AslFeat, "network", lambda *_: (net, torch.device("cpu")))
     y, x = np.mgrid[:500, :1000] + 0.5
     spot = 250 * np.exp(-((x - 700.5) ** 2 + (y - 300.5) ** 2) / (2 * 5.0**2))
     image = np.repeat(spot.round().astype(np.uint8)[..., None], 3, axis=2)

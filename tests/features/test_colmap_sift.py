@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from megloc_kapture.datasets.formats.colmap_database import ColmapDatabase
 from megloc_kapture.features.colmap_sift import ColmapSift, ColmapSiftOptions
 from megloc_kapture.io.images import read_image_rgb, write_image
-from megloc_kapture.plugins import LOCAL_FEATURES, load_plugin
+from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugins import LOCAL_FEATURES
 from megloc_kapture.values import LocalFeatures
 
 import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py

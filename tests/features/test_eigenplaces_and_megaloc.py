@@ -160,7 +160,8 @@ def test_eigenplaces_sees_normalised_rgb_of_the_images_size_or_less(
     network = EigenPlacesNet(50, SIZES["eigenplaces"]).eval()
     seen: list[torch.Tensor] = []
     network.backbone.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0].clone()))
-    monkeypatch.setattr(global_networks, "_network", lambda *_: network)
+    given = network, torch.device("cpu")
+    monkeypatch.setattr(global_networks.GlobalNetwork, "network", lambda *_, **__: given)
     image = random_image(60, 160)
     mean, deviation = np.array([[0.485, 0.456, 0.406], [0.229, 0.224, 0.225]])
 
@@ -201,7 +202,8 @@ def test_megaloc_sees_a_normalised_square_of_rgb(
     network = small()
     spy = Spy(network.backbone)
     network.backbone = spy
-    monkeypatch.setattr(global_networks, "_network", lambda *_: network.eval())
+    given = network.eval(), torch.device("cpu")
+    monkeypatch.setattr(global_networks.GlobalNetwork, "network", lambda *_, **__: given)
     # left half one colour, right half another: their order, their sides, their numbers
     image = np.zeros((50, 200, 3), dtype=np.uint8)
     image[:, :100], image[:, 100:] = (255, 0, 51), (0, 102, 255)

@@ -46,12 +46,12 @@ def test_sizes_up_to_the_bound_are_left_alone() -> None:
 def test_keypoints_of_a_reduced_image_are_where_they_were() -> None:
     image, centres = blobs(1601, 1203)
     whole = RootSift().extract(image)
-    found = extract_bounded(RootSift(RootSiftOptions(max_megapixels=0.5)), image)
+    found = extract_bounded(RootSift(RootSiftOptions(max_megapixels=0.5)), [(image, None)])[0]
     assert len(found.keypoints_px) > len(centres)
     for features in (whole, found):
         near = np.linalg.norm(centres[:, None] - features.keypoints_px[None, :, :2], axis=2)
         assert near.min(axis=1).max() < 1.0
-    same = extract_bounded(RootSift(RootSiftOptions(max_megapixels=2.0)), image)
+    same = extract_bounded(RootSift(RootSiftOptions(max_megapixels=2.0)), [(image, None)])[0]
     np.testing.assert_array_equal(same.keypoints_px, whole.keypoints_px)
     np.testing.assert_array_equal(same.descriptors, whole.descriptors)
 
@@ -60,7 +60,7 @@ def test_the_mask_is_reduced_with_the_image() -> None:
     image, _ = blobs(1601, 1203)
     mask = np.zeros(image.shape[:2], bool)
     mask[:, 801:] = True
-    found = extract_bounded(RootSift(RootSiftOptions(max_megapixels=0.5)), image, mask)
+    found = extract_bounded(RootSift(RootSiftOptions(max_megapixels=0.5)), [(image, mask)])[0]
     assert len(found.keypoints_px) > 10
     assert found.num_masked > 10
     assert found.keypoints_px[:, 0].min() >= 801
@@ -73,7 +73,7 @@ def test_a_plugin_without_the_option_is_bounded_all_the_same() -> None:
             corner = np.array([[image.shape[1], image.shape[0], 7.0]], np.float32)
             return LocalFeatures(corner, np.zeros(1, np.float32), np.zeros((1, 4), np.float32))
 
-    found = extract_bounded(Plain(), np.zeros((9000, 12000, 3), np.uint8))
+    found = extract_bounded(Plain(), [(np.zeros((9000, 12000, 3), np.uint8), None)])[0]
     np.testing.assert_allclose(found.keypoints_px, [[12000, 9000, 7]], rtol=1e-6)
 
 
@@ -97,7 +97,7 @@ def test_memory_does_not_grow_with_the_image(megapixels: int) -> None:
         small = np.random.default_rng(0).integers(0, 255, (height // 8, height // 6, 3), np.uint8)
         image = cv2.resize(small, (height * 4 // 3, height))
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        assert len(extract_bounded(RootSift(), image).keypoints_px) == 5000
+        assert len(extract_bounded(RootSift(), [(image, None)])[0].keypoints_px) == 5000
         print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
     """
     done = subprocess.run(

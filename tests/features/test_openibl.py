@@ -14,7 +14,8 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.features import global_networks
 from megloc_kapture.features.global_networks import OpenIbl, OpenIblOptions, official_size
 from megloc_kapture.nets.netvlad import VggNetVlad
-from megloc_kapture.plugins import GlobalFeatureExtractor, weights_of
+from megloc_kapture.plugin_loading import weights_of
+from megloc_kapture.plugins import GlobalFeatureExtractor
 
 Image = NDArray[np.uint8]
 OUTPUT = 12
@@ -91,7 +92,8 @@ class Watched:
 
 def test_the_network_sees_the_size_of_the_option(monkeypatch: pytest.MonkeyPatch) -> None:
     network = Watched()
-    monkeypatch.setattr(global_networks, "_network", lambda *_: network)
+    given = network, torch.device("cpu")
+    monkeypatch.setattr(global_networks.GlobalNetwork, "network", lambda *_, **__: given)
     image = noise(600, 1600)
     extractor().describe(image)
     extractor(max_size_px=1024).describe(image)
@@ -114,7 +116,7 @@ def test_vectors_are_those_of_the_network_run_by_hand() -> None:
     assert many.shape == (2, OUTPUT)
     np.testing.assert_allclose(many[0], found, atol=1e-5)
     # the colours that its authors subtract, and their scale of 1 / 255
-    net = global_networks._network(global_networks.openibl, plugin._weights, torch.device("cpu"))
+    net, _ = plugin.network(global_networks.openibl)
     planes = torch.from_numpy(np.array(noise(48, 64).transpose(2, 0, 1)))[None] / 255
     mean = torch.tensor([0.48501960784313836, 0.4579568627450961, 0.4076039215686255])
     with torch.inference_mode():

@@ -12,7 +12,7 @@ from megloc_kapture.matching.verification import TwoViewOptions, verify_two_view
 from megloc_kapture.values import Camera
 
 CAMERA = Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))
-OPTIONS = TwoViewOptions(min_matches=5)
+OPTIONS = TwoViewOptions(min_matches=5, max_iterations=5000)  # of matches in no order
 
 
 Pixels = NDArray[np.float64]

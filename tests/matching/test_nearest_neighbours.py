@@ -78,7 +78,11 @@ def test_equal_to_loops_over_all_pairs(
         truth = [float(a[i].astype(np.float64) @ b[j].astype(np.float64)) for i, j in expected]
         np.testing.assert_allclose(found, truth, atol=1e-5)
     products = a.astype(np.float64) @ b.astype(np.float64).T
-    np.testing.assert_allclose(scores, products[matches[:, 0], matches[:, 1]], atol=1e-5)
+    for (i, j), score in zip(matches.tolist(), scores.tolist(), strict=True):
+        others = [other for other in range(len(b)) if other != j]
+        second = max(others, key=lambda other: (products[i, other], -other), default=j)
+        apart = ((a[i].astype(float) - b[[j, second]]) ** 2).sum(axis=1)
+        np.testing.assert_allclose(score, 1 - apart[0] / apart[1] if apart[1] else 0.0, atol=1e-5)
 
 
 @given(descriptors())
@@ -92,8 +96,10 @@ def test_a_mutual_match_uses_every_row_once_and_is_nearest_both_ways(
     assert len(set(matches[:, 0].tolist())) == len(set(matches[:, 1].tolist())) == len(matches)
     assert (np.diff(matches[:, 0]) > 0).all()
     products = a.astype(np.float64) @ b.astype(np.float64).T
-    np.testing.assert_allclose(scores, products[matches[:, 0]].max(axis=1), atol=1e-5)
-    np.testing.assert_allclose(scores, products[:, matches[:, 1]].max(axis=0), atol=1e-5)
+    own = products[matches[:, 0], matches[:, 1]]
+    np.testing.assert_allclose(own, products[matches[:, 0]].max(axis=1), atol=1e-5)
+    np.testing.assert_allclose(own, products[:, matches[:, 1]].max(axis=0), atol=1e-5)
+    assert len(scores) == len(matches)
 
 
 @pytest.mark.parametrize("max_ratio", [0.6, 0.8, 0.95, 1.0])
@@ -159,7 +165,9 @@ def test_uint8_descriptors_do_not_wrap_around() -> None:
     b = np.array([[0, 200], [250, 10]], dtype=np.uint8)
     matches, scores = match_nearest(a, b)
     assert matches.tolist() == [[0, 1], [1, 0]]
-    assert scores.tolist() == [255.0 * 250, 255.0 * 200]
+    # (255, 0) from (250, 10) and (0, 200), (0, 255) from (0, 200) and (250, 10)
+    distances = [1 - (5**2 + 10**2) / (255**2 + 200**2), 1 - 55**2 / (250**2 + 245**2)]
+    np.testing.assert_allclose(scores, distances, rtol=1e-6)
 
 
 @pytest.mark.parametrize(("count_a", "count_b"), [(0, 3), (3, 0), (0, 0)])

@@ -12,7 +12,6 @@ import torch
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, MeglocError
-from megloc_kapture.matching import superglue as module
 from megloc_kapture.matching.superglue import SuperGlue, SuperGlueOptions
 from megloc_kapture.nets.superglue import (
     ImageKeypoints,
@@ -99,13 +98,11 @@ def test_it_is_the_network_on_normalised_integer_pixels(weights: Path) -> None:
     assert 0 < len(strict) < len(matches)
 
 
-def test_many_are_each_alone(weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_are_each_alone(weights: Path) -> None:
     a = image(80, 0)
     others = [seen_again(a, 60, 1), image(0, 2), seen_again(a, 90, 3), image(1, 4)]
     plugin = matcher(weights)
     alone = [plugin.match(a, other) for other in others]
-    # as on a GPU
-    monkeypatch.setitem(module._PAIRS_AT_ONCE, "cpu", 3)
     for (matches, scores), found in zip(alone, plugin.match_many(a, others), strict=True):
         np.testing.assert_array_equal(found[0], matches)
         np.testing.assert_allclose(found[1], scores, atol=1e-5)

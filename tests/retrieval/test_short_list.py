@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import OptionError
 from megloc_kapture.retrieval.fusion import FusionOptions
-from megloc_kapture.retrieval.search import rank_fused
-from megloc_kapture.retrieval.short_list import QuantizedRows, rank_short_lists
+from megloc_kapture.retrieval.search import FusedSearch, rank_fused
+from megloc_kapture.retrieval.short_list import QuantizedRows, short_lists
 from megloc_kapture.stages.candidates import Candidates, QueryPairsOptions, Retrieval
 from megloc_kapture.values import RigidTransform
 
@@ -45,7 +45,9 @@ def test_rankings_are_those_of_exact_search(quantized: type[QuantizedRows], meth
     codes = [quantized(rows) for rows in database]
     exact, exact_scores = rank_fused(queries, database, TOP, fusion=fusion)
     # all rows of the list: what every method must rank as the exact search does
-    found, scores = rank_short_lists(queries, database, codes, TOP, length=3000, fusion=fusion)
+    search = FusedSearch(TOP, fusion)
+    lists = short_lists(search, queries, database, codes, length=3000)
+    found, scores = search.ranking([lists])
     np.testing.assert_array_equal(found, exact)
     np.testing.assert_allclose(scores, exact_scores, rtol=1e-5)
 
@@ -54,9 +56,8 @@ def test_a_short_list_holds_planted_neighbours(quantized: type[QuantizedRows]) -
     queries, rows = planted(2)
     exact, _ = rank_fused([queries], [rows], TOP, fusion=FusionOptions())
     codes = [quantized(rows)]
-    found, scores = rank_short_lists(
-        [queries], [rows], codes, TOP, length=150, fusion=FusionOptions()
-    )
+    search = FusedSearch(TOP, FusionOptions())
+    found, scores = search.ranking([short_lists(search, [queries], [rows], codes, length=150)])
     np.testing.assert_array_equal(found, exact)
     assert (np.diff(scores) <= 0).all()
     coarse = codes[0].nearest(queries, TOP)  # it is the exact scores that make it right
