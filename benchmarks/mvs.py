@@ -40,17 +40,17 @@ from megloc_kapture.io.tables import read_depth_rows
 from megloc_kapture.mvs.consistency import AgreementOptions, confirmed
 from megloc_kapture.mvs.views import pinhole_matrix, stereo_view
 from megloc_kapture.pipeline.executors import single_threaded
+from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import (
     DEPTH_ESTIMATORS,
     DepthEstimate,
     DepthEstimator,
     PluginChoice,
     StereoView,
-    load_plugin,
 )
-from megloc_kapture.stages.densifying import DensifyOptions, densify_map, read_beside
-from megloc_kapture.stages.fusion import read_stereo_depth
+from megloc_kapture.stages.densifying import DensifyOptions, densify_map
 from megloc_kapture.stages.rigs import depth_records
+from megloc_kapture.stages.stereo_depth import read_beside, read_stereo_depth
 from megloc_kapture.values import Camera, RigidTransform
 
 _SIZE = 768
@@ -255,10 +255,12 @@ def _zncc(
 # ------------------------------------------------------------------------------------- scenes
 
 
-def photographs(scene: Path, out: Path, estimator: DepthEstimator, name: str) -> dict[str, float]:
+def photographs(
+    scene: Path, out: Path, estimator: DepthEstimator, name: str, agreement: AgreementOptions
+) -> dict[str, float]:
     """Strecha's scenes."""
     xyz, seen = tracks(scene, out)
-    densified, row = densified_map(scene / "mapping", out, estimator, name)
+    densified, row = densified_map(scene / "mapping", out, estimator, name, agreement)
     errors, claimed = track_errors(densified, xyz, seen)
     known = np.isfinite(errors)
     errors, claimed = np.abs(errors), claimed
@@ -275,9 +277,11 @@ def photographs(scene: Path, out: Path, estimator: DepthEstimator, name: str) ->
     }
 
 
-def sensor_depth(scene: Path, out: Path, estimator: DepthEstimator, name: str) -> dict[str, float]:
+def sensor_depth(
+    scene: Path, out: Path, estimator: DepthEstimator, name: str, agreement: AgreementOptions
+) -> dict[str, float]:
     """A scene whose depth_png/ has the sensor's depth of each image."""
-    densified, row = densified_map(scene / "mapping", out, estimator, name)
+    densified, row = densified_map(scene / "mapping", out, estimator, name, agreement)
     both, within, below, ratios = [], [], [], []
     for image in sorted(depth_records(densified.read())):
         _, depth = depth_of(densified, image)
@@ -300,7 +304,7 @@ def sensor_depth(scene: Path, out: Path, estimator: DepthEstimator, name: str) -
     }
 
 
-def motorcycle(estimator: DepthEstimator) -> dict[str, float]:
+def motorcycle(estimator: DepthEstimator, agreement: AgreementOptions) -> dict[str, float]:
     """Middlebury's motorcycle, a pair; the range of depth is that of its truth."""
     from importlib.util import find_spec
 
@@ -329,7 +333,7 @@ def motorcycle(estimator: DepthEstimator) -> dict[str, float]:
     started = _cpu_seconds()
     pair = [estimator.estimate(views[a], [views[1 - a]], limits) for a in (0, 1)]
     seconds = _cpu_seconds() - started
-    kept = confirmed(views[0], pair[0], [(views[1], pair[1].depth_m)], AgreementOptions())
+    kept = confirmed(views[0], pair[0], [(views[1], pair[1].depth_m)], agreement)
     known = there & (kept.depth_m > 0)
     found = focal * baseline_m / np.where(known, kept.depth_m, 1) - offset
     off = np.abs(found - disparity)[known]
@@ -344,13 +348,18 @@ def motorcycle(estimator: DepthEstimator) -> dict[str, float]:
 
 
 def densified_map(
-    mapping: Path, out: Path, estimator: DepthEstimator, name: str
+    mapping: Path, out: Path, estimator: DepthEstimator, name: str, agreement: AgreementOptions
 ) -> tuple[KaptureFolder, dict[str, float]]:
     """A map of the images with depth, below ``out``, and the first figures of its row."""
     megloc.build_map(mapping, workspace=out / "map")
     target = out / name
     shutil.rmtree(target, ignore_errors=True)
-    options = DensifyOptions(mode="depth", estimator=PluginChoice(name=name), max_size_px=_SIZE)
+    options = DensifyOptions(
+        mode="depth",
+        estimator=PluginChoice(name=name),
+        max_size_px=_SIZE,
+        agreement=agreement,
+    )
     started = _cpu_seconds()
     counts = densify_map(KaptureFolder(out / "map" / "map"), target, options, estimator=estimator)
     seconds = _cpu_seconds() - started
@@ -371,7 +380,9 @@ def _main() -> None:
     scenes = ("fountain_p11", "herzjesu_p25", "hololens_room", "motorcycle")
     parser.add_argument("--scenes", nargs="+", default=list(scenes), choices=scenes)
     parser.add_argument("--ppg-python", help="interpreter of an environment with ppg_core")
+    parser.add_argument("--agreement", default="{}", help="options of mvs.agreement, as JSON")
     asked = parser.parse_args()
+    agreement = AgreementOptions.model_validate_json(asked.agreement)
     asked.output.mkdir(parents=True, exist_ok=True)
     for scene in asked.scenes:
         for name in asked.by:
@@ -384,10 +395,10 @@ def _main() -> None:
             out, data = asked.output / scene, asked.data / scene
             with single_threaded():
                 if scene == "motorcycle":
-                    row = motorcycle(estimator)
+                    row = motorcycle(estimator, agreement)
                 else:
                     measure = sensor_depth if scene == "hololens_room" else photographs
-                    row = measure(data, out, estimator, name)
+                    row = measure(data, out, estimator, name, agreement)
             text = {key: f"{value:.4g}" for key, value in row.items()}
             print(scene, name, *(f"{key} {value}" for key, value in text.items()), flush=True)
             with (asked.output / "mvs.csv").open("a", newline="") as file:

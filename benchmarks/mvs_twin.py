@@ -27,11 +27,12 @@ from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.io.files import link_records
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder, write_sensors
+from megloc_kapture.mvs.consistency import AgreementOptions
 from megloc_kapture.pipeline.executors import single_threaded
-from megloc_kapture.plugins import DEPTH_ESTIMATORS, load_plugin
-from megloc_kapture.stages.densifying import read_beside
-from megloc_kapture.stages.fusion import read_stereo_depth
+from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugins import DEPTH_ESTIMATORS
 from megloc_kapture.stages.rigs import depth_records
+from megloc_kapture.stages.stereo_depth import read_beside, read_stereo_depth
 
 CLASSES = ("facade", "ground", "thin", "textureless", "none")
 _THIN_PX, _NEARER, _FLAT, _GROUND_M = 9, 0.02, 2.0, 0.15
@@ -59,7 +60,8 @@ def measure(world: Path, out: Path, name: str) -> str:
     if not bare.is_dir():
         write_sensors(bare, replace(data, records_depth={}))
         link_records(bare, {"": exact.root / "sensors/records_data"})
-    densified, row = densified_map(bare, out, load_plugin(DEPTH_ESTIMATORS, name, {}), name)
+    estimator = load_plugin(DEPTH_ESTIMATORS, name, {})
+    densified, row = densified_map(bare, out, estimator, name, AgreementOptions())
     parts: list[list[NDArray[np.float64]]] = [[] for _ in CLASSES]
     total = 0
     # of a world with one place

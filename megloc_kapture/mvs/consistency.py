@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.mvs.views import relative_projection
+from megloc_kapture.mvs.views import pixel_step, relative_projection
 from megloc_kapture.plugins import DepthEstimate, StereoView
 from megloc_kapture.values import Options
 
@@ -59,6 +59,28 @@ def agreeing_views(
         limits = options.max_error_px, options.max_relative_error
         count_agreeing(inverse, _inverted(other_depth_m), *forth, *back, *limits, counts)
     return counts
+
+
+def with_pose_errors(
+    view: StereoView,
+    sources: Sequence[StereoView],
+    estimate: DepthEstimate,
+    depth_range_m: tuple[float, float],
+    error_px: float,
+) -> DepthEstimate:
+    """An estimate whose deviations also cover the errors of the views' poses.
+
+    Parameters
+    ----------
+    sources : the views that it was made from.
+    error_px : standard deviation of where the poses put a point in a source, along an axis.
+    """
+    limits = 1.0 / np.array(depth_range_m)[::-1]
+    paths = [relative_projection(view, source) for source in sources]
+    # any of the sources may have decided
+    step = np.sqrt(np.mean([pixel_step([path], view.camera, limits) ** 2 for path in paths]))
+    own = (error_px * step * np.square(estimate.depth_m.astype(np.float64))).astype(np.float32)
+    return replace(estimate, sigma_m=np.hypot(estimate.sigma_m, own))
 
 
 def confirmed(

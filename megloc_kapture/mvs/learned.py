@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -11,16 +10,16 @@ import torch
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.io.weights import WeightsFile, find_weights, read_weights, sha256_of
 from megloc_kapture.mvs.sweep import as_estimate, matching_deviations, tangent_planes
 from megloc_kapture.mvs.views import relative_projection
-from megloc_kapture.nets.patchmatchnet import MULTIPLE, PatchmatchNet, patchmatchnet_from
-from megloc_kapture.nets.runtime import Device, image_tensor, inference, pick_device
+from megloc_kapture.nets.checkpointed import Checkpointed
+from megloc_kapture.nets.patchmatchnet import MULTIPLE, patchmatchnet_from
+from megloc_kapture.nets.runtime import image_tensor, inference
 from megloc_kapture.plugins import DepthEstimate, StereoView
-from megloc_kapture.values import Options
+from megloc_kapture.values import Device, Options
 
 # matching error in pixels, and multiple of the bound of least squares: docs/experiments/mvs.md
-_CALIBRATION = np.array([0.5, 5.0])
+_CALIBRATION = np.array([0.5, 2.5])
 
 
 class LearnedStereoOptions(Options):
@@ -34,19 +33,11 @@ class LearnedStereoOptions(Options):
     seed: int = Field(default=0, ge=0, description="of its first hypotheses")
 
 
-class LearnedStereo:
+class LearnedStereo(Checkpointed[LearnedStereoOptions]):
     """PatchmatchNet; deviations as of :class:`~megloc_kapture.mvs.sweep.Sweep`, by its matching."""
 
     name = "patchmatchnet"
     Options = LearnedStereoOptions
-
-    def __init__(self, options: LearnedStereoOptions | None = None) -> None:
-        self.options = options or LearnedStereoOptions()
-        self._weights = find_weights(self.options.weights)
-
-    def weights(self) -> dict[str, str]:
-        """sha256 of the checkpoint by its file's name."""
-        return {self._weights.path.name: sha256_of(self._weights)}
 
     def estimate(
         self,
@@ -56,8 +47,7 @@ class LearnedStereo:
     ) -> DepthEstimate:
         """Depth of the reference; see :class:`~megloc_kapture.plugins.DepthEstimator`."""
         options = self.options
-        device = pick_device(options.device)
-        network = _network(self._weights, device)
+        network, device = self.network(patchmatchnet_from)
         # stretched to sides that can be halved three times
         fitted, stretches = zip(
             *(_fitted(view.image) for view in (reference, *sources)), strict=True
@@ -89,8 +79,3 @@ def _fitted(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.flo
         return image, stretch
     resized = cv2.resize(image, (columns, rows), interpolation=cv2.INTER_LINEAR)
     return np.asarray(resized, np.uint8), stretch
-
-
-@lru_cache(maxsize=1)
-def _network(weights: WeightsFile, device: torch.device) -> PatchmatchNet:
-    return patchmatchnet_from(read_weights(weights), str(weights.path)).to(device)

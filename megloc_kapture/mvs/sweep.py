@@ -19,13 +19,12 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.geometry.warping import scaled_camera
-from megloc_kapture.mvs.views import pinhole_matrix, relative_projection
+from megloc_kapture.mvs.views import Projections, pinhole_matrix, pixel_step, relative_projection
 from megloc_kapture.plugins import DepthEstimate, StereoView
 from megloc_kapture.values import Camera, Options
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
-Projections = Sequence[tuple[Floats, Floats]]
 
 _BLOCK = 16  # planes at a time
 _MIN_PLANES = 16
@@ -35,7 +34,7 @@ _TONE = 20.0  # of 255, at which a pixel of a window counts 1/e
 _P1, _P2, _EDGE = 8.0, 40.0, 20.0
 _DIRECTIONS = [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1)]
 # matching error in pixels, and multiple of the bound of least squares: docs/experiments/mvs.md
-CALIBRATION = np.array([0.15, 4.0])
+CALIBRATION = np.array([0.15, 2.0])
 _MAX_COST = 0.7  # 1 - ZNCC
 
 
@@ -144,24 +143,6 @@ def sweep(
     return (planes[0] + step * semi_global(volume, grey)).astype(np.float32), step
 
 
-def pixel_step(projections: Projections, camera: Camera, limits: Floats) -> float:
-    """Difference of inverse depth that moves a pixel by one in the source where it moves most.
-
-    The mean between the limits (far, near), of the median over the image.
-    """
-    x, y = np.meshgrid(*(np.linspace(0.1, 0.9, 5) * n for n in (camera.width, camera.height)))
-    pixels = np.stack([x.ravel(), y.ravel(), np.ones(x.size)])
-    steps = np.linspace(limits[0], limits[1], 17)[:, None]
-    longest = 1.0
-    for infinity, baseline in projections:
-        path = (infinity @ pixels)[:, None] + steps * baseline[:, None, None]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            px = np.where(path[2] > 1e-6, path[:2] / path[2], np.nan)
-        lengths = np.nansum(np.linalg.norm(np.diff(px, axis=1), axis=0), axis=0)
-        longest = max(longest, float(np.median(lengths)))
-    return float(limits[1] - limits[0]) / longest
-
-
 def cost_volume(
     reference: Image, sources: Sequence[Image], projections: Projections, inverse_depths: Floats
 ) -> NDArray[np.uint8]:
@@ -226,7 +207,7 @@ def refine(
     -------
     float32 (H, W), the standard deviation of inverse depth; 0 where nothing matches.
     """
-    from megloc_kapture.mvs.kernels import refine_planes
+    from megloc_kapture.mvs.plane_kernels import refine_planes
 
     grey = stereo_image(reference)
     views = _compared(reference, sources)
@@ -245,7 +226,7 @@ def matching_deviations(
 
     0 where nothing matches; ``calibration``: see ``plane_deviations`` of the kernels.
     """
-    from megloc_kapture.mvs.kernels import plane_deviations
+    from megloc_kapture.mvs.plane_kernels import plane_deviations
 
     grey = stereo_image(reference)
     found = np.empty(grey.shape, np.float32)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import cv2
@@ -10,11 +11,12 @@ from numpy.typing import NDArray
 
 from megloc_kapture.geometry.cameras import px_from_cam
 from megloc_kapture.geometry.warping import scaled_camera
-from megloc_kapture.io.colmap import undistorted_pinhole
+from megloc_kapture.io.colmap_cameras import undistorted_pinhole
 from megloc_kapture.plugins import StereoView
 from megloc_kapture.values import ONE_FOCAL_MODELS, Camera, RigidTransform
 
 Floats = NDArray[np.float64]
+Projections = Sequence[tuple[Floats, Floats]]
 
 # angles between two rays to a point, degrees: below the first depth is weak, beyond the second
 # surfaces look different; after Schoenberger et al., ECCV 2016, section 4.1, and MVSNet
@@ -46,6 +48,25 @@ def relative_projection(reference: StereoView, source: StereoView) -> tuple[Floa
     k, k_source = pinhole_matrix(reference.camera), pinhole_matrix(source.camera)
     infinity = k_source @ source_from_reference.rotation_matrix() @ np.linalg.inv(k)
     return infinity, k_source @ np.array(source_from_reference.translation)
+
+
+def pixel_step(projections: Projections, camera: Camera, limits: Floats) -> float:
+    """Difference of inverse depth that moves a pixel by one in the source where it moves most.
+
+    The mean between the limits (far, near), of the median over the image; ``projections``: see
+    :func:`relative_projection`.
+    """
+    x, y = np.meshgrid(*(np.linspace(0.1, 0.9, 5) * n for n in (camera.width, camera.height)))
+    pixels = np.stack([x.ravel(), y.ravel(), np.ones(x.size)])
+    steps = np.linspace(limits[0], limits[1], 17)[:, None]
+    longest = 1.0
+    for infinity, baseline in projections:
+        path = (infinity @ pixels)[:, None] + steps * baseline[:, None, None]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            px = np.where(path[2] > 1e-6, path[:2] / path[2], np.nan)
+        lengths = np.nansum(np.linalg.norm(np.diff(px, axis=1), axis=0), axis=0)
+        longest = max(longest, float(np.median(lengths)))
+    return float(limits[1] - limits[0]) / longest
 
 
 def stereo_view(

@@ -9,7 +9,14 @@ from corner import CAMERA, WALLS, depth_m, pose_at, render
 
 from megloc_kapture.geometry.warping import scaled_camera
 from megloc_kapture.mvs.consistency import AgreementOptions, agreeing_views, confirmed
-from megloc_kapture.mvs.sweep import Sweep, as_estimate, refine, stereo_image
+from megloc_kapture.mvs.sweep import (
+    CALIBRATION,
+    Sweep,
+    as_estimate,
+    matching_deviations,
+    refine,
+    stereo_image,
+)
 from megloc_kapture.mvs.views import stereo_view
 from megloc_kapture.plugins import DepthEstimate, DepthEstimator, StereoView
 
@@ -122,6 +129,20 @@ def test_deviations_follow_the_noise_of_the_images() -> None:
         deviations.append(np.median(deviation[known]))
     assert 1.2 < deviations[1] / deviations[0] < 2.2
     assert 0.75 < ratios[1] / ratios[0] < 1.6
+
+
+def test_the_same_source_twice_knows_no_more_than_once() -> None:
+    exact = truth(0)
+    planes = np.stack([1 / exact, 0 * exact, 0 * exact], axis=-1).astype(np.float64)
+    once, thrice, other, both = (
+        matching_deviations(view(0), [view(n) for n in sources], planes, CALIBRATION)
+        for sources in ([1], [1, 1, 1], [2], [1, 2])
+    )
+    np.testing.assert_allclose(once, thrice, rtol=1e-6)
+    seen = (once > 0) & (other > 0)
+    assert seen.mean() > 0.7
+    # two sources on either side lie between what each says, but for their larger motion
+    assert np.mean(both[seen] <= 1.001 * np.maximum(once, other)[seen]) == 1
 
 
 def test_an_estimate_of_planes_is_unknown_where_its_deviation_is() -> None:

@@ -1,0 +1,281 @@
+"""Compiled loops of stereo: slanted planes, and the deviations of their depth.
+
+As :mod:`megloc_kapture.mvs.kernels`. A plane is what inverse depth is on it: ``w + wx dx + wy dy``
+at an offset in pixels, for inverse depth is linear in a pinhole's pixels.
+"""
+
+# mypy: allow-untyped-defs, allow-untyped-calls, allow-untyped-decorators
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from megloc_kapture.compiling import compiled_loop
+
+_FLAT = np.float32(1e-6)
+
+
+@compiled_loop
+def _plane_score(values, weights, reach, y, x, plane, source, infinity, baseline):
+    """Weighted ZNCC of a window under a plane in one source; -2 where it is not seen whole.
+
+    The window is carried over by the homography's derivative at its centre: over a few pixels the
+    rest is far below what bilinear interpolation leaves.
+    """
+    w, wx, wy = plane[0], plane[1], plane[2]
+    h = infinity
+    px = h[0, 0] * x + h[0, 1] * y + h[0, 2] + baseline[0] * w
+    py = h[1, 0] * x + h[1, 1] * y + h[1, 2] + baseline[1] * w
+    pz = h[2, 0] * x + h[2, 1] * y + h[2, 2] + baseline[2] * w
+    if not pz > 1e-6:
+        return np.float32(-2)
+    inverse = 1.0 / pz
+    u, v = px * inverse, py * inverse
+    down_x, down_y = h[2, 0] + baseline[2] * wx, h[2, 1] + baseline[2] * wy
+    ux = (h[0, 0] + baseline[0] * wx - u * down_x) * inverse
+    uy = (h[0, 1] + baseline[0] * wy - u * down_y) * inverse
+    vx = (h[1, 0] + baseline[1] * wx - v * down_x) * inverse
+    vy = (h[1, 1] + baseline[1] * wy - v * down_y) * inverse
+    height, width = source.shape
+    wide, high = reach * (abs(ux) + abs(uy)), reach * (abs(vx) + abs(vy))
+    if not (u >= wide and v >= high and u + wide < width - 1 and v + high < height - 1):
+        return np.float32(-2)
+    ux, uy, vx, vy = np.float32(ux), np.float32(uy), np.float32(vx), np.float32(vy)
+    s, s2, sr = np.float32(0), np.float32(0), np.float32(0)
+    k = 0
+    for i in range(-reach, reach + 1):
+        at_x = np.float32(u) + uy * np.float32(i) - ux * np.float32(reach)
+        at_y = np.float32(v) + vy * np.float32(i) - vx * np.float32(reach)
+        for j in range(2 * reach + 1):
+            right, below = at_x + ux * np.float32(j), at_y + vx * np.float32(j)
+            left, top = int(right), int(below)
+            across, down = right - np.float32(left), below - np.float32(top)
+            upper, lower = source[top, left], source[top + 1, left]
+            upper += across * (source[top, left + 1] - upper)
+            lower += across * (source[top + 1, left + 1] - lower)
+            value = upper + down * (lower - upper)
+            weighted = weights[k] * value
+            s += weighted
+            s2 += weighted * value
+            sr += weighted * values[k]
+            k += 1
+    variance = s2 - s * s
+    if not variance > _FLAT:
+        return np.float32(-2)
+    return sr / np.float32(math.sqrt(variance))
+
+
+@compiled_loop
+def _plane_cost(values, weights, reach, y, x, plane, sources, infinities, baselines):
+    """1 - mean of the best scores over the sources; 2 where none sees the window."""
+    first, second = np.float32(-2), np.float32(-2)
+    for s in range(len(sources)):
+        score = _plane_score(
+            values, weights, reach, y, x, plane, sources[s], infinities[s], baselines[s]
+        )
+        second = max(second, min(first, score))
+        first = max(first, score)
+    if first < np.float32(-1.5):
+        return np.float32(2)
+    if second > np.float32(-1.5):
+        return np.float32(1) - np.float32(0.5) * (first + second)
+    return np.float32(1) - first
+
+
+@compiled_loop
+def _window(reference, reach, y, x, tone, values, weights):
+    """Values and weights of a window, normalised: weights sum to 1, values have mean 0, spread 1.
+
+    Weights fall with the distance in tone (bilateral), so that a window stays on its surface.
+    False where the window leaves the image or is flat.
+    """
+    height, width = reference.shape
+    if y < reach or x < reach or y >= height - reach or x >= width - reach:
+        return False
+    centre = reference[y, x]
+    k, total = 0, np.float32(0)
+    scale = np.float32(0.5) / np.float32(reach * reach)
+    for i in range(-reach, reach + 1):
+        for j in range(-reach, reach + 1):
+            value = reference[y + i, x + j]
+            weight = np.float32(
+                math.exp(-abs(value - centre) / tone - scale * np.float32(i * i + j * j))
+            )
+            values[k], weights[k] = value, weight
+            total += weight
+            k += 1
+    mean = np.float32(0)
+    for n in range(k):
+        weights[n] /= total
+        mean += weights[n] * values[n]
+    variance = np.float32(0)
+    for n in range(k):
+        values[n] -= mean
+        variance += weights[n] * values[n] * values[n]
+    if not variance > _FLAT:
+        return False
+    spread = np.float32(math.sqrt(variance))
+    for n in range(k):
+        values[n] /= spread
+    return True
+
+
+@compiled_loop
+def _noise(y, x, turn, k):
+    """A number in [-1, 1) that is the same for the same arguments (an integer hash)."""
+    state = np.uint32(y * 73856093) ^ np.uint32(x * 19349663) ^ np.uint32(turn * 83492791 + k)
+    state = np.uint32((state ^ (state >> np.uint32(16))) * np.uint32(0x7FEB352D))
+    state = np.uint32((state ^ (state >> np.uint32(15))) * np.uint32(0x846CA68B))
+    state = np.uint32(state ^ (state >> np.uint32(16)))
+    return float(state) / 2147483648.0 - 1.0
+
+
+@compiled_loop
+def refine_planes(
+    reference,
+    sources,
+    infinities,
+    baselines,
+    planes,
+    costs,
+    reach,
+    tone,
+    turn,
+    step,
+    limits,
+):
+    """One pass of PatchMatch over slanted planes (Bleyer et al., BMVC 2011), in place.
+
+    Rows go down on even turns and up on odd ones. A pixel tries the planes of its two neighbours
+    that were done before it, continued to it, and three changes of its own plane: at random in
+    depth, at random in slope, and both half as large.
+
+    Parameters
+    ----------
+    sources : float32 (S, H, W).
+    infinities, baselines : float64 (S, 3, 3) and (S, 3), see :mod:`megloc_kapture.mvs.sweep`.
+    planes : float64 (H, W, 3).
+    costs : float32 (H, W); on turn 0 they are worked out first.
+    turn : number of the pass.
+    step : inverse depth, about a pixel's motion.
+    limits : least and greatest inverse depth.
+    """
+    height, width = reference.shape
+    count = (2 * reach + 1) ** 2
+    values, weights = np.empty(count, np.float32), np.empty(count, np.float32)
+    tried = np.empty(3, np.float64)
+    way = 1 if turn % 2 == 0 else -1
+    size = step * 0.5**turn
+    for i in range(height):
+        y = i if way > 0 else height - 1 - i
+        for j in range(width):
+            x = j if way > 0 else width - 1 - j
+            own = planes[y, x]
+            if not _window(reference, reach, y, x, tone, values, weights):
+                costs[y, x] = np.float32(2)
+                continue
+            if turn == 0:
+                costs[y, x] = _plane_cost(
+                    values, weights, reach, y, x, own, sources, infinities, baselines
+                )
+            for k in range(5):
+                if k == 0 or k == 1:
+                    from_y, from_x = (y - way, x) if k == 0 else (y, x - way)
+                    if from_y < 0 or from_y >= height or from_x < 0 or from_x >= width:
+                        continue
+                    other = planes[from_y, from_x]
+                    tried[1], tried[2] = other[1], other[2]
+                    tried[0] = other[0] + way * (other[2] if k == 0 else other[1])
+                else:
+                    scale = size if k < 4 else 0.5 * size
+                    tried[0], tried[1], tried[2] = own[0], own[1], own[2]
+                    if k != 3:
+                        tried[0] += scale * _noise(y, x, turn, 3 * k)
+                    if k != 2:
+                        tried[1] += scale / reach * _noise(y, x, turn, 3 * k + 1)
+                        tried[2] += scale / reach * _noise(y, x, turn, 3 * k + 2)
+                if tried[0] < limits[0] or tried[0] > limits[1]:
+                    continue
+                cost = _plane_cost(
+                    values, weights, reach, y, x, tried, sources, infinities, baselines
+                )
+                if cost < costs[y, x]:
+                    costs[y, x] = cost
+                    own[0], own[1], own[2] = tried[0], tried[1], tried[2]
+
+
+@compiled_loop
+def plane_deviations(
+    reference, sources, infinities, baselines, planes, reach, tone, calibration, out
+):
+    """Standard deviation of inverse depth of every pixel, from its matching.
+
+    A window of N pixels that correlates by rho, with gradient g and motion m per inverse depth,
+    both along the epipolar line, knows inverse depth to ``(1 - rho^2) Var / (N mean((g m)^2))``:
+    the bound of least squares. What the sources know is averaged and not added up: they share the
+    window's noise and its plane's misfit. To ``calibration[1]`` times the root is added a matching
+    error of ``calibration[0]`` pixels, over the motion.
+
+    Parameters
+    ----------
+    out : float32 (H, W), filled; 0 where no source sees the window.
+    """
+    height, width = reference.shape
+    count = (2 * reach + 1) ** 2
+    values, weights = np.empty(count, np.float32), np.empty(count, np.float32)
+    for y in range(height):
+        for x in range(width):
+            out[y, x] = np.float32(0)
+            if y <= reach or x <= reach or y >= height - reach - 1 or x >= width - reach - 1:
+                continue
+            if not _window(reference, reach, y, x, tone, values, weights):
+                continue
+            gxx, gxy, gyy, variance, mean = 0.0, 0.0, 0.0, 0.0, 0.0
+            k = 0
+            for i in range(-reach, reach + 1):
+                for j in range(-reach, reach + 1):
+                    mean += weights[k] * reference[y + i, x + j]
+                    k += 1
+            k = 0
+            for i in range(-reach, reach + 1):
+                for j in range(-reach, reach + 1):
+                    gx = 0.5 * (reference[y + i, x + j + 1] - reference[y + i, x + j - 1])
+                    gy = 0.5 * (reference[y + i + 1, x + j] - reference[y + i - 1, x + j])
+                    gxx += weights[k] * gx * gx
+                    gxy += weights[k] * gx * gy
+                    gyy += weights[k] * gy * gy
+                    variance += weights[k] * (reference[y + i, x + j] - mean) ** 2
+                    k += 1
+            plane = planes[y, x]
+            known, moved, seen = 0.0, 0.0, 0
+            for s in range(len(sources)):
+                rho = _plane_score(
+                    values, weights, reach, y, x, plane, sources[s], infinities[s], baselines[s]
+                )
+                if rho < 0.3:
+                    continue
+                h, b = infinities[s], baselines[s]
+                inverse = 1.0 / (h[2, 0] * x + h[2, 1] * y + h[2, 2] + b[2] * plane[0])
+                u = (h[0, 0] * x + h[0, 1] * y + h[0, 2] + b[0] * plane[0]) * inverse
+                v = (h[1, 0] * x + h[1, 1] * y + h[1, 2] + b[1] * plane[0]) * inverse
+                down_x, down_y = h[2, 0] + b[2] * plane[1], h[2, 1] + b[2] * plane[2]
+                ux = (h[0, 0] + b[0] * plane[1] - u * down_x) * inverse
+                uy = (h[0, 1] + b[0] * plane[2] - u * down_y) * inverse
+                vx = (h[1, 0] + b[1] * plane[1] - v * down_x) * inverse
+                vy = (h[1, 1] + b[1] * plane[2] - v * down_y) * inverse
+                du, dv = (b[0] - u * b[2]) * inverse, (b[1] - v * b[2]) * inverse
+                determinant = ux * vy - uy * vx
+                if abs(determinant) < 1e-9:
+                    continue
+                # the motion as the reference's own pixels see it
+                mx, my = (vy * du - uy * dv) / determinant, (ux * dv - vx * du) / determinant
+                slope = gxx * mx * mx + 2.0 * gxy * mx * my + gyy * my * my
+                noise = max(1.0 - float(rho) ** 2, 1e-3) * variance
+                known += count * slope / noise
+                seen += 1
+                moved = max(moved, du * du + dv * dv)
+            if known > 0.0 and moved > 0.0:
+                bound = calibration[1] ** 2 * seen / known + calibration[0] ** 2 / moved
+                out[y, x] = np.float32(math.sqrt(bound))
