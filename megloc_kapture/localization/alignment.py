@@ -22,7 +22,7 @@ from megloc_kapture.plugins import RankingScene
 from megloc_kapture.values import Camera, RigidTransform
 
 # surroundings of a point, and how far they are looked for; of a query as it is localized
-_HALF_PATCH_PX, _SEARCH_PX = 7, 6
+_HALF_PATCH_PX, _SEARCH_PX = 12, 6
 # of an image, and of a view: what is looked at takes time
 _MAX_POINTS, _MAX_IMAGES = 300, 4
 # surroundings without texture say nothing, and such that look alike less are not found

@@ -1,7 +1,7 @@
 """Cluster-wise localization: a pose for each cluster of candidates, the best of them refined.
 
-MegLoc, section "Cluster-wise localization". One view or the views of a rig are treated alike; the
-2D-3D matches may be of several keypoints types, each with an index of its own.
+MegLoc, section "Cluster-wise localization". One view or the views of a rig are treated alike, and
+matches of several keypoints types.
 """
 
 from __future__ import annotations
@@ -19,12 +19,11 @@ from megloc_kapture.geometry.cameras import focal_px
 from megloc_kapture.geometry.poses import cross_matrix
 from megloc_kapture.localization.absolute_pose import refine_pose
 from megloc_kapture.localization.alignment import displacements_px
-from megloc_kapture.localization.confidence import MatchSources, with_confidence
+from megloc_kapture.localization.confidence import with_confidence
 from megloc_kapture.localization.estimation import (
     AbsolutePoseOptions,
     PoseEstimate,
     PoseProblem,
-    View,
     estimate_pose,
     split_by_view,
 )
@@ -34,49 +33,19 @@ from megloc_kapture.localization.focal_length import (
     is_uncertain,
     refine_with_intrinsics,
 )
-from megloc_kapture.localization.map_index import (
-    Correspondences,
-    MapIndex,
-    ObservedMatches,
-    observed_matches,
+from megloc_kapture.localization.map_index import Correspondences, observed_matches
+from megloc_kapture.localization.query_views import (
+    QueryView,
+    match_sources,
+    num_observed,
+    rows_of_images,
+    view_of,
 )
 from megloc_kapture.localization.ranking import poses_agree
 from megloc_kapture.plugins import HypothesisView, PoseHypothesis, RankingScene
-from megloc_kapture.values import Camera, ClusterPose, Failure, Pose, RigidTransform
+from megloc_kapture.values import ClusterPose, Failure, Pose, RigidTransform
 
-ImageMatches = tuple[str, NDArray[np.int64], NDArray[np.floating]]
 Rank = Callable[[Sequence[PoseHypothesis]], NDArray[np.float64]]
-
-
-@dataclass(frozen=True, eq=False)
-class TypedMatches:
-    """Matches of one query image in one keypoints type.
-
-    Attributes
-    ----------
-    index : the map's points of the type.
-    keypoints_px : float32 (N, 2 or more), of the query.
-    matches : of each candidate: its name, rows of query and map keypoints (K, 2), scores (K,).
-    """
-
-    index: MapIndex
-    keypoints_px: NDArray[np.float32]
-    matches: Sequence[ImageMatches]
-
-
-@dataclass(frozen=True, eq=False)
-class QueryView:
-    """One camera of a query: its pose on the rig, and its matches by keypoints type."""
-
-    name: str
-    camera: Camera
-    matches: tuple[TypedMatches, ...]
-    cam_from_rig: RigidTransform = RigidTransform.identity()
-
-    def matched_images(self) -> list[str]:
-        """Map images with a match, in the order given."""
-        named = (image for own in self.matches for image, pairs, _ in own.matches if len(pairs))
-        return list(dict.fromkeys(named))
 
 
 def interleave(rankings: Sequence[Sequence[str]]) -> list[str]:
@@ -131,7 +100,7 @@ def localize_in_clusters(
     rank_of = {image: rank for rank, image in enumerate(matched)}
     clusters = [[image for image in cluster if image in rank_of] for cluster in clusters]
     gathered = [[observed_matches(m.index, m.matches) for m in view.matches] for view in views]
-    counts = [_num_observed(views, gathered, cluster) for cluster in clusters]
+    counts = [num_observed(views, gathered, cluster) for cluster in clusters]
     by_matches = sorted(range(len(clusters)), key=lambda at: (-counts[at], at))
     tried = sorted(at for at in by_matches[:max_clusters] if counts[at])
     clock.lap("correspondences")
@@ -139,12 +108,12 @@ def localize_in_clusters(
     def attempt(cluster: Sequence[str], frame: str) -> _Attempt:
         found = [
             [
-                observed.resolve(_rows(m, cluster))
+                observed.resolve(rows_of_images(m, cluster))
                 for m, observed in zip(view.matches, own, strict=True)
             ]
             for view, own in zip(views, gathered, strict=True)
         ]
-        problem = PoseProblem.of(list(map(_view, views, found)))
+        problem = PoseProblem.of(list(map(view_of, views, found)))
         clock.lap("correspondences")
         if is_uncertain(problem):
             problem, estimate = estimate_with_intrinsics(problem, options)
@@ -177,7 +146,7 @@ def localize_in_clusters(
         clock.lap("refinement")
         if min_confidence is not None and isinstance(result, Pose):
             found = attempts[best].found
-            sources = _sources(views, found, ranked[best].images, centers or {})
+            sources = match_sources(views, found, ranked[best].images, centers or {})
             if scene is not None:
                 seen = partial(_displacements_rad, problem, views, found, scene)
                 sources = replace(sources, displacements_rad=seen)
@@ -269,78 +238,6 @@ def _failure(clusters: Sequence[ClusterPose], best: int) -> Failure:
     nearest = clusters[best]
     others = f", the best of {len(clusters)} clusters" if len(clusters) > 1 else ""
     return Failure(nearest.reason + others, nearest.num_matches, nearest.num_inliers)
-
-
-def _rows(typed: TypedMatches, cluster: Sequence[str]) -> NDArray[np.bool_]:
-    members = set(cluster)
-    return np.array([image in members for image, _, _ in typed.matches], bool)
-
-
-def _num_observed(
-    views: Sequence[QueryView],
-    gathered: Sequence[Sequence[ObservedMatches]],
-    cluster: Sequence[str],
-) -> int:
-    total = 0
-    for view, own in zip(views, gathered, strict=True):
-        for typed, observed in zip(view.matches, own, strict=True):
-            if len(typed.matches):
-                total += int(_rows(typed, cluster)[observed.image_rows].sum())
-    return total
-
-
-def _view(view: QueryView, found: Sequence[Correspondences]) -> View:
-    """The 2D-3D matches of one camera, types one after another."""
-    pixels, points, covariances = [np.zeros((0, 2))], [np.zeros((0, 3))], [np.zeros((0, 6))]
-    known = False
-    for typed, own in zip(view.matches, found, strict=True):
-        pixels.append(typed.keypoints_px[own.keypoint_ids, :2].astype(np.float64))
-        points.append(typed.index.xyz[own.point_ids])
-        if typed.index.covariances is None:
-            covariances.append(np.full((len(own.point_ids), 6), np.nan))
-        else:
-            known = True
-            covariances.append(np.asarray(typed.index.covariances[own.point_ids]))
-    return View(
-        camera=view.camera,
-        cam_from_rig=view.cam_from_rig,
-        points_px=np.concatenate(pixels),
-        points_world=np.concatenate(points),
-        point_covariances=np.concatenate(covariances) if known else None,
-    )
-
-
-def _sources(
-    views: Sequence[QueryView],
-    found: Sequence[Sequence[Correspondences]],
-    cluster: Sequence[str],
-    centers: Mapping[str, NDArray[np.float64]],
-) -> MatchSources:
-    """Where the matches of a cluster come from, and what its images see."""
-    number = {image: at for at, image in enumerate(cluster)}
-    center_of = np.array([centers[image] for image in cluster]).reshape(-1, 3)
-    support, images, seen = [], [], []
-    noise: list[NDArray[np.float64]] = []
-    for view, of_types in zip(views, found, strict=True):
-        for typed, own in zip(view.matches, of_types, strict=True):
-            rows = np.array([number.get(image, -1) for image, _, _ in typed.matches], np.int64)
-            support.append(own.support)
-            images.append(rows[own.image_rows])
-            index = typed.index
-            noise.append(np.tile([index.noise_rad, index.noise_px], (len(own.support), 1)))
-        seen.append(
-            np.concatenate([np.zeros((0, 3)), *(m.index.seen_by(cluster) for m in view.matches)])
-        )
-    rows_of_images = np.concatenate(images)
-    return MatchSources(
-        support=np.concatenate(support),
-        centers=center_of[rows_of_images],
-        images=rows_of_images,
-        num_keypoints=sum(len(m.keypoints_px) for view in views for m in view.matches),
-        noise=np.concatenate(noise),
-        seen=seen,
-        local_types={own.index.local_type for view in views for own in view.matches},
-    )
 
 
 def _displacements_rad(

@@ -26,6 +26,7 @@ from megloc_kapture.localization.estimation import (
     PoseProblem,
     reprojection_errors_px,
     split_by_view,
+    whitened_errors_px,
 )
 from megloc_kapture.values import Failure, Pose, RigidTransform
 
@@ -38,9 +39,9 @@ _MAX_PROJECTED = 2048
 _MIN_ERROR_PX = 0.5
 # no map is better than that, in pixels of the query
 _MIN_NOISE_PX = 0.3
-# an image of the scene fits worse than the map's own by less than that, and fewer inliers than
-# these say nothing about it
-_USUAL_RATIO, _FEW = 3.3, 20
+# an image of the scene fits worse than the map makes expected by less than that, and fewer inliers
+# than these say nothing about it
+_USUAL_RATIO, _FEW = 2.9, 20
 
 TERMS: dict[str, str] = {
     "surprise": "hardly more matches agree than would by chance",
@@ -204,27 +205,33 @@ def _misfit(
     """How much many inliers contradict the pose together.
 
     The scene in a mirror, or its like elsewhere, has hundreds of inliers that fit nearly; noise of
-    so many is known from the map's own images, and a larger error is of the pose, or of keypoints
-    that are found elsewhere on the same things at night, which what surrounds them tells. It is the
-    logarithm of the inliers' median angular error, or of that of their surroundings where it is
-    smaller, over that of the map's observations, beyond what an image of the scene may have, times
-    that of their number; 0 where the map's is not known.
+    so many is known from the map's own images and the points' covariances, and a larger error is of
+    the pose, or of keypoints that are found elsewhere on the same things at night, which what
+    surrounds them tells. It is the logarithm of the inliers' median angular error, or of that of
+    their surroundings where it is smaller, over what map and points make expected, beyond what an
+    image of the scene may have, times that of their number; 0 where the map's noise is not known.
     """
     lengths = np.diff(problem.starts)
-    focals = np.repeat([focal_px(view.camera) for view in problem.views], lengths)[inliers]
+    focals = np.repeat([focal_px(view.camera) for view in problem.views], lengths)
     # seen from as far the map's points are no better than they are, and a keypoint of a smaller
     # image is off by as many of its larger pixels
-    noise_rad, noise_px = sources.noise[inliers].T
-    own = np.maximum(noise_rad, np.maximum(noise_px, _MIN_NOISE_PX) / focals)
-    ratios = (errors_px[inliers] / focals / own)[np.isfinite(own)]
-    if len(ratios) <= _FEW:
+    noise_rad, noise_px = sources.noise.T
+    own_px = np.maximum(noise_rad * focals, np.maximum(noise_px, _MIN_NOISE_PX))
+    # points that little parallax placed are off by more where they are seen from elsewhere
+    share = (noise_px / own_px)[:, None] ** 2
+    relative = replace(problem, covariances=problem.covariances * share[: len(problem.covariances)])
+    explained = whitened_errors_px(relative, pose.cam_from_world)
+    known = inliers & np.isfinite(own_px)
+    if known.sum() <= _FEW:
         return 0.0
-    ratio = float(np.median(ratios))
+    ratio = float(np.median((explained / own_px)[known]))
     if ratio > _USUAL_RATIO and sources.displacements_rad is not None:
         displaced = sources.displacements_rad(pose)
         if len(displaced) > _FEW:
-            ratio = min(ratio, float(np.median(displaced)) / float(np.nanmedian(own)))
-    return math.log(max(ratio / _USUAL_RATIO, 1.0)) * math.log(len(ratios) / _FEW)
+            per_error = errors_px[known] / np.maximum(explained[known], 1e-9)
+            expected = (own_px / focals)[known] * per_error
+            ratio = min(ratio, float(np.median(displaced)) / float(np.median(expected)))
+    return math.log(max(ratio / _USUAL_RATIO, 1.0)) * math.log(int(known.sum()) / _FEW)
 
 
 def _num_visible(

@@ -232,7 +232,7 @@ def estimate_pose(
             num_matches=count,
         )
     rig_from_world = _ransac(problem, rays, usable, options)
-    errors_px = _errors_px(problem, rig_from_world, usable)
+    errors_px, _ = _measured(problem, rig_from_world, usable)
     inliers = errors_px <= options.max_error_px
     num_inliers = int(np.count_nonzero(inliers))
     if num_inliers < options.min_inliers:
@@ -250,17 +250,18 @@ def too_few_agree(num_inliers: int, count: int, options: AbsolutePoseOptions) ->
     )
 
 
-def _errors_px(
+def _measured(
     problem: PoseProblem, rig_from_world: RigidTransform, usable: NDArray[np.bool_]
-) -> NDArray[np.float64]:
-    """Errors in pixels (N,), infinite behind the camera and where a match is not ``usable``.
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Errors in pixels (N,), infinite behind the camera and where a match is not ``usable``; and
+    their lengths when whitened.
 
     ``rig_from_world`` is that of the recentred world.
     """
     from megloc_kapture.localization import pose_kernels
 
     count = len(usable)
-    errors = np.empty(count)
+    errors, squared = np.empty(count), np.full(count, np.inf)
     pose_kernels.measure(
         problem.matches,
         usable,
@@ -268,18 +269,30 @@ def _errors_px(
         np.array(rig_from_world.translation),
         errors,
         np.empty((count, 3)),
-        np.empty(count),
+        squared,
         np.empty(count),
     )
-    return errors
+    return errors, np.sqrt(squared)
 
 
 def reprojection_errors_px(
     problem: PoseProblem, rig_from_world: RigidTransform
 ) -> NDArray[np.float64]:
     """Errors in pixels (N,) of all matches; infinite behind a camera and where a point is none."""
+    return _measured_in_world(problem, rig_from_world)[0]
+
+
+def whitened_errors_px(problem: PoseProblem, rig_from_world: RigidTransform) -> NDArray[np.float64]:
+    """As :func:`reprojection_errors_px`, by Mahalanobis' distance: an error of one pixel, and what
+    the point's covariance makes of it, count as one."""
+    return _measured_in_world(problem, rig_from_world)[1]
+
+
+def _measured_in_world(
+    problem: PoseProblem, rig_from_world: RigidTransform
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     usable = np.asarray(np.isfinite(problem.points).all(axis=1))
-    return _errors_px(problem, undo_recentring(rig_from_world, -problem.offset), usable)
+    return _measured(problem, undo_recentring(rig_from_world, -problem.offset), usable)
 
 
 def _ransac(

@@ -33,7 +33,7 @@ from megloc_kapture.geometry.cameras import (
     shift_principal_point,
     with_distortion,
 )
-from megloc_kapture.io.colmap import focal_from_matches
+from megloc_kapture.io.colmap_cameras import focal_from_matches
 from megloc_kapture.localization.absolute_pose import check_stable, refine_pose
 from megloc_kapture.localization.estimation import (
     AbsolutePoseOptions,

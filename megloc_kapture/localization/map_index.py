@@ -172,7 +172,7 @@ class ObservedMatches:
 
         The same keypoint can meet several points through different map images, and the reverse.
         A point that several images observe comes before one that was lifted through one's depth;
-        then what most images say wins; then the most similar descriptors; then the smaller ids.
+        then what most images say wins; then the best score; then the smaller ids.
         Conflicts are settled greedily from the best on, so that a loser may still get its second
         choice. Images that are left out have no say.
 

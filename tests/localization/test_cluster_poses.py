@@ -12,9 +12,6 @@ from scipy.spatial.transform import Rotation
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.localization.cluster_poses import (
     ClusterLocalization,
-    ImageMatches,
-    QueryView,
-    TypedMatches,
     interleave,
     localize_in_clusters,
     poses_of_cameras,
@@ -22,6 +19,7 @@ from megloc_kapture.localization.cluster_poses import (
 )
 from megloc_kapture.localization.estimation import AbsolutePoseOptions
 from megloc_kapture.localization.map_index import MapIndex
+from megloc_kapture.localization.query_views import ImageMatches, QueryView, TypedMatches
 from megloc_kapture.plugins import PoseHypothesis
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 

@@ -13,7 +13,8 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.io.weights import MissingWeightsError
 from megloc_kapture.localization.lpips import LpipsDistance, LpipsOptions
 from megloc_kapture.nets.lpips import Lpips
-from megloc_kapture.plugins import IMAGE_DISTANCES, ImageDistance, load_plugin
+from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugins import IMAGE_DISTANCES, ImageDistance
 
 
 @pytest.fixture(scope="module")

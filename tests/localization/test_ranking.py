@@ -13,13 +13,8 @@ from megloc_kapture.localization.ranking import (
     InlierSpread,
     ReprojectionScore,
 )
-from megloc_kapture.plugins import (
-    POSE_RANKERS,
-    HypothesisView,
-    PoseHypothesis,
-    PoseRanker,
-    load_plugin,
-)
+from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugins import POSE_RANKERS, HypothesisView, PoseHypothesis, PoseRanker
 from megloc_kapture.values import Camera, RigidTransform
 
 CAMERA = Camera("SIMPLE_PINHOLE", 640, 480, (500.0, 320.0, 240.0))
