@@ -4,6 +4,7 @@
     .venv/bin/python benchmarks/train_free.py descriptor   # hours; the same command goes on
     .venv/bin/python benchmarks/train_free.py matcher      # on the descriptors so trained
     .venv/bin/python benchmarks/train_free.py evaluate     # recall on worlds of other seeds
+    .venv/bin/python benchmarks/train_free.py inliers --scene DIR ...    # matchers on real pairs
 
 XFeat's weights are Apache-2.0 and the rendered worlds are this project's own, so what comes out may
 be published under a free licence; the manifests beside the files say what went in. Other data with
@@ -15,21 +16,26 @@ twin, of seeds from 1000 on, those held out from 2000 on; no test, no other benc
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 from megloc_twins.aachen import AachenTwin, AachenTwinOptions, build_aachen_frames
 from megloc_twins.frames import Frame
 from megloc_twins.render import RenderedFrame, render_frames
 
 import megloc_kapture as megloc
-from megloc_kapture.io.images import write_depth_map, write_image
-from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
+from megloc_kapture.geometry.cameras import normalized_from_px
+from megloc_kapture.io.images import read_image_rgb, write_depth_map, write_image
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
+from megloc_kapture.matching.verification import ray_slopes, sampson_error_px
 from megloc_kapture.pipeline.executors import open_executor
+from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS
 from megloc_kapture.stages.work import HERE, Work
-from megloc_kapture.values import RigidTransform
+from megloc_kapture.values import ImageFeatures, RigidTransform
 
 RENDERED_LICENCE = "BSD-3-Clause"
 TRAINING_SEED, HELD_OUT_SEED = 1000, 2000
@@ -88,6 +94,9 @@ def train(task: str, root: Path, arguments: argparse.Namespace) -> None:
     chosen = {**PAIRS, **(DESCRIPTOR if task == "descriptor" else MATCHER)}
     if task == "matcher":
         chosen["features.options.descriptor_weights"] = str(root / "xfeat-night.safetensors")
+    asked = dict(text.split("=", 1) for text in arguments.set or ())
+    if "matcher_weights" in asked:
+        chosen.pop("layers", None)  # those of the weights
     name = {"descriptor": "xfeat-night", "matcher": "xfeat-night-superglue"}[task]
     last = megloc.train(
         task,
@@ -96,7 +105,7 @@ def train(task: str, root: Path, arguments: argparse.Namespace) -> None:
         photographs=list(photographs),
         held_out=held_out,
         features="xfeat",
-        set={**chosen, **dict(text.split("=", 1) for text in arguments.set or ())},
+        set={**chosen, **asked},
         licences={**dict.fromkeys(map(str, rendered), RENDERED_LICENCE), **also, **photographs},
     )
     print({key: round(value, 5) for key, value in last.items()})
@@ -132,9 +141,74 @@ def evaluate(root: Path, seeds: Sequence[int], scenes: Sequence[Path], workers: 
         print(f"mean gain, {kind}\n{(sum(found[1:], found[0]) / len(found)).round(3)}")
 
 
+def inliers(root: Path, scenes: Sequence[Path]) -> None:
+    """Matches within 3 px of the true epipolar line, of pairs of real images with known poses.
+
+    Each image of mapping/ with the three nearest that look within 60 degrees of it; the sum of all
+    pairs, and the share of the matches.
+    """
+    own: dict[str, object] = {"max_keypoints": 2048}
+    night: dict[str, object] = {**own, "descriptor_weights": str(root / "xfeat-night.safetensors")}
+    weights = str(root / "xfeat-night-superglue.safetensors")
+    trained: dict[str, object] = {"weights": weights, "match_threshold": 0.05}
+    nearest: dict[str, object] = {"max_ratio": 1.0}
+    ways = [
+        ("own descriptors, mutual nearest neighbours", own, "nn", nearest),
+        ("night descriptors, mutual nearest neighbours", night, "nn", nearest),
+        ("night descriptors, SuperGlue", night, "superglue", trained),
+        ("own descriptors, LighterGlue", own, "lighterglue", {}),
+    ]
+    rows = []
+    for scene in scenes:
+        folder = KaptureFolder(scene / "mapping")
+        data = folder.read()
+        poses = data.poses()
+        pairs = _near_pairs(poses)
+        for way, features, matcher_name, options in ways:
+            extractor = load_plugin(LOCAL_FEATURES, "xfeat", features)
+            matcher = load_plugin(MATCHERS, matcher_name, options)
+            found, right, total = {}, 0, 0
+            for name in sorted({name for pair in pairs for name in pair}):
+                image = read_image_rgb(folder.image_path(name))
+                local = extractor.extract(image)
+                size = image.shape[1], image.shape[0]
+                found[name] = ImageFeatures(local.keypoints_px, local.descriptors, *size)
+            for a, b in pairs:
+                matches, _ = matcher.match(found[a], found[b])
+                sides = []
+                for name, ids in zip((a, b), matches.T, strict=True):
+                    px = found[name].keypoints_px[ids, :2].astype(np.float64)
+                    rays = normalized_from_px(data.camera_of(name), px)
+                    rays = np.column_stack([rays, np.ones(len(rays))])
+                    sides += [rays, ray_slopes(data.camera_of(name), px, rays)]
+                rays_a, slopes_a, rays_b, slopes_b = sides
+                b_from_a = poses[b] @ poses[a].inverse()
+                errors = sampson_error_px(rays_a, slopes_a, rays_b, slopes_b, b_from_a)
+                right += int((errors < 3).sum())
+                total += len(matches)
+            rows.append((scene.name, way, len(pairs), right, right / max(total, 1)))
+            print(rows[-1], flush=True)
+    table = pd.DataFrame(rows, columns=["scene", "way", "pairs", "inliers", "share"])
+    print(table.to_string(index=False))
+
+
+def _near_pairs(poses: Mapping[str, RigidTransform]) -> list[tuple[str, str]]:
+    names = sorted(poses)
+    centres = np.array([poses[name].center() for name in names])
+    axes = np.array([poses[name].rotation_matrix()[2] for name in names])
+    pairs = set()
+    for row, name in enumerate(names):
+        distances = np.linalg.norm(centres - centres[row], axis=1)
+        distances[(axes @ axes[row] < 0.5) | (distances == 0)] = np.inf
+        for other in np.argsort(distances, kind="stable")[:3]:
+            if np.isfinite(distances[other]):
+                pairs.add((min(name, names[other]), max(name, names[other])))
+    return sorted(pairs)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("task", choices=("worlds", "descriptor", "matcher", "evaluate"))
+    parser.add_argument("task", choices=("worlds", "descriptor", "matcher", "evaluate", "inliers"))
     parser.add_argument("--root", type=Path, default=Path("runs") / "train_free")
     parser.add_argument("--worlds", type=int, default=24, help="to train on")
     parser.add_argument("--held-out", type=int, default=2, help="worlds")
@@ -152,6 +226,8 @@ def main() -> None:
         worlds(root, seeds, arguments.workers)
     elif arguments.task == "evaluate":
         evaluate(root, arguments.seeds, arguments.scene, arguments.workers)
+    elif arguments.task == "inliers":
+        inliers(root, arguments.scene)
     else:
         train(arguments.task, root, arguments)
 

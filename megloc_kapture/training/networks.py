@@ -173,6 +173,24 @@ class ProductHead(nn.Module):
         return log_optimal_transport(products, self.scale * self.dustbin, iterations)
 
 
+@torch.no_grad()
+def begin_at_products(net: SuperGlueNet) -> None:
+    """Let a new SuperGlue match by its descriptors' products alone, as :class:`ProductHead` does.
+
+    The last layers of the keypoint encoder and of every message are zero, the final projection is
+    the identity: what descriptors tell need not be learned once more, and what attention adds is
+    learned on top of it (as residual branches that begin at zero: Bachlechner et al., UAI 2021).
+    """
+    perceptrons = [module for module in net.modules() if isinstance(module, nn.Sequential)]
+    for last in (net.final_proj, *(perceptron[-1] for perceptron in perceptrons)):
+        for parameter in last.parameters():
+            parameter.zero_()
+    size = net.descriptor_size
+    scale = (_FIRST_SCALE * size**0.5) ** 0.5  # products are divided by the root of the size
+    net.final_proj.weight.copy_(scale * torch.eye(size)[:, :, None])
+    net.bin_score.fill_(_FIRST_SCALE * _FIRST_DUSTBIN)
+
+
 def encoder_sizes(descriptor_size: int) -> tuple[int, ...]:
     """Of SuperGlue's keypoint encoder, in the proportions of the official network.
 

@@ -27,12 +27,8 @@ from megloc_kapture.io.weights import find_weights, read_weights
 from megloc_kapture.nets.runtime import NetworkOptions, pick_device
 from megloc_kapture.nets.superglue import SuperGlueNet, superglue
 from megloc_kapture.nets.training_state import load_state, state_bytes
-from megloc_kapture.plugins import (
-    LOCAL_FEATURES,
-    LocalFeatureExtractor,
-    PluginChoice,
-    load_plugin,
-)
+from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugins import LOCAL_FEATURES, LocalFeatureExtractor, PluginChoice
 from megloc_kapture.stages.work import HERE, Work, ordered_map
 from megloc_kapture.training.held_out import AUC_DEG, HeldOutResult, held_out_result
 from megloc_kapture.training.networks import (
@@ -40,6 +36,7 @@ from megloc_kapture.training.networks import (
     PairModel,
     PreparedPair,
     ProductHead,
+    begin_at_products,
     describer_of,
     encoder_sizes,
 )
@@ -199,6 +196,7 @@ def model_of(options: TrainingOptions, extractor: LocalFeatureExtractor) -> Pair
             head = superglue(read_weights(file), str(file.path))
         else:
             head = SuperGlueNet(encoder_sizes(size), options.layers)
+            begin_at_products(head)
         if isinstance(head, SuperGlueNet) and head.descriptor_size != size:
             raise OptionError(
                 f"matcher_weights={options.matcher_weights} are for descriptors of "

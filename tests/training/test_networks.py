@@ -23,6 +23,7 @@ from megloc_kapture.training.networks import (
     PairModel,
     ProductHead,
     XFeatDescriber,
+    begin_at_products,
     describer_of,
     encoder_sizes,
 )
@@ -55,6 +56,27 @@ def test_a_describer_begins_as_its_extractor(files: dict[str, str]) -> None:
         described = describer_of(extractor).train()(image, xy_px)
         assert described.requires_grad
         np.testing.assert_allclose(described.detach().numpy(), found.descriptors, atol=2e-5)
+
+
+def test_a_new_superglue_matches_as_its_descriptors_do() -> None:
+    draw = torch.Generator().manual_seed(0)
+    sides = []
+    for count in (7, 5):
+        own = nn.functional.normalize(torch.randn(count, 64, generator=draw), dim=1)
+        at = torch.rand(count, 2, generator=draw)
+        sides.append(ImageKeypoints(at, torch.rand(count, generator=draw), own))
+    pair = (sides[0], sides[1])
+    net = SuperGlueNet(encoder_sizes(64), 4).train()
+    (own,) = ProductHead()([pair], 20)
+    assert not torch.allclose(net([pair], 20)[0], own, atol=0.1)
+    begin_at_products(net)
+    (found,) = net([pair], 20)
+    torch.testing.assert_close(found, own, atol=1e-4, rtol=1e-4)
+    # all of it can learn
+    found[0, 0].backward()
+    for layer in net.gnn.layers:
+        assert layer.mlp[-1].weight.grad.abs().sum() > 0
+    assert net.kenc.encoder[-1].weight.grad.abs().sum() > 0
 
 
 def test_what_is_trained_is_read_as_descriptor_weights(

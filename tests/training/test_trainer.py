@@ -195,7 +195,7 @@ def test_a_trained_matcher_is_read_by_the_matcher(
     sides = []
     for name in ("1.png", "2.png"):
         image = read_image_rgb(walk / "sensors" / "records_data" / name)
-        sides.append(megloc.api.extract("xfeat", image, **chosen, max_keypoints=50))  # type: ignore[attr-defined]
+        sides.append(megloc.extract("xfeat", image, **chosen, max_keypoints=50))
     matches, scores = matcher.match(*sides)
     assert matches.shape[1] == 2 and len(matches) == len(scores)
 
