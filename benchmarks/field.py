@@ -8,13 +8,20 @@ queries are held-out photographs: at their true poses the field's rendering is c
 warping of the four nearest map images by their depth, on the pixels that this covers of the right
 half; the light of both is fitted on the left half, of the warping as a gain and a bias of each
 channel. Refined poses are compared as by ``refinement.py``, and the medians' difference by a
-bootstrap over queries. Arguments that are not known here go to ``megloc eval``.
+bootstrap over queries. ``--views SIDE`` also renders what is halfway between the map's cameras,
+with that longer side, and runs again with these views as map images more. ``--condition night``
+prints the comparisons of the queries whose names contain it, too. Arguments that are not known here
+go to ``megloc eval``; the twin of Aachen is a scene once ``megloc eval`` has imported it.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -24,21 +31,25 @@ from numpy.typing import NDArray
 from refinement import NONE, Thresholds, comparison, refined
 from scenes import DRAWS, errors_of, megloc
 
+from megloc_kapture.geometry.poses import rotation_angles_deg
 from megloc_kapture.geometry.warping import warp_to_view
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.kapture.matches import read_pairs
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.refinement.neural_field import FieldView, NeuralField, reduced_view
 from megloc_kapture.stages.neural_field import open_field, views_of
 
 _SIDE = 320  # of the images that are compared, as the field is trained
 _NEAREST = 4
+_MIN_COVERED_PX = 100
 
 
 def held_out_psnr(
     field: NeuralField, scene: Path, map_views: list[FieldView]
 ) -> list[tuple[str, float, float, float]]:
-    """Of each query its name, the share that warping covers, PSNR of warping and of the field."""
+    """Of each query its name, the share that warping covers, PSNR of warping and of the field;
+    those of which it covers no part of one half are left out."""
     query, truth = KaptureFolder(scene / "query"), KaptureFolder(scene / "query_gt").read().poses()
     centers = np.array([view.cam_from_world.center() for view in map_views])
     rows = []
@@ -54,6 +65,8 @@ def held_out_psnr(
         light = field.fitted_appearance(fitted, _SIDE)
         shown = field.render(view.camera, pose, appearance=light).image
         ours, judged = warped.valid & left, warped.valid & ~left
+        if min(ours.sum(), judged.sum()) < _MIN_COVERED_PX:
+            continue
         matched = np.empty(view.image.shape)
         for channel in range(3):
             of_warp, seen = (
@@ -81,11 +94,14 @@ def main() -> None:
     parser.add_argument("--scene", type=lambda text: Path(text).resolve(), required=True)
     parser.add_argument("--workspace", type=Path, required=True, help="the run stays here")
     parser.add_argument("--steps", type=int, default=2000, help="of the field's training")
+    parser.add_argument("--views", type=int, metavar="SIDE", help="px: try views between, too")
+    parser.add_argument("--condition", help="part of the names of queries to compare apart, too")
     options, more = parser.parse_known_args()
     run, scene, name = options.workspace, options.scene, options.scene.name
     stereo = [] if KaptureFolder(scene / "mapping").read().records_depth else ["mvs.mode=depth"]
-    settings = [part for text in ("pose_refinement.by=[]", *stereo) for part in ("--set", text)]
-    megloc("eval", "kapture", "--root", str(scene), "--workspace", str(run), *settings, *more)
+    settings = ["--set", "pose_refinement.by=[]", *more]
+    depth = [part for text in stereo for part in ("--set", text)]
+    megloc("eval", "kapture", "--root", str(scene), "--workspace", str(run), *settings, *depth)
     steps = ("--steps", str(options.steps), "--held-out-every", "0")
     megloc("train-field", "-i", str(run / "map"), "-o", str(run / "field"), *steps)
     with single_threaded():
@@ -98,9 +114,53 @@ def main() -> None:
     chosen = json.dumps(str((run / "field").resolve()))
     setting = f'pose_refinement.by=[{{name="field",options={{field={chosen}}}}}]'
     before = errors_of(run / "evaluation").assign(chain=NONE, seed=0, accepted=False, seconds=0.0)
-    after = refined("field", 0, run, setting)
-    print(comparison(name, pd.concat([before, after]), Thresholds.read(run / "evaluation")))
-    print(medians(before, after))
+    others = [refined("field", 0, run, setting)]
+    if options.views is not None:
+        others.append(with_views(scene, run, options.views, settings))
+    for condition in [part for part in ("", options.condition) if part is not None]:
+        ours, *theirs = (
+            each[each["query"].str.contains(condition, regex=False)] for each in (before, *others)
+        )
+        label, thresholds = f"{name} {condition}", Thresholds.read(run / "evaluation")
+        print(comparison(label, pd.concat([ours, *theirs]), thresholds))
+        for each in theirs:
+            print(f"{each.chain.iloc[0]}: {medians(ours, each)}{os.linesep}")
+
+
+def with_views(scene: Path, run: Path, side_px: int, arguments: list[str]) -> pd.DataFrame:
+    """Errors of a run whose map also has what the field shows between the cameras."""
+    views, joined, again = run / "views", run / "joined", run / "with-views"
+    between = ("--between", str(run / "map"), "--max-side", str(side_px))
+    megloc("render", str(run / "field"), *between, "-o", str(views), "-f")
+    joined.mkdir(exist_ok=True)
+    merge = str(Path(sys.executable).with_name("kapture_merge"))
+    parts = ("-i", str(scene / "mapping"), str(views), "-o", str(joined / "mapping"), "-f")
+    keep = ("--keep-sensor-ids", "--image_transfer", "copy")
+    subprocess.run([merge, *parts, *keep], check=True, capture_output=True)
+    for part in ("query", "query_gt"):
+        shutil.copytree(scene / part, joined / part, dirs_exist_ok=True)
+    megloc("eval", "kapture", "--root", str(joined), "--workspace", str(again), *arguments)
+    for label, of_run in (("map images", run), ("with views between", again)):
+        print(f"first of the ranking, {label}: {first_ranked(of_run, scene / 'query_gt')}")
+    errors = errors_of(again / "evaluation")
+    return errors.assign(chain="views", seed=0, accepted=True, seconds=0.0)
+
+
+def first_ranked(run: Path, truth: Path) -> str:
+    """How far from each query, in the median, the image stands that retrieval ranks first."""
+    of_map, posed = (KaptureFolder(each).read().poses() for each in (run / "map", truth))
+    first: dict[str, str] = {}
+    for pair in read_pairs(run / "pairs" / "query.txt"):
+        first.setdefault(pair.query, pair.map)
+    ranked = {query: of_map[image] for query, image in first.items() if query in posed}
+    away = [np.linalg.norm(pose.center() - posed[q].center()) for q, pose in ranked.items()]
+    apart = rotation_angles_deg(
+        *(
+            np.array([pose.quat_wxyz for pose in each.values()])
+            for each in (ranked, {query: posed[query] for query in ranked})
+        )
+    )
+    return f"{np.median(away):.2f} m, {np.median(apart):.1f} deg"
 
 
 def medians(before: pd.DataFrame, after: pd.DataFrame) -> str:

@@ -11,15 +11,16 @@ import tyro
 
 from megloc_kapture.cli.common import Common, Force, Input, Linked, Output, camera_of_text
 from megloc_kapture.errors import DataError, OptionError, OutputError
-from megloc_kapture.io.files import staged_output
 from megloc_kapture.io.images import WRITABLE_SUFFIXES
 from megloc_kapture.io.kapture.sensors import unit_quaternion
+from megloc_kapture.io.output_folders import staged_output
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.values import RigidTransform
 
 FIELD = "field"
 RENDERED = "rendered"
 _MILLIMETRES = 1000.0
+_MIN_SHOWN = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +55,8 @@ class TrainField(Linked, Common):
         """Run it."""
         from pydantic import ValidationError
 
-        from megloc_kapture.io.files import claim_folder, first_problem, remove
+        from megloc_kapture.io.files import first_problem, remove
+        from megloc_kapture.io.output_folders import claim_folder
         from megloc_kapture.refinement.field_training import FieldTrainingOptions
         from megloc_kapture.stages.neural_field import STATE_FILE, train_field_of_map
 
@@ -98,12 +100,12 @@ class TrainField(Linked, Common):
 
 @dataclass(frozen=True, kw_only=True)
 class Render(Linked, Common):
-    """Render a view of a neural field, or all views of a result, in colour and depth."""
+    """Render a view of a neural field, views of a result, or views that no camera took."""
 
     field: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FIELD")]
     """Folder that megloc train-field wrote."""
     output: Output
-    """Image file for --pose, kapture folder for --along."""
+    """Image file for --pose, kapture folder for --along and --between."""
     pose: str | None = None
     """cam_from_world as qw,qx,qy,qz,tx,ty,tz; write --pose=... where the first is negative."""
     camera: str | None = None
@@ -112,8 +114,11 @@ class Render(Linked, Common):
     """Of --pose: file for the depth, 16-bit PNG in thousandths of the map's unit, 0 where empty."""
     along: Path | None = None
     """Kapture folder, e.g. a result: all its images that have poses are rendered, with depth."""
+    between: Path | None = None
+    """The map: views halfway between its neighbouring cameras are rendered, with depth, as map
+    images more (kapture_merge joins them); those that show the scene in less than half are not."""
     max_side: int | None = None
-    """Of --along: longer side of the renderings, px; larger cameras are reduced."""
+    """Of --along and --between: longer side of the renderings, px; larger cameras are reduced."""
     appearance: str | None = None
     """An image that was trained on, in whose light to render; the mean of all unless given."""
     force: Force = False
@@ -121,35 +126,36 @@ class Render(Linked, Common):
 
     def run(self) -> int:
         """Run it."""
-        from megloc_kapture.stages.neural_field import open_field, render_along
+        from megloc_kapture.stages.neural_field import open_field, render_along, views_between
 
         console = self.console()
-        if (self.pose is None) == (self.along is None):
-            raise OptionError("say what to render: either --pose and --camera, or --along")
-        if self.along is None and self.max_side is not None:
-            raise OptionError("--max-side changes nothing: it is of --along")
+        if sum(each is not None for each in (self.pose, self.along, self.between)) != 1:
+            raise OptionError("say what to render: --pose and --camera, --along or --between")
+        many = self.along or self.between
+        if many is None:
+            if self.max_side is not None:
+                raise OptionError("--max-side changes nothing: it is of --along and --between")
+            self._render_one()
+            console.result(f"rendered: {self.output}")
+            return 0
         if self.max_side is not None and self.max_side < 1:
             raise OptionError(f"--max-side {self.max_side} is not positive")
-        if self.along is not None:
-            for name in ("camera", "depth"):
-                if getattr(self, name) is not None:
-                    raise OptionError(f"--{name} changes nothing: it is of --pose")
-            field = open_field(self.field)
-            with (
-                single_threaded(),
-                staged_output(self.output, kind=RENDERED, force=self.force) as out,
-            ):
-                count = render_along(
-                    field,
-                    self.kapture(self.along),
-                    out,
-                    appearance=self.appearance,
-                    max_side_px=self.max_side,
-                )
-            console.result(f"{count} views rendered: {self.output}")
-            return 0
-        self._render_one()
-        console.result(f"rendered: {self.output}")
+        for name in ("camera", "depth"):
+            if getattr(self, name) is not None:
+                raise OptionError(f"--{name} changes nothing: it is of --pose")
+        field, data = open_field(self.field), self.kapture(many).read()
+        if not data.poses():
+            raise DataError("no image here has a pose", path=many)
+        with single_threaded(), staged_output(self.output, kind=RENDERED, force=self.force) as out:
+            count = render_along(
+                field,
+                data if self.between is None else views_between(data),
+                out,
+                appearance=self.appearance,
+                max_side_px=self.max_side,
+                min_shown=0.0 if self.between is None else _MIN_SHOWN,
+            )
+        console.result(f"{count} views rendered: {self.output}")
         return 0
 
     def _render_one(self) -> None:

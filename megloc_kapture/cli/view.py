@@ -23,6 +23,8 @@ class View(Linked, Common):
     """Localized kapture folder, or pose file."""
     gt: Path | None = None
     """Kapture folder with the true poses: queries are coloured by their error, and joined to it."""
+    rendered: Path | None = None
+    """Kapture folder of `megloc render --along RESULT`: shown beside the queries' photographs."""
     output: Output = Path("view.html")
     """File to write."""
     rerun: Annotated[Path | None, tyro.conf.arg(metavar="FILE.rrd")] = None
@@ -38,14 +40,22 @@ class View(Linked, Common):
         from megloc_kapture.evaluation.view import write_view
 
         console = self.console()
-        for path in (self.result, self.gt):
+        for path in (self.result, self.gt, self.rendered):
             if path is not None and not path.exists():
                 raise DataError("no such file or folder", path=path)
         if self.gt is not None and self.result is None:
             raise OptionError("--gt needs a result to compare with it: megloc view MAP RESULT")
+        if self.rendered is not None and self.result is None:
+            raise OptionError("--rendered needs the result it is of: megloc view MAP RESULT")
         folder = self.kapture(opened_map(self.map, console))
         left_out = write_view(
-            self.output, folder, self.result, self.gt, force=self.force, rerun=self.rerun
+            self.output,
+            folder,
+            self.result,
+            self.gt,
+            force=self.force,
+            rerun=self.rerun,
+            rendered=None if self.rendered is None else self.kapture(self.rendered),
         )
         if left_out:
             console.say(left_out)

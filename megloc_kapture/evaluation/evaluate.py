@@ -8,6 +8,7 @@ from pathlib import Path
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.metrics import Threshold
+from megloc_kapture.evaluation.pairs import evaluate_pairs
 from megloc_kapture.evaluation.protocols import Benchmark, benchmark_of
 from megloc_kapture.evaluation.results import (
     Poses,
@@ -19,7 +20,7 @@ from megloc_kapture.evaluation.results import (
     result_in_memory,
     side_tables_near,
 )
-from megloc_kapture.evaluation.scoring import Evaluation, evaluate_pairs, evaluate_poses
+from megloc_kapture.evaluation.scoring import Evaluation, evaluate_poses
 from megloc_kapture.evaluation.without_truth import WithoutTruth, evaluate_without_truth
 from megloc_kapture.io.dataset_tables import METRES, read_nowhere, unit_of
 from megloc_kapture.io.kapture import KaptureFolder

@@ -34,6 +34,7 @@ def write_view(
     cameras: Mapping[str, Camera] | None = None,
     force: bool = False,
     rerun: Path | str | None = None,
+    rendered: KaptureFolder | Path | str | None = None,
 ) -> str:
     """Write a page that shows a map in 3D, and the queries of a result in it.
 
@@ -48,6 +49,8 @@ def write_view(
     cameras : of the queries of a result in memory, where they are known.
     rerun : file (.rrd) to write the same to as a recording of Rerun's viewer, with the images; an
         existing one is overwritten only where it is a recording, or with ``force``.
+    rendered : kapture folder that ``megloc render --along`` wrote of the result; the page shows
+        rendering and depth beside the photograph of the query that is chosen.
 
     Returns
     -------
@@ -55,11 +58,12 @@ def write_view(
 
     Raises
     ------
-    DataError : map, result or truth are missing or broken, or no camera has a pose.
-    OptionError : a truth without a result.
+    DataError : map, result, truth or renderings are missing or broken, or no camera has a pose.
+    OptionError : a truth, or renderings, without a result.
     OutputError : a file cannot be written, or is another one than a view.
     ModuleNotFoundError : for ``rerun``, where the extra of that name is not installed.
     """
+    from megloc_kapture.evaluation.report.rendered import rendered_queries
     from megloc_kapture.evaluation.report.scene import render_view, scene_of
     from megloc_kapture.evaluation.report.shown_queries import StoredInliers, shown_queries
 
@@ -79,9 +83,15 @@ def write_view(
         title = found.label or title
     elif truth is not None:
         raise OptionError("a truth needs a result to be compared with")
+    elif rendered is not None:
+        raise OptionError("renderings need the result along which they were made")
     scene = scene_of(title, StoredInliers(context), queries)
     if scene is None:
         raise DataError("no image has a pose, so there is nothing to see", path=folder.root)
+    if rendered is not None:
+        views = rendered if isinstance(rendered, KaptureFolder) else KaptureFolder(rendered)
+        pictures, notes = rendered_queries(views, scene.queries, context.queries)
+        scene = replace(scene, rendered=pictures, notes=(*scene.notes, *notes))
     if rerun is not None:
         write_recording(Path(rerun), scene, context)
     write_bytes(path, render_view(scene).encode("utf-8"))

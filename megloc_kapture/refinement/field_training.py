@@ -192,18 +192,6 @@ class FieldTrainer:
         self._optimizer.step()
 
 
-def train_field(
-    views: Sequence[FieldView],
-    options: FieldTrainingOptions | None = None,
-    *,
-    module: NerfW | TriPlane | None = None,
-    progress: Callable[[int, float, list[float]], None] | None = None,
-) -> tuple[NeuralField, dict[str, float]]:
-    """Train a field at once; see :class:`FieldTrainer` for parameters, results and errors."""
-    trainer = FieldTrainer(views, options or FieldTrainingOptions(), module)
-    return trainer.train(progress=progress)
-
-
 def _groups(module: NerfW | TriPlane) -> list[dict[str, object]]:
     if isinstance(module, NerfW):
         return [{"params": list(module.parameters()), "lr": _NERF_RATE}]

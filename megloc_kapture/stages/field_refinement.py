@@ -24,6 +24,7 @@ from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.localization.absolute_pose import absolute_pose
 from megloc_kapture.localization.estimation import AbsolutePoseOptions
 from megloc_kapture.mapping.depth import sample_depth
+from megloc_kapture.plugin_loading import load_plugin, weights_of
 from megloc_kapture.plugins import (
     LOCAL_FEATURES,
     MATCHERS,
@@ -33,8 +34,6 @@ from megloc_kapture.plugins import (
     PluginChoice,
     PoseRefinement,
     RankingScene,
-    load_plugin,
-    weights_of,
 )
 from megloc_kapture.refinement.references import (
     RenderingOptions,
@@ -42,7 +41,7 @@ from megloc_kapture.refinement.references import (
     RenderingReference,
 )
 from megloc_kapture.refinement.rendering import judge_by_rendering
-from megloc_kapture.values import Camera, Failure, ImageFeatures, Options, RigidTransform
+from megloc_kapture.values import Camera, Device, Failure, ImageFeatures, Options, RigidTransform
 
 if TYPE_CHECKING:
     import torch
@@ -60,6 +59,7 @@ class FieldRefinerOptions(Options):
     """Options of the refinement by a neural field."""
 
     field: str = Field(default="", description="folder that megloc train-field wrote")
+    device: Device = Field(default="auto", description="of the field: auto, cpu, cuda or cuda:N")
     features: PluginChoice = Field(
         default=PluginChoice(name="rootsift"), description="local features that are matched"
     )
@@ -128,7 +128,7 @@ class FieldRefiner:
         from megloc_kapture.refinement.neural_field import FieldView
         from megloc_kapture.stages.neural_field import open_field
 
-        field = open_field(Path(self.options.field))
+        field = open_field(Path(self.options.field), self.options.device)
         image, mask = scene.query_image(query), scene.query_mask(query)
         fitted = _checkers(image.shape[:2])
         used = fitted if mask is None else fitted & mask

@@ -6,11 +6,13 @@ tensors; nothing in either can run.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from megloc_kapture.errors import DataError
@@ -24,7 +26,8 @@ from megloc_kapture.io.files import (
 from megloc_kapture.io.images import write_depth_map, write_image
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.io.weights import WeightsFile, describe, read_weights
-from megloc_kapture.nets.runtime import Device, load_strictly, pick_device
+from megloc_kapture.mapping.pairs import PairsByPosesOptions, pairs_by_poses
+from megloc_kapture.nets.runtime import load_strictly, pick_device
 from megloc_kapture.refinement.field_training import FieldTrainer, FieldTrainingOptions
 from megloc_kapture.refinement.neural_field import (
     FieldFrame,
@@ -35,9 +38,12 @@ from megloc_kapture.refinement.neural_field import (
     light_rows,
 )
 from megloc_kapture.stages.ranking_scene import KaptureScene
+from megloc_kapture.values import Device, RigidTransform
 
 FIELD_FILE, MANIFEST_FILE = "field.safetensors", "field.json"
 STATE_FILE = "field.state.pt"  # while it is trained
+# of views between cameras: to how many others, and how far these may look elsewhere
+_NEIGHBOURS, _MAX_ANGLE_DEG = 2, 45.0
 
 
 class FieldManifest(BaseModel):
@@ -148,13 +154,45 @@ def _opened(file: WeightsFile, device: Device) -> NeuralField:
     return NeuralField(module.to(pick_device(device)), manifest.frame, manifest.images, rows)
 
 
+def views_between(data: KaptureData) -> KaptureData:
+    """Views that no camera took: halfway between each camera and the nearest that look its way.
+
+    Poses, and cameras under sensors of their own, so that kapture merges the renderings with the
+    map; each has the camera of the first of its two images by name.
+
+    Raises
+    ------
+    DataError : no two cameras look the same way.
+    """
+    names, poses = data.image_names(), data.poses()
+    names = [name for name in names if name in poses]
+    near = PairsByPosesOptions(num_neighbours=_NEIGHBOURS, max_angle_deg=_MAX_ANGLE_DEG)
+    pairs = pairs_by_poses([poses[name] for name in names], near).tolist()
+    if not pairs:
+        raise DataError("no two cameras here look the same way: nothing is between them")
+    found = KaptureData()
+    for number, (a, b) in enumerate(pairs):
+        first, second = poses[names[a]], poses[names[b]]
+        one, other = np.array(first.quat_wxyz), np.array(second.quat_wxyz)
+        middle = one + math.copysign(1.0, one @ other) * other
+        w, x, y, z = (middle / np.linalg.norm(middle)).tolist()
+        turned = RigidTransform((w, x, y, z), (0.0, 0.0, 0.0))
+        t_x, t_y, t_z = turned.apply(-0.5 * (first.center() + second.center())).tolist()
+        sensor = f"{data.record_of(names[a])[1]}_between"
+        found.sensors[sensor] = Sensor.from_camera(data.camera_of(names[a]))
+        found.trajectories[number, sensor] = RigidTransform(turned.quat_wxyz, (t_x, t_y, t_z))
+        found.records_camera[number, sensor] = f"between/{number:06d}.png"
+    return found
+
+
 def render_along(
     field: NeuralField,
-    folder: KaptureFolder,
+    data: KaptureData,
     output: Path,
     *,
     appearance: str | None = None,
     max_side_px: int | None = None,
+    min_shown: float = 0.0,
 ) -> int:
     """Render all images of a kapture that have poses, as a kapture with depth of its own.
 
@@ -162,6 +200,7 @@ def render_along(
     ----------
     appearance : image that was trained on, whose light it is; the mean of all unless given.
     max_side_px : longer side of the renderings; larger cameras are reduced.
+    min_shown : views in which less than this share of the pixels has depth are left out.
 
     Returns
     -------
@@ -169,24 +208,32 @@ def render_along(
 
     Raises
     ------
-    DataError : no image has a pose, or the field does not know the appearance.
+    DataError : no image has a pose, two are told apart by their endings alone, or the field does
+        not know the appearance.
     """
-    data = folder.read()
     poses = data.poses()
     if not poses:
-        raise DataError("no image here has a pose", path=folder.root)
+        raise DataError("no image here has a pose")
     light = None if appearance is None else field.appearance_of(appearance)
     written = KaptureData()
+    stems = {Path(name).with_suffix(""): name for name in poses}
     for name, pose in poses.items():
+        if (other := stems[Path(name).with_suffix("")]) != name:
+            raise DataError(f"{name!r} and {other!r} would be rendered into one file")
         timestamp, sensor = data.record_of(name)
         rendering = field.render(
             data.camera_of(name), pose, appearance=light, max_side_px=max_side_px
         )
+        if np.mean(rendering.depth_m > 0) < min_shown:
+            continue
         image, depth = f"{Path(name).with_suffix('')}.png", f"{Path(name).with_suffix('')}.depth"
         ids = sensor, f"{sensor}_depth"
         for one, kind in zip(ids, ("camera", "depth"), strict=True):
             written.sensors[one] = Sensor.from_camera(rendering.camera, sensor_type=kind)
             written.trajectories[timestamp, one] = pose
+        # kapture joins depth with an image by the rig that carries both
+        same = RigidTransform.identity()
+        written.rigs[f"{sensor}_with_depth"] = dict.fromkeys(ids, same)
         written.records_camera[timestamp, ids[0]] = image
         written.records_depth[timestamp, ids[1]] = depth
         folder_of = output / "sensors" / "records_data"
@@ -194,4 +241,4 @@ def render_along(
         write_image(folder_of / image, rendering.image)
         write_depth_map(folder_of / depth, rendering.depth_m)
     write_sensors(output, written)
-    return len(poses)
+    return len(written.records_camera)

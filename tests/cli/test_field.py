@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import base64
 import json
+import re
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +16,12 @@ import numpy as np
 import pytest
 from corner import write_scene
 
+import megloc_kapture as megloc_package
+from megloc_kapture.errors import OptionError
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.tables import read_status
+from megloc_kapture.stages.rigs import depth_records
 
 pytest.importorskip("torch")
 
@@ -117,6 +124,104 @@ def test_views_along_a_result(megloc: Any, mapping: Path, field: Path, tmp_path:
     (depth,) = data.records_depth.values()
     assert (data.camera_of(name).width, data.camera_of(name).height) == (80, 60)
     assert written.depth_path(depth).stat().st_size == 4 * 80 * 60
+    # names that differ in their ending alone would become one
+    records = one / "sensors" / "records_camera.txt"
+    records.write_text(records.read_text().replace("0002.jpg", "0000.jpeg"))
+    path.write_text("".join(lines))
+    megloc("render", field, "--along", one, "-o", tmp_path / "x").refused("rendered into one file")
+
+
+def test_the_view_shows_them_beside_the_photographs(
+    megloc: Any, finished: Path, field: Path, tmp_path: Path
+) -> None:
+    found, rendered, page = finished / "localized", tmp_path / "rendered", tmp_path / "view.html"
+    assert megloc("render", field, "--along", found, "-o", rendered, "--max-side", "80").status == 0
+    view = ("view", finished / "map", found, "-o", page)
+    assert megloc(*view, "--rendered", rendered).status == 0
+    poses, photographs = KaptureFolder(found).read().poses(), KaptureFolder(finished / "query")
+    shown = {query["name"]: query["pictures"] for query in data_of(page)["queries"]}
+    assert len(poses) > 0 and {name for name, pictures in shown.items() if pictures} == set(poses)
+    for name in poses:
+        captions, addresses = zip(*shown[name], strict=True)
+        assert captions == ("photograph", "rendered at the pose", "its depth")
+        photograph, rendering, depth = (pixels_of(address) for address in addresses)
+        written = KaptureFolder(rendered)
+        whole = read_image_rgb(written.image_path(Path(name).with_suffix(".png").as_posix()))
+        # a JPEG is near what it is of, but for the fine grain of its colours
+        assert rendering.shape == whole.shape == depth.shape
+        own = cv2.resize(
+            read_image_rgb(photographs.image_path(name)),
+            photograph.shape[1::-1],
+            interpolation=cv2.INTER_AREA,
+        )
+        for picture, expected in ((rendering, whole), (photograph, own)):
+            assert apart(picture, expected) < 3
+        small = cv2.resize(photograph, whole.shape[1::-1], interpolation=cv2.INTER_AREA)
+        assert apart(small, whole) > 10
+    assert "img-src data:" in page.read_text() and len(page.read_text()) < 3_000_000
+    # without them as before, and those of other images are refused
+    assert megloc(*view).status == 0
+    assert all(query["pictures"] == [] for query in data_of(page)["queries"])
+    megloc(*view, "--rendered", finished / "mapping").refused("no image here is a query")
+    megloc("view", finished / "map", "--rendered", rendered, "-o", page).refused(
+        "--rendered needs the result it is of"
+    )
+    with pytest.raises(OptionError, match="renderings need the result"):
+        megloc_package.open_map(finished / "map").view(page, rendered=rendered)
+
+
+def data_of(page: Path) -> dict[str, Any]:
+    found = re.search(r'id="data">(.*?)</script>', page.read_text(), re.DOTALL)
+    assert found is not None
+    data: dict[str, Any] = json.loads(found[1])
+    return data
+
+
+def apart(one: np.ndarray, other: np.ndarray) -> float:
+    smooth = [cv2.blur(each, (9, 9)).astype(float) for each in (one, other)]
+    return float(np.abs(smooth[0] - smooth[1]).mean())
+
+
+def pixels_of(address: str) -> np.ndarray:
+    head, text = address.split(",")
+    assert head == "data:image/jpeg;base64"
+    return cv2.imdecode(np.frombuffer(base64.b64decode(text), np.uint8), cv2.IMREAD_COLOR_RGB)
+
+
+def test_views_that_no_camera_took_join_the_map(
+    megloc: Any, mapping: Path, field: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "between"
+    done = megloc("render", field, "--between", mapping, "-o", out, "--max-side", "64")
+    assert done.status == 0, done
+    written, real = KaptureFolder(out), KaptureFolder(mapping).read().poses()
+    written.validate(deep=True)
+    views = written.read().poses()
+    assert done.out.startswith(f"{len(views)} views rendered") and len(views) >= len(real) // 2
+    centers = np.array([pose.center() for pose in real.values()])
+    axes = np.array([pose.rotation_matrix()[2] for pose in real.values()])
+    for pose in views.values():
+        middles = 0.5 * (centers[:, None] + centers[None])
+        away = np.linalg.norm(middles - pose.center(), axis=2)
+        one, other = np.unravel_index(int(np.argmin(away)), away.shape)
+        assert away[one, other] < 1e-9 and one != other
+        # it looks between the two: as far from one as from the other
+        between = [float(np.dot(pose.rotation_matrix()[2], axes[row])) for row in (one, other)]
+        assert between[0] == pytest.approx(between[1], abs=1e-3)
+        assert min(between) >= np.dot(axes[one], axes[other]) - 1e-9
+    merge = Path(sys.executable).with_name("kapture_merge")
+    joined = tmp_path / "joined"
+    command = [merge, "-i", mapping, out, "-o", joined, "--keep-sensor-ids"]
+    subprocess.run([*map(str, command), "--image_transfer", "copy"], check=True)
+    data = KaptureFolder(joined).read()
+    assert set(data.poses()) == set(real) | set(views)
+    assert len(data.records_depth) == len(real) + len(views)
+    assert set(depth_records(data)) == set(real) | set(views)
+    assert all(KaptureFolder(joined).image_path(name).is_file() for name in data.image_names())
+    megloc("render", field, "--between", out / "none", "-o", tmp_path / "x").refused("none")
+    megloc("render", field, "--between", mapping, "--along", mapping, "-o", tmp_path / "x").refused(
+        "say what to render"
+    )
 
 
 def test_poses_are_refined_by_it_or_stay(
@@ -138,7 +243,9 @@ def test_poses_are_refined_by_it_or_stay(
 def test_what_is_refused(megloc: Any, mapping: Path, field: Path, tmp_path: Path) -> None:
     out = tmp_path / "view.png"
     pose, camera = pose_text(mapping), ("--camera", CAMERA_TEXT)
-    megloc("render", field, "-o", out).refused("either --pose and --camera, or --along")
+    megloc("render", field, "-o", out).refused(
+        "say what to render: --pose and --camera, --along or --between"
+    )
     megloc("render", field, pose, "-o", out).refused("--pose needs the --camera")
     side = ("--max-side", "9")
     megloc("render", field, pose, *camera, *side, "-o", out).refused("--max-side changes nothing")

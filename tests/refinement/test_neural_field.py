@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,7 +21,6 @@ from megloc_kapture.refinement import field_training  # noqa: E402
 from megloc_kapture.refinement.field_training import (  # noqa: E402
     FieldTrainer,
     FieldTrainingOptions,
-    train_field,
 )
 from megloc_kapture.refinement.neural_field import (  # noqa: E402
     FieldView,
@@ -34,6 +33,16 @@ from megloc_kapture.values import Camera, RigidTransform  # noqa: E402
 SMALL = Camera("PINHOLE", 32, 24, (22.0, 22.0, 16.0, 12.0))
 QUICK = FieldTrainingOptions(steps=8, rays_per_step=128, device="cpu")
 IDENTITY = RigidTransform.identity()
+
+
+def train_field(
+    given: Sequence[FieldView],
+    options: FieldTrainingOptions,
+    *,
+    module: TriPlane | None = None,
+    progress: Callable[[int, float, list[float]], None] | None = None,
+) -> tuple[NeuralField, dict[str, float]]:
+    return FieldTrainer(given, options, module).train(progress=progress)
 
 
 @pytest.fixture(autouse=True, scope="module")

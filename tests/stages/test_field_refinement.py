@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import OptionError
 from megloc_kapture.geometry.poses import movement
-from megloc_kapture.plugins import POSE_REFINERS, DepthView, PoseRefinement, load_plugin
+from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugins import POSE_REFINERS, DepthView, PoseRefinement
 from megloc_kapture.values import Camera, RigidTransform
 
 pytest.importorskip("torch")

@@ -41,7 +41,7 @@ def depth_blocks(context: ResultContext) -> tuple[Block, ...]:
     -------
     Empty where the map has no depth by stereo.
     """
-    from megloc_kapture.stages.densifying import DEPTH_FILE
+    from megloc_kapture.stages.stereo_depth import DEPTH_FILE
 
     mapping, rows = context.mapping, []
     if mapping is not None and (mapping.root / DEPTH_FILE).is_file():
@@ -68,31 +68,30 @@ def depth_blocks(context: ResultContext) -> tuple[Block, ...]:
 
 def _pictured(folder: KaptureFolder, row: DepthRow, unit: str) -> Pictures:
     """The panels of an image; raises DataError where it or its depth cannot be read."""
-    from megloc_kapture.stages.densifying import read_beside
-    from megloc_kapture.stages.fusion import read_stereo_depth
     from megloc_kapture.stages.rigs import depth_records
+    from megloc_kapture.stages.stereo_depth import read_beside, read_stereo_depth
 
     record = depth_records(folder.read()).get(row.image)
     if record is None:
         raise DataError(f"no depth record of {row.image}", path=folder.root)
     pixels = read_image_rgb(folder.image_path(row.image))
-    depth = _small(read_stereo_depth(folder, record))
+    depth = subsampled(read_stereo_depth(folder, record))
     known = depth > 0
     low, high = np.quantile(depth[known], _SPAN) if known.any() else (0.0, 0.0)
     # of inverse depth, so that what is near keeps its shades
     near = 1 / np.where(known, depth, 1)
     panels = [
         Picture(image_tag(encoded(*shrunk(pixels, width=_BOX[0], height=_BOX[1])), row.image)),
-        Picture(_tag(_colored(near, known), "depth"), f"depth, {low:.2f} to {high:.2f} {unit}"),
+        Picture(_tag(colored(near, known), "depth"), f"depth, {low:.2f} to {high:.2f} {unit}"),
     ]
     sigma, normals = (read_beside(folder.root, row.image, kind) for kind in ("sigma", "normals"))
     if sigma is not None and sigma.shape == (record.camera.height, record.camera.width):
-        share = _small(sigma) * near
+        share = subsampled(sigma) * near
         middle = 100 * float(np.median(share[known])) if known.any() else 0.0
-        picture = _tag(_colored(share, known), "standard deviation")
+        picture = _tag(colored(share, known), "standard deviation")
         panels.append(Picture(picture, f"deviation, median {middle:.2g} %"))
     if normals is not None and normals.shape[:2] == (record.camera.height, record.camera.width):
-        towards = _small(normals) * np.array([1, -1, -1], np.float32)
+        towards = subsampled(normals) * np.array([1, -1, -1], np.float32)
         colors = np.round(127.5 * (1 + towards)).clip(0, 255).astype(np.uint8)
         colors[~known] = _UNKNOWN
         panels.append(Picture(_tag(colors, "normals"), "normals"))
@@ -101,10 +100,11 @@ def _pictured(folder: KaptureFolder, row: DepthRow, unit: str) -> Pictures:
     return Pictures(row.image, facts, panels=tuple(panels))
 
 
-def _small(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Every so many pixels of a map: between two depths there need not be a surface."""
+def subsampled(values: NDArray[np.float32], box: tuple[int, int] = _BOX) -> NDArray[np.float32]:
+    """Every so many pixels of a map, so that it fits into ``box``, px: between two depths there
+    need not be a surface."""
     height, width = values.shape[:2]
-    scale = min(_BOX[0] / width, _BOX[1] / height, 1.0)
+    scale = min(box[0] / width, box[1] / height, 1.0)
     rows, columns = (
         ((np.arange(round(size * scale)) + 0.5) / scale).astype(np.int64).clip(0, size - 1)
         for size in (height, width)
@@ -112,7 +112,7 @@ def _small(values: NDArray[np.float32]) -> NDArray[np.float32]:
     return values[np.ix_(rows, columns)]
 
 
-def _colored(values: NDArray[np.floating], known: NDArray[np.bool_]) -> NDArray[np.uint8]:
+def colored(values: NDArray[np.floating], known: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """Values (H, W) as colours from purple (least) to yellow, (H, W, 3) RGB."""
     import cv2  # only a report with images waits for it
 

@@ -11,7 +11,7 @@ import base64
 import contextlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.report.map_view import top_view
+from megloc_kapture.evaluation.report.rendered import RenderedQuery
 from megloc_kapture.evaluation.report.renderers import plain, template
 from megloc_kapture.evaluation.report.shown_queries import (
     ShownQuery,
@@ -73,6 +74,7 @@ class Scene:
     frames : names of the map's coordinate frames, which share no world and are shown one at a time;
         ``point_frames``, ``camera_frames``, ``query_frames`` uint8 (P,), (C,), (Q,) say which.
     notes : sentences on what is left out.
+    rendered : query -> what was rendered at its pose.
     """
 
     title: str
@@ -94,6 +96,7 @@ class Scene:
     camera_frames: NDArray[np.uint8]
     query_frames: NDArray[np.uint8]
     notes: tuple[str, ...]
+    rendered: Mapping[str, RenderedQuery] = field(default_factory=dict)
 
 
 def scene_of(title: str, stored: StoredInliers, queries: Sequence[ShownQuery] = ()) -> Scene | None:
@@ -209,6 +212,7 @@ def render_view(scene: Scene) -> str:
                 "confidence": query.confidence,
                 "inliers": query.num_inliers,
                 "drawn": drawn,
+                "pictures": shown.panels() if (shown := scene.rendered.get(query.name)) else [],
             }
             for query, drawn in zip(scene.queries, scene.num_inliers, strict=True)
         ],
@@ -310,7 +314,8 @@ def _dense_points(
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8], list[str]]:
     """Points (N, 3) of depth by stereo with their colours (N, 3) and images; none without any."""
     from megloc_kapture.mvs.consistency import AgreementOptions  # loads more than others wait for
-    from megloc_kapture.stages.fusion import fused_cloud, stereo_images
+    from megloc_kapture.stages.fusion import fused_cloud
+    from megloc_kapture.stages.stereo_depth import stereo_images
 
     nothing = np.zeros((0, 3)), np.zeros((0, 3), np.uint8), list[str]()
     if mapping is None:
