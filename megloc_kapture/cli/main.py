@@ -10,14 +10,18 @@ import operator
 import os
 import signal
 import sys
+import threading
+import time
 import traceback
 from collections.abc import Sequence
 from importlib import import_module
-from typing import Annotated, Any, NoReturn, Protocol
+from typing import Annotated, Any, Protocol
 
 from megloc_kapture.errors import MeglocError, missing_extra
 
 DONE, DEFECT, USER_ERROR, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
+
+_ONE_END_S = 2.0  # signals within it are one wish
 
 
 class Terminated(BaseException):
@@ -130,7 +134,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     ),
     "render": (
         "field:Render",
-        "Render a view of a neural field, or all views of a result, in colour and depth.",
+        "Render a view of a neural field, views of a result, or views that no camera took.",
     ),
     "weights": (
         "weights:WeightsCommand",
@@ -165,7 +169,8 @@ def _parser(given: Sequence[str]) -> Any:
 
     import tyro
 
-    from megloc_kapture.plugins import STAGES, plugin_names
+    from megloc_kapture.plugin_loading import plugin_names
+    from megloc_kapture.plugins import STAGES
 
     stages = [name.replace("_", "-") for name in plugin_names(STAGES)]
     annotated: Any = Annotated  # of types that are values here, which mypy does not follow
@@ -182,21 +187,51 @@ def _parser(given: Sequence[str]) -> Any:
     return functools.reduce(operator.or_, entries)
 
 
-def _obey_signals() -> None:
-    """End in an orderly way on Ctrl-C and SIGTERM; a second one meanwhile changes nothing."""
+class _Ending:
+    """How Ctrl-C and SIGTERM end the process: in an orderly way, and whatever they meet.
 
-    def end(number: int, _frame: object) -> NoReturn:
-        _ignore_signals()
-        raise KeyboardInterrupt if number == signal.SIGINT else Terminated
+    A compiled module that is being imported turns the exception of a signal into an error of its
+    own, and a callback of the interpreter drops it; so what was met is kept here, and a dropped
+    one is raised again.
+    """
 
-    for one in (signal.SIGINT, signal.SIGTERM):
-        if signal.getsignal(one) != signal.SIG_IGN:  # as of what a shell runs in the background
-            signal.signal(one, end)
+    def __init__(self) -> None:
+        self.status: int | None = None  # of what was met
+        self._deaf_until = 0.0
+        self._unraisable = sys.unraisablehook
 
+    def obey(self) -> None:
+        """Let the signals of this process raise KeyboardInterrupt or Terminated."""
+        for one in (signal.SIGINT, signal.SIGTERM):
+            if signal.getsignal(one) != signal.SIG_IGN:  # as of what a shell runs behind
+                signal.signal(one, self._raise)
+        sys.unraisablehook = self._raise_again
 
-def _ignore_signals() -> None:
-    for one in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(one, signal.SIG_IGN)
+    def ignore(self) -> None:
+        """Let nothing more disturb the end of the process."""
+        for one in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(one, signal.SIG_IGN)
+        sys.unraisablehook = self._unraisable
+
+    def _raise(self, number: int, _frame: object) -> None:
+        # who presses twice means one end; who waited for it in vain, another
+        if time.monotonic() < self._deaf_until:
+            return
+        self._deaf_until = time.monotonic() + _ONE_END_S
+        interrupted = number == signal.SIGINT
+        self.status = INTERRUPTED if interrupted else TERMINATED
+        raise KeyboardInterrupt if interrupted else Terminated
+
+    def _raise_again(self, dropped: sys.UnraisableHookArgs) -> None:
+        if not issubclass(dropped.exc_type, KeyboardInterrupt | Terminated):
+            self._unraisable(dropped)
+            return
+        self._deaf_until = 0.0
+        of = signal.SIGTERM if issubclass(dropped.exc_type, Terminated) else signal.SIGINT
+        # later: raised in here it would be dropped, too
+        again = threading.Timer(0.01, os.kill, (os.getpid(), of))
+        again.daemon = True
+        again.start()
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -206,10 +241,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     orderly way.
     """
     given = sys.argv[1:] if arguments is None else arguments
+    ending = _Ending()
     debug = False
     try:
         if arguments is None:
-            _obey_signals()
+            ending.obey()
         if list(given) == ["--version"]:
             from megloc_kapture import __version__
 
@@ -226,38 +262,35 @@ def main(arguments: Sequence[str] | None = None) -> None:
         debug = command.debug
         status = command.run()
         sys.stdout.flush()
-    except MeglocError as error:
-        if debug:
-            traceback.print_exc()
-        for line in error.lines():
-            print(f"megloc: {line}", file=sys.stderr)
-        status = USER_ERROR
-    except KeyboardInterrupt:
-        print("megloc: interrupted; run the same command again to go on", file=sys.stderr)
-        status = INTERRUPTED
-    except Terminated:
-        print("megloc: terminated; run the same command again to go on", file=sys.stderr)
-        status = TERMINATED
-    except ModuleNotFoundError as error:
-        if (hint := missing_extra(error)) is None:
-            raise
-        if debug:
-            traceback.print_exc()
-        print(f"megloc: {hint}", file=sys.stderr)
-        status = USER_ERROR
-    except BrokenPipeError:
-        # who reads our output has gone; the flush at exit must not complain about it
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        status = DONE
-    except OSError as error:
-        # closed to us, or too long a name
-        if error.filename is None:
-            raise
-        if debug:
-            traceback.print_exc()
-        print(f"megloc: {error.filename}: {error.strerror}", file=sys.stderr)
-        status = USER_ERROR
+    except BaseException as error:
+        if ending.status is None and not isinstance(error, KeyboardInterrupt):
+            status = _tell(error, debug)
+        else:
+            status = ending.status or INTERRUPTED
+            how = "terminated" if status == TERMINATED else "interrupted"
+            print(f"megloc: {how}; run the same command again to go on", file=sys.stderr)
     finally:
         if arguments is None:
-            _ignore_signals()  # or Python would print tracebacks of its own ending
+            ending.ignore()  # or Python would print tracebacks of its own ending
     sys.exit(status)
+
+
+def _tell(error: BaseException, debug: bool) -> int:
+    """Tell the user's errors in a line each, and the exit status; raises again what is a defect."""
+    if isinstance(error, BrokenPipeError):
+        # who reads our output has gone; the flush at exit must not complain about it
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return DONE
+    if isinstance(error, MeglocError):
+        lines = error.lines()
+    elif isinstance(error, ModuleNotFoundError) and (hint := missing_extra(error)) is not None:
+        lines = [hint]
+    elif isinstance(error, OSError) and error.filename is not None:
+        lines = [f"{error.filename}: {error.strerror}"]  # closed to us, or too long a name
+    else:
+        raise error
+    if debug:
+        traceback.print_exception(error)
+    for line in lines:
+        print(f"megloc: {line}", file=sys.stderr)
+    return USER_ERROR

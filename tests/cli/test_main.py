@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from megloc_kapture import plugins
+from megloc_kapture import plugin_loading
 from megloc_kapture.cli.arguments import summary
 from megloc_kapture.cli.console import Console
 from megloc_kapture.cli.main import COMMANDS, command_class
@@ -114,7 +114,7 @@ def test_a_rendered_dataset_is_refused_in_one_line(
         "nothing renders 'venice'; known: 4seasons, aachen"
     )
     megloc("synth", "aachen", "-o", out, "--set", "width=3").refused("'aachen' .* width: .* 64")
-    monkeypatch.setattr(plugins, "entry_points", lambda group: EntryPoints())
+    monkeypatch.setattr(plugin_loading, "entry_points", lambda group: EntryPoints())
     megloc("synth", "aachen", "-o", out).refused("pip install megloc-twins")
     monkeypatch.undo()
     assert not out.exists()
@@ -174,3 +174,59 @@ def test_progress_says_how_many_how_fast_and_how_long(
         start = f"  features, 4 of 7 kept: {number} of 3, "
         assert re.fullmatch(re.escape(start) + r"[0-9.e+]+/s, 0:00:00 left", line)
     assert len(lines) == 2
+
+
+# what a signal's exception meets on its way: a compiled module that is being imported makes an
+# error of its own of it (pycolmap, poselib), a callback of the interpreter drops it, and so does
+# who catches all
+MEETINGS = {
+    "made another error": """
+        try:
+            signal.raise_signal(NUMBER)
+        except BaseException as error:
+            raise RuntimeError("cannot import the C++ backend") from error
+    """,
+    "made an error of the user's": """
+        try:
+            signal.raise_signal(NUMBER)
+        except BaseException as error:
+            raise MeglocError("cannot be loaded") from error
+    """,
+    "dropped by the interpreter": """
+        class Dropping:
+            def __del__(self):
+                signal.raise_signal(NUMBER)
+        Dropping()
+        time.sleep(60.0)
+    """,
+    "caught, and asked again": """
+        try:
+            signal.raise_signal(NUMBER)
+        except BaseException:
+            signal.raise_signal(NUMBER)  # at once: the same wish
+        ending._deaf_until = 0.0  # and later
+        signal.raise_signal(NUMBER)
+        time.sleep(60.0)
+    """,
+}
+
+
+@pytest.mark.parametrize(("number", "told"), [("SIGINT", "interrupted"), ("SIGTERM", "terminated")])
+@pytest.mark.parametrize("meeting", MEETINGS.values(), ids=MEETINGS)
+def test_a_signal_ends_a_run_whatever_it_meets(number: str, told: str, meeting: str) -> None:
+    meeting = meeting.replace("NUMBER", f"signal.{number}").replace("\n        ", "\n    ")
+    script = f"""
+import signal, sys, time
+from megloc_kapture.cli import main
+from megloc_kapture.cli.doctor import Doctor
+from megloc_kapture.errors import MeglocError
+def run(self):
+    ending = signal.getsignal(signal.SIGINT).__self__
+{meeting}
+Doctor.run = run
+sys.argv = ["megloc", "doctor"]
+main.main()
+"""
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert run.stderr == f"megloc: {told}; run the same command again to go on\n"
+    assert run.returncode == {"SIGINT": 130, "SIGTERM": 143}[number]
