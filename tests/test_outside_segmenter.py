@@ -20,7 +20,8 @@ import torch
 
 from megloc_kapture.errors import DataError, PluginError
 from megloc_kapture.io.images import read_image_rgb
-from megloc_kapture.plugins import SEGMENTERS, load_plugin, plugin_names, weights_of
+from megloc_kapture.plugin_loading import load_plugin, plugin_names, weights_of
+from megloc_kapture.plugins import SEGMENTERS
 
 pytestmark = pytest.mark.slow
 

@@ -173,13 +173,39 @@ class Reading(Linked):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Choosing:
+class Computing:
+    """Flags that say where and how networks compute."""
+
+    device: str | None = None
+    """Where networks compute: auto (a GPU where there is one), cpu, cuda, or cuda:N."""
+    precision: Literal["full", "half"] | None = None
+    """Of networks; half: float16 on a GPU, bfloat16 on a processor. Full unless given."""
+
+    def placement(self) -> list[str]:
+        """As ``--set`` takes them."""
+        given = {"device": self.device, "precision": self.precision}
+        return [f"{name}={value}" for name, value in given.items() if value is not None]
+
+    def check_computes(self, chosen: object) -> None:
+        """Raise OptionError where no network, of options or a tuple of them, has what is given."""
+        from megloc_kapture.stages.devices import unheeded
+
+        if lacking := unheeded(chosen, self.device or "auto", self.precision or "full"):
+            raise OptionError(f"--{lacking[0]} changes nothing: no network here has it")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Choosing(Computing):
     """Flags that choose options."""
 
     preset: str | None = None
     """A set of options by name: classic, modern, modern-large, megloc."""
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
     """Change an option: key.key=value; may be repeated."""
+
+    def assignments(self) -> tuple[str, ...]:
+        """What is set by --set and by flags of its own."""
+        return (*self.set, *self.placement())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,5 +219,5 @@ class Deciding(Choosing):
     def assignments(self) -> tuple[str, ...]:
         """What is set by --set and by flags of its own."""
         if self.min_confidence is None:
-            return self.set
-        return (*self.set, f"localization.min_confidence={self.min_confidence:g}")
+            return super().assignments()
+        return (*super().assignments(), f"localization.min_confidence={self.min_confidence:g}")

@@ -15,7 +15,7 @@ from megloc_kapture.datasets.kapture_folders import QUERY
 from megloc_kapture.datasets.megadepth import MegaDepthOptions, import_megadepth
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.dataset_tables import METRES, SIDE_TABLES, write_unit
-from megloc_kapture.io.files import staged_output
+from megloc_kapture.io.output_folders import staged_output
 from megloc_kapture.pipeline.colmap_maps import import_colmap
 from megloc_kapture.pipeline.datasets import (
     KAPTURE,

@@ -8,10 +8,10 @@ from pathlib import Path
 from megloc_kapture.cli.common import Force, Input, Output, Reading
 from megloc_kapture.cli.stage_command import StageCommand, restrictions_beside
 from megloc_kapture.cli.stages import MAP
-from megloc_kapture.io.files import staged_output
 from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.output_folders import staged_output
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
-from megloc_kapture.stages.densifying import densify_map
+from megloc_kapture.stages.densifying import densify_map, fitted_to_poses
 from megloc_kapture.stages.fusion import fuse_depth
 from megloc_kapture.stages.work import Work
 
@@ -62,6 +62,7 @@ class Densify(Reading, StageCommand):
                 + (f"; {counts['points_lifted']} keypoints lifted" if self.points else "")
             )
             if self.fuse is not None:
-                fused = fuse_depth(KaptureFolder(out), self.fuse, options.agreement, work=work)
+                agreement = fitted_to_poses(source, options)[0].agreement
+                fused = fuse_depth(KaptureFolder(out), self.fuse, agreement, work=work)
                 console.say(f"{fused} points in {self.fuse}")
         return 0

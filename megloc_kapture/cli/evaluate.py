@@ -11,7 +11,7 @@ import tyro
 from megloc_kapture.cli.common import Common, Force, existing
 from megloc_kapture.cli.stages import Inputs
 from megloc_kapture.errors import OptionError
-from megloc_kapture.io.files import staged_output
+from megloc_kapture.io.output_folders import staged_output
 
 EVALUATION = "evaluation"
 

@@ -23,7 +23,8 @@ from megloc_kapture.pipeline.local_types import local_types_of
 from megloc_kapture.pipeline.map_retrieval import MapRetrieval
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, options_of_preset
 from megloc_kapture.pipeline.queries import Preprocessor
-from megloc_kapture.plugins import LOCAL_FEATURES, PluginChoice, load_plugin
+from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugins import LOCAL_FEATURES, PluginChoice
 from megloc_kapture.stages.matches import FeatureCache
 
 _COLUMN = 18

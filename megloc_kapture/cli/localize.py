@@ -27,15 +27,15 @@ from megloc_kapture.cli.common import (
 )
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.dataset_tables import METRES
-from megloc_kapture.io.files import staged_output
 from megloc_kapture.io.kapture import KaptureFolder, read_pairs
+from megloc_kapture.io.output_folders import staged_output
 from megloc_kapture.io.tables import STATUS_FILE
 from megloc_kapture.pipeline.executors import available_cores
 from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
+from megloc_kapture.pipeline.kapture_queries import KaptureQueries
 from megloc_kapture.pipeline.localizer import LOCALIZING, Localizer
 from megloc_kapture.pipeline.photographs import Photographs
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, assigned, options_of_preset
-from megloc_kapture.pipeline.queries import KaptureQueries
 from megloc_kapture.pipeline.results import Results
 from megloc_kapture.stages.layout import LOCALIZED
 from megloc_kapture.stages.matches import iterate_candidates
@@ -98,7 +98,7 @@ class Localize(Reading, Deciding, Common):
         localizer = Localizer(kapture_map, options=options)
         results = Results(localizer, folder, workers=workers, candidates=given, track=console.track)
         queries = results.queries
-        check_acted_on(assigned(self.set), localizer, queries, pairs=given is not None)
+        check_acted_on(assigned(self.assignments()), localizer, queries, pairs=given is not None)
         with staged_output(self.output, kind=LOCALIZED, force=self.force) as out:
             started = time.perf_counter()
             named = list(results.items())

@@ -49,7 +49,7 @@ class MapPhotographs(Choosing, Working, Common):
         """Run it."""
         console = self.console()
         options = options_of_photographs(
-            self.preset or DEFAULT_PRESET, self.set, used=MAPPING_OPTIONS
+            self.preset or DEFAULT_PRESET, self.assignments(), used=MAPPING_OPTIONS
         )
         camera = None if self.camera is None else camera_of_text(self.camera)
         photographs = Photographs(self.images, camera, every=self.every)

@@ -19,6 +19,7 @@ from megloc_kapture.pipeline.presets import (
     options_of,
     options_of_preset,
 )
+from megloc_kapture.plugin_loading import plugin_class, plugin_names
 from megloc_kapture.plugins import (
     DATASETS,
     GLOBAL_FEATURES,
@@ -28,8 +29,6 @@ from megloc_kapture.plugins import (
     POSE_REFINERS,
     SEGMENTERS,
     PluginChoice,
-    plugin_class,
-    plugin_names,
 )
 from megloc_kapture.stages.global_features import VLAD
 from megloc_kapture.values import Options

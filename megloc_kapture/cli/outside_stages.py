@@ -15,7 +15,8 @@ from megloc_kapture.pipeline.executors import available_cores, single_threaded
 from megloc_kapture.pipeline.plan import describe, run_plan
 from megloc_kapture.pipeline.presets import assigned
 from megloc_kapture.pipeline.workspace import Workspace
-from megloc_kapture.plugins import STAGES, load_plugin, plugin_class
+from megloc_kapture.plugin_loading import load_plugin, plugin_class
+from megloc_kapture.plugins import STAGES
 from megloc_kapture.stages.work import Work
 
 

@@ -10,11 +10,22 @@ from typing import Annotated, Any
 import tyro
 from pydantic import ValidationError
 
-from megloc_kapture.cli.common import Common, Force, Input, Linked, Output, Working, existing
+from megloc_kapture.cli.common import (
+    Common,
+    Computing,
+    Force,
+    Input,
+    Linked,
+    Output,
+    Working,
+    existing,
+)
 from megloc_kapture.errors import OptionError
-from megloc_kapture.io.files import first_problem, replace_directory, staged_output
+from megloc_kapture.io.files import first_problem
+from megloc_kapture.io.output_folders import replace_directory, staged_output
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.presets import assigned
+from megloc_kapture.stages.devices import placed
 from megloc_kapture.stages.preprocessing import (
     REPORT_FILE,
     PreprocessingOptions,
@@ -40,7 +51,7 @@ Several = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Preprocess(Linked, Working, Common):
+class Preprocess(Linked, Computing, Working, Common):
     """Resize, undistort and mask the images of a kapture; poses stay, cameras follow."""
 
     input: Input
@@ -115,9 +126,11 @@ class Preprocess(Linked, Working, Common):
         }
         changes = tree.pop("masks", {})
         try:
-            return PreprocessingOptions.model_validate({**tree, "masks": {**masks, **changes}})
+            options = PreprocessingOptions.model_validate({**tree, "masks": {**masks, **changes}})
         except ValidationError as error:
             raise OptionError(f"option {first_problem(error)}") from error
+        self.check_computes(options)
+        return placed(options, self.device or "auto", self.precision or "full")
 
     def _fixed_masks(self) -> Iterator[dict[str, Any]]:
         for camera, value in _assignments("--bottom-share", self.bottom_share):

@@ -8,7 +8,8 @@ from pathlib import Path
 from megloc_kapture.cli.common import Force, Input, Output, Reading
 from megloc_kapture.cli.stage_command import StageCommand
 from megloc_kapture.cli.stages import MAP
-from megloc_kapture.io.files import read_json_model, staged_output
+from megloc_kapture.io.files import read_json_model
+from megloc_kapture.io.output_folders import staged_output
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.stages.map_refinement import REPORT_FILE, RefinementReport, refine_map
 from megloc_kapture.stages.work import Work

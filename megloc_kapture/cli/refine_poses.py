@@ -11,10 +11,11 @@ from megloc_kapture.cli.common import Force, Input, Linked, Output
 from megloc_kapture.cli.stage_command import StageCommand, restrictions_beside
 from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.report.refinement import consistency_sentence
-from megloc_kapture.io.files import staged_output
+from megloc_kapture.io.output_folders import staged_output
 from megloc_kapture.io.tables import CONSISTENCY_FILE, read_consistency
 from megloc_kapture.pipeline.executors import single_threaded
-from megloc_kapture.plugins import POSE_REFINERS, plugin_names
+from megloc_kapture.plugin_loading import plugin_names
+from megloc_kapture.plugins import POSE_REFINERS
 from megloc_kapture.stages.layout import LOCALIZED
 from megloc_kapture.stages.pose_refinement import refine_poses
 from megloc_kapture.stages.work import Work

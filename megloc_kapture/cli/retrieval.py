@@ -20,7 +20,7 @@ from megloc_kapture.io.kapture import ImagePair, KaptureFolder, write_pairs
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.retrieval.fusion import FusionMethod
 from megloc_kapture.stages.candidates import Retrieval
-from megloc_kapture.stages.global_features import GlobalFeaturesChoice, extract_global_features
+from megloc_kapture.stages.global_features import extract_global_features
 from megloc_kapture.stages.global_vlad import extract_vlad, vlad_type
 from megloc_kapture.stages.image_pairs import PairingMethod, pair_map_images, pair_queries
 from megloc_kapture.stages.matches import match_pairs
@@ -50,16 +50,13 @@ class ExtractGlobal(Reading, StageCommand):
     def run(self) -> int:
         """Run it."""
         console = self.console()
-        named = {chosen.name: chosen for chosen in self.options().global_features}
-        choices = [
-            named.get(name, GlobalFeaturesChoice(name=name)) for name in self.features or named
-        ]
+        choices = self.options(self.named("global_features", self.features)).global_features
         folders = [self.kapture(folder) for folder in (self.input, *self.query)]
-        extractors = {chosen.name: chosen.make() for chosen in choices if not chosen.is_vlad}
+        extractors = {one.name: one.make() for one in choices if not one.is_vlad}
         with self.features_folder(self.output, force=self.force) as (out, work):
-            for chosen in choices:
-                if chosen.is_vlad:
-                    options = chosen.vlad_options()
+            for choice in choices:
+                if choice.is_vlad:
+                    options = choice.vlad_options()
                     local_type = only_type(
                         folders[0], "descriptors", self.local_type or options.local_type
                     )
@@ -73,7 +70,7 @@ class ExtractGlobal(Reading, StageCommand):
                         work=work,
                     )
                 else:
-                    extractor = extractors[chosen.name]
+                    extractor = extractors[choice.name]
                     type_name = extractor.name
                     counts = extract_global_features(folders, extractor, out, work=work)
                 console.say(f"{type_name}: {counts['images']} images")
@@ -177,6 +174,8 @@ class PairsQuery(Reading, StageCommand):
         matching = ("local_features", "matching", "verification", "query_verification")
         also = () if self.rerank is None else matching
         options = self.options({"query_pairs": changes}, also=also)
+        of_types = (chosen.matching for chosen in options.local_features)
+        self.check_computes((options.matching, *of_types))
         retrieval = None
         if not self.exhaustive:
             retrieval = _retrieval(mapping, self.features, self.fusion, options)

@@ -86,7 +86,7 @@ class Serve(Reading, Deciding, Common):
             )
             kapture_map = served.open()
             check_consistent(kapture_map, self.map, force=self.force)
-            check_acted_on(assigned(self.set), kapture_map, options)
+            check_acted_on(assigned(self.assignments()), kapture_map, options)
 
             def ready() -> None:
                 host = f"[{self.host}]" if ":" in self.host else self.host

@@ -10,10 +10,10 @@ from typing import ClassVar
 
 from megloc_kapture.cli.common import Choosing, Common, Working, side_tables_beside
 from megloc_kapture.errors import OptionError
-from megloc_kapture.io.files import staged_output
 from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.output_folders import staged_output
 from megloc_kapture.pipeline.executors import single_threaded
-from megloc_kapture.pipeline.presets import DEFAULT_PRESET, options_of_preset
+from megloc_kapture.pipeline.presets import DEFAULT_PRESET, assigned, options_of_preset
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.work import Work
@@ -34,13 +34,27 @@ class StageCommand(Choosing, Working, Common):
         Parameters
         ----------
         also : options that are acted on beside :attr:`uses`, because of other flags.
+
+        Raises
+        ------
+        OptionError : see ``options_of_preset``; or a device is given and no network is used.
         """
-        return options_of_preset(
+        used = (*self.uses, *also)
+        options = options_of_preset(
             self.preset or DEFAULT_PRESET,
-            changes=[changes or {}],
+            changes=[changes or {}, assigned(self.placement())],
             assignments=self.set,
-            used=(*self.uses, *also),
+            used=used,
         )
+        self.check_computes(tuple(getattr(options, name) for name in used))
+        return options
+
+    def named(self, key: str, names: Sequence[str]) -> dict[str, object]:
+        """Changes that choose plugins by their names, with the settings that the preset has of
+        them; none without names."""
+        preset = getattr(options_of_preset(self.preset or DEFAULT_PRESET), key)
+        known = {one.name: one.model_dump() for one in preset}
+        return {key: [known.get(name, {"name": name}) for name in names]} if names else {}
 
     @contextmanager
     def features_folder(self, output: Path, *, force: bool) -> Iterator[tuple[Path, Work]]:

@@ -12,10 +12,11 @@ import tyro
 from megloc_kapture.cli.common import Force, Input, Linked, Output, Reading
 from megloc_kapture.cli.stage_command import StageCommand, only_type
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.io.files import staged_output
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs
+from megloc_kapture.io.output_folders import staged_output
 from megloc_kapture.pipeline.executors import available_cores
-from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS, load_plugin
+from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugins import MATCHERS
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.matches import match_pairs
 from megloc_kapture.stages.triangulation import triangulate_map
@@ -46,10 +47,8 @@ class ExtractLocal(Linked, StageCommand):
         if not self.input:
             raise OptionError("no kapture folder given; use -i")
         folders = [self.kapture(path) for path in self.input]
-        options = self.options()
-        chosen = {one.name: one.options for one in options.local_features}
-        names = self.features or tuple(chosen)
-        extractors = [load_plugin(LOCAL_FEATURES, name, chosen.get(name, {})) for name in names]
+        options = self.options(self.named("local_features", self.features))
+        extractors = options.make_extractors()
         with self.features_folder(self.output, force=self.force) as (out, work):
             for extractor in extractors:
                 counts = extract_local_features(
@@ -106,10 +105,10 @@ class Match(Reading, StageCommand):
         changes: dict[str, object] = {"matching": {"name": self.matcher}} if self.matcher else {}
         between = "mapping_verification" if self.query is None else "query_verification"
         options = self.options(changes, also=(between,))
-        if self.matcher:  # also where the preset has another one for this type
-            matcher = load_plugin(MATCHERS, self.matcher, options.matching.options)
-        else:
-            matcher = options.make_matcher(local_type)
+        # --matcher also where the preset has another one for this type
+        chosen = options.matching if self.matcher else options.matching_of(local_type)
+        self.check_computes(chosen)
+        matcher = load_plugin(MATCHERS, chosen.name, chosen.options)
         first, verification = mapping, options.verify_mapping()
         if self.query is not None:
             first = self.kapture(self.query)

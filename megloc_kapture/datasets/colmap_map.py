@@ -36,7 +36,8 @@ from megloc_kapture.io.kapture import (
     writable_name,
     write_sensors,
 )
-from megloc_kapture.plugins import LOCAL_FEATURES, load_plugin
+from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugins import LOCAL_FEATURES
 from megloc_kapture.stages.given_map import given_map
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.work import HERE, Work

@@ -54,12 +54,14 @@ def check_root(root: Path) -> Path:
     if not root.is_dir():
         raise DataError("no such folder", path=root)
     for part in (MAPPING, QUERY):
-        if not (root / part / "sensors" / "sensors.txt").is_file():
+        try:  # is_file() of Python 3.14 takes what may not be read for missing
+            (root / part / "sensors" / "sensors.txt").stat()
+        except (FileNotFoundError, NotADirectoryError) as error:
             raise DataError(
                 f"{part}/sensors/sensors.txt is missing; a dataset of kapture folders has "
                 "mapping/ and query/, and query_gt/ where the true poses are known",
                 path=root,
-            )
+            ) from error
     return root
 
 

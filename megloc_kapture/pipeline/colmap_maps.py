@@ -29,12 +29,12 @@ from megloc_kapture.io.files import (
     output_error,
     read_json_model,
     remove,
-    replace_directory,
     temporary_name,
     user_cache,
     write_json_model,
 )
 from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.output_folders import replace_directory
 from megloc_kapture.pipeline.evaluation_plan import plan_map
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.plan import run_plan

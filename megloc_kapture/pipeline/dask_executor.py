@@ -7,6 +7,7 @@ that joins later, is asked for that and for equal packages and weights before it
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import os
 import platform
@@ -16,8 +17,10 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Executor, Future, InvalidStateError
+from concurrent.futures import wait as wait_for
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from signal import SIGINT
@@ -29,7 +32,7 @@ from distributed.comm.core import CommClosedError
 
 from megloc_kapture.errors import MeglocError, OptionError
 from megloc_kapture.io.files import clear_leftovers, owned_name
-from megloc_kapture.io.weights import describe, files_of, sha256_of
+from megloc_kapture.io.weights import describe, files_of, sha256_of, share_weights
 from megloc_kapture.io.weights.registry import registry
 from megloc_kapture.pipeline.executors import deaf_to, enter_single_threaded
 
@@ -75,7 +78,7 @@ def dask_executor(workers: int, scheduler: str | None, shared: Path) -> Iterator
         plugin = _Preparation.of_this_process(shared, elsewhere=scheduler is not None)
         try:
             client.register_plugin(plugin, name="megloc")
-            executor = _ClusterExecutor(client)
+            executor = _ClusterExecutor(client, is_elsewhere=scheduler is not None)
             try:
                 yield executor
             finally:
@@ -144,18 +147,23 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Client]:
 
 
 class _ClusterExecutor(Executor):
-    """A client's executor, for functions that may give something else each time they are called.
+    """Runs functions on a client's workers; they may give something else each time.
+
+    dask's own executor looks at a task's state after its result has come, and raises an error of
+    its own making where the worker that had the result has died in between.
 
     Attributes
     ----------
     window : items that keep all workers busy.
+    is_elsewhere : its machines have GPUs of their own, if any.
     over : set where nothing is waited for any more.
     """
 
-    def __init__(self, client: Client) -> None:
+    def __init__(self, client: Client, *, is_elsewhere: bool) -> None:
+        self.is_elsewhere = is_elsewhere
         self.over = threading.Event()
-        self._executor = client.get_executor(pure=False)
         self._client = client
+        self._loop: Any = client.loop
         self._waiting: set[Future[Any]] = set()
         threading.Thread(target=self._watch, daemon=True).start()
         threads = sum(one["nthreads"] for one in client.scheduler_info(-1)["workers"].values())
@@ -163,10 +171,31 @@ class _ClusterExecutor(Executor):
 
     def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """A future of the result, which a worker computes with one thread per matrix product."""
-        found: Future[Any] = self._executor.submit(_single_threaded, function, *args, **kwargs)
+        call = partial(_single_threaded, function, *args, **kwargs)
+        task, found = self._client.submit(call, pure=False), Future[Any]()
+
+        def ended(_: Future[Any]) -> None:
+            self._waiting.discard(found)
+            if found.cancelled() and task.status != "cancelled":
+                task.cancel()
+
         self._waiting.add(found)
-        found.add_done_callback(self._waiting.discard)
+        found.add_done_callback(ended)
+        self._loop.add_callback(self._deliver, task, found)
         return found
+
+    async def _deliver(self, task: Any, found: Future[Any]) -> None:
+        try:
+            result = await self._client.gather(task, asynchronous=True)
+        except (CancelledError, asyncio.CancelledError):
+            if found.cancel():
+                found.set_running_or_notify_cancel()  # which wakes who waits for several
+        except BaseException as error:
+            with suppress(InvalidStateError):  # it was given up meanwhile
+                found.set_exception(error)
+        else:
+            with suppress(InvalidStateError):
+                found.set_result(result)
 
     def _watch(self) -> None:
         """End futures of a scheduler that has gone: dask forgets what is asked while it reconnects,
@@ -179,7 +208,11 @@ class _ClusterExecutor(Executor):
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Wait for what is under way, or cancel it."""
-        self._executor.shutdown(wait=wait and not cancel_futures)
+        under_way = list(self._waiting)
+        if wait and not cancel_futures:
+            wait_for(under_way)
+        for future in under_way:
+            future.cancel()
 
 
 _prepared = threading.local()
@@ -202,12 +235,14 @@ class _Preparation(WorkerPlugin):
     weights : sha256 of the files of networks that this process has.
     folder : current folder, which relative paths start from.
     token : file in the shared folder.
+    elsewhere : the workers were there before, and stay.
     """
 
     packages: dict[str, str]
     weights: dict[str, str]
     folder: Path
     token: Path
+    elsewhere: bool
     name = "megloc"
 
     @classmethod
@@ -215,7 +250,8 @@ class _Preparation(WorkerPlugin):
         shared.mkdir(parents=True, exist_ok=True)
         handle, token = tempfile.mkstemp(prefix=f".{owned_name()}", dir=shared.resolve())
         os.close(handle)
-        return cls(_packages(), _weights() if elsewhere else {}, Path.cwd(), Path(token))
+        weights = _weights() if elsewhere else {}
+        return cls(_packages(), weights, Path.cwd(), Path(token), elsewhere)
 
     def setup(self, worker: Worker) -> None:
         """Raise MeglocError where the worker differs."""
@@ -239,6 +275,8 @@ class _Preparation(WorkerPlugin):
             if own.get(name) != sha256:
                 there = "other weights" if name in own else "no weights"
                 raise MeglocError(f"{where} has {there} of {name} (megloc weights list)")
+        if not self.elsewhere:  # their folder goes with the run
+            share_weights(Path(worker.local_directory).parent)
         cv2.setNumThreads(1)
 
 

@@ -27,14 +27,8 @@ from megloc_kapture.evaluation.protocols import TWIN_PREFIX
 from megloc_kapture.io.dataset_tables import SIDE_TABLES, Protocol
 from megloc_kapture.io.files import write_bytes
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.plugins import (
-    DATASETS,
-    RENDERED_DATASETS,
-    DatasetAdapter,
-    RenderedDataset,
-    load_plugin,
-    plugin_names,
-)
+from megloc_kapture.plugin_loading import load_plugin, plugin_names
+from megloc_kapture.plugins import DATASETS, RENDERED_DATASETS, DatasetAdapter, RenderedDataset
 from megloc_kapture.stages.work import Work
 
 KAPTURE, SYNTHETIC = "kapture", "synthetic"

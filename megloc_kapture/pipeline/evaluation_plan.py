@@ -19,7 +19,8 @@ from megloc_kapture.pipeline.datasets import DatasetChoice, with_model
 from megloc_kapture.pipeline.missing_weights import check_weights
 from megloc_kapture.pipeline.run import Run
 from megloc_kapture.pipeline.submission import write_submission
-from megloc_kapture.plugins import STAGES, load_plugin
+from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugins import STAGES
 from megloc_kapture.stages.densifying import Densify
 from megloc_kapture.stages.global_features import ExtractGlobalFeatures
 from megloc_kapture.stages.image_pairs import PairMapping, PairQueries

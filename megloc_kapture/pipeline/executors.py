@@ -41,7 +41,8 @@ class _SingleThreads:
     - BLAS has one pool for the process: the first block that opens limits it, and the last that
       closes gives it back, whichever threads these are. threadpoolctl ignores all threads but the
       one that set OpenBLAS first, as long as that one lives; so its claim is cleared.
-    - OpenMP counts for each thread that calls it: every thread limits its own.
+    - OpenMP counts for each thread that calls it, and so does an OpenBLAS made with it, as FAISS
+      brings one: every thread limits its own.
     - torch keeps both, the process's number being that of threads it has not met yet, and it
       overrides MKL and OpenMP; so every thread sets it last.
 
@@ -64,17 +65,15 @@ class _SingleThreads:
         from threadpoolctl import ThreadpoolController
 
         with self._lock:
-            libraries = ThreadpoolController()
+            blas, openmp = _pools(ThreadpoolController())
             if self._threads == 0:
                 self._variable = os.environ.get("OMP_NUM_THREADS")
                 os.environ["OMP_NUM_THREADS"] = "1"
-                blas = libraries.select(user_api="blas").lib_controllers
                 self._blas = {library.filepath: library.num_threads for library in blas}
                 torch = _loaded_torch()
                 self._torch = self._default() if torch is None else torch.get_num_threads()
                 _set_blas(blas, dict.fromkeys(self._blas, 1))
             self._threads += 1
-            openmp = libraries.select(user_api="openmp").lib_controllers
             self._own.openmp = {library.filepath: library.num_threads for library in openmp}
             for library in openmp:
                 library.set_num_threads(1)
@@ -88,14 +87,13 @@ class _SingleThreads:
         from threadpoolctl import ThreadpoolController
 
         with self._lock:
-            libraries = ThreadpoolController()
-            for library in libraries.select(user_api="openmp").lib_controllers:
+            blas, openmp = _pools(ThreadpoolController())
+            for library in openmp:
                 number = self._own.openmp.get(library.filepath, self._default())
                 library.set_num_threads(number)
             self._threads -= 1
             _set_torch(self._torch, others=1 if self._threads else self._torch)
             if self._threads == 0:
-                blas = libraries.select(user_api="blas").lib_controllers
                 before = {library.filepath: self._default() for library in blas} | self._blas
                 _set_blas(blas, before)
                 _clear_claim(blas)
@@ -107,6 +105,14 @@ class _SingleThreads:
         """Threads of a library that is loaded without a block."""
         number = (self._variable or "").split(",")[0].strip()  # "4,2" is for nested regions
         return int(number) if number.isdigit() and int(number) > 0 else available_cores()
+
+
+def _pools(libraries: Any) -> tuple[list[Any], list[Any]]:
+    """Libraries with a pool for the process, and those that count for each thread."""
+    blas = libraries.select(user_api="blas").lib_controllers
+    own = [one for one in blas if getattr(one, "threading_layer", None) == "openmp"]
+    openmp = libraries.select(user_api="openmp").lib_controllers
+    return [one for one in blas if one not in own], [*openmp, *own]
 
 
 def _set_blas(libraries: Sequence[Any], numbers: Mapping[str, int]) -> None:
@@ -174,10 +180,13 @@ _PATIENCE_S = 600.0  # of silence before a line says so
 _log = logging.getLogger(__name__)
 
 
-def _start_worker() -> None:
+def _start_worker(shared: Path) -> None:
     import cv2
     import numpy  # noqa: F401  its thread pool must be there to be limited
 
+    from megloc_kapture.io.weights import share_weights
+
+    share_weights(shared)
     end_with_parent()
     enter_single_threaded()
     cv2.setNumThreads(1)
@@ -292,7 +301,10 @@ def open_executor(
         _name_as_ours()
         with deaf_to(signal.SIGINT):
             forkserver.ensure_running()
-        pool = _WatchedPool(count, mp_context=context, initializer=_start_worker)
+        temporary = Path(get_temp_dir())  # ends with the run
+        pool = _WatchedPool(
+            count, mp_context=context, initializer=_start_worker, initargs=(temporary,)
+        )
     except OSError as error:
         raise output_error(tempfile.gettempdir(), error) from error
     try:

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, OptionError, OutputError, suggestion
 from megloc_kapture.io.dataset_tables import read_world, tables_of
-from megloc_kapture.io.files import staged_output
 from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.output_folders import staged_output
 from megloc_kapture.pipeline import export_formats as formats
 from megloc_kapture.pipeline.colmap_maps import kapture_of
 from megloc_kapture.pipeline.export_formats import GeoOrigin, PosedImage, Scene

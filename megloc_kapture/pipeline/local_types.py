@@ -11,29 +11,32 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.weights import MissingWeightsError
-from megloc_kapture.localization.cluster_poses import ImageMatches
+from megloc_kapture.localization.query_views import ImageMatches
 from megloc_kapture.matching.guided_pyramid import base_type, equivalent_types
 from megloc_kapture.pipeline.kapture_map import KaptureMap, MapKeypoints
 from megloc_kapture.pipeline.queries import QueryImage
+from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import (
     LOCAL_FEATURES,
     MATCHERS,
     LocalFeatureExtractor,
     Matcher,
     PluginChoice,
-    load_plugin,
 )
+from megloc_kapture.stages.devices import BATCH, placed
 from megloc_kapture.stages.given_map import rows_found_again
 from megloc_kapture.stages.guided_pyramid import PyramidMethod, retry_query
-from megloc_kapture.stages.local_features import extract_checked, read_frame
+from megloc_kapture.stages.local_features import extract_all, read_frame
 from megloc_kapture.stages.matches import (
     FeatureCache,
     Features,
     VerifiedMatches,
-    match_images,
+    match_all,
     verification_of,
+    verified,
 )
 from megloc_kapture.stages.options import LocalFeaturesChoice, PipelineOptions
+from megloc_kapture.stages.work import batched
 
 _MIN_FOUND_AGAIN = 0.5
 _NO_MATCHES = VerifiedMatches(np.zeros((0, 2), np.int64), np.zeros(0, np.float32), 0)
@@ -99,7 +102,7 @@ class LocalType:
         DataError : none is installed, or the options' makes features of another type.
         PluginError, MissingWeightsError : it cannot be made.
         """
-        found = self._extractor_choice()
+        found = self.brought()
         if found is None:
             raise DataError(
                 f"features of type {self.name!r} are missing and no extractor for them is "
@@ -109,10 +112,11 @@ class LocalType:
         extractor: LocalFeatureExtractor = load_plugin(LOCAL_FEATURES, found.name, found.options)
         return extractor
 
-    def _extractor_choice(self) -> PluginChoice | None:
+    def brought(self) -> PluginChoice | None:
+        """The extractor, where one is known by the options or by the map's name of the type."""
         found = self.first.extractor()
-        if self.choice is None:
-            return found
+        if self.choice is None:  # the options do not know it
+            return placed(found, self._options.device, self._options.precision)
         known = {} if found is None else found.options
         return PluginChoice(name=self.choice.name, options={**self.choice.options, **known})
 
@@ -135,15 +139,14 @@ class LocalType:
 
     def match(self, query: Features, images: Sequence[str]) -> list[VerifiedMatches]:
         """Verified matches of a query with each of several map images."""
-        known = [image for image in images if image in self.first]
-        pairs = match_images(
-            query,
-            known,
-            lambda image: self._map_features(self.first, image),
-            self.matcher,
-            lambda _: verification_of(self._options.verify_queries()),
-        )
-        found = dict.fromkeys(images, _NO_MATCHES) | dict(zip(known, pairs, strict=True))
+        found = dict.fromkeys(images, _NO_MATCHES)
+        verify = verification_of(self._options.verify_queries())
+        # features of some at a time are in memory
+        for names in batched((image for image in images if image in self.first), BATCH):
+            others = [self._map_features(self.first, name) for name in names]
+            pairs = match_all(self.matcher, query, others, [f"pair with {name}" for name in names])
+            for name, other, pair in zip(names, others, pairs, strict=True):
+                found[name] = verified(query, other, pair, verify)
         return [found[image] for image in images]
 
     def match_again(
@@ -284,7 +287,7 @@ def extract_again(
         if image not in keypoints:
             continue
         frame = read_frame(kapture_map.folder, image)
-        features = extract_checked(extractor, *frame, image)
+        features = extract_all(extractor, [frame], [image])[0]
         stored = keypoints.keypoints_px(image)
         rows = rows_found_again(stored[:, :2], features.keypoints_px[:, :2])
         descriptors = np.zeros((len(stored), features.descriptors.shape[1]), np.float32)

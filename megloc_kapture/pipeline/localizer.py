@@ -15,32 +15,21 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.localization.cluster_poses import (
-    Clock,
-    ImageMatches,
-    QueryView,
-    TypedMatches,
-    interleave,
-)
+from megloc_kapture.localization.cluster_poses import Clock, interleave
+from megloc_kapture.localization.query_views import ImageMatches, QueryView, TypedMatches
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap
+from megloc_kapture.pipeline.kapture_queries import KaptureQueries, Unit
 from megloc_kapture.pipeline.local_types import local_types_of
 from megloc_kapture.pipeline.map_retrieval import MapRetrieval
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.queries import (
-    KaptureQueries,
-    Preprocessor,
-    Query,
-    QueryImage,
-    QueryImages,
-    Unit,
-)
+from megloc_kapture.pipeline.queries import Preprocessor, Query, QueryImage, QueryImages
+from megloc_kapture.stages.devices import Precision, unheeded
+from megloc_kapture.stages.map_refiners import MapRefiners
 from megloc_kapture.stages.matches import FeatureCache, Features, VerifiedMatches
 from megloc_kapture.stages.options import PipelineOptions
-from megloc_kapture.stages.pose_refinement import MapRefiners
 from megloc_kapture.stages.query_poses import (
     Solved,
-    among_first,
     in_turn,
     localize_unit,
     localize_views,
@@ -49,11 +38,13 @@ from megloc_kapture.stages.ranking_scene import KaptureScene
 from megloc_kapture.stages.reranking import counted, rerank
 from megloc_kapture.stages.unreadable import unreadable_image
 from megloc_kapture.stages.work import ordered_map
-from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
+from megloc_kapture.values import Camera, Device, Failure, Pose, RigidTransform
 
 _ALONE = RigidTransform.identity()
 # the options that localizing uses; the others are of maps that are made
 LOCALIZING = (
+    "device",
+    "precision",
     "preprocessing",
     "local_features",
     "mask_margin_px",
@@ -81,7 +72,8 @@ class Localizer:
     Parameters
     ----------
     kapture_map : the map.
-    preset : options by name; ``options`` gives them whole instead.
+    preset, device, precision : options by name, and where and how its networks compute: auto (a GPU
+        where there is one), cpu, cuda, cuda:N; full or half. ``options`` gives all of it instead.
 
     Raises
     ------
@@ -101,10 +93,15 @@ class Localizer:
         preset: str = "classic",
         *,
         options: PipelineOptions | None = None,
+        device: Device = "auto",
+        precision: Precision = "full",
     ) -> None:
         self.map = kapture_map
         self._key = uuid4().hex  # tells it from another of the same name, in processes that live on
-        self.options = options or options_of_preset(preset)
+        if options is not None and (device, precision) != ("auto", "full"):
+            raise OptionError("give the device and the precision in the options")
+        where = {"device": device, "precision": precision}
+        self.options = options or options_of_preset(preset, changes=[where])
         self.options.check()
         self._ranker = self.options.localization.make_ranker()
         self._preprocessor = Preprocessor(self.options)
@@ -115,6 +112,10 @@ class Localizer:
         for local in self.types:
             local.prepare()
         self._retrieval = MapRetrieval(kapture_map, self.options, self.types, self._preprocessor)
+        choices = (one.choice for one in self._retrieval.known)
+        chosen = self.options, *choices, *(local.brought() for local in self.types)
+        if lacking := unheeded(chosen, self.options.device, self.options.precision):
+            raise OptionError(f"{lacking[0]} changes nothing: no network is chosen that has it")
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickled it is its map's name and its options; another process makes it again, once."""
@@ -288,7 +289,7 @@ class Localizer:
             first = [one.candidates[:count] for one in matched]
             candidates = interleave(first)
             return solve(
-                [among_first(one.view, own) for one, own in zip(matched, first, strict=True)],
+                [one.view.among(own) for one, own in zip(matched, first, strict=True)],
                 candidates,
                 [self.map.restrictions.frame(name) for name in candidates],
                 self.options.localization,

@@ -18,8 +18,10 @@ from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.local_types import LocalType
 from megloc_kapture.pipeline.queries import Preprocessor, Query, QueryImage
-from megloc_kapture.plugins import GLOBAL_FEATURES, GlobalFeatureExtractor, plugin_names
+from megloc_kapture.plugin_loading import plugin_names
+from megloc_kapture.plugins import GLOBAL_FEATURES, GlobalFeatureExtractor
 from megloc_kapture.stages.candidates import Candidates, Retrieval, vectors_of
+from megloc_kapture.stages.devices import placed
 from megloc_kapture.stages.global_features import GlobalFeaturesChoice
 from megloc_kapture.stages.global_vlad import VladSettings, read_vocabulary, vlad_type
 from megloc_kapture.stages.local_features import read_image_of
@@ -166,7 +168,7 @@ class MapRetrieval:
                     for name in named or shared
                 ]
             usable = [one for one in self._wanted if one.stored or self._trains_vlad(one)]
-            return usable or self._known or self._wanted
+            return usable or self.known or self._wanted
 
     @cached_property
     def _wanted(self) -> tuple[_Compared, ...]:
@@ -174,10 +176,11 @@ class MapRetrieval:
         return tuple(map(self._asked_for, self._options.global_features))
 
     @cached_property
-    def _known(self) -> tuple[_Compared, ...]:
+    def known(self) -> tuple[_Compared, ...]:
         """The map's vectors that an extractor is known for."""
+        where = self._options.device, self._options.precision
         return tuple(
-            self._made_by(choice, name, 1.0, stored=True)
+            self._made_by(placed(choice, *where), name, 1.0, stored=True)
             for name in self._map.global_types()
             if (choice := _choice_of(name)) is not None
         )

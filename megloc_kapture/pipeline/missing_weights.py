@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from megloc_kapture.io.weights import MissingWeightsError, all_missing
+from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import (
     LOCAL_FEATURES,
     MATCHERS,
@@ -12,7 +13,6 @@ from megloc_kapture.plugins import (
     POSE_REFINERS,
     SEGMENTERS,
     PluginChoice,
-    load_plugin,
 )
 from megloc_kapture.stages.options import PipelineOptions
 

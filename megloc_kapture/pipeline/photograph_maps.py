@@ -49,6 +49,8 @@ from megloc_kapture.values import Options
 GPS = "gps"
 # the options that making a map of photographs uses
 MAPPING_OPTIONS = (
+    "device",
+    "precision",
     "preprocessing",
     "local_features",
     "mask_margin_px",

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 from megloc_kapture.errors import OptionError, suggestion
 from megloc_kapture.evaluation.provenance import package_versions
-from megloc_kapture.io.files import hard_link, write_bytes, write_json_model
+from megloc_kapture.io.files import clear_temporary, hard_link, write_bytes, write_json_model
 from megloc_kapture.pipeline.manifests import FileHashes, Manifest, fingerprint, read_manifest
 from megloc_kapture.pipeline.workspace import HASHES, JOURNAL, Workspace
 from megloc_kapture.pipeline.written_files import changed_file, remember_files, written_files
@@ -253,6 +253,8 @@ def _run(
         kept = KeptItems(own, folder, journal, sources, _digest(workspace), verify=verify)
         settled = replace(work, kept=kept)
         counts = dict(stage.run(StageWork(**vars(settled), root=workspace.root, out=folder)))
+        if work.executor is not None:
+            clear_temporary(folder)  # workers of a cluster may die, and others do what they began
         # without its manifest a stage counts as not done: killed between here and the end, it
         # runs again whatever of its output has moved by then
         workspace.manifest_path(stage.name).unlink(missing_ok=True)

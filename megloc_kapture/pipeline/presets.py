@@ -105,6 +105,9 @@ def options_of_preset(
     typed = assigned(assignments)
     _merge(tree, typed)
     options = _validated(PipelineOptions, tree)
+    if used is not None and "localization" in used:
+        # a map may bring types of features that the options do not name
+        typed = {key: value for key, value in typed.items() if key not in ("device", "precision")}
     check_assigned(options, typed, used=used)
     return options
 

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.dataset_tables import METRES, write_unit
-from megloc_kapture.io.files import staged_output
 from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.output_folders import staged_output
 from megloc_kapture.io.tables import CONSISTENCY_FILE, write_consistency
 from megloc_kapture.localization.shared_camera import solve_with_shared_camera
+from megloc_kapture.pipeline.kapture_queries import KaptureQueries
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.photographs import Photographs
-from megloc_kapture.pipeline.queries import KaptureQueries
 from megloc_kapture.stages.layout import LOCALIZED
 from megloc_kapture.stages.localized_folder import query_status, write_localized
 from megloc_kapture.stages.unreadable import unreadable_image
@@ -151,7 +151,13 @@ class Results(Mapping[str, Pose | Failure]):
             rows.append(row)
         return pd.DataFrame(rows).set_index("image")
 
-    def view(self, path: Path | str, truth: Path | str | None = None) -> None:
+    def view(
+        self,
+        path: Path | str,
+        truth: Path | str | None = None,
+        *,
+        rendered: Path | str | None = None,
+    ) -> None:
         """Write a page that shows the images in the map in 3D; see
         :func:`megloc_kapture.evaluation.view.write_view`."""
         from megloc_kapture.evaluation.view import write_view
@@ -160,7 +166,8 @@ class Results(Mapping[str, Pose | Failure]):
         for name in self:
             with contextlib.suppress(DataError):  # of a photograph perhaps nobody knows it
                 cameras[name] = data.camera_of(name)
-        write_view(path, self.localizer.map.folder, self, truth, cameras=cameras)
+        folder = self.localizer.map.folder
+        write_view(path, folder, self, truth, cameras=cameras, rendered=rendered)
 
     def _localized(self, workers: int, track: Track) -> Iterator[tuple[str, Pose | Failure]]:
         with ThreadPoolExecutor(workers) as executor:

@@ -11,14 +11,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from megloc_kapture.errors import OutputError
-from megloc_kapture.io.files import (
-    claim_folder,
-    clear_leftovers,
-    output_error,
-    remove,
-    replace_directory,
-)
+from megloc_kapture.io.files import clear_leftovers, output_error, remove
 from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.output_folders import claim_folder, replace_directory
 
 PARTIAL = ".partial"
 LOCK = ".lock"

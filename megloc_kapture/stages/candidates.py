@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +16,16 @@ from megloc_kapture.io.kapture import FeatureReader, KaptureFolder
 from megloc_kapture.io.kapture.vectors import KaptureVectors
 from megloc_kapture.retrieval.fusion import FusionOptions
 from megloc_kapture.retrieval.reranking import DiversityOptions, diversify
-from megloc_kapture.retrieval.search import Found, rank_fused
-from megloc_kapture.retrieval.short_list import QuantizedRows, rank_short_lists
-from megloc_kapture.retrieval.vectors import VectorSource, as_blocks, common_length
+from megloc_kapture.retrieval.search import Found, FusedSearch
+from megloc_kapture.retrieval.short_list import QuantizedRows, short_lists
+from megloc_kapture.retrieval.vectors import VectorBlocks, as_blocks, common_length
+from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Options, RigidTransform
 
+Vectors = KaptureVectors | NDArray[np.float32]  # unit rows
 _QUERY_ELEMENTS = 1 << 27  # of query vectors held at once: 512 MiB of float32
+_ROWS = 1 << 14  # of a database at most that a worker searches at once
+_CODED_ROWS = 1 << 20  # by product quantisation, each with a short list
 _POOL = 5  # images looked at for each that a diversified ranking keeps
 
 
@@ -67,36 +72,73 @@ class Retrieval:
 
     def rank(
         self,
-        queries: Sequence[VectorSource],
-        database: Sequence[VectorSource],
+        queries: Sequence[Vectors],
+        database: Sequence[Vectors],
         top_k: int,
         *,
-        codes: Sequence[QuantizedRows] = (),
-    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        codes: _Codes | None = None,
+        work: Work = HERE,
+    ) -> Found:
         """The most similar rows of the database: indices and scores (Q, at most ``top_k``).
+
+        The database is searched in parts, which the workers share.
 
         Parameters
         ----------
         queries, database : of each type, unit rows; neither is held in memory as a whole.
-        codes : of the database, of each type: only short lists by them are compared
-            exactly; none: all rows are.
+        codes : those of parts that are made already, to which others are added in this process:
+            only short lists are compared exactly; None: all rows are.
         """
-        how: dict[str, Any] = {"fusion": self.fusion, "weights": self.weights or None}
-
-        def ranked(rows: Sequence[NDArray[np.float32]]) -> Found:
-            if codes:
-                return rank_short_lists(rows, database, codes, top_k, **how)
-            return rank_fused(rows, database, top_k, **how)
-
-        sources = [as_blocks(source) for source in queries]
-        total, width = common_length(sources), sum(source.dimension for source in sources)
-        step = max(1, _QUERY_ELEMENTS // max(width, 1))
-        found = [
-            ranked([source.read(start, min(start + step, total)) for source in sources])
-            for start in range(0, total, step) or (0,)
+        search = FusedSearch(top_k, self.fusion, self.weights or None)
+        asked = [as_blocks(source) for source in queries]
+        total = common_length([as_blocks(source) for source in database])
+        most = _ROWS if codes is None else _CODED_ROWS
+        bounds = np.linspace(0, total, max(1, -(-total // most)) + 1).astype(int).tolist()
+        parts = [
+            _Part(search, asked, [_part(one, *of) for one in database], of[0], codes)
+            for of in pairwise(bounds)
         ]
-        indices, scores = zip(*found, strict=True)
-        return np.concatenate(indices), np.concatenate(scores)
+        shared = work if len(parts) > 1 else HERE
+        return search.ranking(list(shared.map(_search_part, parts, "retrieval")))
+
+
+def _part(source: Vectors, start: int, stop: int) -> VectorBlocks:
+    rows = source[start:stop] if isinstance(source, np.ndarray) else source.part(start, stop)
+    return as_blocks(rows)
+
+
+_Codes = dict[int, list[QuantizedRows]]  # of the part that begins at a row
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """A part of a database that is searched, by type, and the row it begins at."""
+
+    search: FusedSearch
+    queries: Sequence[VectorBlocks]
+    database: Sequence[VectorBlocks]
+    first_row: int
+    codes: _Codes | None
+
+
+def _search_part(part: _Part) -> list[Found]:
+    if part.codes is not None and part.first_row not in part.codes:
+        part.codes[part.first_row] = [QuantizedRows(source) for source in part.database]
+    total, width = common_length(part.queries), sum(one.dimension for one in part.queries)
+    step = max(1, _QUERY_ELEMENTS // max(width, 1))
+    found = []
+    for start in range(0, total, step) or (0,):
+        rows = [source.read(start, min(start + step, total)) for source in part.queries]
+        if part.codes is None:
+            found.append(part.search.lists(rows, part.database))
+        else:
+            codes = part.codes[part.first_row]
+            found.append(short_lists(part.search, rows, part.database, codes))
+    lists = []
+    for blocks in zip(*found, strict=True):
+        indices, scores = (np.concatenate(arrays) for arrays in zip(*blocks, strict=True))
+        lists.append((np.where(indices >= 0, indices + part.first_row, -1), scores))
+    return lists
 
 
 def vectors_of(readers: Sequence[FeatureReader], images: Sequence[str]) -> list[KaptureVectors]:
@@ -127,19 +169,20 @@ class Candidates:
 
     def __init__(
         self,
-        database: Callable[[NDArray[np.int64]], Sequence[VectorSource]],
+        database: Callable[[NDArray[np.int64]], Sequence[Vectors]],
         poses: Sequence[RigidTransform],
         retrieval: Retrieval,
     ) -> None:
         self._database, self._poses, self._retrieval = database, poses, retrieval
-        self._coded = (np.zeros(0, np.int64), list[QuantizedRows]())  # what was coded last
+        self._coded: tuple[NDArray[np.int64], _Codes] = (np.zeros(0, np.int64), {})  # the last
 
     def of(
         self,
-        queries: Sequence[VectorSource],
+        queries: Sequence[Vectors],
         permitted: NDArray[np.int64],
         options: QueryPairsOptions,
-    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        work: Work = HERE,
+    ) -> Found:
         """Positions of the most similar images, best first, and scores: (Q, K), -1 for none.
 
         Parameters
@@ -150,18 +193,15 @@ class Candidates:
         few = options.diversity is None
         wanted = options.top_k if few else options.top_k * _POOL
         database = self._database(permitted)
-        many = len(permitted) > options.quantized_above
-        codes = self._codes(permitted, database) if many else []
-        index, scores = self._retrieval.rank(queries, database, wanted, codes=codes)
+        codes = self._codes(permitted) if len(permitted) > options.quantized_above else None
+        index, scores = self._retrieval.rank(queries, database, wanted, codes=codes, work=work)
         if options.diversity is not None:
             index, scores = self._spread(index, scores, permitted, options.top_k, options.diversity)
         return np.where(index >= 0, permitted[np.maximum(index, 0)], -1), scores
 
-    def _codes(
-        self, permitted: NDArray[np.int64], database: Sequence[VectorSource]
-    ) -> list[QuantizedRows]:
+    def _codes(self, permitted: NDArray[np.int64]) -> _Codes:
         if not np.array_equal(self._coded[0], permitted):
-            self._coded = (permitted, [QuantizedRows(source) for source in database])
+            self._coded = (permitted, {})
         return self._coded[1]
 
     def _spread(

@@ -1,11 +1,7 @@
 """Stage: depth of map images without a depth sensor, by multi-view stereo.
 
-The map that is written is the one that is read, with depth beside its images: ordinary kapture
-depth records of a sensor ``CAMERA_mvs`` that shares the camera's centre, float32 in the map's unit,
-0 where nothing is known. Beside them, which kapture does not know and ignores:
-``sensors/mvs/IMAGE.sigma.npy`` (float32, the standard deviation of depth), ``IMAGE.normals.npy``
-(int8 (H, W, 3), 127 times the unit normal in the camera's frame, towards it) and
-``reconstruction/depth.csv``, a row per image. Images that have depth keep theirs.
+The map that is written is the one that is read, with depth beside its images; how it lies there:
+:mod:`.stereo_depth`. Images that have depth keep theirs.
 """
 
 from __future__ import annotations
@@ -21,50 +17,64 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.errors import DataError, MeglocError
+from megloc_kapture.geometry.cameras import focal_px
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
-from megloc_kapture.io.files import link_images, link_records, remove
+from megloc_kapture.io.files import remove
 from megloc_kapture.io.images import write_depth_map
 from megloc_kapture.io.kapture import (
     KaptureData,
     KaptureFolder,
-    Observations,
-    Sensor,
-    read_point_covariances,
-    write_observations,
-    write_point_covariances,
-    write_points3d,
     write_sensors,
 )
 from megloc_kapture.io.paths import safe_join
 from megloc_kapture.io.tables import DepthRow, write_depth_rows
 from megloc_kapture.mapping.depth import LiftingOptions, lift_with_covariances
-from megloc_kapture.mvs.consistency import AgreementOptions, agreeing_views, confirmed
-from megloc_kapture.mvs.views import choose_sources, depth_range, stereo_camera, stereo_view
+from megloc_kapture.mvs.consistency import (
+    AgreementOptions,
+    agreeing_views,
+    confirmed,
+    with_pose_errors,
+)
+from megloc_kapture.mvs.views import choose_sources, depth_range, stereo_view
+from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import (
     DEPTH_ESTIMATORS,
     DepthEstimate,
     DepthEstimator,
     PluginChoice,
     StereoView,
-    load_plugin,
 )
 from megloc_kapture.stages.layout import MAP
 from megloc_kapture.stages.local_features import read_frame
 from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.rigs import depth_records
-from megloc_kapture.stages.shared_index import index_map, write_array
+from megloc_kapture.stages.shared_index import index_map, with_noise, write_array
 from megloc_kapture.stages.stage import PipelineStage, StageWork
+from megloc_kapture.stages.stereo_depth import (
+    DEPTH_FILE,
+    FOLDER,
+    LiftedPoints,
+    depth_path,
+    link_images_and_masks,
+    side_file,
+    with_depth_sensors,
+    write_points,
+)
 from megloc_kapture.stages.triangulation import copy_features
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
-from megloc_kapture.values import Camera, Options, RigidTransform
+from megloc_kapture.values import Camera, Options
 
 if TYPE_CHECKING:
     from megloc_kapture.stages.options import PipelineOptions
 
-FOLDER = "mvs"  # of depth maps below records_data, and of what is beside them below sensors
-DEPTH_FILE = "reconstruction/depth.csv"
 _NO_POINTS = np.zeros(0, np.int64)
 _ANCHOR_VIEWS = 2  # that agree with a keypoint's depth, for it to be lifted
+# of keypoints where poses are exact, in pixels of the image; more is laid to the poses
+_KEYPOINT_ERROR_PX = 0.3
+# median error by the poses, in pixels of the depth maps, that images are reduced to; multiples of
+# it that views may differ by; and the deviation between two views, both of which err, when points
+# of three views have taken up half of the variance, for a median of distances in a plane
+_ERROR_PX, _DIFFERENCE, _DEVIATION = 0.5, 5.0, 2 / 1.1774
 
 Floats = NDArray[np.float64]
 
@@ -110,18 +120,10 @@ class _Job:
     sources: tuple[str, ...]
     range_m: tuple[float, float]
     options: DensifyOptions
+    error_px: float
     estimator: DepthEstimator
     # keypoints that have a point, by type; empty where none is lifted
     seen: Mapping[str, NDArray[np.int32]]
-
-
-@dataclass(frozen=True, eq=False)
-class _Lifted:
-    """Points (N, 3) and covariances (N, 6) in the world, of keypoints (N,)."""
-
-    xyz: Floats
-    covariances: Floats
-    keypoint_ids: NDArray[np.int64]
 
 
 def densify_map(
@@ -154,12 +156,13 @@ def densify_map(
     estimator = estimator or options.make_estimator()
     data = source.read()
     _check(source, data)
-    jobs, rows = _plan(source, output, options, estimator, restrictions)
-    reasons = work.map(_estimate, jobs, "depth")
+    options, error_px = fitted_to_poses(source, options)
+    jobs, rows = _plan(source, output, options, error_px, estimator, restrictions)
+    reasons = work.map(_estimate, jobs, "depth", plugins=(estimator,))
     failed = {job.image: reason for job, reason in zip(jobs, list(reasons), strict=True) if reason}
     done = [job for job in jobs if job.image not in failed]
     rows = [replace(row, reason=failed.get(row.image, row.reason)) for row in rows]
-    lifted: dict[str, dict[str, _Lifted]] = {}
+    lifted: dict[str, dict[str, LiftedPoints]] = {}
     fills = {}
     for job, (fill, found) in zip(done, work.map(_confirm, done, "agreement"), strict=True):
         fills[job.image] = fill
@@ -168,17 +171,21 @@ def densify_map(
     if jobs:
         remove(jobs[0].scratch)
     rows = [replace(row, fill=fills.get(row.image, 0.0)) for row in rows]
-    write_sensors(output, _with_depth(data, [job.image for job in done], options.max_size_px))
-    _link(source, output)
+    write_sensors(
+        output, with_depth_sensors(data, [job.image for job in done], options.max_size_px)
+    )
+    link_images_and_masks(source, output)
     for type_name in sorted({*source.types("keypoints"), *source.types("descriptors")}):
         copy_features(source, output, type_name, link_own=link_features)
-    num_lifted = _write_points(source, output, lifted)
+    num_lifted = write_points(source, output, lifted)
     write_depth_rows(output / DEPTH_FILE, rows)
     return {
         "images": len(rows),
         "images_with_depth": len(done),
         "fill": round(float(np.mean(list(fills.values()))), 4) if fills else 0.0,
         "points_lifted": num_lifted,
+        "max_size_px": options.max_size_px,
+        "map_error_px": round(error_px, 4),
     }
 
 
@@ -198,10 +205,47 @@ def _check(source: KaptureFolder, data: KaptureData) -> None:
 # ------------------------------------------------------------------------------------ planning
 
 
+def fitted_to_poses(source: KaptureFolder, options: DensifyOptions) -> tuple[DensifyOptions, float]:
+    """Options for poses as accurate as a map's, and the error that remains.
+
+    The median distance between observations and their points tells how far poses can be trusted.
+    Where it is more than half a pixel of the depth maps, beyond what keypoints err by, images are
+    reduced until it is that, as no view could confirm finer detail, and compared with more sources
+    in proportion; views may differ by five times that median.
+
+    Returns
+    -------
+    Options, and the median error in pixels of the depth maps, 0 where the map does not tell it.
+    """
+    indices = [index_map(source, local_type) for local_type in source.observations()]
+    angles = [with_noise(source, index).noise_rad for index in indices]
+    error_rad = min((angle for angle in angles if np.isfinite(angle)), default=0.0)
+    data = source.read()
+    cameras = [data.camera_of(image) for image in data.poses()]
+    side = int(np.median([max(camera.width, camera.height) for camera in cameras]))
+    error_px = error_rad * float(np.median([focal_px(camera) for camera in cameras]))
+    share = float(np.sqrt(max(error_px**2 - _KEYPOINT_ERROR_PX**2, 0.0))) / side
+    size = min(options.max_size_px, side)
+    reduced = max(64, int(min(size, _ERROR_PX / share))) if share else size
+    error_px, limits = share * reduced, options.agreement
+    wider = max(1.0, _DIFFERENCE * error_px / limits.max_error_px)
+    changes = {
+        "max_error_px": wider * limits.max_error_px,
+        "max_relative_error": wider * limits.max_relative_error,
+    }
+    changed = {
+        "max_size_px": reduced if reduced < size else options.max_size_px,
+        "num_sources": min(16, round(options.num_sources * size / reduced)),
+        "agreement": limits.model_copy(update=changes),
+    }
+    return options.model_copy(update=changed), error_px
+
+
 def _plan(
     source: KaptureFolder,
     output: Path,
     options: DensifyOptions,
+    error_px: float,
     estimator: DepthEstimator,
     restrictions: Restrictions,
 ) -> tuple[list[_Job], list[DepthRow]]:
@@ -249,7 +293,9 @@ def _plan(
             continue
         lifts = indices if options.mode == "points" else ()
         seen = {index.local_type: index.observed(image)[0] for index in lifts}
-        jobs.append(_Job(spec, scratch, output, image, sources, found, options, estimator, seen))
+        jobs.append(
+            _Job(spec, scratch, output, image, sources, found, options, error_px, estimator, seen)
+        )
         rows.append(replace(blank, sources=sources, near_m=found[0], far_m=found[1]))
     return jobs, rows
 
@@ -286,19 +332,21 @@ def _estimate(job: _Job) -> str:
     return ""
 
 
-def _confirm(job: _Job) -> tuple[float, dict[str, _Lifted]]:
+def _confirm(job: _Job) -> tuple[float, dict[str, LiftedPoints]]:
     """Write what the sources confirm of an image's depth; the share of it, and lifted points."""
     folder, size = job.folder.open(), job.options.max_size_px
     view = _view(folder, job.image, size)
     names = ("depth", "sigma", "normals")
     estimate = DepthEstimate(*(np.load(_scratch(job, job.image, name)) for name in names))
+    sources = [_view(folder, other, size) for other in job.sources]
     others = [
-        (_view(folder, other, size), np.load(path))
-        for other in job.sources
+        (source, np.load(path))
+        for other, source in zip(job.sources, sources, strict=True)
         if (path := _scratch(job, other, "depth")).is_file()
     ]
     agreement = job.options.agreement
     kept = confirmed(view, estimate, others, agreement)
+    kept = with_pose_errors(view, sources, kept, job.range_m, _DEVIATION * job.error_px)
     write_depth_map(
         safe_join(job.out / "sensors" / "records_data", depth_path(job.image)), kept.depth_m
     )
@@ -327,7 +375,7 @@ def _lift(
     view: StereoView,
     depth_m: NDArray[np.float32],
     sigma_m: NDArray[np.float32],
-) -> _Lifted:
+) -> LiftedPoints:
     points, covariances, valid = lift_with_covariances(
         keypoints_px[ids],
         depth_m,
@@ -339,122 +387,18 @@ def _lift(
     turned = view.cam_from_world.rotation_matrix()
     world = np.einsum("ji,njk,kl->nil", turned, covariances[valid], turned)
     packed = world[:, *np.triu_indices(3)]
-    return _Lifted(view.cam_from_world.inverse().apply(points[valid]), packed, ids[valid])
+    return LiftedPoints(view.cam_from_world.inverse().apply(points[valid]), packed, ids[valid])
 
 
 def _scratch(job: _Job, image: str, kind: str) -> Path:
     return safe_join(job.scratch, f"{image}.{kind}.npy")
 
 
-# -------------------------------------------------------------------------------------- output
-
-
-def depth_path(image: str) -> str:
-    """The depth map of an image, below ``records_data``."""
-    return f"{FOLDER}/{image}.depth"
-
-
-def side_file(root: Path, image: str, kind: Literal["sigma", "normals"]) -> Path:
-    """What lies beside the depth map of an image in the kapture at ``root``; see the module."""
-    return safe_join(root / "sensors" / FOLDER, f"{image}.{kind}.npy")
-
-
-def read_beside(
-    root: Path, image: str, kind: Literal["sigma", "normals"]
-) -> NDArray[np.float32] | None:
-    """Standard deviations (H, W) or normals (H, W, 3) of an image's depth by stereo, float32, 0
-    where nothing is known; None without; raises DataError."""
-    path = side_file(root, image, kind)
-    if not path.is_file():
-        return None
-    try:
-        found = np.load(path, allow_pickle=False).astype(np.float32)
-    except (OSError, ValueError) as error:
-        raise DataError(f"no array of numpy: {error}", path=path) from error
-    return np.asarray(found / np.float32(127) if kind == "normals" else found)
-
-
-def _with_depth(data: KaptureData, images: Sequence[str], max_size_px: int) -> KaptureData:
-    """The sensors with a depth sensor on one rig with each camera whose images have depth."""
-    found = replace(
-        data,
-        sensors=dict(data.sensors),
-        rigs={rig: dict(members) for rig, members in data.rigs.items()},
-        trajectories=dict(data.trajectories),
-        records_depth=dict(data.records_depth),
-    )
-    for image in images:
-        timestamp, camera = data.record_of(image)
-        sensor = f"{camera}_mvs"
-        if sensor not in found.sensors:
-            pinhole = stereo_camera(data.camera_of(image), max_size_px)
-            found.sensors[sensor] = Sensor.from_camera(pinhole, name=sensor, sensor_type="depth")
-            carriers = [rig for rig, members in data.rigs.items() if camera in members]
-            for rig in carriers:
-                found.rigs[rig][sensor] = found.rigs[rig][camera]
-            if not carriers:
-                same = RigidTransform.identity()
-                found.rigs[f"{camera}_with_mvs"] = {camera: same, sensor: same}
-        if (own := data.trajectories.get((timestamp, camera))) is not None:
-            found.trajectories[timestamp, sensor] = own
-        found.records_depth[timestamp, sensor] = depth_path(image)
-    return found
-
-
-def _link(source: KaptureFolder, output: Path) -> None:
-    """Link the images, beside which there are depth maps now, and the masks."""
-    records = source.root / "sensors" / "records_data"
-    link_records(output, {entry.name: entry for entry in sorted(records.iterdir())})
-    link_images(source.root, output, ("masks",))
-
-
-def _write_points(
-    source: KaptureFolder, output: Path, lifted: Mapping[str, Mapping[str, _Lifted]]
-) -> int:
-    """Write the map's points, unchanged, and those of lifted keypoints behind them."""
-    points = source.points3d()
-    covariances = read_point_covariances(source.root, len(points))
-    parts, uncertain = [points], [np.full((len(points), 6), np.nan)]
-    if covariances is not None:
-        uncertain = [np.asarray(covariances)]
-    observations = {}
-    total = len(points)
-    for local_type, seen in source.observations().items():
-        new = lifted.get(local_type, {})
-        names = tuple(sorted({*seen.image_names, *new}))
-        row_of = {name: row for row, name in enumerate(names)}
-        rows = np.array([row_of[name] for name in seen.image_names], np.int32)
-        point_ids, image_ids, keypoint_ids = (
-            [seen.point_ids],
-            [rows[seen.image_ids] if len(rows) else seen.image_ids],
-            [seen.keypoint_ids],
-        )
-        for image, own in sorted(new.items()):
-            count = len(own.xyz)
-            parts.append(np.concatenate([own.xyz, np.zeros_like(own.xyz)], axis=1))
-            uncertain.append(own.covariances)
-            point_ids.append(total + np.arange(count))
-            image_ids.append(np.full(count, row_of[image], np.int32))
-            keypoint_ids.append(own.keypoint_ids.astype(np.int32))
-            total += count
-        observations[local_type] = Observations(
-            local_type,
-            names,
-            np.concatenate(point_ids),
-            np.concatenate(image_ids),
-            np.concatenate(keypoint_ids),
-        )
-    write_points3d(output, np.concatenate(parts))
-    write_observations(output, observations)
-    if covariances is not None or total > len(points):
-        write_point_covariances(output, np.concatenate(uncertain))
-    return total - len(points)
-
-
 class Densify(PipelineStage):
     """Estimate depth of the map's images that have none."""
 
     name = "densify"
+    version = 3
     uses = ("mvs",)
     writes = (MAP,)
 

@@ -10,16 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.images import read_depth_map
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.ply import write_ply
-from megloc_kapture.io.tables import read_depth_rows
 from megloc_kapture.mvs.consistency import AgreementOptions, agreeing_views
 from megloc_kapture.mvs.views import pinhole_matrix, stereo_view
 from megloc_kapture.plugins import StereoView
-from megloc_kapture.stages.densifying import DEPTH_FILE, read_beside
 from megloc_kapture.stages.local_features import read_image_of
-from megloc_kapture.stages.rigs import DepthRecord, depth_records
+from megloc_kapture.stages.rigs import depth_records
+from megloc_kapture.stages.stereo_depth import (
+    DEPTH_FILE,
+    read_beside,
+    read_stereo_depth,
+    stereo_images,
+)
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
 
 
@@ -42,16 +45,6 @@ class _Job:
     earlier: tuple[str, ...]
     agreement: AgreementOptions
     share: float
-
-
-def stereo_images(folder: KaptureFolder) -> dict[str, tuple[str, ...]]:
-    """The images that have depth by stereo, by name, each with those it was compared with.
-
-    Empty where there is no densified map; raises DataError where its table is broken.
-    """
-    path = folder.root / DEPTH_FILE
-    rows = read_depth_rows(path) if path.is_file() else []
-    return {row.image: row.sources for row in sorted(rows, key=lambda r: r.image) if not row.reason}
 
 
 def fused_cloud(
@@ -134,12 +127,6 @@ def _points(job: _Job) -> Cloud:
         sigma[new].astype(np.float64),
         np.full(len(rows), float(job.row)),
     )
-
-
-def read_stereo_depth(folder: KaptureFolder, record: DepthRecord) -> NDArray[np.float32]:
-    """Depth (H, W) of a record, 0 where nothing is known; raises DataError."""
-    size = {"width": record.camera.width, "height": record.camera.height}
-    return read_depth_map(folder.depth_path(record.path), **size)
 
 
 def _view_with_depth(folder: KaptureFolder, image: str) -> tuple[StereoView, NDArray[np.float32]]:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -16,25 +16,22 @@ from megloc_kapture.errors import DataError, OptionError, PluginError, suggestio
 from megloc_kapture.features.image_bound import bounded_image
 from megloc_kapture.features.vlad import VladOptions
 from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
+from megloc_kapture.plugin_loading import load_plugin, plugin_names
 from megloc_kapture.plugins import (
     GLOBAL_FEATURES as PLUGINS,
 )
-from megloc_kapture.plugins import (
-    GlobalFeatureExtractor,
-    PluginChoice,
-    load_plugin,
-    plugin_names,
-)
+from megloc_kapture.plugins import GlobalFeatureExtractor, PluginChoice
+from megloc_kapture.stages.devices import in_batches
 from megloc_kapture.stages.global_vlad import extract_vlad, vlad_type
 from megloc_kapture.stages.layout import FEATURES, GLOBAL_FEATURES, LOCAL_FEATURES
 from megloc_kapture.stages.local_features import image_inputs, read_image_of
 from megloc_kapture.stages.map_points import described_images
 from megloc_kapture.stages.stage import LOCAL_TYPES, PipelineStage, StageWork
-from megloc_kapture.stages.work import HERE, Work
+from megloc_kapture.stages.work import HERE, Batched, Work
 from megloc_kapture.values import Camera
 
 VLAD = "vlad"
-BATCH = 4  # images of one size that a network gets at once, where it can use them
+_SIZE = attrgetter("camera.width", "camera.height")
 
 
 class VladChoiceOptions(VladOptions):
@@ -100,7 +97,9 @@ class GlobalFeaturesChoice(PluginChoice):
 @dataclass(frozen=True)
 class _Job:
     extractor: GlobalFeatureExtractor
-    images: tuple[tuple[str, Path, Camera], ...]
+    image: str
+    path: Path
+    camera: Camera
 
 
 def extract_global_features(
@@ -128,28 +127,33 @@ def extract_global_features(
         list(folder_of),
         lambda image, digest: image_inputs(folder_of[image], image, digest)[:3],
     )
-    todo = [image for image in folder_of if image not in items.done]
-    jobs = _jobs(folder_of, todo, extractor)
+    jobs = [
+        _Job(extractor, image, folder.image_path(image), folder.read().camera_of(image))
+        for image, folder in folder_of.items()
+        if image not in items.done
+    ]
+    jobs.sort(key=_SIZE)  # images of one size can be a batch
+    steps: Batched[_Job, NDArray[np.float32]] = Batched(
+        _read, _describe, extractor, "describe_many", _SIZE
+    )
     writer: FeatureWriter | None = None
-    results = work.map(_describe, jobs, items.label(extractor.name))
     size = 0
-    for job, vectors in zip(jobs, results, strict=True):
+    for job, vector in zip(jobs, work.map(steps, jobs, items.label(extractor.name)), strict=True):
         if writer is None:
-            size = vectors.shape[1]
+            size = len(vector)
             config = FeatureConfig(extractor.name, np.dtype(np.float32), size, metric_type="L2")
             writer = FeatureWriter(output, "global_features", extractor.name, config, orphan=True)
-        if vectors.shape[1] != size:
+        if len(vector) != size:
             raise PluginError(
-                f"plugin {extractor.name!r} on image {job.images[0][0]}: {vectors.shape[1]} "
+                f"plugin {extractor.name!r} on image {job.image}: {len(vector)} "
                 f"values, {size} of the images before"
             )
-        for (image, _, _), vector in zip(job.images, vectors, strict=True):
-            items.add(image, writer.write(image, vector))
+        items.add(job.image, writer.write(job.image, vector))
     return {"images": len(items.done)}
 
 
 def describe_images(
-    extractor: GlobalFeatureExtractor, images: Sequence[NDArray[np.uint8]], label: str
+    extractor: GlobalFeatureExtractor, images: Sequence[NDArray[np.uint8]], names: Sequence[str]
 ) -> NDArray[np.float32]:
     """Vectors of RGB images of one size: float32 (B, D), unit length.
 
@@ -157,19 +161,30 @@ def describe_images(
 
     Parameters
     ----------
-    label : names the images in messages.
+    names : of the images, for messages.
 
     Raises
     ------
     PluginError : the extractor returns something else.
+    DeviceMemoryError : there is no memory for one image.
     """
-    images = [bounded_image(image) for image in images]
-    at_once: Any = getattr(extractor, "describe_many", None)
-    if at_once is not None and len(images) > 1:
-        found = at_once(images)
-    else:
-        found = [extractor.describe(image) for image in images]
-    return _checked(extractor, found, len(images), label)
+    many: Any = extractor
+
+    def describe(batch: Sequence[NDArray[np.uint8]]) -> list[Any]:
+        found = many.describe_many(batch) if len(batch) > 1 else [extractor.describe(batch[0])]
+        return list(_checked(extractor, found, len(batch), names[0]))
+
+    bounded = [bounded_image(image) for image in images]
+    return np.stack(
+        in_batches(
+            extractor,
+            "describe_many",
+            describe,
+            bounded,
+            size=lambda image: image.size,
+            name=lambda k: f"image {names[k]}",
+        )
+    )
 
 
 def _checked(
@@ -207,28 +222,12 @@ def _images(folders: Sequence[KaptureFolder]) -> dict[str, KaptureFolder]:
     return dict(named)
 
 
-def _jobs(
-    folder_of: Mapping[str, KaptureFolder],
-    images: Iterable[str],
-    extractor: GlobalFeatureExtractor,
-) -> list[_Job]:
-    """Images in their order, neighbours of one size together."""
-    named = [
-        (image, folder_of[image].image_path(image), folder_of[image].read().camera_of(image))
-        for image in images
-    ]
-    batch = BATCH if hasattr(extractor, "describe_many") else 1
-    jobs = []
-    for _, group in groupby(named, key=lambda item: (item[2].width, item[2].height)):
-        alike = tuple(group)
-        for start in range(0, len(alike), batch):
-            jobs.append(_Job(extractor, alike[start : start + batch]))
-    return jobs
+def _read(job: _Job) -> NDArray[np.uint8]:
+    return read_image_of(job.path, job.camera)
 
 
-def _describe(job: _Job) -> NDArray[np.float32]:
-    images = [read_image_of(path, camera) for _, path, camera in job.images]
-    return describe_images(job.extractor, images, job.images[0][0])
+def _describe(jobs: Sequence[_Job], images: Sequence[NDArray[np.uint8]]) -> Sequence[Any]:
+    return list(describe_images(jobs[0].extractor, images, [job.image for job in jobs]))
 
 
 class ExtractGlobalFeatures(PipelineStage):

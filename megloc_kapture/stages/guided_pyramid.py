@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.geometry.image_variants import ImageVariant
-from megloc_kapture.localization.cluster_poses import ImageMatches
+from megloc_kapture.localization.query_views import ImageMatches
 from megloc_kapture.matching.guided_pyramid import (
     GuidedPyramidOptions,
     PairVerifier,
@@ -40,8 +40,10 @@ from megloc_kapture.matching.verification import (
     two_view_of_variants,
 )
 from megloc_kapture.plugins import LocalFeatureExtractor, Matcher
-from megloc_kapture.stages.local_features import extract_checked
-from megloc_kapture.stages.matches import BATCH, Features, batched, match_all
+from megloc_kapture.stages.devices import BATCH
+from megloc_kapture.stages.local_features import extract_all
+from megloc_kapture.stages.matches import Features, match_all
+from megloc_kapture.stages.work import batched
 
 
 @dataclass(frozen=True)
@@ -113,7 +115,7 @@ def match_image_again(
         pixels,
         mask,
         every if others else scaled,
-        lambda image, mask: extract_checked(method.extractor, image, mask, name),
+        lambda image, mask: extract_all(method.extractor, [(image, mask)], [name])[0],
         like=itself,
     )
 
@@ -126,7 +128,9 @@ def match_image_again(
             judgements = [
                 judge(other, features) for other, features in zip(batch, loaded, strict=True)
             ]
-            found += match_variants(some, loaded, partial(match_all, method.matcher), judgements)
+            pairs = [f"pair {name}, {other}" for other in batch]
+            match_with = partial(match_all, method.matcher, names=pairs)
+            found += match_variants(some, loaded, match_with, judgements)
         return found
 
     found: list[list[VariantMatches]] = []

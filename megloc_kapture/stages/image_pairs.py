@@ -18,6 +18,7 @@ from megloc_kapture.io.kapture import (
     KaptureFolder,
     write_pairs,
 )
+from megloc_kapture.io.kapture.vectors import KaptureVectors
 from megloc_kapture.mapping.pairs import (
     PairsByCovisibilityOptions,
     PairsByPosesOptions,
@@ -28,7 +29,6 @@ from megloc_kapture.mapping.pairs import (
     pairs_by_poses,
     pairs_by_sequence,
 )
-from megloc_kapture.retrieval.vectors import VectorSource
 from megloc_kapture.stages.candidates import (
     Candidates,
     QueryPairsOptions,
@@ -45,6 +45,7 @@ from megloc_kapture.stages.layout import (
 from megloc_kapture.stages.map_points import described_images
 from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.stage import LOCAL_TYPES, PipelineStage, StageWork
+from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Options, RigidTransform
 
 if TYPE_CHECKING:
@@ -121,6 +122,7 @@ def pair_map_images(
     retrieval: Retrieval | None,
     restrictions: Restrictions = UNRESTRICTED,
     covisible: KaptureFolder | None = None,
+    work: Work = HERE,
 ) -> list[ImagePair]:
     """Pairs of map images with a pose, each once, first name before second, sorted.
 
@@ -154,7 +156,7 @@ def pair_map_images(
                 if retrieval is None:
                     raise DataError("pairs by retrieval need global features of the map")
                 vectors = vectors_of(retrieval.readers(mapping), names)
-                pairs, similarity = _most_similar(vectors, retrieval, options.top_k)
+                pairs, similarity = _most_similar(vectors, retrieval, options.top_k, work)
             elif method == "poses":
                 pairs = _by_poses(data, [poses[name] for name in names], names, within, options)
             elif method == "sequence":
@@ -204,10 +206,10 @@ def _united(
 
 
 def _most_similar(
-    vectors: Sequence[VectorSource], retrieval: Retrieval, top_k: int
+    vectors: Sequence[KaptureVectors], retrieval: Retrieval, top_k: int, work: Work
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Pairs (P, 2), i < j, of each row and its ``top_k`` most similar others, and similarities."""
-    index, similarity = retrieval.rank(vectors, vectors, top_k + 1)
+    index, similarity = retrieval.rank(vectors, vectors, top_k + 1, work=work)
     rows = np.repeat(np.arange(len(index)), index.shape[1])
     both = np.stack([rows, index.ravel()], axis=1)
     # an image is its own nearest, or ties with its copies: it must not use up a place
@@ -224,6 +226,7 @@ def pair_queries(
     *,
     retrieval: Retrieval | None,
     restrictions: Restrictions = UNRESTRICTED,
+    work: Work = HERE,
 ) -> list[ImagePair]:
     """Candidates of every query among the posed map images its prior permits, best first.
 
@@ -252,7 +255,7 @@ def pair_queries(
     )
     for positions, permitted in restrictions.pools(queries, images):
         asked = vectors_of(described, [queries[at] for at in positions])
-        index, scores = candidates.of(asked, permitted, options)
+        index, scores = candidates.of(asked, permitted, options, work)
         for at, row, row_scores in zip(positions, index.tolist(), scores.tolist(), strict=True):
             of_query[at] = [
                 ImagePair(queries[at], images[i], score)
@@ -290,6 +293,7 @@ class PairMapping(PipelineStage):
             retrieval=self.options.retrieval(),
             restrictions=work.restrictions(),
             covisible=work.folder(REFERENCE) if self.options.pairs_by_points() else None,
+            work=work,
         )
         write_pairs(work.out / MAPPING_PAIRS, pairs)
         return {"pairs": len(pairs)}
@@ -321,6 +325,7 @@ class PairQueries(PipelineStage):
             self.options.query_pairs,
             retrieval=self.options.retrieval(),
             restrictions=work.restrictions(),
+            work=work,
         )
         write_pairs(work.out / self.layout.candidates, pairs)
         return {"pairs": len(pairs)}

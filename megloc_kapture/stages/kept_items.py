@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError, OutputError
 from megloc_kapture.io.file_states import FileState, state_if_unchanged, state_of
 from megloc_kapture.io.files import hard_link, output_error
-from megloc_kapture.io.kapture import FeatureReader
+from megloc_kapture.io.kapture import FeatureReader, KaptureFolder
 from megloc_kapture.io.paths import check_relative
 
 Digest = Callable[[Path], str]
@@ -41,6 +41,13 @@ def feature_inputs(reader: FeatureReader, image: str, digest: Digest) -> list[ob
     in_tar = not file.is_file()
     content = content_of([reader.read(image)]) if in_tar else digest(file)
     return [reader.config.dtype.name, reader.config.dsize, content]
+
+
+def map_inputs(mapping: KaptureFolder, digest: Digest) -> list[list[str]]:
+    """What every query reads of the map: points, observations, cameras, poses."""
+    root = mapping.root
+    files = [*(root / "reconstruction").rglob("*"), *(root / "sensors").glob("*.txt")]
+    return [[str(f.relative_to(root)), digest(f)] for f in sorted(files) if f.is_file()]
 
 
 def content_of(arrays: Iterable[NDArray[Any]]) -> str:

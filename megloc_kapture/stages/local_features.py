@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, PluginError
 from megloc_kapture.features.image_bound import (
+    Frame,
     bounded_size,
     extract_bounded,
     max_megapixels_of,
@@ -22,13 +25,16 @@ from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolde
 from megloc_kapture.io.tables import write_mask_counts
 from megloc_kapture.plugins import LocalFeatureExtractor
 from megloc_kapture.preprocessing.masks import with_margin
+from megloc_kapture.stages.devices import in_batches
 from megloc_kapture.stages.given_map import has_descriptors
 from megloc_kapture.stages.kept_items import Digest
 from megloc_kapture.stages.layout import LOCAL_FEATURES, REFERENCE
 from megloc_kapture.stages.map_points import check_given_type
 from megloc_kapture.stages.stage import LOCAL_TYPES, PipelineStage, StageWork
-from megloc_kapture.stages.work import HERE, FolderSpec, Work
+from megloc_kapture.stages.work import HERE, Batched, FolderSpec, Work
 from megloc_kapture.values import Camera, LocalFeatures
+
+_SIZE = attrgetter("size")
 
 
 @dataclass(frozen=True)
@@ -36,6 +42,7 @@ class _Job:
     extractor: LocalFeatureExtractor
     folder: FolderSpec
     image: str
+    size: tuple[int, int]
     has_mask: bool
     mask_margin_px: float
 
@@ -82,8 +89,10 @@ def extract_local_features(
 
     items = work.items(extractor.name, list(folder_of), inputs)
     todo = [job for job in jobs if job.image not in items.done]
+    todo.sort(key=_SIZE)  # images of one size can be a batch
+    steps: Batched[_Job, LocalFeatures] = Batched(_read, _extract, extractor, "extract_many", _SIZE)
     writers: tuple[FeatureWriter, FeatureWriter] | None = None
-    results = work.map(_extract, todo, items.label(f"{extractor.name} features"))
+    results = work.map(steps, todo, items.label(f"{extractor.name} features"))
     for job, features in zip(todo, results, strict=True):
         writers = writers or _writers(output, extractor, features)
         files = (
@@ -93,9 +102,7 @@ def extract_local_features(
         items.add(job.image, files, [len(features.keypoints_px), features.num_masked])
     counts = {"images": len(jobs), "keypoints": sum(count for count, _ in items.done.values())}
     bound = max_megapixels_of(extractor)
-    cameras = (job.folder.open().read().camera_of(job.image) for job in jobs)
-    sizes = ((camera.width, camera.height) for camera in cameras)
-    if reduced := sum(bounded_size(*size, bound) != size for size in sizes):
+    if reduced := sum(bounded_size(*job.size, bound) != job.size for job in jobs):
         counts["images_reduced"] = reduced
     masked = {job.image: items.done[job.image][1] for job in jobs if job.has_mask}
     if masked:
@@ -112,8 +119,10 @@ def _jobs(
     )
     specs = [FolderSpec(folder) for folder in folders]
     for image, k in named:
+        camera = folders[k].read().camera_of(image)
         has_mask = mask_path(folders[k], image).is_file()
-        yield _Job(extractor, specs[k], image, has_mask, mask_margin_px)
+        size = camera.width, camera.height
+        yield _Job(extractor, specs[k], image, size, has_mask, mask_margin_px)
 
 
 def _writers(
@@ -136,9 +145,12 @@ def _writers(
     )
 
 
-def _extract(job: _Job) -> LocalFeatures:
-    frame = read_frame(job.folder.open(), job.image, margin_px=job.mask_margin_px)
-    return extract_checked(job.extractor, *frame, job.image)
+def _read(job: _Job) -> Frame:
+    return read_frame(job.folder.open(), job.image, margin_px=job.mask_margin_px)
+
+
+def _extract(jobs: Sequence[_Job], frames: Sequence[Frame]) -> list[LocalFeatures]:
+    return extract_all(jobs[0].extractor, frames, [job.image for job in jobs])
 
 
 def image_inputs(folder: KaptureFolder, image: str, digest: Digest) -> list[object]:
@@ -158,9 +170,7 @@ def mask_path(folder: KaptureFolder, image: str) -> Path:
     return folder.root / "sensors" / "masks" / f"{image}.png"
 
 
-def read_frame(
-    folder: KaptureFolder, image: str, *, margin_px: float = 0.0
-) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+def read_frame(folder: KaptureFolder, image: str, *, margin_px: float = 0.0) -> Frame:
     """An image of a folder, uint8 (H, W, 3) RGB, and its mask, see :func:`read_mask`."""
     pixels = read_image_of(folder.image_path(image), folder.read().camera_of(image))
     return pixels, read_mask(mask_path(folder, image), pixels.shape[:2], margin_px=margin_px)
@@ -208,27 +218,34 @@ def read_mask(
     return with_margin(np.asarray(mask), margin_px)
 
 
-def extract_checked(
-    extractor: LocalFeatureExtractor,
-    pixels: NDArray[np.uint8],
-    mask: NDArray[np.bool_] | None,
-    image: str,
-) -> LocalFeatures:
-    """What a plugin makes of an image, a very large one reduced meanwhile.
+def extract_all(
+    extractor: LocalFeatureExtractor, frames: Sequence[Frame], names: Sequence[str]
+) -> list[LocalFeatures]:
+    """What a plugin makes of images of one size, very large ones reduced meanwhile.
 
     Parameters
     ----------
-    image : its name, for messages.
+    names : of the images, for messages.
 
     Raises
     ------
     PluginError : it breaks the protocol.
+    DeviceMemoryError : there is no memory for one image.
     """
+    found = in_batches(
+        extractor,
+        "extract_many",
+        partial(extract_bounded, extractor),
+        frames,
+        size=lambda frame: frame[0].size,
+        name=lambda k: f"image {names[k]}",
+    )
+    return [_checked(extractor, *each) for each in zip(found, names, strict=True)]
 
+
+def _checked(extractor: LocalFeatureExtractor, features: Any, image: str) -> LocalFeatures:
     def refuse(what: str) -> PluginError:
         return PluginError(f"plugin {extractor.name!r} on image {image}: {what}")
-
-    features: Any = extract_bounded(extractor, pixels, mask)
 
     if not isinstance(features, LocalFeatures):
         raise refuse(f"extract returned {type(features).__name__}, not LocalFeatures")

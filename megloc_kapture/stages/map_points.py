@@ -144,6 +144,7 @@ class TriangulatePoints(PipelineStage):
             own,
             self.options.triangulation,
             num_threads=work.num_threads,
+            work=work,
         )
         if not joined:
             return counts

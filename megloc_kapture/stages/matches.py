@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import threading
 from collections import Counter, OrderedDict
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass
-from functools import cache, cached_property
-from itertools import groupby, islice
+from functools import cache, cached_property, partial
+from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, MatchesWriter, read_pairs
 from megloc_kapture.io.tables import PairCount, write_match_counts
+from megloc_kapture.matching.guided_pyramid import verify_best_first
 from megloc_kapture.matching.verification import (
     KnownPoseOptions,
     TwoViewOptions,
@@ -29,6 +30,7 @@ from megloc_kapture.matching.verification import (
     verify_with_poses,
 )
 from megloc_kapture.plugins import Matcher
+from megloc_kapture.stages.devices import in_batches
 from megloc_kapture.stages.kept_items import Digest, feature_inputs
 from megloc_kapture.stages.layout import (
     FEATURES,
@@ -40,17 +42,15 @@ from megloc_kapture.stages.layout import (
 )
 from megloc_kapture.stages.map_points import matched_images
 from megloc_kapture.stages.stage import PipelineStage, StageWork
-from megloc_kapture.stages.work import HERE, FolderSpec, Work
+from megloc_kapture.stages.work import HERE, Batched, FolderSpec, Work, batched
 from megloc_kapture.values import Camera, ImageFeatures, Options, RigidTransform
 
 if TYPE_CHECKING:
     from megloc_kapture.stages.options import PipelineOptions
 
 
-Item = TypeVar("Item")
-
 _CACHE_BYTES = 256 << 20  # descriptors kept per process: about a hundred images
-BATCH = 8  # pairs that a matcher gets at once, where it can use them
+_PAIRS_PER_ITEM = 32  # of one image, whose features are read once for them
 
 
 class NoVerification(Options):
@@ -90,7 +90,7 @@ class Features(ImageFeatures):
 
 
 Verify = Callable[[Features, Features, NDArray[np.int64]], NDArray[np.bool_]]
-"""Which of the matches (K, 2) of two images are right, bool (K,)."""
+"""Which of the matches (K, 2) of two images, best first, are right, bool (K,)."""
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ def match_pairs(
     -------
     Counts for the log: pairs, pairs with matches, matches.
     """
-    specs = [FolderSpec(f) for f in (first, second)]
+    specs = FolderSpec(first), FolderSpec(second)
     jobs = []
     within_one = first.root == second.root
     ordered = sorted(
@@ -161,10 +161,11 @@ def match_pairs(
     )
     todo = [pair for name, pair in named.items() if name not in items.done]
     for image, group in groupby(todo, key=lambda pair: pair[0]):
-        others = tuple(other for _, other in group)
-        jobs.append(_Job(specs[0], specs[1], local_type, matcher, verification, image, others))
+        for some in batched((other for _, other in group), _PAIRS_PER_ITEM):
+            jobs.append(_Job(*specs, local_type, matcher, verification, image, tuple(some)))
+    steps = Batched(_read, _match, matcher, "match_many", None, _verify)
     writer = MatchesWriter(output, local_type, orphan=True)
-    for job, found in zip(jobs, work.map(_match, jobs, items.label("matching")), strict=True):
+    for job, found in zip(jobs, work.map(steps, jobs, items.label("matching")), strict=True):
         for other, pair in zip(job.others, found, strict=True):
             file = writer.write(job.image, other, pair.matches, pair.scores)
             items.add(f"{job.image}\0{other}", [file], [pair.num_found, len(pair.matches)])
@@ -188,70 +189,75 @@ def _image_inputs(
     return [*found, pose and astuple(pose)]
 
 
-def _match(job: _Job) -> list[VerifiedMatches]:
+def _read(job: _Job) -> list[Features]:
+    """Features of the image, and of the others."""
+    first, second = job.first.open(), job.second.open()
+    return [
+        cached_features(job.first, first, job.local_type, job.image),
+        *(cached_features(job.second, second, job.local_type, other) for other in job.others),
+    ]
+
+
+def _match(
+    jobs: Sequence[_Job], features: Sequence[Sequence[Features]]
+) -> list[list[_PairMatches]]:
+    return [
+        match_all(job.matcher, a, others, [f"pair {job.image}, {other}" for other in job.others])
+        for job, (a, *others) in zip(jobs, features, strict=True)
+    ]
+
+
+def _verify(found: tuple[_Job, Sequence[_PairMatches]]) -> list[VerifiedMatches]:
+    job, matched = found
     first, second = job.first.open(), job.second.open()
 
-    def verifier(other: str) -> Verify:
-        def relative() -> RigidTransform | None:
-            a_from_world = first.read().cam_from_world(job.image)
-            b_from_world = second.read().cam_from_world(other)
-            if a_from_world is None or b_from_world is None:
-                return None
-            return b_from_world @ a_from_world.inverse()
+    def relative(other: str) -> RigidTransform | None:
+        a_from_world = first.read().cam_from_world(job.image)
+        b_from_world = second.read().cam_from_world(other)
+        if a_from_world is None or b_from_world is None:
+            return None
+        return b_from_world @ a_from_world.inverse()
 
-        return verification_of(job.verification, relative)
-
-    return match_images(
-        cached_features(job.first, first, job.local_type, job.image),
-        job.others,
-        lambda other: cached_features(job.second, second, job.local_type, other),
-        job.matcher,
-        verifier,
-    )
-
-
-def match_images(
-    a: Features,
-    others: Sequence[str],
-    load: Callable[[str], Features],
-    matcher: Matcher,
-    verifier: Callable[[str], Verify],
-) -> list[VerifiedMatches]:
-    """Match one image with several, and keep the matches that are verified.
-
-    Parameters
-    ----------
-    load : features of another image, by its name; not all are in memory at once.
-    verifier : what verifies the matches with another image.
-    """
-    found = []
-    for names in batched(others, BATCH):
-        loaded = [load(name) for name in names]
-        matched = match_all(matcher, a, loaded)
-        for name, b, (matches, scores) in zip(names, loaded, matched, strict=True):
-            good = verifier(name)(a, b, matches) if len(matches) else np.zeros(0, bool)
-            found.append(VerifiedMatches(matches[good], scores[good], len(matches)))
-    return found
+    a, *others = _read(job)
+    return [
+        verified(a, b, pair, verification_of(job.verification, partial(relative, other)))
+        for other, b, pair in zip(job.others, others, matched, strict=True)
+    ]
 
 
 def match_all(
-    matcher: Matcher, a: ImageFeatures, others: Sequence[ImageFeatures]
+    matcher: Matcher, a: ImageFeatures, others: Sequence[ImageFeatures], names: Sequence[str]
 ) -> list[_PairMatches]:
-    """Matches of one image with each of several, at once where the matcher can."""
-    at_once = getattr(matcher, "match_many", None)
-    if at_once is None:
-        return [matcher.match(a, other) for other in others]
-    found: list[_PairMatches] = []
-    for batch in batched(others, BATCH):
-        found += at_once(a, batch)
-    return found
+    """Matches of one image with each of several, as many at once as there is memory for.
+
+    Parameters
+    ----------
+    names : of the pairs, for messages.
+
+    Raises
+    ------
+    DeviceMemoryError : there is no memory for one pair.
+    """
+    many: Any = matcher
+
+    def match(batch: Sequence[ImageFeatures]) -> Sequence[_PairMatches]:
+        return many.match_many(a, batch) if len(batch) > 1 else [matcher.match(a, batch[0])]
+
+    return in_batches(
+        matcher,
+        "match_many",
+        match,
+        others,
+        size=lambda b: len(b.keypoints_px) * (len(a.keypoints_px) + 1),
+        name=names.__getitem__,
+    )
 
 
-def batched(items: Iterable[Item], size: int) -> Iterator[list[Item]]:
-    """The items in lists of at most ``size``."""
-    waiting = iter(items)
-    while batch := list(islice(waiting, size)):
-        yield batch
+def verified(a: Features, b: Features, pair: _PairMatches, verify: Verify) -> VerifiedMatches:
+    """The matches of a pair that are verified."""
+    matches, scores = pair
+    good = verify_best_first(partial(verify, a, b), matches, scores)
+    return VerifiedMatches(matches[good], scores[good], len(matches))
 
 
 def verification_of(
@@ -362,7 +368,7 @@ class MatchMapping(PipelineStage):
     """Match and verify pairs of map images."""
 
     name = "mapping_matches"
-    version = 2
+    version = 3
     uses = (*MATCHING_OPTIONS, "mapping_verification")
     writes = (MAPPING_MATCHES,)
 
@@ -404,7 +410,7 @@ class MatchQueries(PipelineStage):
     """Match and verify queries with their candidates; where those are reranked, with all."""
 
     name = "query_matches"
-    version = 3
+    version = 4
     uses = (*MATCHING_OPTIONS, "query_verification")
     writes = (QUERY_MATCHES,)
 

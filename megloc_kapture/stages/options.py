@@ -4,33 +4,34 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.colmap import TriangulationOptions
 from megloc_kapture.mapping.depth import LiftingOptions
 from megloc_kapture.matching.guided_pyramid import GuidedPyramidOptions, base_type, pyramid_type
 from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
+from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import (
     LOCAL_FEATURES,
     MATCHERS,
     LocalFeatureExtractor,
     Matcher,
     PluginChoice,
-    load_plugin,
 )
 from megloc_kapture.retrieval.fusion import FusionOptions
 from megloc_kapture.stages.candidates import QueryPairsOptions, Retrieval
 from megloc_kapture.stages.densifying import DensifyOptions
+from megloc_kapture.stages.devices import Precision, placed, unheeded
 from megloc_kapture.stages.global_features import GlobalFeaturesChoice
 from megloc_kapture.stages.image_pairs import MappingPairsOptions
 from megloc_kapture.stages.map_refinement import MapRefinementOptions
+from megloc_kapture.stages.map_refiners import PoseRefinementOptions
 from megloc_kapture.stages.matches import NoVerification, Verification
-from megloc_kapture.stages.pose_refinement import PoseRefinementOptions
 from megloc_kapture.stages.preprocessing import PreprocessingOptions
 from megloc_kapture.stages.query_poses import LocalizationOptions
 from megloc_kapture.stages.reranking import RerankingOptions
-from megloc_kapture.values import Options
+from megloc_kapture.values import Device, Options
 
 
 class LocalFeaturesChoice(PluginChoice):
@@ -44,6 +45,14 @@ class LocalFeaturesChoice(PluginChoice):
 class PipelineOptions(Options):
     """All options of a run. ``--set matching.options.max_ratio=0.9`` sets one of them."""
 
+    device: Device = Field(
+        default="auto",
+        description="of networks that name none: auto (a GPU if there is one), cpu, cuda, cuda:N",
+    )
+    precision: Precision = Field(
+        default="full",
+        description="of networks that do not say; half: float16 on a GPU, bfloat16 on a processor",
+    )
     preprocessing: PreprocessingOptions = PreprocessingOptions()
     local_features: tuple[LocalFeaturesChoice, ...] = Field(
         default=(LocalFeaturesChoice(name="rootsift"),),
@@ -97,8 +106,16 @@ class PipelineOptions(Options):
         """One choice stands for a list of one."""
         return (value,) if isinstance(value, str | dict) else value
 
+    @model_validator(mode="after")
+    def _placed(self) -> PipelineOptions:
+        """Tell the networks; it is in their options that stages depend on it."""
+        for name in type(self).model_fields:
+            self.__dict__[name] = placed(getattr(self, name), self.device, self.precision)
+        return self
+
     def idle(self) -> dict[str, str]:
-        idle: dict[str, str] = {}
+        lacking = unheeded(self, self.device, self.precision)
+        idle = dict.fromkeys(lacking, "no network is chosen that has it")
         if len(self.global_features) == 1:
             idle["fusion"] = "there is one type of global features (global_features)"
         if not self.makes_points():

@@ -17,6 +17,7 @@ from pydantic import Field
 
 from megloc_kapture.geometry.warping import WarpedView, WarpSource, warp_to_view
 from megloc_kapture.localization.ranking import DistinctiveInliers
+from megloc_kapture.plugin_loading import load_plugin, weights_of
 from megloc_kapture.plugins import (
     IMAGE_DISTANCES,
     HypothesisView,
@@ -24,8 +25,6 @@ from megloc_kapture.plugins import (
     PluginChoice,
     PoseHypothesis,
     RankingScene,
-    load_plugin,
-    weights_of,
 )
 from megloc_kapture.values import Camera, Options, RigidTransform
 

@@ -32,14 +32,14 @@ from megloc_kapture.io.images import (
     write_image,
 )
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
-from megloc_kapture.plugins import SEGMENTERS, Segmenter, load_plugin
+from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugins import SEGMENTERS, Segmenter
 from megloc_kapture.preprocessing.frames import (
     FrameOptions,
     FramePlan,
     plan_frame,
 )
 from megloc_kapture.preprocessing.masks import UnchangingRegion
-from megloc_kapture.preprocessing.resampling import PixelMap
 from megloc_kapture.stages.image_masks import (
     JPEG_QUALITY,
     ClassMasks,
@@ -179,16 +179,6 @@ def read_report(root: Path) -> PreprocessingReport | None:
     return read_json_model(path, PreprocessingReport) if path.is_file() else None
 
 
-def pixel_maps(report: PreprocessingReport) -> dict[str, PixelMap]:
-    """By sensor id: what carries keypoints between the original images and the processed ones."""
-    return {
-        sensor_id: PixelMap(
-            *(Sensor("", "camera", params).camera() for params in (row.original, row.processed))
-        )
-        for sensor_id, row in report.cameras.items()
-    }
-
-
 def preprocess_images(
     folder: KaptureFolder,
     output: Path,
@@ -280,7 +270,13 @@ def preprocess_images(
                 classes=classes,
             )
 
-    results = work.map(_process, jobs(), items.label("pre-processing"), len(todo))
+    results = work.map(
+        _process,
+        jobs(),
+        items.label("pre-processing"),
+        len(todo),
+        plugins=() if classes is None else (classes.segmenter,),
+    )
     for image, (written, found) in zip(todo, results, strict=True):
         items.add(image, written, found)
     shares: dict[str, float] = {}

@@ -153,7 +153,9 @@ def pyramid_mapping(
     spool = MatchSpool(output / ".variants", keypoints, mapping.descriptors(local_type))
     items = work.items(f"variants of {local_type}", [job.image for job in jobs], inputs)
     todo = [job for job in jobs if job.image not in items.done]
-    results = work.map(_match_again, todo, items.label("guided pyramid"))
+    results = work.map(
+        _match_again, todo, items.label("guided pyramid"), plugins=(extractor, matcher)
+    )
     for job, matched in zip(todo, results, strict=True):
         file, found = spool.write(job.image, matched.found)
         told = [found, matched.num_variants, described(matched.skipped), matched.seconds]
@@ -400,6 +402,7 @@ class PyramidMapping(PipelineStage):
     """Match map images with few matches again, at other scales and turns."""
 
     name = "mapping_pyramid"
+    version = 2
     uses = (*MATCHING_OPTIONS, "mapping_verification", "guided_pyramid", "mask_margin_px")
     writes = (MAPPING_PYRAMID,)
 

@@ -166,7 +166,9 @@ def pyramid_queries(
     ]
     features.leave(items.done)
     with closing(MatchesWriter(output, larger, orphan=True)) as writer:
-        results = work.map(_retry, jobs, items.label("guided pyramid"))
+        results = work.map(
+            _retry, jobs, items.label("guided pyramid"), plugins=(extractor, matcher)
+        )
         for job, found in zip(jobs, results, strict=True):
             files = [writer.write(job.image, *one) for one in found.matches]
             files += features.write(job.image, found.added_px, found.added_descriptors)
@@ -260,6 +262,7 @@ class PyramidQueries(PipelineStage):
     """Match queries with few matches again; see :class:`PyramidMapping`."""
 
     name = "query_pyramid"
+    version = 2
     uses = (*MATCHING_OPTIONS, "query_verification", "guided_pyramid", "mask_margin_px")
     writes = (QUERY_PYRAMID,)
 

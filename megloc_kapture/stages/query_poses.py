@@ -23,8 +23,6 @@ from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs
 from megloc_kapture.io.tables import Fallback
 from megloc_kapture.localization.cluster_poses import (
     ClusterLocalization,
-    QueryView,
-    TypedMatches,
     interleave,
     localize_in_clusters,
     poses_of_cameras,
@@ -32,15 +30,11 @@ from megloc_kapture.localization.cluster_poses import (
 from megloc_kapture.localization.clusters import ClusterOptions, cluster_candidates
 from megloc_kapture.localization.estimation import AbsolutePoseOptions
 from megloc_kapture.localization.map_index import MapIndex
+from megloc_kapture.localization.query_views import QueryView, TypedMatches
 from megloc_kapture.matching.guided_pyramid import base_type
-from megloc_kapture.plugins import (
-    POSE_RANKERS,
-    PluginChoice,
-    PoseRanker,
-    RankingScene,
-    load_plugin,
-)
-from megloc_kapture.stages.kept_items import Digest, content_of, feature_inputs
+from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugins import POSE_RANKERS, PluginChoice, PoseRanker, RankingScene
+from megloc_kapture.stages.kept_items import Digest, content_of, feature_inputs, map_inputs
 from megloc_kapture.stages.layout import (
     FEATURES,
     LOCAL_FEATURES,
@@ -50,12 +44,11 @@ from megloc_kapture.stages.layout import (
     QUERY_PAIRS,
     TIMING,
 )
-from megloc_kapture.stages.local_features import mask_path
 from megloc_kapture.stages.localized_folder import plain_result, result_of, write_localized
 from megloc_kapture.stages.matches import iterate_candidates
-from megloc_kapture.stages.ranking_scene import KaptureScene
+from megloc_kapture.stages.ranking_scene import KaptureScene, image_inputs
 from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
-from megloc_kapture.stages.rigs import Unit, depth_records, query_units
+from megloc_kapture.stages.rigs import Unit, query_units
 from megloc_kapture.stages.shared_index import index_map, open_index, shared_index, with_noise
 from megloc_kapture.stages.stage import LOCAL_TYPES, PipelineStage, StageWork
 from megloc_kapture.stages.unreadable import unreadable_queries
@@ -212,18 +205,6 @@ def in_turn(
     return solve(num_candidates)
 
 
-def among_first(view: QueryView, candidates: Sequence[str]) -> QueryView:
-    """A view with its matches with these map images only."""
-    members = set(candidates)
-    return replace(
-        view,
-        matches=tuple(
-            replace(typed, matches=[one for one in typed.matches if one[0] in members])
-            for typed in view.matches
-        ),
-    )
-
-
 def _indices_of(views: Sequence[QueryView]) -> list[MapIndex]:
     by_identity = {id(typed.index): typed.index for view in views for typed in view.matches}
     return list(by_identity.values())
@@ -247,7 +228,7 @@ def _localize(job: _Job) -> list[tuple[str, Pose | Failure]]:
         first = [own[:count] for own in own_candidates]
         candidates = interleave(first)
         return localize_unit(
-            list(map(among_first, views, first)),
+            [view.among(own) for view, own in zip(views, first, strict=True)],
             candidates,
             [frame_of[image] for image in candidates],
             job.options,
@@ -330,7 +311,7 @@ def localize_from_matches(
     read = {name: index_map(map_folder, type_in_map(map_folder, name)) for name in local_types}
     measured = {name: with_noise(map_folder, index) for name, index in read.items()}
     unit_of = {"\0".join(image for image, _ in unit): unit for unit in units}
-    of_query, of_map = files_of(query), files_of(map_folder)
+    of_query, of_map = image_inputs(query), image_inputs(map_folder)
     points_of = cache(partial(map_inputs, map_folder))
 
     def inputs(name: str, digest: Digest) -> object:
@@ -382,29 +363,6 @@ def localize_from_matches(
             pass
 
 
-def map_inputs(mapping: KaptureFolder, digest: Digest) -> list[list[str]]:
-    """What every query reads of the map: points, observations, cameras, poses."""
-    root = mapping.root
-    files = [*(root / "reconstruction").rglob("*"), *(root / "sensors").glob("*.txt")]
-    return [[str(f.relative_to(root)), digest(f)] for f in sorted(files) if f.is_file()]
-
-
-def files_of(folder: KaptureFolder) -> Callable[[str, Digest], list[str | None]]:
-    """What a ranker may look at: an image's file, its mask and its depth."""
-    names, records = set(folder.read().image_names()), depth_records(folder.read())
-
-    @cache
-    def of_image(image: str, digest: Digest) -> list[str | None]:
-        if image not in names:
-            return []
-        files = [folder.image_path(image), mask_path(folder, image)]
-        if image in records:
-            files.append(folder.depth_path(records[image].path))
-        return [digest(file) if file.is_file() else None for file in files]
-
-    return of_image
-
-
 def type_in_map(map_folder: KaptureFolder, local_type: str) -> str:
     """The type that a map knows keypoints by; one without any point is known by its keypoints."""
     names = (local_type, base_type(local_type))
@@ -416,7 +374,7 @@ class LocalizeQueries(PipelineStage):
     """Estimate the poses of the queries from their matches with the map."""
 
     name = "localization"
-    version = 6
+    version = 7
     uses = ("localization", "guided_pyramid.mode", *LOCAL_TYPES)
 
     @property

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -13,6 +13,7 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.io.images import read_depth_map
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.plugins import DepthView
+from megloc_kapture.stages.kept_items import Digest
 from megloc_kapture.stages.local_features import mask_path, read_image_of, read_mask
 from megloc_kapture.stages.rigs import DepthRecord, depth_records
 from megloc_kapture.values import Camera, RigidTransform
@@ -158,3 +159,19 @@ class KaptureScene:
         if pose is None:
             raise DataError(f"map image {name} has no pose", path=self._map.folder.root)
         return pose
+
+
+def image_inputs(folder: KaptureFolder) -> Callable[[str, Digest], list[str | None]]:
+    """What a ranker may look at: an image's file, its mask and its depth."""
+    names, records = set(folder.read().image_names()), depth_records(folder.read())
+
+    @cache
+    def of_image(image: str, digest: Digest) -> list[str | None]:
+        if image not in names:
+            return []
+        files = [folder.image_path(image), mask_path(folder, image)]
+        if image in records:
+            files.append(folder.depth_path(records[image].path))
+        return [digest(file) if file.is_file() else None for file in files]
+
+    return of_image

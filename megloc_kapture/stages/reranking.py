@@ -144,7 +144,7 @@ class RerankQueries(PipelineStage):
     """Keep of each query's candidates those that its local features say are right."""
 
     name = "query_pairs"
-    version = 3
+    version = 4
     uses = ("reranking", *LOCAL_TYPES)
     writes = (QUERY_PAIRS,)
 

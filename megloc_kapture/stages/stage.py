@@ -7,6 +7,7 @@ stage of another package, its command. ``docs/plugins.md`` has an example.
 
 from __future__ import annotations
 
+import json
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, cast
 
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.plugins import code_of, is_ours, weights_of
+from megloc_kapture.plugin_loading import code_of, is_ours, weights_of
 from megloc_kapture.stages.layout import Layout
 from megloc_kapture.stages.restrictions import Restrictions
 from megloc_kapture.stages.work import Work
@@ -155,7 +156,11 @@ class PipelineStage(Stage):
         return True
 
     def settings(self) -> dict[str, Any]:
-        dump = self._all.model_dump(mode="json")
+        # where networks compute is no part: what is done stays done when it goes on elsewhere
+        dump = json.loads(
+            json.dumps(self._all.model_dump(mode="json")),
+            object_hook=lambda table: {k: v for k, v in table.items() if k != "device"},
+        )
         chosen: dict[str, Any] = _selected(dump, [key.split(".") for key in self.uses])
         weights = {
             file: sha for plugin in self.plugins() for file, sha in weights_of(plugin).items()

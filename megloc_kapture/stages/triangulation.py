@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.colmap import MapImage, TriangulationOptions, triangulate
+from megloc_kapture.io.colmap import MapImage, TriangulatedPoints, TriangulationOptions, triangulate
 from megloc_kapture.io.files import hard_link, link_images
 from megloc_kapture.io.kapture import (
     FeatureReader,
@@ -25,6 +28,9 @@ from megloc_kapture.io.kapture import (
 from megloc_kapture.io.kapture.features import SUFFIX, ArrayKind
 from megloc_kapture.io.kapture.matches import MatchesReader
 from megloc_kapture.matching.guided_pyramid import base_type
+from megloc_kapture.stages.work import HERE, FolderSpec, Work
+
+_IMAGES_AT_ONCE = 1000  # that parts are put together to
 
 
 def triangulate_map(
@@ -36,11 +42,14 @@ def triangulate_map(
     *,
     pairs: Sequence[ImagePair] | None = None,
     num_threads: int = 1,
+    work: Work = HERE,
 ) -> dict[str, float]:
     """Triangulate and write the map: sensors, features of its types, points3d, observations.
 
     Each type has points and observations of its own, those of the first type come first. Poses,
-    given per camera or per rig, and intrinsics stay exactly what they are.
+    given per camera or per rig, and intrinsics stay exactly what they are. Parts of a large map
+    that no match connects are triangulated one by one, which loses nothing: a point is seen from
+    one part alone, and poses are known.
 
     Parameters
     ----------
@@ -48,6 +57,7 @@ def triangulate_map(
     matches : where the verified matches of the types are.
     local_types : keypoints types; a repeated one counts once.
     pairs : use the matches of these pairs only.
+    num_threads : of COLMAP, where no workers share the parts.
 
     Returns
     -------
@@ -69,14 +79,13 @@ def triangulate_map(
     errors_px = [np.zeros(0)]
     observations = {}
     by_type: dict[str, float] = {}
-    of_type = {name: (matches.matches(name), mapping.keypoints(name)) for name in types}
-    for type_name, (reader, keypoints) in of_type.items():
-        verified = verified_matches(reader, images, asked)
-        map_images = [
-            MapImage(image, data.camera_of(image), poses[image], keypoints.read(image)[:, :2])
-            for image in images
-        ]
-        found = triangulate(map_images, verified, options, num_threads=num_threads, scratch=output)
+    of_type = {name: _matched_pairs(matches.matches(name), images, asked) for name in types}
+    for name in types:
+        mapping.keypoints(name)  # refused before any work
+    specs = FolderSpec(mapping), FolderSpec(matches)
+    for type_name, matched in of_type.items():
+        part = _Part(*specs, type_name, tuple(images), matched, options, num_threads, output)
+        found = _triangulate(part, work)
         observations[type_name] = Observations(
             keypoints_type=type_name,
             image_names=tuple(images),
@@ -84,7 +93,7 @@ def triangulate_map(
             image_ids=found.image_ids.astype(np.int32),
             keypoint_ids=found.keypoint_ids.astype(np.int32),
         )
-        num_pairs += len(verified)
+        num_pairs += len(matched)
         points.append(found.xyz)
         errors_px.append(found.errors_px)
         by_type[f"points_{type_name}"] = len(found.xyz)
@@ -116,14 +125,100 @@ def verified_matches(
     asked: Collection[tuple[str, ...]] | None = None,
 ) -> dict[tuple[int, int], NDArray[np.int64]]:
     """Matches by pairs of rows of ``images``; of the pairs asked for alone (first name first)."""
+    return _read(reader, images, _matched_pairs(reader, images, asked))
+
+
+def _read(
+    reader: MatchesReader, images: Sequence[str], pairs: NDArray[np.int64]
+) -> dict[tuple[int, int], NDArray[np.int64]]:
+    return {(a, b): reader.read(images[a], images[b])[0] for a, b in pairs.tolist()}
+
+
+def _matched_pairs(
+    reader: MatchesReader, images: Sequence[str], asked: Collection[tuple[str, ...]] | None
+) -> NDArray[np.int64]:
+    """Pairs (P, 2) of rows of ``images`` that have a match."""
     row_of = {image: row for row, image in enumerate(images)}
-    verified = {}
-    for a, b in reader.pairs:
-        if a in row_of and b in row_of and (asked is None or (a, b) in asked):
-            indices, _ = reader.read(a, b)
-            if len(indices):
-                verified[row_of[a], row_of[b]] = indices
-    return verified
+    pairs = [
+        (row_of[a], row_of[b])
+        for a, b in reader.pairs
+        if a in row_of and b in row_of and (asked is None or (a, b) in asked)
+        if reader.length(a, b)
+    ]
+    return np.array(pairs, np.int64).reshape(-1, 2)
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Images of a map, and those pairs (P, 2) of them that match."""
+
+    mapping: FolderSpec
+    matches: FolderSpec
+    local_type: str
+    images: tuple[str, ...]
+    pairs: NDArray[np.int64]
+    options: TriangulationOptions
+    num_threads: int
+    scratch: Path
+
+
+def _triangulate(whole: _Part, work: Work) -> TriangulatedPoints:
+    """Points of the images, part by part where no match connects them."""
+    members = _unconnected(len(whole.images), whole.pairs)
+    if len(members) == 1:
+        return _triangulate_part(whole)
+    parts = [
+        replace(
+            whole,
+            images=tuple(whole.images[row] for row in rows.tolist()),
+            pairs=np.searchsorted(rows, whole.pairs[np.isin(whole.pairs[:, 0], rows)]),
+            num_threads=whole.num_threads if work.executor is None else 1,
+            scratch=whole.scratch.absolute(),
+        )
+        for rows in members
+    ]
+    found = list(work.map(_triangulate_part, parts, f"triangulation of {whole.local_type}"))
+    before = np.cumsum([0, *(len(one.xyz) for one in found)]).tolist()
+    return TriangulatedPoints(
+        xyz=np.concatenate([one.xyz for one in found]),
+        errors_px=np.concatenate([one.errors_px for one in found]),
+        point_ids=np.concatenate(
+            [one.point_ids + offset for one, offset in zip(found, before, strict=False)]
+        ),
+        image_ids=np.concatenate(
+            [rows[one.image_ids] for one, rows in zip(found, members, strict=True)]
+        ),
+        keypoint_ids=np.concatenate([one.keypoint_ids for one in found]),
+    )
+
+
+def _triangulate_part(part: _Part) -> TriangulatedPoints:
+    mapping, reader = part.mapping.open(), part.matches.open().matches(part.local_type)
+    data, keypoints = mapping.read(), mapping.keypoints(part.local_type)
+    images = [
+        MapImage(image, data.camera_of(image), pose, keypoints.read(image)[:, :2])
+        for image in part.images
+        if (pose := data.cam_from_world(image)) is not None  # all have one
+    ]
+    verified = _read(reader, part.images, part.pairs)
+    threads, scratch = part.num_threads, part.scratch
+    return triangulate(images, verified, part.options, num_threads=threads, scratch=scratch)
+
+
+def _unconnected(num_images: int, pairs: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Rows of the images of parts that no pair connects; small ones are put together."""
+    links = csr_array((np.ones(len(pairs)), pairs.T), shape=(num_images, num_images))
+    _, part_of = connected_components(links, directed=False)
+    rows = np.argsort(part_of, kind="stable")
+    groups: list[list[NDArray[np.int64]]] = [[]]
+    size = 0
+    for part in np.split(rows, np.flatnonzero(np.diff(part_of[rows])) + 1):
+        if size and size + len(part) > _IMAGES_AT_ONCE:
+            groups.append([])
+            size = 0
+        groups[-1].append(part)
+        size += len(part)
+    return [np.sort(np.concatenate(group)) for group in groups]
 
 
 _COPIED: tuple[ArrayKind, ...] = ("keypoints", "descriptors", "global_features")

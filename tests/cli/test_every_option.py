@@ -68,7 +68,11 @@ TOO_FEW = "map images are too few for product quantisation"
 OF_FOLDERS = "are for folders of images"
 PYRAMID = ("guided_pyramid.mode=all", "guided_pyramid.min_matches=200")
 
+NO_NETWORK = "no network is chosen that has it"
+
 CASES: dict[str, Case] = {
+    "device": Case('"cpu"', refused=NO_NETWORK, localize=NO_NETWORK),
+    "precision": Case('"half"', refused=NO_NETWORK, localize=NO_NETWORK),
     "preprocessing.max_size_px": Case("240", "preprocessed/"),
     "preprocessing.upscale": Case("true", "preprocessed/", ("preprocessing.max_size_px=480",)),
     "preprocessing.multiple_of": Case("64", "preprocessed/", ("preprocessing.max_size_px=300",)),
@@ -166,7 +170,9 @@ CASES: dict[str, Case] = {
         ("matching.options.max_ratio=1.0", "query_verification.confidence=0.01"),
     ),
     "query_verification.confidence": Case("0.01", "matches/query", LOOSE),
-    "query_verification.seed": Case("7", "matches/query", LOOSE),
+    "query_verification.seed": Case(
+        "7", "matches/query", (*LOOSE, "query_verification.max_iterations=1")
+    ),
     "guided_pyramid.mode": Case('"all"', "pyramid/", also=("guided_pyramid.min_matches=200",)),
     "guided_pyramid.min_matches": Case("200", "pyramid/", PYRAMID[:1]),
     "guided_pyramid.scales": Case("[1.0,2.0]", "pyramid/", PYRAMID),

@@ -10,7 +10,8 @@ from colmap_workspace import write_workspace
 
 from megloc_kapture.evaluation.evaluate import evaluate
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.plugins import LOCAL_FEATURES, load_plugin
+from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugins import LOCAL_FEATURES
 
 import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
 

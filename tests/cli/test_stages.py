@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from megloc_kapture.io.kapture import KaptureFolder, read_pairs
 from megloc_kapture.io.tables import read_match_counts
@@ -247,7 +248,7 @@ def test_ways_to_pair(megloc: Any, finished: Path, tmp_path: Path) -> None:
 def test_a_map_of_two_types_of_features(megloc: Any, scene: Path, tmp_path: Path) -> None:
     features, mapping, pairs = tmp_path / "features", scene / "mapping", tmp_path / "pairs.txt"
     place = ("-i", mapping, "--features-dir", features)
-    few = ("--set", "local_features.options.max_keypoints=500")
+    few = ("--set", "local_features.rootsift.options.max_keypoints=500")
     both = ("--features", "rootsift", "sift")
     commands = [
         ["extract-local", "-i", mapping, "-o", features, *both, *few, *INLINE],
@@ -310,3 +311,33 @@ def test_import_links_images_and_prefixes_queries(megloc: Any, scene: Path, tmp_
         == (scene / "query/sensors/records_data/0001.jpg").read_bytes()
     )
     megloc("import", "venice", scene, "-o", tmp_path / "x").refused("unknown dataset 'venice'")
+
+
+def test_networks_compute_where_the_flags_say(
+    megloc: Any, shared_data: Path, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MEGLOC_WEIGHTS", str(shared_data / "weights"))
+    mapping, features = scene / "mapping", tmp_path / "features"
+    extract = ["extract-local", "-i", mapping, *INLINE]
+    half = [*extract, "--features", "xfeat", "-o", features, "--precision", "half"]
+    assert megloc(*half, "--device", "cpu").status == 0
+    full = [*extract, "--features", "xfeat", "-o", tmp_path / "full"]
+    assert megloc(*full).status == 0
+    name = "local_features/xfeat/keypoints/" + next(
+        iter(KaptureFolder(mapping).read().image_names())
+    )
+    both = [(place / f"{name}.kpt").read_bytes() for place in (features, tmp_path / "full")]
+    assert both[0] != both[1]
+    pairs = tmp_path / "pairs.txt"
+    megloc("pairs-mapping", "-i", mapping, "-o", pairs, "--by", "sequence")
+    place = ("-i", mapping, "--features-dir", features, "--pairs", pairs, *INLINE)
+    refused = "changes nothing: no network here has it"
+    megloc("match", *place, "-o", tmp_path / "new", "--device", "cpu").refused(refused)
+    megloc(*extract, "-o", tmp_path / "new", "--precision", "half").refused(refused)
+    by = ["pairs-mapping", "-i", mapping, "-o", tmp_path / "new.txt", "--by", "sequence"]
+    megloc(*by, "--device", "cpu").refused(refused)
+    run = ["eval", "kapture", "--root", scene, "-w", tmp_path / "run", "-q", "--dry-run"]
+    megloc(*run, "--device", "cpu").refused("device changes nothing: no network is chosen")
+    megloc(*run, "--preset", "modern", "--device", "gpu").refused("option device: String should")
+    if not torch.cuda.is_available():
+        megloc(*full, "-f", "--device", "cuda:1").refused("device=cuda:1: this machine has no GPU")

@@ -3,79 +3,38 @@
 from __future__ import annotations
 
 import os
-import re
 import signal
-import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psutil
 import pytest
-from distributed import Client
 from threadpoolctl import threadpool_info
 
 import megloc_kapture as megloc
 from megloc_kapture.errors import DataError, MeglocError, OptionError
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline import dask_executor
-from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
-from megloc_kapture.pipeline.executors import open_executor, single_threaded
-from megloc_kapture.pipeline.plan import run_plan
-from megloc_kapture.pipeline.queries import KaptureQueries
-from megloc_kapture.pipeline.run import choose_run
-from megloc_kapture.pipeline.workspace import Workspace
-from megloc_kapture.stages.work import Item, Track, Work, ordered_map, untracked
+from megloc_kapture.pipeline.executors import open_executor
+from megloc_kapture.pipeline.kapture_queries import KaptureQueries
+from megloc_kapture.stages.work import ordered_map
 from megloc_kapture.values import Pose
 
-
-@dataclass(frozen=True)
-class Cluster:
-    """A scheduler and two workers of their own, as somebody starts them."""
-
-    address: str
-    scheduler: subprocess.Popen[str]
-    workers: tuple[subprocess.Popen[str], ...]
-
-
-@contextmanager
-def running(folder: Path, number: int = 2, **environment: str) -> Iterator[Cluster]:
-    """A cluster on this machine, whose workers start in another folder than this process."""
-    settings = {"env": {**os.environ, **environment}, "cwd": folder}
-    settings |= {"stderr": subprocess.PIPE, "text": True, "start_new_session": True}
-    dask = [sys.executable, "-m", "dask"]
-    started: list[subprocess.Popen[str]] = []
-    command = [*dask, "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"]
-    try:
-        started.append(subprocess.Popen(command, **settings))  # type: ignore[call-overload]
-        stderr: Any = started[0].stderr
-        line = next(line for line in stderr if "Scheduler at:" in line)
-        address = re.findall(r"tcp://\S+", line)[0]
-        command = [*dask, "worker", address, "--nthreads", "1", "--no-dashboard"]
-        for _ in range(number):
-            started.append(subprocess.Popen(command, **settings))  # type: ignore[call-overload]
-        with Client(address, set_as_default=False) as client:
-            client.wait_for_workers(number, timeout=60)
-        yield Cluster(address, started[0], tuple(started[1:]))
-    finally:
-        for process in started:
-            with_children(process.pid)
-            process.wait()
-            if process.stderr:
-                process.stderr.close()
-
-
-def with_children(pid: int) -> None:
-    """Kill a process and those of its session."""
-    try:
-        os.killpg(pid, signal.SIGKILL)
-    except ProcessLookupError:
-        return
+sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
+from kills import (  # noqa: E402
+    At,
+    Cluster,
+    Given,
+    contents,
+    kill_session,
+    resume_after_kills,
+    run_with_kills,
+    running,
+)
 
 
 @pytest.fixture(scope="module")
@@ -182,7 +141,7 @@ def test_a_scheduler_that_goes_away_is_one_line(tmp_path: Path) -> None:
     ):
         for number, _ in enumerate(ordered_map(_slow_square, range(500), executor)):
             if number == 3:
-                with_children(found.scheduler.pid)
+                kill_session(found.scheduler.pid)
 
 
 def test_what_cannot_be_used_is_refused(cluster: Cluster) -> None:
@@ -195,17 +154,6 @@ def test_what_cannot_be_used_is_refused(cluster: Cluster) -> None:
         open_executor("dask", 2, cluster.address).__enter__()
     with pytest.raises(OptionError, match="--scheduler"):
         open_executor("processes", 2, cluster.address).__enter__()
-
-
-def contents(workspace: Path) -> dict[str, bytes]:
-    """The files of a workspace but for those that have times in them."""
-    return {
-        str(path.relative_to(workspace)): path.read_bytes()
-        for path in sorted(workspace.rglob("*"))
-        if path.is_file()
-        and path.name != "timing.csv"
-        and not {"stages", "evaluation", "submissions"} & set(path.relative_to(workspace).parts)
-    }
 
 
 def test_a_map_is_the_same_bytes_on_a_cluster(
@@ -236,48 +184,16 @@ def test_images_are_localized_on_a_cluster_as_here(
         assert (one.name, one.confidence) == (other.name, other.confidence)
 
 
-def run_whole(scene: Path, root: Path, address: str | None, track: Track = untracked) -> None:
-    """What ``megloc eval`` runs: in this process, or on the cluster of an address."""
-    few = {"local_features.options.max_keypoints": 400}
-    choice, opened = choose_run("kapture", scene, assignments=few), Workspace(root)
-    kind = "dask" if address else "inline"
-    with (
-        opened.lock(),
-        single_threaded(),
-        open_executor(kind, scheduler=address, shared=root) as executor,  # type: ignore[arg-type]
-    ):
-        run_plan(plan_evaluation(choice.run_in(opened)), opened, Work(executor, track))
-
-
-class At:
-    """Calls a function each time that so many results of a run have arrived."""
-
-    def __init__(self, moments: Iterable[int], action: Callable[[], None]) -> None:
-        self.results, self._moments, self._action = 0, set(moments), action
-
-    def __call__(self, items: Iterable[Item], total: int, label: str) -> Iterator[Item]:
-        for item in items:
-            yield item
-            self.results += 1
-            if self.results in self._moments:
-                self._action()
-
-
-def worker_pids(cluster: Cluster) -> list[int]:
-    """The processes that do the work; their parents only start them again."""
-    found = []
-    for nanny in cluster.workers:
-        for child in psutil.Process(nanny.pid).children(recursive=True):
-            with suppress(psutil.Error):  # it has just died
-                found += [child.pid] if "spawn_main" in "".join(child.cmdline()) else []
-    return found
+def whole(scene: Path) -> Given:
+    """A whole run on a scene, with few keypoints."""
+    return Given("kapture", scene, {"local_features.options.max_keypoints": 400})
 
 
 @pytest.fixture(scope="module")
 def inline(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, bytes], int]:
     """The files of a whole run in this process, and the number of results that it waits for."""
-    root, counter = tmp_path_factory.mktemp("inline") / "workspace", At((), lambda: None)
-    run_whole(scene, root, None, counter)
+    root, counter = tmp_path_factory.mktemp("inline") / "workspace", At()
+    whole(scene).run(root, track=counter)
     return contents(root), counter.results
 
 
@@ -287,22 +203,7 @@ def test_workers_killed_at_ten_moments_change_no_byte(
     number: int, inline: tuple[dict[str, bytes], int], scene: Path, tmp_path: Path
 ) -> None:
     here, results = inline
-    random = np.random.default_rng(number)
-    killed = []
-    with running(tmp_path, number) as found:
-
-        def kill() -> None:
-            pids: list[int] = []
-            while not pids:  # all may be about to be started again
-                time.sleep(0.01)
-                pids = worker_pids(found)
-            killed.append(int(random.choice(pids)))
-            with suppress(ProcessLookupError):
-                os.kill(killed[-1], signal.SIGKILL)
-
-        moments = random.choice(np.arange(1, results), 10, replace=False).tolist()
-        run_whole(scene, tmp_path / "workspace", found.address, At(moments, kill))
-    assert len(killed) == 10
+    assert run_with_kills(whole(scene), tmp_path, number, results, seed=number) == 10
     assert contents(tmp_path / "workspace") == here
 
 
@@ -311,13 +212,5 @@ def test_a_run_goes_on_after_its_scheduler_was_killed(
     inline: tuple[dict[str, bytes], int], scene: Path, tmp_path: Path
 ) -> None:
     here, results = inline
-    root = tmp_path / "workspace"
-    # what was done before is not done again, so each must come early enough for the next
-    for moment in np.random.default_rng(0).integers(1, results // 4, 3).tolist():
-        with running(tmp_path, 2) as found:
-            track = At([moment], lambda: with_children(found.scheduler.pid))  # noqa: B023
-            with pytest.raises(MeglocError, match=r"has gone; .*to go on$"):
-                run_whole(scene, root, found.address, track)
-    with running(tmp_path, 2) as found:
-        run_whole(scene, root, found.address)
-    assert contents(root) == here
+    assert resume_after_kills(whole(scene), tmp_path, results, seed=0) == 3
+    assert contents(tmp_path / "workspace") == here

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from megloc_kapture import plugins
+from megloc_kapture import plugin_loading
 from megloc_kapture.datasets.official import Count, DatasetCard, Missing, OfficialDataset
 from megloc_kapture.errors import DataError, OptionError, PluginError
 from megloc_kapture.io.dataset_tables import Protocol, read_protocol
@@ -20,13 +20,8 @@ from megloc_kapture.pipeline.datasets import (
     dataset_names,
     twin_of,
 )
-from megloc_kapture.plugins import (
-    DATASETS,
-    RENDERED_DATASETS,
-    DatasetAdapter,
-    RenderedDataset,
-    plugin_names,
-)
+from megloc_kapture.plugin_loading import plugin_names
+from megloc_kapture.plugins import DATASETS, RENDERED_DATASETS, DatasetAdapter, RenderedDataset
 from megloc_kapture.values import Camera, RigidTransform
 
 OFFICIAL = ("4seasons", "aachen", "inloc", "robotcar")
@@ -124,7 +119,7 @@ def test_without_the_twins_one_line_says_what_to_install(
 ) -> None:
     others = {group: entry_points(group=group) for group in (DATASETS, RENDERED_DATASETS)}
     others[RENDERED_DATASETS] = EntryPoints()
-    monkeypatch.setattr(plugins, "entry_points", lambda group: others[group])
+    monkeypatch.setattr(plugin_loading, "entry_points", lambda group: others[group])
     for name in ("synthetic", "synthetic-aachen"):
         with pytest.raises(OptionError, match="pip install megloc-twins"):
             choose_dataset(name, None)

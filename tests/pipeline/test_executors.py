@@ -341,5 +341,35 @@ def test_libraries_loaded_within_a_block_have_one_thread_there_and_all_afterward
         subprocess.run([sys.executable, "-c", script], check=True, env=environment)
 
 
+def test_an_openblas_made_with_openmp_counts_for_each_thread() -> None:
+    pytest.importorskip("faiss")  # brings one
+    script = """if True:
+        import threading
+        import numpy, faiss
+        from threadpoolctl import threadpool_info
+        from megloc_kapture.pipeline.executors import single_threaded
+        def numbers():
+            return {library["num_threads"] for library in threadpool_info()}
+        inside, leave = threading.Event(), threading.Event()
+        seen = []
+        def other():
+            with single_threaded():
+                seen.append(numbers())
+                inside.set()
+                leave.wait(30)
+            seen.append(numbers())
+        thread = threading.Thread(target=other)
+        with single_threaded():
+            thread.start()
+            assert inside.wait(30)
+        leave.set()
+        thread.join()
+        assert seen == [{1}, {2}], seen
+        assert numbers() == {2}, numbers()
+    """
+    environment = {**os.environ, "OMP_NUM_THREADS": "2"}
+    subprocess.run([sys.executable, "-c", script], check=True, env=environment)
+
+
 def test_there_is_a_core_at_least() -> None:
     assert 1 <= available_cores() <= (os.cpu_count() or 1)

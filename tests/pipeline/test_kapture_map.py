@@ -16,11 +16,11 @@ from megloc_kapture.geometry.cameras import project, shift_principal_point
 from megloc_kapture.io.kapture import FeatureWriter, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.localization.map_index import observed_matches
 from megloc_kapture.pipeline.kapture_map import KaptureMap
+from megloc_kapture.pipeline.kapture_queries import KaptureQueries
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.queries import KaptureQueries
 from megloc_kapture.plugins import PluginChoice
-from megloc_kapture.stages.matches import Features, match_images, verification_of
+from megloc_kapture.stages.matches import Features, match_all, verification_of, verified
 from megloc_kapture.values import Pose
 
 
@@ -97,7 +97,7 @@ def residuals_px(opened: KaptureMap, queries: KaptureFolder, truth: Path) -> lis
     )
 
     def match_one(a: Features, b: Features) -> tuple[np.ndarray, np.ndarray]:
-        return match_images(a, ["b"], lambda _: b, matcher, lambda _: verify)[0][:2]
+        return verified(a, b, match_all(matcher, a, [b], ["b"])[0], verify)[:2]
 
     for query in KaptureQueries(queries, opened):
         features = query.features[local_type]

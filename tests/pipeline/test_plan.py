@@ -5,7 +5,10 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,6 +19,7 @@ from megloc_kapture.errors import DataError, OptionError, OutputError
 from megloc_kapture.pipeline.plan import StageReport, all_kept, describe, run_plan
 from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.stages.stage import Hashes, Stage, StageWork
+from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Options
 
 
@@ -75,6 +79,9 @@ class Kitchen:
             place.write_text(text + name + str(self.options[name].get("extra", "")))
             if self.options[name].get("csv"):
                 (out / "b.csv").write_text("table")
+            if command := self.options[name].get("killed"):
+                assert subprocess.run([*command, str(place)], check=False).returncode == 9
+                assert len(list(place.parent.iterdir())) == 2
             if self.options[name].get("burns"):
                 raise DataError("burnt")
             return {"letters": float(len(text) + 1)}
@@ -221,6 +228,15 @@ def test_rests_of_a_killed_run_do_not_get_into_the_output(kitchen: Kitchen) -> N
     rest.mkdir(parents=True)
     (rest / "rest.txt").write_text("half")
     kitchen.cook()
+    assert [p.name for p in kitchen.workspace.path("b").iterdir()] == ["b.txt"]
+
+
+def test_half_a_file_of_a_worker_that_died_does_not_get_into_the_output(kitchen: Kitchen) -> None:
+    dying = "from megloc_kapture.io.files import *; import os, sys\n"
+    dying += "with atomic_write(sys.argv[1]) as file: file.write(b'half'); os._exit(9)"
+    kitchen.options["b"]["killed"] = [sys.executable, "-c", dying]
+    with ThreadPoolExecutor(1) as executor:
+        kitchen.cook(work=Work(executor))
     assert [p.name for p in kitchen.workspace.path("b").iterdir()] == ["b.txt"]
 
 

@@ -2,18 +2,31 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
+from megloc_kapture.io.kapture import (
+    FeatureConfig,
+    FeatureWriter,
+    KaptureData,
+    KaptureFolder,
+    write_sensors,
+)
 from megloc_kapture.retrieval.fusion import FusionOptions, fuse
 from megloc_kapture.retrieval.reranking import DiversityOptions
 from megloc_kapture.stages import candidates
-from megloc_kapture.stages.candidates import Candidates, QueryPairsOptions, Retrieval
+from megloc_kapture.stages.candidates import (
+    Candidates,
+    QueryPairsOptions,
+    Retrieval,
+    vectors_of,
+)
 from megloc_kapture.stages.image_pairs import MappingPairsOptions, pair_map_images, pair_queries
+from megloc_kapture.stages.work import Work
 from megloc_kapture.values import RigidTransform
 
 SIZES = {"short": 3, "long": 8}
@@ -90,3 +103,56 @@ def test_diversity_spreads_over_places_and_keeps_the_scores_order() -> None:
     # only what is permitted, by positions in the whole map
     some, _ = ranked.of(query, np.array([1, 2, 4]), QueryPairsOptions(top_k=2, diversity=diversity))
     assert some.tolist() == [[1, 4]]
+
+
+@pytest.fixture
+def two_types(tmp_path: Path) -> KaptureFolder:
+    """300 images, described by two types."""
+    rng = np.random.default_rng(7)
+    for name, width in (("one", 8), ("two", 5)):
+        config = FeatureConfig(name, np.dtype("float32"), width, None, "L2")
+        with FeatureWriter(tmp_path, "global_features", name, config, orphan=True) as writer:
+            for image in range(300):
+                writer.write(f"{image:03}.jpg", rng.normal(size=width).astype(np.float32))
+    write_sensors(tmp_path / "map", KaptureData())
+    return KaptureFolder(tmp_path / "map", features_dirs=[tmp_path])
+
+
+@pytest.mark.parametrize(
+    "method", ["ghm", "mean", "early", "round_robin", "borda", "reciprocal_rank"]
+)
+@pytest.mark.parametrize("types", [("one",), ("one", "two")])
+def test_parts_of_a_database_give_the_ranking_of_the_whole(
+    two_types: KaptureFolder,
+    two_processes: Executor,
+    monkeypatch: pytest.MonkeyPatch,
+    types: tuple[str, ...],
+    method: str,
+) -> None:
+    lists = {"list_length": 30} if method in ("borda", "reciprocal_rank") else {}
+    fusion = FusionOptions.model_validate({"method": method, **lists})
+    retrieval = Retrieval(types, fusion=fusion)
+    images = [f"{image:03}.jpg" for image in range(300)]
+    vectors = vectors_of(retrieval.readers(two_types), images)
+    whole = retrieval.rank(vectors, vectors, 20)
+    monkeypatch.setattr(candidates, "_ROWS", 70)
+    for work in (Work(), Work(two_processes)):
+        index, scores = retrieval.rank(vectors, vectors, 20, work=work)
+        np.testing.assert_array_equal(index, whole[0])
+        np.testing.assert_allclose(scores, whole[1], atol=1e-6)
+
+
+def test_each_part_has_codes_and_a_short_list(
+    two_processes: Executor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("faiss")
+    rng = np.random.default_rng(8)
+    rows = rng.normal(size=(3000, 32)).astype(np.float32)
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+    exact, _ = Retrieval(("one",)).rank([rows[:50]], [rows], 10)
+    monkeypatch.setattr(candidates, "_CODED_ROWS", 1100)
+    kept: dict[int, Any] = {}
+    for work, codes in ((Work(), kept), (Work(), kept), (Work(two_processes), {})):
+        found, _ = Retrieval(("one",)).rank([rows[:50]], [rows], 10, codes=codes, work=work)
+        np.testing.assert_array_equal(found, exact)
+    assert sorted(kept) == [0, 1000, 2000]

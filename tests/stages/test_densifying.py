@@ -8,14 +8,17 @@ from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any
 
+import cv2
 import kapture
 import kapture.io.csv
 import kapture.io.records
 import numpy as np
 import pytest
 from corner import CAMERA, depth_m
+from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError
+from megloc_kapture.geometry.cameras import project
 from megloc_kapture.geometry.warping import scaled_camera
 from megloc_kapture.io.images import read_depth_map
 from megloc_kapture.io.kapture import KaptureFolder, read_point_covariances, write_sensors
@@ -23,17 +26,18 @@ from megloc_kapture.io.tables import read_depth_rows
 from megloc_kapture.localization.map_index import observed_matches
 from megloc_kapture.mapping.uncertainty import point_deviations
 from megloc_kapture.plugins import PluginChoice
-from megloc_kapture.stages.densifying import (
-    DEPTH_FILE,
-    DensifyOptions,
-    densify_map,
-    read_beside,
-    side_file,
-)
+from megloc_kapture.stages.densifying import DensifyOptions, densify_map, fitted_to_poses
 from megloc_kapture.stages.fusion import fuse_depth
 from megloc_kapture.stages.rigs import depth_records
 from megloc_kapture.stages.shared_index import index_map
+from megloc_kapture.stages.stereo_depth import (
+    DEPTH_FILE,
+    read_beside,
+    read_stereo_depth,
+    side_file,
+)
 from megloc_kapture.stages.work import Work
+from megloc_kapture.values import RigidTransform
 
 FAST = PluginChoice(name="sweep", options={"passes": 1, "max_planes": 64})
 OPTIONS = DensifyOptions(mode="points", max_size_px=200, num_sources=2, estimator=FAST)
@@ -95,6 +99,58 @@ def test_points_of_the_map_stay_and_lifted_ones_lie_on_the_walls(
     # along the ray they are unsure, across it a pixel: z / f is 1.5 to 3 cm here
     assert np.median(deviations[:, 2] / deviations[:, 0]) > 1.2
     assert 0.01 < np.median(deviations[:, 0]) < 0.04
+
+
+def test_depth_is_as_sure_and_as_fine_as_the_poses(
+    world: Any, densified: KaptureFolder, tmp_path: Path
+) -> None:
+    options = OPTIONS.model_copy(update={"mode": "depth", "max_size_px": 400})
+    fitted, error_px = fitted_to_poses(world.map(), options)
+    assert fitted == options and error_px < 0.2  # its poses are exact
+    doubtful = tmp_path / "doubtful"
+    shutil.copytree(world.map().root, doubtful, symlinks=True)
+    data = world.map().read()
+    draw = np.random.default_rng(0)
+    turns = {key: draw.normal(0, 0.004, 3) for key in data.trajectories}
+    truth = data.poses()
+    data.trajectories = {
+        key: RigidTransform.from_matrix(Rotation.from_rotvec(turn).as_matrix(), np.zeros(3)) @ pose
+        for (key, turn), pose in zip(turns.items(), data.trajectories.values(), strict=True)
+    }
+    write_sensors(doubtful, data)
+    source = KaptureFolder(doubtful, features_dirs=[world.features_dir])
+    fitted, error_px = fitted_to_poses(source, options)
+    # the median distance between observations and points that the turned cameras see elsewhere
+    distances = []
+    for seen in source.observations().values():
+        for row, image in enumerate(seen.image_names):
+            own = seen.image_ids == row
+            at = project(
+                CAMERA, source.read().poses()[image], source.points3d()[seen.point_ids[own], :3]
+            )
+            keypoints = source.keypoints("rootsift").read(image)[seen.keypoint_ids[own], :2]
+            distances.append(np.linalg.norm(at - keypoints, axis=1))
+    median = np.median(np.concatenate(distances))
+    assert median > 1
+    assert fitted.max_size_px == pytest.approx(400 * 0.5 / np.sqrt(median**2 - 0.09), abs=2)
+    assert error_px == pytest.approx(0.5, abs=0.01)
+    assert fitted.num_sources == round(2 * 400 / fitted.max_size_px)
+    assert fitted.agreement.max_error_px == pytest.approx(2.5, abs=0.05)
+    assert fitted_to_poses(source, fitted)[0] == fitted
+    densify_map(source, tmp_path / "out", options)
+    found = KaptureFolder(tmp_path / "out")
+    for image, record in depth_records(found.read()).items():
+        camera = record.camera
+        assert max(camera.width, camera.height) == fitted.max_size_px
+        depth = read_stereo_depth(found, record)
+        size = depth.shape[::-1]
+        exact = cv2.resize(depth_m(truth[image]), size, interpolation=cv2.INTER_NEAREST)
+        known = (depth > 0) & (exact > 0)
+        sigma = read_beside(found.root, image, "sigma")
+        assert sigma is not None and known.mean() > 0.25
+        assert np.median(np.abs(depth[known] / exact[known] - 1)) < 0.04
+        # the walls are 4 to 6 m away, the cameras 1 m apart: half a pixel is 2 to 4 % of the depth
+        assert 0.02 < np.median(sigma[known] / depth[known]) < 0.08
 
 
 def test_a_lifted_point_does_not_displace_a_triangulated_one(densified: KaptureFolder) -> None:

@@ -23,7 +23,8 @@ from megloc_kapture.evaluation.report.shown_queries import StoredInliers
 from megloc_kapture.evaluation.results import ResultContext
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.plugins import PluginChoice
-from megloc_kapture.stages.densifying import DEPTH_FILE, DensifyOptions, densify_map, side_file
+from megloc_kapture.stages.densifying import DensifyOptions, densify_map
+from megloc_kapture.stages.stereo_depth import DEPTH_FILE, side_file
 
 FAST = PluginChoice(name="sweep", options={"passes": 1, "max_planes": 64})
 

@@ -12,7 +12,8 @@ import pytest
 
 from megloc_kapture.errors import DataError, PluginError
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.stages.global_features import BATCH, describe_images, extract_global_features
+from megloc_kapture.stages import devices
+from megloc_kapture.stages.global_features import describe_images, extract_global_features
 from megloc_kapture.stages.work import Work
 
 
@@ -56,7 +57,10 @@ def test_every_image_of_map_and_queries_is_described(world: Any, tmp_path: Path)
     assert len(np.unique(vectors, axis=0)) == len(vectors)
 
 
-def test_batches_give_the_same_vectors(world: Any, tmp_path: Path) -> None:
+def test_batches_give_the_same_vectors(
+    world: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(devices, "BATCH", 4)
     one, many = Colours(), ManyColours()
     extract_global_features([world.mapping(), world.query()], one, tmp_path)
     extract_global_features([world.mapping(), world.query()], many, tmp_path)
@@ -64,7 +68,7 @@ def test_batches_give_the_same_vectors(world: Any, tmp_path: Path) -> None:
     assert singly.keys() == together.keys()
     for image, vector in singly.items():
         np.testing.assert_array_equal(vector, together[image])
-    assert max(many.seen) == BATCH
+    assert max(many.seen) == 4
 
 
 def test_threads_write_the_same_bytes(
@@ -97,7 +101,7 @@ def test_what_a_plugin_may_not_return(returned: Any, what: str) -> None:
             return returned
 
     with pytest.raises(PluginError, match=f"'wrong' on image a.png: .*{what}"):
-        describe_images(Wrong(), [np.zeros((4, 4, 3), np.uint8)], "a.png")
+        describe_images(Wrong(), [np.zeros((4, 4, 3), np.uint8)], ["a.png"])
 
 
 def test_vectors_of_different_lengths_are_refused(world: Any, tmp_path: Path) -> None:

@@ -27,8 +27,9 @@ from megloc_kapture.stages.matches import (
     Features,
     NoVerification,
     iterate_candidates,
-    match_images,
+    match_all,
     match_pairs,
+    verified,
 )
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera
@@ -209,9 +210,8 @@ def test_the_matchers_rows_are_those_that_verification_judges() -> None:
         seen.append(matches.tolist())
         return np.array([True, False, True])
 
-    matches, scores, found = match_images(
-        features(4), ["b"], lambda _: features(3), Fixed(), lambda _: verify
-    )[0]
+    a, b = features(4), features(3)
+    matches, scores, found = verified(a, b, match_all(Fixed(), a, [b], ["b"])[0], verify)
     assert seen == [[[0, 2], [1, 1], [3, 0]]]
     assert matches.tolist() == [[0, 2], [3, 0]]
     np.testing.assert_allclose(scores, [0.9, 0.7])

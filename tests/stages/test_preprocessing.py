@@ -25,12 +25,12 @@ from megloc_kapture.io.images import image_size, read_depth_map, read_image_rgb,
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.mapping.depth import lift_keypoints
 from megloc_kapture.preprocessing.masks import FixedMask
+from megloc_kapture.preprocessing.resampling import PixelMap
 from megloc_kapture.stages.image_masks import MaskOptions
 from megloc_kapture.stages.local_features import extract_local_features, read_mask
 from megloc_kapture.stages.preprocessing import (
     PreprocessingOptions,
     PreprocessingReport,
-    pixel_maps,
     preprocess_images,
     read_report,
 )
@@ -40,6 +40,16 @@ from megloc_kapture.values import Camera, RigidTransform
 
 Image = NDArray[np.uint8]
 FISHEYE = Camera("OPENCV_FISHEYE", 240, 180, (120.0, 121.0, 119.0, 92.0, -0.02, 0.004, 0.0, 0.0))
+
+
+def pixel_maps(report: PreprocessingReport) -> dict[str, PixelMap]:
+    """By sensor id: what carries keypoints between the original images and the processed ones."""
+    return {
+        sensor_id: PixelMap(
+            *(Sensor("", "camera", params).camera() for params in (row.original, row.processed))
+        )
+        for sensor_id, row in report.cameras.items()
+    }
 
 
 def cloudy(seed: int, height: int = 180, width: int = 240) -> Image:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from concurrent.futures import Executor
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -30,8 +31,10 @@ from megloc_kapture.io.kapture import (
 )
 from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
 from megloc_kapture.matching.verification import KnownPoseOptions
+from megloc_kapture.stages import triangulation
 from megloc_kapture.stages.matches import match_pairs
 from megloc_kapture.stages.triangulation import triangulate_map
+from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera, RigidTransform
 
 
@@ -141,6 +144,56 @@ def test_only_the_pairs_asked_for_are_used(world: Any, tmp_path: Path) -> None:
         "left/1.png",
         "right/2.png",
     }
+
+
+def test_parts_that_no_match_connects_give_the_map_of_the_whole(
+    world: Any, tmp_path: Path, two_processes: Executor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two copies of the world in one map, whose images are matched across without any match."""
+    source, reader = world.mapping(), world.with_matches("mapping").matches("rootsift")
+    data = KaptureData(sensors=dict(source.read().sensors))
+    for number, (image, pose) in enumerate(sorted(world.map_poses.items())):
+        for copy in ("a", "b"):
+            camera = source.read().record_of(image)[1]
+            data.records_camera[number, camera + copy] = f"{copy}/{image}"
+            data.sensors[camera + copy] = source.read().sensors[camera]
+            data.trajectories[number, camera + copy] = pose
+    write_sensors(tmp_path / "twice", data)
+    features = tmp_path / "features"
+    for kind in ("keypoints", "descriptors"):
+        of_kind = getattr(source, kind)("rootsift")
+        with FeatureWriter(features, kind, "rootsift", of_kind.config, orphan=True) as writer:  # type: ignore[arg-type]
+            for image in world.map_poses:
+                for copy in ("a", "b"):
+                    writer.write(f"{copy}/{image}", of_kind.read(image))
+    with MatchesWriter(features, "rootsift", orphan=True) as matches:
+        for a, b in reader.pairs:
+            for copy in ("a", "b"):
+                matches.write(f"{copy}/{a}", f"{copy}/{b}", *reader.read(a, b))
+            matches.write(f"a/{a}", f"b/{b}", np.zeros((0, 2), np.int64), np.zeros(0))
+    twice = KaptureFolder(tmp_path / "twice", features_dirs=[features])
+    options = TriangulationOptions()
+    found = {}
+    for name, at_once, executor in (("whole", 10, None), ("a", 5, None), ("b", 5, two_processes)):
+        monkeypatch.setattr(triangulation, "_IMAGES_AT_ONCE", at_once)
+        counts = triangulate_map(
+            twice, twice, "rootsift", tmp_path / name, options, work=Work(executor)
+        )
+        found[name] = KaptureFolder(tmp_path / name)
+        assert counts["images"] == 10 and counts["pairs"] == 2 * len(reader.pairs)
+    parts = found["a"].points3d()
+    num_points = len(world.map().points3d())
+    assert len(parts) == 2 * num_points
+    # each part is what the world alone gives, bit by bit
+    np.testing.assert_array_equal(parts[:num_points], world.map().points3d())
+    np.testing.assert_array_equal(parts[num_points:], world.map().points3d())
+    np.testing.assert_array_equal(parts, found["b"].points3d())
+    np.testing.assert_allclose(parts, found["whole"].points3d(), atol=1e-4)
+    ours, whole = (found[name].observations()["rootsift"] for name in ("a", "whole"))
+    assert ours.image_names == whole.image_names
+    for rows in ("point_ids", "image_ids", "keypoint_ids"):
+        np.testing.assert_array_equal(getattr(ours, rows), getattr(whole, rows))
+    found["a"].validate()
 
 
 def test_a_map_without_poses_is_refused(world: Any, tmp_path: Path) -> None:

@@ -22,7 +22,8 @@ from megloc_kapture.errors import DataError, PluginError
 from megloc_kapture.io.dataset_tables import read_groups, read_names, read_protocol
 from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
-from megloc_kapture.plugins import DATASETS, DatasetAdapter, load_plugin
+from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugins import DATASETS, DatasetAdapter
 from megloc_kapture.values import Camera, RigidTransform
 
 import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py

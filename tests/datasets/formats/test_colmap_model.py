@@ -22,7 +22,7 @@ from megloc_kapture.datasets.formats.colmap_reading import colmap_model_files, r
 from megloc_kapture.datasets.formats.sparse_points import SparsePoints
 from megloc_kapture.datasets.formats.text_lines import TextFile
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.colmap import px_from_cam
+from megloc_kapture.io.colmap_cameras import px_from_cam
 from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, RigidTransform
 
 import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py

@@ -18,7 +18,8 @@ from megloc_kapture.datasets.official import OfficialDataset, write_official
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.dataset_tables import read_groups, read_names, read_protocol
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.plugins import DATASETS, load_plugin
+from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugins import DATASETS
 from megloc_kapture.values import Camera
 
 

@@ -18,7 +18,8 @@ from megloc_kapture.errors import DataError, MeglocError, OptionError, PluginErr
 from megloc_kapture.io.dataset_tables import read_groups, read_names, read_priors, read_protocol
 from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture import KaptureFolder, write_sensors
-from megloc_kapture.plugins import DATASETS, DatasetAdapter, load_plugin
+from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugins import DATASETS, DatasetAdapter
 from megloc_kapture.values import Camera, RigidTransform
 
 

@@ -1,0 +1,178 @@
+"""Depth by multi-view stereo as a map holds it: beside its images, its sensors and its points.
+
+The maps are ordinary kapture depth records of a sensor ``CAMERA_mvs`` that shares the camera's
+centre, float32 in the map's unit, 0 where nothing is known. Beside them, which kapture does not
+know and ignores: ``sensors/mvs/IMAGE.sigma.npy`` (float32, the standard deviation of depth),
+``IMAGE.normals.npy`` (int8 (H, W, 3), 127 times the unit normal in the camera's frame, towards it)
+and ``reconstruction/depth.csv``, a row per image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.files import link_images, link_records
+from megloc_kapture.io.images import read_depth_map
+from megloc_kapture.io.kapture import (
+    KaptureData,
+    KaptureFolder,
+    Observations,
+    Sensor,
+    read_point_covariances,
+    write_observations,
+    write_point_covariances,
+    write_points3d,
+)
+from megloc_kapture.io.paths import safe_join
+from megloc_kapture.io.tables import read_depth_rows
+from megloc_kapture.mvs.views import stereo_camera
+from megloc_kapture.stages.rigs import DepthRecord
+from megloc_kapture.values import RigidTransform
+
+FOLDER = "mvs"  # of depth maps below records_data, and of what is beside them below sensors
+DEPTH_FILE = "reconstruction/depth.csv"
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class LiftedPoints:
+    """Points (N, 3) and covariances (N, 6) in the world, of keypoints (N,)."""
+
+    xyz: Floats
+    covariances: Floats
+    keypoint_ids: NDArray[np.int64]
+
+
+def stereo_images(folder: KaptureFolder) -> dict[str, tuple[str, ...]]:
+    """The images that have depth by stereo, by name, each with those it was compared with.
+
+    Empty where there is no densified map; raises DataError where its table is broken.
+    """
+    path = folder.root / DEPTH_FILE
+    rows = read_depth_rows(path) if path.is_file() else []
+    return {row.image: row.sources for row in sorted(rows, key=lambda r: r.image) if not row.reason}
+
+
+def read_stereo_depth(folder: KaptureFolder, record: DepthRecord) -> NDArray[np.float32]:
+    """Depth (H, W) of a record, 0 where nothing is known; raises DataError."""
+    size = {"width": record.camera.width, "height": record.camera.height}
+    return read_depth_map(folder.depth_path(record.path), **size)
+
+
+def depth_path(image: str) -> str:
+    """The depth map of an image, below ``records_data``."""
+    return f"{FOLDER}/{image}.depth"
+
+
+def side_file(root: Path, image: str, kind: Literal["sigma", "normals"]) -> Path:
+    """What lies beside the depth map of an image in the kapture at ``root``; see the module."""
+    return safe_join(root / "sensors" / FOLDER, f"{image}.{kind}.npy")
+
+
+def read_beside(
+    root: Path, image: str, kind: Literal["sigma", "normals"]
+) -> NDArray[np.float32] | None:
+    """Standard deviations (H, W) or normals (H, W, 3) of an image's depth by stereo, float32, 0
+    where nothing is known; None without; raises DataError."""
+    path = side_file(root, image, kind)
+    if not path.is_file():
+        return None
+    try:
+        found = np.load(path, allow_pickle=False).astype(np.float32)
+    except (OSError, ValueError) as error:
+        raise DataError(f"no array of numpy: {error}", path=path) from error
+    return np.asarray(found / np.float32(127) if kind == "normals" else found)
+
+
+def with_depth_sensors(data: KaptureData, images: Sequence[str], max_size_px: int) -> KaptureData:
+    """The sensors with a depth sensor on one rig with each camera whose images have depth."""
+    found = replace(
+        data,
+        sensors=dict(data.sensors),
+        rigs={rig: dict(members) for rig, members in data.rigs.items()},
+        trajectories=dict(data.trajectories),
+        records_depth=dict(data.records_depth),
+    )
+    for image in images:
+        timestamp, camera = data.record_of(image)
+        sensor = f"{camera}_mvs"
+        if sensor not in found.sensors:
+            pinhole = stereo_camera(data.camera_of(image), max_size_px)
+            found.sensors[sensor] = Sensor.from_camera(pinhole, name=sensor, sensor_type="depth")
+            carriers = [rig for rig, members in data.rigs.items() if camera in members]
+            for rig in carriers:
+                found.rigs[rig][sensor] = found.rigs[rig][camera]
+            if not carriers:
+                same = RigidTransform.identity()
+                found.rigs[f"{camera}_with_mvs"] = {camera: same, sensor: same}
+        if (own := data.trajectories.get((timestamp, camera))) is not None:
+            found.trajectories[timestamp, sensor] = own
+        found.records_depth[timestamp, sensor] = depth_path(image)
+    return found
+
+
+def link_images_and_masks(source: KaptureFolder, output: Path) -> None:
+    """Link a map's images, beside which depth maps lie now, and its masks."""
+    records = source.root / "sensors" / "records_data"
+    link_records(output, {entry.name: entry for entry in sorted(records.iterdir())})
+    link_images(source.root, output, ("masks",))
+
+
+def write_points(
+    source: KaptureFolder, output: Path, lifted: Mapping[str, Mapping[str, LiftedPoints]]
+) -> int:
+    """Write a map's points, unchanged, and behind them those of keypoints that were lifted.
+
+    Parameters
+    ----------
+    lifted : by keypoints type and image.
+
+    Returns
+    -------
+    The number of lifted points.
+    """
+    points = source.points3d()
+    covariances = read_point_covariances(source.root, len(points))
+    parts, uncertain = [points], [np.full((len(points), 6), np.nan)]
+    if covariances is not None:
+        uncertain = [np.asarray(covariances)]
+    observations = {}
+    total = len(points)
+    for local_type, seen in source.observations().items():
+        new = lifted.get(local_type, {})
+        names = tuple(sorted({*seen.image_names, *new}))
+        row_of = {name: row for row, name in enumerate(names)}
+        rows = np.array([row_of[name] for name in seen.image_names], np.int32)
+        point_ids, image_ids, keypoint_ids = (
+            [seen.point_ids],
+            [rows[seen.image_ids] if len(rows) else seen.image_ids],
+            [seen.keypoint_ids],
+        )
+        for image, own in sorted(new.items()):
+            count = len(own.xyz)
+            parts.append(np.concatenate([own.xyz, np.zeros_like(own.xyz)], axis=1))
+            uncertain.append(own.covariances)
+            point_ids.append(total + np.arange(count))
+            image_ids.append(np.full(count, row_of[image], np.int32))
+            keypoint_ids.append(own.keypoint_ids.astype(np.int32))
+            total += count
+        observations[local_type] = Observations(
+            local_type,
+            names,
+            np.concatenate(point_ids),
+            np.concatenate(image_ids),
+            np.concatenate(keypoint_ids),
+        )
+    write_points3d(output, np.concatenate(parts))
+    write_observations(output, observations)
+    if covariances is not None or total > len(points):
+        write_point_covariances(output, np.concatenate(uncertain))
+    return total - len(points)

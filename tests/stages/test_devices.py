@@ -1,0 +1,349 @@
+"""Batches: the same features and matches, halved where memory runs out; where networks compute."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from megloc_kapture.errors import OptionError, PluginError
+from megloc_kapture.features.xfeat import XFeat, XFeatOptions
+from megloc_kapture.io.images import read_image_rgb
+from megloc_kapture.io.kapture import ImagePair
+from megloc_kapture.matching.lightglue import LighterGlue, LighterGlueOptions
+from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
+from megloc_kapture.matching.verification import TwoViewOptions
+from megloc_kapture.nets.aslfeat import AslFeatNet
+from megloc_kapture.nets.runtime import pick_device
+from megloc_kapture.nets.superpoint import SuperPointNet
+from megloc_kapture.pipeline.kapture_map import KaptureMap
+from megloc_kapture.pipeline.localizer import Localizer
+from megloc_kapture.pipeline.presets import options_of_preset
+from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS, PluginChoice
+from megloc_kapture.stages import devices
+from megloc_kapture.stages import work as work_module
+from megloc_kapture.stages.devices import DeviceMemoryError, placed, unheeded
+from megloc_kapture.stages.local_features import (
+    ExtractLocalFeatures,
+    extract_all,
+    extract_local_features,
+)
+from megloc_kapture.stages.matches import MatchQueries, match_all, match_pairs
+from megloc_kapture.stages.work import Work
+from megloc_kapture.values import ImageFeatures, LocalFeatures
+
+Image = NDArray[np.uint8]
+NAMES = [f"{k}.jpg" for k in range(5)]
+
+
+@pytest.fixture(scope="module")
+def frames(shared_data: Path) -> list[tuple[Image, NDArray[np.bool_] | None]]:
+    """Photographs of one size, one of them with a mask."""
+    folder = shared_data / "scenes" / "fountain_p11" / "mapping" / "sensors" / "records_data"
+    found: list[tuple[Image, NDArray[np.bool_] | None]] = []
+    for path in sorted(folder.rglob("*.jpg"))[:5]:
+        small = cv2.resize(read_image_rgb(path), (192, 128), interpolation=cv2.INTER_AREA)
+        found.append((np.asarray(small, np.uint8), None))
+    half = np.zeros((128, 192), bool)
+    half[:, :96] = True
+    found[2] = found[2][0], half
+    return found
+
+
+@pytest.fixture(scope="module")
+def random_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Checkpoints of networks whose own are not free."""
+    folder = tmp_path_factory.mktemp("random")
+    torch.manual_seed(1)
+    torch.save(SuperPointNet().state_dict(), folder / "superpoint.pth")
+    state = AslFeatNet().state_dict()
+    for key, value in state.items():
+        noise = 0.1 * torch.randn_like(value)
+        state[key] = value + (noise.abs() + 0.5 if "var" in key or "max" in key else noise)
+    torch.save(state, folder / "aslfeat.pth")
+    return folder
+
+
+@pytest.fixture
+def xfeat(shared_data: Path) -> XFeatOptions:
+    weights = str(shared_data / "weights" / "xfeat" / "xfeat.onnx")
+    return XFeatOptions(weights=weights, max_keypoints=300, device="cpu")
+
+
+def nearly_same(a: LocalFeatures, b: LocalFeatures) -> None:
+    """All keypoints but those whose score is at the threshold by a last bit."""
+    distance, row = cKDTree(a.keypoints_px[:, :2]).query(b.keypoints_px[:, :2])
+    near = distance < 0.01
+    assert near.sum() >= 0.99 * max(len(a.scores), len(b.scores))
+    np.testing.assert_allclose(a.scores[row[near]], b.scores[near], atol=1e-4)
+    np.testing.assert_allclose(a.descriptors[row[near]], b.descriptors[near], atol=5e-3)
+    assert a.num_masked == pytest.approx(b.num_masked, abs=2)
+
+
+@pytest.mark.parametrize("name", ["aliked", "xfeat", "r2d2", "superpoint", "aslfeat"])
+def test_features_of_a_batch(
+    shared_data: Path, random_weights: Path, frames: Any, name: str
+) -> None:
+    of = {"aliked": "aliked/aliked-n16.pth", "xfeat": "xfeat/xfeat.onnx"}
+    of["r2d2"] = "r2d2/r2d2_WASF_N16.pt"
+    path = shared_data / "weights" / of[name] if name in of else random_weights / f"{name}.pth"
+    options = {"min_size": 96, "max_size": 144} if name == "r2d2" else {}
+    given = {"weights": str(path), "device": "cpu", **options}
+    extractor = load_plugin(LOCAL_FEATURES, name, given)
+    alone = [extractor.extract(*frame) for frame in frames]
+    assert min(len(found.scores) for found in alone) > 20
+    together = extractor.extract_many(*map(list, zip(*frames, strict=True)))
+    for a, b in zip(alone, together, strict=True):
+        nearly_same(a, b)
+    # on a processor each runs alone: the same bytes, whatever it comes with
+    for a, b in zip(alone, extract_all(extractor, frames, NAMES), strict=True):
+        assert a.keypoints_px.tobytes() == b.keypoints_px.tobytes()
+        assert a.descriptors.tobytes() == b.descriptors.tobytes()
+
+
+class Limited(XFeat):
+    """A device that has memory for so many images."""
+
+    def __init__(self, options: XFeatOptions, most: int) -> None:
+        super().__init__(options)
+        self.most = most
+        self.seen: list[int] = []
+        self.threads: set[int] = set()
+
+    def extract_many(self, images: Any, masks: Any) -> list[LocalFeatures]:
+        self.seen.append(len(images))
+        self.threads.add(threading.get_ident())
+        if len(images) > self.most:
+            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 MiB.")
+        return super().extract_many(images, masks)
+
+
+@pytest.fixture
+def eight_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(devices, "_limits", {})
+    monkeypatch.setitem(devices.MOST_AT_ONCE, "cpu", 8)
+
+
+def test_memory_that_runs_out_halves_the_batch(
+    eight_at_once: None, xfeat: XFeatOptions, frames: Any
+) -> None:
+    extractor = Limited(xfeat, most=2)
+    plain = XFeat(xfeat)
+    for sizes in ([5, 2, 2, 1], [2, 2, 1]):  # what is known stays known
+        found = extract_all(extractor, frames, NAMES)
+        assert extractor.seen == sizes
+        extractor.seen.clear()
+        for a, b in zip(found, (plain.extract(*frame) for frame in frames), strict=True):
+            nearly_same(a, b)
+
+
+def test_an_image_that_does_not_fit_alone_is_named(
+    eight_at_once: None, xfeat: XFeatOptions, frames: Any
+) -> None:
+    with pytest.raises(DeviceMemoryError, match=r"image 0\.jpg: there is not enough memory"):
+        extract_all(Limited(xfeat, most=0), frames, NAMES)
+
+
+def test_errors_of_another_kind_come_through(xfeat: XFeatOptions, frames: Any) -> None:
+    class Broken(XFeat):
+        def extract(self, image: Any, mask: Any = None) -> LocalFeatures:
+            raise RuntimeError("sizes do not agree")
+
+    class Few(XFeat):
+        def extract_many(self, images: Any, masks: Any) -> list[LocalFeatures]:
+            return []
+
+    with pytest.raises(RuntimeError, match="sizes do not agree"):
+        extract_all(Broken(xfeat), frames, NAMES)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(devices.MOST_AT_ONCE, "cpu", 8)
+        with pytest.raises(PluginError, match="extract_many of .*Few gave 0 for 5 items"):
+            extract_all(Few(xfeat), frames, NAMES)
+
+
+def test_a_budget_is_what_is_free() -> None:
+    for free_bytes, count in ((10**6, 4), (5000, 4), (4999, 3), (2000, 1), (0, 1)):
+        assert devices.fitting([50, 100, 100, 80], 10.0, free_bytes) == count
+
+
+@pytest.mark.parametrize("name", ["lighterglue", pytest.param("lightglue", marks=pytest.mark.slow)])
+def test_matches_of_a_batch(
+    shared_data: Path, frames: Any, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(devices, "_limits", {})
+    kinds = {
+        "lighterglue": ("xfeat/xfeat.onnx", "lighterglue/lighterglue_L3.onnx"),
+        "lightglue": ("aliked/aliked-n16rot.pth", "aliked_lightglue/aliked_lightglue.pth"),
+    }
+    files = [str(shared_data / "weights" / one) for one in kinds[name]]
+    options = {"weights": files[0], "threshold": 0.02, "device": "cpu"}
+    extractor = load_plugin(LOCAL_FEATURES, Path(files[0]).parent.name, options)
+    images = [
+        ImageFeatures(found.keypoints_px[:number], found.descriptors[:number], 192, 128)
+        for number, found in zip(
+            (200, 300, 150, 0, 250), (extractor.extract(image) for image, _ in frames), strict=True
+        )
+    ]
+    matcher = load_plugin(MATCHERS, name, {"weights": files[1], "device": "cpu"})
+    first, *others = images
+    alone = [matcher.match(first, other) for other in others]
+    assert sum(len(matches) for matches, _ in alone) > 30
+    together = matcher.match_many(first, others)  # of different size: padded
+    for (matches, scores), (expected, expected_scores) in zip(together, alone, strict=True):
+        np.testing.assert_array_equal(matches, expected)
+        np.testing.assert_allclose(scores, expected_scores, atol=1e-4)
+    for ours, theirs in zip(match_all(matcher, first, others, NAMES[1:]), alone, strict=True):
+        assert ours[1].tobytes() == theirs[1].tobytes()
+
+
+def test_a_pair_that_does_not_fit_is_named(
+    eight_at_once: None, shared_data: Path, xfeat: XFeatOptions, frames: Any
+) -> None:
+    class LimitedPairs(LighterGlue):
+        most = 2
+        seen: list[int] = []
+
+        def match_many(self, a: ImageFeatures, others: Sequence[ImageFeatures]) -> list[Any]:
+            self.seen.append(len(others))
+            if len(others) > self.most:
+                raise torch.OutOfMemoryError("CUDA out of memory.")
+            return super().match_many(a, others)
+
+    images = []
+    for image, _ in frames:
+        found = XFeat(xfeat).extract(image)
+        images.append(ImageFeatures(found.keypoints_px, found.descriptors, 192, 128))
+    weights = str(shared_data / "weights" / "lighterglue" / "lighterglue_L3.onnx")
+    matcher = LimitedPairs(LighterGlueOptions(weights=weights, device="cpu"))
+    names = [f"pair 0, {k}" for k in range(1, 5)]
+    found_pairs = match_all(matcher, images[0], images[1:], names)
+    assert matcher.seen == [4, 2, 2] and min(len(m) for m, _ in found_pairs) > 10
+    matcher.most = 0
+    with pytest.raises(DeviceMemoryError, match="pair 0, 1: there is not enough memory"):
+        match_all(matcher, images[0], images[1:], names)
+
+
+def test_one_process_has_the_gpu(
+    world: Any,
+    tmp_path: Path,
+    two_processes: Executor,
+    xfeat: XFeatOptions,
+    folder_bytes: Callable[[Path], dict[str, bytes]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What runs where a GPU is: here with a processor in its place."""
+    folders = [world.mapping(), world.query()]
+    pairs = [ImagePair(q, m, 1.0) for q in world.query_poses for m in world.map_poses]
+
+    def run(output: Path, work: Work) -> Limited:
+        extractor = Limited(xfeat, most=99)
+        extract_local_features(folders, extractor, output, work=work)
+        query, mapping = (folder.with_features([output]) for folder in reversed(folders))
+        verification = TwoViewOptions()
+        match_pairs(
+            query, mapping, pairs, "xfeat", NearestNeighbours(), verification, output, work=work
+        )
+        return extractor
+
+    monkeypatch.setattr(devices, "_limits", {})
+    monkeypatch.setitem(devices.MOST_AT_ONCE, "cpu", 3)
+    run(tmp_path / "here", Work())
+    monkeypatch.setattr(
+        work_module, "on_gpu", lambda plugin: isinstance(plugin, XFeat | NearestNeighbours)
+    )
+    there = run(tmp_path / "there", Work(two_processes))
+    assert folder_bytes(tmp_path / "here") == folder_bytes(tmp_path / "there")
+    assert there.seen == [3, 3, 1]
+    assert len(there.threads) == 1 and threading.get_ident() not in there.threads
+
+
+# ------------------------------------------------------------------------------------ options
+
+
+def test_networks_are_told_and_those_that_say_so_themselves_stay() -> None:
+    options = options_of_preset(
+        "megloc",
+        assignments={
+            "device": "cuda:1",
+            "precision": "half",
+            "local_features.aslfeat.options.device": "cpu",
+            "localization.rank": {"name": "perceptual", "options": {"distance": "lpips"}},
+        },
+    )
+    points, aslfeat = options.local_features
+    assert points.options == {"device": "cuda:1", "half_precision": True}
+    assert aslfeat.options["device"] == "cpu" and aslfeat.options["half_precision"] is True
+    assert points.matching is not None and points.matching.options["device"] == "cuda:1"
+    assert aslfeat.matching is not None and "device" not in aslfeat.matching.options  # nn has none
+    assert {one.options["device"] for one in options.global_features} == {"cuda:1"}
+    distance = options.localization.rank.options["distance"]
+    assert distance["name"] == "lpips" and distance["options"]["half_precision"] is True
+    assert "device" not in options.localization.rank.options
+
+
+def test_where_it_was_done_is_no_part_of_what_was_done() -> None:
+    settings = [
+        [
+            stage(options_of_preset("megloc", assignments=changes)).settings
+            for stage in (ExtractLocalFeatures, MatchQueries)
+        ]
+        for changes in ({}, {"device": "cpu"}, {"precision": "half"})
+    ]
+    with pytest.MonkeyPatch.context() as patch:
+        for stage in (ExtractLocalFeatures, MatchQueries):
+            patch.setattr(stage, "plugins", lambda _: ())
+        plain, here, half = [[of_stage() for of_stage in both] for both in settings]
+    assert plain == here != half
+
+
+@pytest.mark.parametrize("wrong", ["gpu", "cuda:x", "cuda:-1", "CPU"])
+def test_no_such_device(wrong: str) -> None:
+    with pytest.raises(OptionError, match="option device: "):
+        options_of_preset("megloc", assignments={"device": wrong})
+
+
+def test_a_device_that_changes_nothing_is_refused() -> None:
+    for name, value in (("device", "cpu"), ("precision", "half")):
+        with pytest.raises(OptionError, match=f"{name} changes nothing: no network is chosen"):
+            options_of_preset("classic", assignments={name: value})
+    options_of_preset("classic", assignments={"device": "auto", "precision": "full"})
+    assert unheeded(options_of_preset("classic"), "cpu", "half") == ["device", "precision"]
+    lpips = PluginChoice(name="perceptual", options={"distance": {"name": "lpips"}})
+    assert unheeded(lpips, "cpu", "half") == []
+    stereo = PluginChoice(name="patchmatchnet")  # always in full precision
+    assert unheeded((stereo,), "cpu", "half") == ["precision"]
+    choice = PluginChoice(name="nn")
+    assert placed(choice, "cpu", "half") is choice
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_no_gpu() -> None:
+    assert pick_device("auto") == pick_device("cpu") == torch.device("cpu")
+    for device in ("cuda", "cuda:0", "cuda:3"):
+        with pytest.raises(OptionError, match=f"device={device}: this machine has no GPU"):
+            pick_device(device)
+
+
+def test_a_localizer_is_told(world: Any) -> None:
+    opened = KaptureMap.open(world.root / "map", features_dirs=[world.features_dir])
+    told = Localizer(opened, preset="modern", device="cpu", precision="half").options
+    assert told.device == "cpu" and told.local_features[0].options["half_precision"] is True
+    changes = {"global_features": ["netvlad"], "device": "cpu"}
+    options = options_of_preset("classic", assignments=changes)
+    assert Localizer(opened, options=options).options.global_features[0].options == {
+        "device": "cpu"
+    }
+    with pytest.raises(OptionError, match="give the device and the precision in the options"):
+        Localizer(opened, options=options, device="cuda")
+    with pytest.raises(OptionError, match="device changes nothing: no network is chosen"):
+        Localizer(opened, device="cpu")
