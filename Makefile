@@ -4,7 +4,7 @@
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .SUFFIXES:
-.PHONY: help venv eval test test-slow test-all lint docs bench kloc-env clean
+.PHONY: help venv eval test test-slow test-all lint docs bench kloc-env hloc-env clean
 
 # make eval
 DATASET ?= synthetic-aachen
@@ -37,6 +37,7 @@ help:
 	@echo 'make docs       write the API reference into build/docs, from the docstrings'
 	@echo 'make bench      measure speed; SCENE=folder, KLOC_PYTHON=.venv-kloc/bin/python to compare'
 	@echo 'make kloc-env   build .venv-kloc: kapture-localization with its old packages, and COLMAP'
+	@echo 'make hloc-env   build .venv-hloc: what hloc calls, for benchmarks/speed/hloc_side_by_side.py'
 	@echo 'make clean      remove caches; leaves .venv, runs/ and submissions/ alone'
 	@echo 'Set-up happens once, by itself, in .venv (VENV=folder): PYTHON=interpreter (3.11 or newer),'
 	@echo 'TORCH_INDEX=URL to take torch from another package index (the CPU wheels are smaller).'
@@ -78,6 +79,14 @@ bench: $(STAMP)
 
 kloc-env:
 	@PYTHON='$(PYTHON)' sh benchmarks/speed/kloc_env.sh .venv-kloc
+
+# the last pycolmap that hloc's map is not empty with; hloc itself is not in the package index
+HLOC_PIP := .venv-hloc/bin/python -m pip install -qq --disable-pip-version-check -c constraints.txt
+hloc-env:
+	@python=$$(PYTHON='$(PYTHON)' sh scripts/find_python.sh) && "$$python" -m venv .venv-hloc
+	@$(HLOC_PIP) $(if $(TORCH_INDEX),--index-url '$(TORCH_INDEX)') torch
+	@$(HLOC_PIP) h5py numpy
+	@$(subst -c constraints.txt,,$(HLOC_PIP)) pycolmap==3.13.0
 
 clean:
 	@rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache build dist

@@ -10,6 +10,7 @@ once; every query is matched with all map images, without the pyramid (off), and
 all pairs: all variants tried on every pair, none left out by the probed ones).
 
 ``--choose`` compares sets of scales and of turns on the same queries by mode ``all`` instead.
+Plugins with options: ``--matcher '{name="superglue",options={weights="FILE"}}'``.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import argparse
 import os
 import sys
 import tempfile
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,12 +42,13 @@ from megloc_kapture.io.kapture import (
 from megloc_kapture.matching.guided_pyramid import GuidedPyramidOptions, pyramid_type
 from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
+from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import (
     LOCAL_FEATURES,
     MATCHERS,
     LocalFeatureExtractor,
     Matcher,
-    load_plugin,
+    PluginChoice,
 )
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.matches import match_pairs
@@ -294,11 +297,17 @@ HEADER = (
 )
 
 
+def plugin(text: str) -> PluginChoice:
+    """A plugin from its name, or from an inline table of TOML."""
+    given = tomllib.loads(f"plugin = {text}")["plugin"] if text.startswith("{") else text
+    return PluginChoice.model_validate(given)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--scene", type=lambda text: Path(text).resolve(), action="append")
-    parser.add_argument("--features", default="xfeat")
-    parser.add_argument("--matcher", default="nn")
+    parser.add_argument("--features", type=plugin, default="xfeat")
+    parser.add_argument("--matcher", type=plugin, default="nn")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--map-mode", choices=("off", "all", "max"), default="off")
     parser.add_argument("--choose", action="store_true")
@@ -314,11 +323,11 @@ def main() -> None:
     )
     changes: Sequence[Change] = CHOSEN_BY if options.choose else CHANGES
     changes = [c for c in changes if options.change is None or c.name in options.change]
-    extractor = load_plugin(LOCAL_FEATURES, options.features)
-    matcher = load_plugin(MATCHERS, options.matcher)
+    extractor = load_plugin(LOCAL_FEATURES, options.features.name, options.features.options)
+    matcher = load_plugin(MATCHERS, options.matcher.name, options.matcher.options)
     with tempfile.TemporaryDirectory(prefix="megloc-pyramid-") as temporary, single_threaded():
         for scene in options.scene:
-            root = (options.workspace or Path(temporary)) / f"{scene.name}-{options.features}"
+            root = (options.workspace or Path(temporary)) / f"{scene.name}-{extractor.name}"
             map_options = GuidedPyramidOptions(mode=options.map_mode)
             bench = Bench(
                 scene, root, extractor, matcher, options.jobs, map_options, options.queries

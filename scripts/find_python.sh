@@ -7,7 +7,7 @@ can_run() {
     "$1" -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1
 }
 
-for candidate in ${PYTHON:-python3.11 python3 python3.12 python3.13}; do
+for candidate in ${PYTHON:-python3.11 python3 python3.12 python3.13 python3.14}; do
     can_run "$candidate" || continue
     if ! "$candidate" -c 'import ensurepip, venv' >/dev/null 2>&1; then
         echo "$candidate cannot make virtual environments: install its venv package (Debian: apt-get install python3-venv)" >&2

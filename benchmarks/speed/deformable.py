@@ -76,7 +76,7 @@ def convolutions(sizes: Sequence[tuple[int, int]], rounds: int) -> list[tuple[st
 
 def run_ours(net: AlikedNet, image: torch.Tensor, xy: torch.Tensor) -> list[torch.Tensor]:
     """Score map (H, W) and descriptors (N, D) at pixels xy (N, 2)."""
-    maps = net(image)
+    maps = net(image)[0]
     return [maps.scores, net.desc_head(maps, xy)]
 
 

@@ -51,8 +51,8 @@ from megloc_kapture.io.kapture import (
 )
 from megloc_kapture.io.kapture.vectors import KaptureVectors
 from megloc_kapture.retrieval.fusion import FusionOptions
-from megloc_kapture.retrieval.search import rank_by_similarity
-from megloc_kapture.retrieval.short_list import QuantizedRows, rank_short_lists
+from megloc_kapture.retrieval.search import FusedSearch, rank_by_similarity
+from megloc_kapture.retrieval.short_list import QuantizedRows, short_lists
 from megloc_kapture.values import Camera, RigidTransform
 
 TYPE = "generated"
@@ -349,7 +349,7 @@ class Mixture:
             yield from self.drawn(min(10_000, self.count - start), start)
 
 
-def short_lists(count: int, options: argparse.Namespace) -> bool:
+def measure_short_lists(count: int, options: argparse.Namespace) -> bool:
     """Print recall of the exact ranking, seconds and memory; whether 0.99 is reached."""
     made = Mixture(count, options.dimension)
     folder = options.cache / f"mixture_{count}_{options.dimension}"
@@ -382,10 +382,10 @@ def short_lists(count: int, options: argparse.Namespace) -> bool:
     search = partial(rank_by_similarity, queries, rows, options.top_k)
     exact, _ = step("exact", search, len(queries))
     codes = [step("codes made", lambda: QuantizedRows(rows))]
+    exactly = FusedSearch(options.top_k, FusionOptions())
     for length in LENGTHS:
-        among = partial(rank_short_lists, [queries], [rows], codes, options.top_k)
-        among = partial(among, length=length, fusion=FusionOptions())
-        found, _ = step(f"short lists of {length}", among, len(queries))
+        among = partial(short_lists, exactly, [queries], [rows], codes, length=length)
+        ((found, _),) = step(f"short lists of {length}", among, len(queries))
         rows_of[-1] = (*rows_of[-1], f"{recall(found):.4f}")
     print(f"{count} x {options.dimension} in a tar, {len(queries)} queries")
     print(table([(*row, "")[:6] for row in rows_of]))
@@ -409,7 +409,9 @@ def main() -> int:
         million(options)
         return 0
     if options.short_list:
-        return 0 if all([short_lists(count, options) for count in options.short_list]) else 1
+        return (
+            0 if all([measure_short_lists(count, options) for count in options.short_list]) else 1
+        )
     load = os.getloadavg()[0]
     print(
         f"{options.queries} queries in {options.images} images x {options.dimension}, "

@@ -29,7 +29,7 @@ os.environ["OMP_NUM_THREADS"] = "1"
 
 import numpy as np  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
-from street import CAMERA, Street, in_view, make_street, random_pose  # noqa: E402
+from street import CAMERA, Street, in_view, make_street, pose_near  # noqa: E402
 from timing import peak_gib, table  # noqa: E402
 
 from megloc_kapture.geometry.cameras import project  # noqa: E402
@@ -78,10 +78,11 @@ class World:
     truth: dict[str, RigidTransform]
 
 
-def write_world(root: Path, num_images: int, num_keypoints: int) -> World:
+def write_world(root: Path, num_images: int, num_keypoints: int, num_parts: int = 1) -> World:
     """Write ``mapping/`` and ``query/`` with features below a folder."""
     seen = num_keypoints // 2
-    street = make_street(num_images, num_images * seen // SEEN_BY, seen, num_keypoints)
+    num_points = num_images * seen // SEEN_BY
+    street = make_street(num_images, num_points, seen, num_keypoints, num_parts)
     rng = np.random.default_rng(5)
     descriptors = _unit(rng.normal(size=(len(street.xyz), 128)))
 
@@ -111,12 +112,12 @@ def write_world(root: Path, num_images: int, num_keypoints: int) -> World:
         "mapping",
         lambda i: (street.keypoints_px(i), street.keypoints_of_seen(i), street.seen(i)),
     )
-    places = [random_pose(street, rng, 3) for _ in range(max(5, num_images // 10))]
+    near_of = rng.integers(0, num_images, max(5, num_images // 10)).tolist()
+    places = [pose_near(street, rng, near) for near in near_of]
     truth = {f"query/{i:06d}.jpg": pose for i, pose in enumerate(places)}
 
     def query(at: int) -> tuple[Floats, NDArray[np.int64], NDArray[np.int64]]:
-        near = int(np.clip(places[at].center()[0], 0, num_images - 1))
-        points = street.seen(near)
+        points = street.seen(near_of[at])
         points = points[in_view(places[at], street.xyz[points])]
         px = rng.uniform((0, 0), (CAMERA.width, CAMERA.height), (num_keypoints, 2))
         rows = rng.permutation(num_keypoints)[: len(points)]
@@ -192,6 +193,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--images", type=int, nargs="+", default=[200, 400, 800, 1600])
     parser.add_argument("--keypoints", type=int, default=500)
+    parser.add_argument("--parts", type=int, default=1, help="streets that do not meet")
     parser.add_argument("--overhead", type=float, default=1.1, help="times, of an executor")
     parser.add_argument("--target", type=int, default=26_121, help="images that hours are for")
     parser.add_argument("--most", type=float, default=1.1, help="exponent of any stage")
@@ -200,7 +202,8 @@ def main() -> int:
     with single_threaded():
         for count in (40, *given.images):
             with tempfile.TemporaryDirectory() as folder:
-                measured[count] = run(write_world(Path(folder), count, given.keypoints))
+                parts = 1 if count == 40 else given.parts
+                measured[count] = run(write_world(Path(folder), count, given.keypoints, parts))
             if count != 40:
                 steps = ", ".join(
                     f"{k} {s:.1f} s {g:.2f} GiB" for k, (s, g) in measured[count][0].items()

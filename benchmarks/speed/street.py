@@ -17,6 +17,7 @@ from megloc_kapture.values import Camera, RigidTransform
 
 CAMERA = Camera("PINHOLE", 1600, 1200, (1000.0, 1000.0, 800.0, 600.0))
 STEP_M = 1.0
+GAP_M = 1000.0  # between parts
 # x to the right along the street, y down, z away from it
 LOOKING_LEFT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
@@ -76,8 +77,10 @@ class Street:
         return MapIndex.build(self.xyz, self.names, images, keypoints, points)
 
 
-def make_street(num_images: int, num_points: int, num_seen: int, num_keypoints: int) -> Street:
-    """A street of that size; the same every time."""
+def make_street(
+    num_images: int, num_points: int, num_seen: int, num_keypoints: int, num_parts: int = 1
+) -> Street:
+    """A street of that size, in parts a kilometre from each other; the same every time."""
     rng = np.random.default_rng(0)
     length = num_images * STEP_M
     xyz = np.stack(
@@ -88,9 +91,14 @@ def make_street(num_images: int, num_points: int, num_seen: int, num_keypoints: 
         ],
         axis=1,
     )
-    poses = tuple(looking_left((i + 0.5) * STEP_M, 0.0, 0.0, 0.0) for i in range(num_images))
-    middle = (np.arange(num_images) + 0.5) * num_points / num_images
-    first = np.clip(np.round(middle - num_seen / 2), 0, num_points - num_seen).astype(np.int64)
+    middles = (np.arange(num_images) + 0.5) * STEP_M
+    part, part_of_point = ((x * num_parts / length).astype(np.int64) for x in (middles, xyz[:, 0]))
+    bounds = np.searchsorted(part_of_point, np.arange(num_parts + 1))
+    xyz[:, 0] += part_of_point * GAP_M
+    places = middles + part * GAP_M
+    poses = tuple(looking_left(x, 0.0, 0.0, 0.0) for x in places.tolist())
+    nearest = np.round(middles * num_points / length - num_seen / 2)
+    first = np.clip(nearest, bounds[part], bounds[part + 1] - num_seen).astype(np.int64)
     return Street(xyz, poses, first, num_seen, num_keypoints)
 
 
@@ -105,6 +113,12 @@ def looking_left(x: float, y: float, z: float, angle_rad: float) -> RigidTransfo
 def random_pose(street: Street, rng: np.random.Generator, margin: int) -> RigidTransform:
     """A query's pose, at least ``margin`` images from the street's ends."""
     x = rng.uniform(margin, len(street.poses) - margin) * STEP_M
+    return looking_left(x, rng.uniform(-1, 1), rng.uniform(-0.5, 0.5), rng.uniform(-0.3, 0.3))
+
+
+def pose_near(street: Street, rng: np.random.Generator, image: int) -> RigidTransform:
+    """A query's pose within half a step of an image."""
+    x = street.poses[image].center()[0] + rng.uniform(-0.5, 0.5) * STEP_M
     return looking_left(x, rng.uniform(-1, 1), rng.uniform(-0.5, 0.5), rng.uniform(-0.3, 0.3))
 
 

@@ -1,0 +1,251 @@
+"""Ours beside hloc: the same images, pycolmap 3.13's SIFT and the same pairs, step by step.
+
+    make hloc-env
+    .venv/bin/python benchmarks/speed/hloc_side_by_side.py --hloc-python .venv-hloc/bin/python \\
+        --scene ../shared/data/scenes/redkitchen_rgbd [--keypoints sparse]
+
+hloc is not in the package index: ``hloc_steps.py`` restates its steps with what it calls. Features
+are pycolmap 3.13's for both, ``sparse`` as hloc asks for them (from the image's own size on), or
+``dense``, COLMAP's default with twice the size first; pairs are ours by VLAD over them. Each side
+then matches (hloc with ratio 0.8, ours as the preset ``classic``), triangulates and localizes in a
+process of its own, on one thread, after its imports. Seconds are those of the processor, the least
+of the rounds, which the two sides do by turns. ``--most 0.5`` fails above that share of hloc's.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+os.environ["OMP_NUM_THREADS"] = "1"
+
+import numpy as np  # noqa: E402
+from end_to_end import scene_folder  # noqa: E402
+from timing import table  # noqa: E402
+
+from megloc_kapture.io.colmap import TriangulationOptions  # noqa: E402
+from megloc_kapture.io.kapture import (  # noqa: E402
+    FeatureConfig,
+    FeatureWriter,
+    KaptureFolder,
+    read_pairs,
+)
+from megloc_kapture.matching.nearest_neighbours import NearestNeighbours  # noqa: E402
+from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions  # noqa: E402
+from megloc_kapture.pipeline.executors import single_threaded  # noqa: E402
+from megloc_kapture.stages.matches import match_pairs  # noqa: E402
+from megloc_kapture.stages.query_poses import (  # noqa: E402
+    LocalizationOptions,
+    localize_from_matches,
+)
+from megloc_kapture.stages.triangulation import triangulate_map  # noqa: E402
+from megloc_kapture.values import Camera, Pose, RigidTransform  # noqa: E402
+
+TYPE, FLOAT = "sift", np.dtype("float32")
+SIFT = {"sparse": {"first_octave": 0, "peak_threshold": 0.01}, "dense": {}}
+THRESHOLDS = ((0.05, 5.0), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
+STEPS = ("match map", "triangulation", "match queries", "localization")
+HERE = Path(__file__).resolve().parent
+Poses = dict[str, RigidTransform]
+
+
+def ours(given: dict[str, Any]) -> dict[str, Any]:
+    """Processor seconds of each step, the poses, points of the map: as ``hloc_steps.run``."""
+    seconds: dict[str, float] = {}
+    features, folder = Path(given["kapture"]), Path(given["folder"])
+    mapping, query = (
+        KaptureFolder(Path(given["scene"]) / name, features_dirs=[features])
+        for name in ("mapping", "query")
+    )
+    of_map, asked = (read_pairs(Path(given[name])) for name in ("map_txt", "query_txt"))
+
+    def step(name: str, work: Callable[[], Any]) -> Any:
+        start = time.process_time()
+        found = work()
+        seconds[name] = time.process_time() - start
+        return found
+
+    def matched(first: KaptureFolder, pairs: Any, how: Any) -> KaptureFolder:
+        match_pairs(first, mapping, pairs, TYPE, NearestNeighbours(), how, folder)
+        return KaptureFolder(first.root, features_dirs=[features, folder])
+
+    found_map = step("match map", lambda: matched(mapping, of_map, KnownPoseOptions()))
+    made, options = folder / "map", TriangulationOptions()
+    step("triangulation", lambda: triangulate_map(mapping, found_map, TYPE, made, options))
+    found = step("match queries", lambda: matched(query, asked, TwoViewOptions()))
+
+    def localized() -> dict[str, Any]:
+        results = localize_from_matches(
+            KaptureFolder(made), query, found, asked, [TYPE], LocalizationOptions()
+        )
+        return {
+            name: pose.cam_from_world.matrix()[:3].tolist()
+            for name, pose in results
+            if isinstance(pose, Pose)
+        }
+
+    poses = step("localization", localized)
+    return {
+        "seconds": seconds,
+        "poses": {"clusters": poses},
+        "points": len(KaptureFolder(made).points3d()),
+    }
+
+
+# ------------------------------------------------------------------------------ what both are given
+
+
+def prepared(options: argparse.Namespace, root: Path) -> dict[str, Any]:
+    """Features and pairs in root, in the files of both sides."""
+    folders = [KaptureFolder(options.scene / name) for name in ("mapping", "query")]
+    job: dict[str, Any] = {"sift": SIFT[options.keypoints], "scene": str(options.scene)}
+    job |= {name: str(root / name) for name in ("features", "arrays", "kapture")}
+    job["arrays"] += ".npz"
+    job |= {"images": {}, "cameras": {}, "poses": {}}
+    for folder in folders:
+        data = folder.read()
+        for name in data.image_names():
+            camera: Camera = data.camera_of(name)
+            job["images"][name] = str(folder.image_path(name))
+            job["cameras"][name] = [camera.model, camera.width, camera.height, list(camera.params)]
+    for name, pose in sorted(folders[0].read().poses().items()):
+        job["poses"][name] = [*map(float, pose.quat_wxyz), *map(float, pose.translation)]
+    ask_hloc(options.hloc_python, "features", job, root)
+
+    kinds: Any = (("kpt", "keypoints", (2,)), ("desc", "descriptors", (128, TYPE, "L2")))
+    writers = {
+        kind: FeatureWriter(
+            root / "kapture", name, TYPE, FeatureConfig(TYPE, FLOAT, *of), orphan=True
+        )
+        for kind, name, of in kinds
+    }
+    with np.load(job["arrays"]) as arrays:
+        for key in arrays.files:
+            name, kind = key.rsplit(".", 1)
+            writers[kind].write(name, arrays[key])
+        job["mean"] = sum(len(arrays[key]) for key in arrays.files) / len(arrays.files)
+
+    mapping, query = (["-i", str(folders[0].root)], ["--query", str(folders[1].root)])
+    features = ["--features-dir", job["kapture"]]
+    job["map_txt"], job["query_txt"] = (str(root / name) for name in ("map.txt", "query.txt"))
+    describe = [*mapping, *query, *features, "--features", "vlad", "-o", job["kapture"], "-f"]
+    megloc("extract-global", *describe, "--set", "global_features.options.num_clusters=64")
+    megloc("pairs-mapping", *mapping, *features, "-o", job["map_txt"])
+    candidates = ("--topk", str(options.candidates))
+    megloc("pairs-query", *mapping, *query, *features, *candidates, "-o", job["query_txt"])
+    pairs = {tuple(sorted((one.query, one.map))) for one in read_pairs(Path(job["map_txt"]))}
+    job["mapping_pairs"], job["query_pairs"] = sorted(pairs), {}
+    for one in read_pairs(Path(job["query_txt"])):
+        job["query_pairs"].setdefault(one.query, []).append(one.map)
+    return job
+
+
+def megloc(*arguments: str) -> None:
+    command = str(Path(sys.executable).with_name("megloc"))
+    subprocess.run([command, *arguments, "-q"], check=True)
+
+
+def ask_hloc(python: Path, what: str, job: dict[str, Any], folder: Path) -> Any:
+    return asked([str(python), str(HERE / "hloc_steps.py"), what], job, folder)
+
+
+def asked(command: list[str], job: dict[str, Any], folder: Path) -> Any:
+    """What a process of its own says of a job."""
+    path = folder / "job.json"
+    result = folder / "result.json"
+    path.write_text(json.dumps({**job, "result": str(result)}))
+    done = subprocess.run([*command, str(path)], capture_output=True, text=True, check=False)
+    if done.returncode:
+        sys.exit(f"{done.stdout[-2000:]}{done.stderr[-2000:]}\n{' '.join(command)} failed")
+    return json.loads(result.read_text()) if result.exists() else None
+
+
+# --------------------------------------------------------------------------------------- the tables
+
+
+def errors(poses: dict[str, Any], truth: Poses) -> np.ndarray:
+    """Metres and degrees (Q, 2) of all queries; those without a pose are infinitely far."""
+    found = np.full((len(truth), 2), np.inf)
+    for row, (name, true) in enumerate(sorted(truth.items())):
+        if name in poses:
+            matrix = np.array(poses[name])
+            center = -matrix[:, :3].T @ matrix[:, 3]
+            turned = (np.trace(matrix[:, :3] @ true.rotation_matrix().T) - 1) / 2
+            angle = np.degrees(np.arccos(np.clip(turned, -1, 1)))
+            found[row] = np.linalg.norm(center - true.center()), angle
+    return found
+
+
+def recall_row(name: str, points: int, poses: dict[str, Any], truth: Poses) -> tuple[str, ...]:
+    off = errors(poses, truth)
+    within = [100 * float((off <= limits).all(axis=1).mean()) for limits in THRESHOLDS]
+    metres, degrees = np.median(off, axis=0)
+    recall = " / ".join(f"{share:.1f}" for share in within)
+    return name, str(points), recall, f"{100 * metres:.1f} cm, {degrees:.2f} deg"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--hloc-python", type=Path, help="made by make hloc-env")
+    parser.add_argument("--scene", type=scene_folder)
+    parser.add_argument("--keypoints", choices=SIFT, default="sparse")
+    parser.add_argument("--candidates", type=int, default=30)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--most", type=float, help="share of hloc's seconds")
+    parser.add_argument("--ours", type=Path, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.ours:
+        job = json.loads(options.ours.read_text())
+        with single_threaded():
+            Path(job["result"]).write_text(json.dumps(ours(job)))
+        return 0
+    if not (options.scene and options.hloc_python and options.hloc_python.exists()):
+        parser.error("--scene and --hloc-python are needed; make hloc-env builds the latter")
+    sides: dict[str, list[dict[str, Any]]] = {"ours": [], "hloc": []}
+    with tempfile.TemporaryDirectory(prefix="megloc-hloc-") as temporary:
+        root = Path(temporary)
+        job = prepared(options, root)
+        for number in range(options.rounds):
+            for side, runs in sides.items():
+                folder = root / f"{side}{number}"
+                folder.mkdir()
+                own = {**job, "folder": str(folder)}
+                own |= {f"{n}_matches": str(folder / f"{n}.h5") for n in ("mapping", "query")}
+                if side == "ours":
+                    runs.append(asked([sys.executable, __file__, "--ours"], own, folder))
+                else:
+                    runs.append(ask_hloc(options.hloc_python, "localize", own, folder))
+    num_query = sum(map(len, job["query_pairs"].values()))
+    print(f"{len(job['mapping_pairs'])} map pairs, {num_query} query pairs")
+    print(f"{job['mean']:.0f} keypoints per image; load {os.getloadavg()[0]:.1f}")
+    rows: list[tuple[str, ...]] = [("processor s", *STEPS, "total", "with clusters")]
+    totals = {}
+    for side, runs in sides.items():
+        least = {k: min(run["seconds"][k] for run in runs) for k in runs[0]["seconds"]}
+        totals[side] = sum(least[name] for name in STEPS)
+        other = least.get("localization, clusters")
+        cells = [*(least[name] for name in STEPS), totals[side]]
+        more = totals[side] + (other - least["localization"] if other is not None else 0.0)
+        rows.append((side, *(f"{cell:.2f}" for cell in cells), f"{more:.2f}"))
+    print(table(rows))
+    truth = KaptureFolder(options.scene / "query_gt").read().poses()
+    rows = [("", "points", "recall, %", "median")]
+    for side, (run, *_) in sides.items():
+        for how, poses in run["poses"].items():
+            rows.append(recall_row(f"{side}, {how}", run["points"], poses, truth))
+    print(table(rows))
+    share = totals["ours"] / totals["hloc"]
+    print(f"ours takes {share:.2f} of hloc's seconds")
+    return int(options.most is not None and share > options.most)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
