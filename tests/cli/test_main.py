@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import subprocess
 import sys
+from functools import partial
 from importlib.metadata import EntryPoints
 from pathlib import Path
 from typing import Any
@@ -227,6 +229,12 @@ Doctor.run = run
 sys.argv = ["megloc", "doctor"]
 main.main()
 """
-    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    run = subprocess.run(
+        [sys.executable, "-c", script],
+        capture_output=True,
+        text=True,
+        # a shell ignores SIGINT for what it starts in the background, and that is inherited
+        preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),
+    )
     assert run.stderr == f"megloc: {told}; run the same command again to go on\n"
     assert run.returncode == {"SIGINT": 130, "SIGTERM": 143}[number]
