@@ -18,12 +18,11 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Executor, Future, InvalidStateError
 from concurrent.futures import wait as wait_for
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from importlib import metadata
 from pathlib import Path
-from signal import SIGINT
 from typing import Any
 
 from distributed import Client, KilledWorker, LocalCluster, Worker, WorkerPlugin
@@ -34,7 +33,7 @@ from megloc_kapture.errors import MeglocError, OptionError
 from megloc_kapture.io.files import clear_leftovers, owned_name
 from megloc_kapture.io.weights import describe, files_of, sha256_of, share_weights
 from megloc_kapture.io.weights.registry import registry
-from megloc_kapture.pipeline.executors import deaf_to, enter_single_threaded
+from megloc_kapture.pipeline.executors import enter_single_threaded, starting_processes
 
 # the last bits of a result depend on these
 _PACKAGES = (
@@ -127,21 +126,20 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Client]:
         clear_leftovers(Path(tempfile.gettempdir()))
         folder = tempfile.mkdtemp(prefix=owned_name())
         try:
-            with deaf_to(SIGINT):
-                cluster = LocalCluster(
-                    n_workers=workers,
-                    threads_per_worker=1,
-                    dashboard_address="127.0.0.1:0",
-                    local_directory=folder,
-                    memory_limit=0,  # memory is the system's to give, as to other processes
-                    silence_logs=logging.CRITICAL,
-                )
-            with (
-                cluster,
+            with ExitStack() as stack:
+                with starting_processes():
+                    cluster = LocalCluster(
+                        n_workers=workers,
+                        threads_per_worker=1,
+                        dashboard_address="127.0.0.1:0",
+                        local_directory=folder,
+                        memory_limit=0,  # memory is the system's to give, as to other processes
+                        silence_logs=logging.CRITICAL,
+                    )
+                    stack.enter_context(cluster)
                 # results need not pass through the scheduler
-                Client(cluster, set_as_default=False, direct_to_workers=True) as client,
-            ):
-                yield client
+                client = Client(cluster, set_as_default=False, direct_to_workers=True)
+                yield stack.enter_context(client)
         finally:
             shutil.rmtree(folder, ignore_errors=True)
 

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, nullcontext, suppress
-from multiprocessing import forkserver
+from multiprocessing import forkserver, resource_tracker
 from multiprocessing.connection import wait
 from multiprocessing.util import Finalize, get_temp_dir
 from pathlib import Path
@@ -194,10 +194,7 @@ def _start_worker(shared: Path) -> None:
 
 @contextmanager
 def deaf_to(*signals: signal.Signals) -> Iterator[None]:
-    """This process ignores signals in the block, and so do for good those that are started in it.
-
-    A terminal sends Ctrl-C to every process; the run itself ends its workers.
-    """
+    """This process ignores signals in the block: what it ends must not be disturbed."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -207,6 +204,24 @@ def deaf_to(*signals: signal.Signals) -> Iterator[None]:
     finally:
         for one, handler in before.items():
             signal.signal(one, handler)
+
+
+@contextmanager
+def starting_processes() -> Iterator[None]:
+    """Processes that are started in the block never hear Ctrl-C, and none is left half started.
+
+    A terminal sends Ctrl-C to every process; the run itself ends its workers. On this process
+    Ctrl-C and SIGTERM have their effect at the end of the block.
+    """
+    with _signals_held():
+        # where it is started later, it lets the signals through again
+        resource_tracker.ensure_running()
+        # blocked, for that is inherited: were it ignored meanwhile, one would be lost
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            yield
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextmanager
@@ -297,29 +312,37 @@ def open_executor(
     # never fork: BLAS and OpenCV have threads by now
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["megloc_kapture.stages.query_poses"])
+    pool: _WatchedPool | None = None
     try:
-        _name_as_ours()
-        with deaf_to(signal.SIGINT):
+        with _writing_temporary(), starting_processes():
+            _name_as_ours()
             forkserver.ensure_running()
-        temporary = Path(get_temp_dir())  # ends with the run
-        pool = _WatchedPool(
-            count, mp_context=context, initializer=_start_worker, initargs=(temporary,)
-        )
-    except OSError as error:
-        raise output_error(tempfile.gettempdir(), error) from error
-    try:
+            temporary = Path(get_temp_dir())  # ends with the run
+            pool = _WatchedPool(
+                count, mp_context=context, initializer=_start_worker, initargs=(temporary,)
+            )
         yield pool
     except BaseException as error:
-        with deaf_to(signal.SIGINT, signal.SIGTERM):
-            pool.kill()
-            pool.shutdown()
+        if pool is not None:
+            with deaf_to(signal.SIGINT, signal.SIGTERM):
+                pool.kill()
+                pool.shutdown()
         if isinstance(error, BrokenProcessPool):
             raise MeglocError(
                 "a worker process died, perhaps for want of memory; try fewer with --workers"
             ) from error
         raise
     finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+        if pool is not None:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+@contextmanager
+def _writing_temporary() -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise output_error(tempfile.gettempdir(), error) from error
 
 
 class _WatchedPool(ProcessPoolExecutor):
@@ -340,7 +363,7 @@ class _WatchedPool(ProcessPoolExecutor):
     def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         number = next(self._numbers)
         # the first starts the workers: one that is half started could not be killed
-        with nullcontext() if number else _signals_held():
+        with nullcontext() if number else starting_processes():
             future = super().submit(_noted, self._notes, number, function, *args, **kwargs)
         self._tasks[number] = args[0] if args else function
         future.add_done_callback(lambda _: self._end(number))

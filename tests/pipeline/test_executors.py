@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 import os
 import re
 import signal
@@ -14,6 +15,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -154,6 +156,49 @@ def test_an_error_does_not_wait_for_what_workers_are_at(tmp_path: Path) -> None:
             executor.submit(time.sleep, 600)
             raise ValueError("of the block")
     assert not any(Path(f"/proc/{pid}").exists() for pid in pids)
+
+
+@pytest.fixture
+def interruptible() -> Iterator[None]:
+    """As in a terminal: what a shell starts behind ignores Ctrl-C."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize("within", ["forkserver.ensure_running", "_name_as_ours", "_WatchedPool"])
+def test_ctrl_c_while_workers_are_made_ready_is_not_lost(
+    interruptible: None, monkeypatch: pytest.MonkeyPatch, within: str
+) -> None:
+    do = operator.attrgetter(within)(executors)
+    done = []
+
+    def interrupted(*args: Any, **settings: Any) -> Any:
+        os.kill(os.getpid(), signal.SIGINT)
+        found = do(*args, **settings)
+        done.append(found)
+        return found
+
+    monkeypatch.setattr(f"megloc_kapture.pipeline.executors.{within}", interrupted)
+    with pytest.raises(KeyboardInterrupt), open_executor("processes", 2):
+        pytest.fail("it went on")
+    assert len(done) == 1, "what it was at was left half done"
+    monkeypatch.undo()
+    with open_executor("processes", 2) as pool:
+        assert pool is not None and pool.submit(abs, -1).result() == 1
+
+
+def test_workers_do_not_hear_ctrl_c(interruptible: None) -> None:
+    for _ in range(2):  # the fork server of the first stays
+        with open_executor("processes", 2) as pool:
+            assert pool is not None
+            (pid,) = {pool.submit(os.getpid).result()}
+            os.kill(pid, signal.SIGINT)
+            assert pool.submit(abs, -1).result() == 1
+            assert pool.submit(signal.pthread_sigmask, signal.SIG_BLOCK, ()).result() == {
+                signal.SIGINT
+            }
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
 
 
 def wait_for(log: pytest.LogCaptureFixture, pattern: str) -> None:
