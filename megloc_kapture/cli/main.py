@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 import traceback
+import weakref
 from collections.abc import Sequence
 from importlib import import_module
 from typing import Annotated, Any, Protocol
@@ -21,7 +22,11 @@ from megloc_kapture.errors import MeglocError, missing_extra
 
 DONE, DEFECT, USER_ERROR, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
 
-_ONE_END_S = 2.0  # signals within it are one wish
+_ONE_END_S = 5.0  # for what is cleared up at the end, until another signal ends that, too
+
+
+class Interrupted(KeyboardInterrupt):
+    """Somebody pressed Ctrl-C."""
 
 
 class Terminated(BaseException):
@@ -191,47 +196,56 @@ class _Ending:
     """How Ctrl-C and SIGTERM end the process: in an orderly way, and whatever they meet.
 
     A compiled module that is being imported turns the exception of a signal into an error of its
-    own, and a callback of the interpreter drops it; so what was met is kept here, and a dropped
-    one is raised again.
+    own, or drops it, as callbacks of the interpreter do. So it is kept here what was met, and an
+    exception that is gone before :func:`main` has met it is raised again.
     """
 
     def __init__(self) -> None:
         self.status: int | None = None  # of what was met
-        self._deaf_until = 0.0
-        self._unraisable = sys.unraisablehook
+        self._exception: weakref.ref[BaseException] | None = None
+        self._raised_s = 0.0
+        self._is_over = False
+        self._tell_unraisable = sys.unraisablehook
 
     def obey(self) -> None:
         """Let the signals of this process raise KeyboardInterrupt or Terminated."""
         for one in (signal.SIGINT, signal.SIGTERM):
             if signal.getsignal(one) != signal.SIG_IGN:  # as of what a shell runs behind
                 signal.signal(one, self._raise)
-        sys.unraisablehook = self._raise_again
+        sys.unraisablehook = self._dropped
 
     def ignore(self) -> None:
         """Let nothing more disturb the end of the process."""
+        self._is_over = True
         for one in (signal.SIGINT, signal.SIGTERM):
             signal.signal(one, signal.SIG_IGN)
-        sys.unraisablehook = self._unraisable
+        sys.unraisablehook = self._tell_unraisable
 
     def _raise(self, number: int, _frame: object) -> None:
+        ends = self._exception is not None and self._exception() is not None
         # who presses twice means one end; who waited for it in vain, another
-        if time.monotonic() < self._deaf_until:
+        if ends and time.monotonic() < self._raised_s + _ONE_END_S:
             return
-        self._deaf_until = time.monotonic() + _ONE_END_S
         interrupted = number == signal.SIGINT
         self.status = INTERRUPTED if interrupted else TERMINATED
-        raise KeyboardInterrupt if interrupted else Terminated
+        error = Interrupted() if interrupted else Terminated()
+        self._exception = weakref.ref(error, lambda _: self._raise_again(number))
+        self._raised_s = time.monotonic()
+        try:
+            raise error
+        finally:
+            del error  # its traceback has this frame, and it would live for ever
 
-    def _raise_again(self, dropped: sys.UnraisableHookArgs) -> None:
-        if not issubclass(dropped.exc_type, KeyboardInterrupt | Terminated):
-            self._unraisable(dropped)
-            return
-        self._deaf_until = 0.0
-        of = signal.SIGTERM if issubclass(dropped.exc_type, Terminated) else signal.SIGINT
-        # later: raised in here it would be dropped, too
-        again = threading.Timer(0.01, os.kill, (os.getpid(), of))
-        again.daemon = True
-        again.start()
+    def _raise_again(self, number: int) -> None:
+        if not self._is_over:
+            # not from here, for what is raised while something is deleted is dropped
+            again = threading.Timer(0.01, os.kill, (os.getpid(), number))
+            again.daemon = True
+            again.start()
+
+    def _dropped(self, what: sys.UnraisableHookArgs) -> None:
+        if not issubclass(what.exc_type, Interrupted | Terminated):
+            self._tell_unraisable(what)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -262,7 +276,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         debug = command.debug
         status = command.run()
         sys.stdout.flush()
+    except SystemExit:
+        raise
     except BaseException as error:
+        if arguments is None:
+            ending.ignore()
         if ending.status is None and not isinstance(error, KeyboardInterrupt):
             status = _tell(error, debug)
         else:

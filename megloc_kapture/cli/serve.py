@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -109,7 +110,7 @@ class Serve(Reading, Deciding, Common):
                 )
             except (KeyboardInterrupt, Terminated) as end:
                 console.say("stopped")
-                return TERMINATED if isinstance(end, Terminated) else INTERRUPTED
+                sys.exit(TERMINATED if isinstance(end, Terminated) else INTERRUPTED)
         return 0
 
 

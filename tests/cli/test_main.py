@@ -201,14 +201,28 @@ MEETINGS = {
         Dropping()
         time.sleep(60.0)
     """,
-    "caught, and asked again": """
+    "dropped by who catches all": """
         try:
             signal.raise_signal(NUMBER)
         except BaseException:
-            signal.raise_signal(NUMBER)  # at once: the same wish
-        ending._deaf_until = 0.0  # and later
-        signal.raise_signal(NUMBER)
+            signal.raise_signal(NUMBER)  # pressed twice
         time.sleep(60.0)
+    """,
+    "dropped by a compiled module": """
+        class Meddling:
+            def __hash__(self):
+                signal.raise_signal(NUMBER)
+                return 1
+        ctypes.pythonapi.PyDict_GetItem(ctypes.py_object({}), ctypes.py_object(Meddling()))
+        time.sleep(60.0)
+    """,
+    "kept by who clears up for long": """
+        try:
+            signal.raise_signal(NUMBER)
+        except BaseException as error:
+            main._ONE_END_S = 0.0
+            signal.raise_signal(NUMBER)
+            time.sleep(60.0)
     """,
 }
 
@@ -218,12 +232,11 @@ MEETINGS = {
 def test_a_signal_ends_a_run_whatever_it_meets(number: str, told: str, meeting: str) -> None:
     meeting = meeting.replace("NUMBER", f"signal.{number}").replace("\n        ", "\n    ")
     script = f"""
-import signal, sys, time
+import ctypes, signal, sys, time
 from megloc_kapture.cli import main
 from megloc_kapture.cli.doctor import Doctor
 from megloc_kapture.errors import MeglocError
 def run(self):
-    ending = signal.getsignal(signal.SIGINT).__self__
 {meeting}
 Doctor.run = run
 sys.argv = ["megloc", "doctor"]
