@@ -32,8 +32,11 @@ class TrainField(Linked, Common):
     """Kapture map: images with poses; masks and depth maps are used where there are any."""
     output: Output
     """Folder of the field: field.json and field.safetensors."""
-    kind: Literal["triplane", "nerfw"] = "triplane"
-    """triplane: minutes on a processor; nerfw: the published network, which needs a GPU."""
+    kind: Literal["triplane", "nerfw", "gaussians"] = "triplane"
+    """triplane: minutes on a processor; nerfw: the published network, which needs a GPU; gaussians:
+    splats, which begin where the map's depth says."""
+    gaussians: int | None = None
+    """How many, of that kind; 8192 unless given."""
     steps: int = 4000
     """Of the training."""
     minutes: float | None = None
@@ -64,6 +67,7 @@ class TrainField(Linked, Common):
         try:
             options = FieldTrainingOptions(
                 kind=self.kind,
+                gaussians=self.gaussians,
                 steps=self.steps,
                 minutes=self.minutes,
                 max_side_px=self.max_side,

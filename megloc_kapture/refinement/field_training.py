@@ -15,18 +15,20 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import pixel_rays
+from megloc_kapture.nets.gaussians import DEFAULT_COUNT, Gaussians
 from megloc_kapture.nets.nerfw import NerfW
 from megloc_kapture.nets.radiance import Rays, nerf_w_loss
 from megloc_kapture.nets.runtime import NetworkOptions, pick_device
 from megloc_kapture.nets.training_state import load_state, state_bytes
-from megloc_kapture.nets.triplane import TriPlane
 from megloc_kapture.refinement.neural_field import (
     FieldFrame,
+    FieldModule,
     FieldView,
+    Floats,
     Kind,
     Lights,
     NeuralField,
@@ -39,6 +41,7 @@ from megloc_kapture.refinement.neural_field import (
 # Adam's rates at the beginning; at the end a thirtieth
 _PLANE_RATE, _RATE, _NERF_RATE = 2e-2, 5e-3, 5e-4
 _DECAY = 1 / 30
+_GAUSSIAN_RATES = {"means": 1e-3, "quats_wxyz": 2e-3, "opacity_logits": 2e-2, "colour_logits": 1e-2}
 _KEEP_EVERY = 200  # steps
 
 
@@ -46,7 +49,8 @@ class FieldTrainingOptions(NetworkOptions):
     """Options of a field's training."""
 
     kind: Kind = Field(
-        default="triplane", description="triplane: minutes on a processor; nerfw: needs a GPU"
+        default="triplane",
+        description="triplane: minutes on a processor; nerfw: needs a GPU; gaussians: needs depth",
     )
     steps: int = Field(default=4000, gt=0, description="of the training")
     minutes: float | None = Field(
@@ -67,7 +71,16 @@ class FieldTrainingOptions(NetworkOptions):
     lights: Lights = Field(
         default="image", description="an appearance for each image, or for each folder of images"
     )
+    gaussians: int | None = Field(
+        default=None, ge=16, description=f"how many, of that kind; {DEFAULT_COUNT} unless given"
+    )
     seed: int = Field(default=0, ge=0)
+
+    @model_validator(mode="after")
+    def _of_its_kind(self) -> FieldTrainingOptions:
+        if self.gaussians is not None and self.kind != "gaussians":
+            raise ValueError(f"gaussians changes nothing: the kind is {self.kind}")
+        return self
 
 
 class FieldTrainer:
@@ -83,14 +96,15 @@ class FieldTrainer:
 
     Raises
     ------
-    DataError : too few images, or one does not fit its camera; no pixel may be used.
+    DataError : too few images, or one does not fit its camera; no pixel may be used; Gaussians
+        have no depth to begin with.
     """
 
     def __init__(
         self,
         views: Sequence[FieldView],
         options: FieldTrainingOptions,
-        module: NerfW | TriPlane | None = None,
+        module: FieldModule | None = None,
     ) -> None:
         self.options = options
         every = options.held_out_every
@@ -101,11 +115,14 @@ class FieldTrainer:
             raise DataError(f"{len(views)} images with poses and pixels are too few for a field")
         images = [view.name for view in trained]
         rows = light_rows(images, options.lights)
+        self._data = _Pixels(trained, options.max_side_px)
         if module is None:
             with torch.random.fork_rng([]):
                 torch.manual_seed(options.seed)
-                module = build_field(options.kind, len(images), max(rows) + 1)
-        self._data = _Pixels(trained, options.max_side_px)
+                sizes = len(images), max(rows) + 1, options.gaussians
+                module = build_field(options.kind, *sizes)
+            if isinstance(module, Gaussians):
+                module.place(*self._data.surface(len(module.means), options.seed))
         module = module.to(pick_device(options.device))
         self._field = NeuralField(module, self._data.frame(), images, rows)
         self._held_out = [reduced_view(view, options.max_side_px) for view in held_out]
@@ -192,9 +209,14 @@ class FieldTrainer:
         self._optimizer.step()
 
 
-def _groups(module: NerfW | TriPlane) -> list[dict[str, object]]:
+def _groups(module: FieldModule) -> list[dict[str, object]]:
     if isinstance(module, NerfW):
         return [{"params": list(module.parameters()), "lr": _NERF_RATE}]
+    if isinstance(module, Gaussians):
+        return [
+            {"params": [value], "lr": _GAUSSIAN_RATES.get(name, _RATE)}
+            for name, value in module.named_parameters()
+        ]
     planes = list(module.planes)
     others = [value for name, value in module.named_parameters() if not name.startswith("planes")]
     return [{"params": planes, "lr": _PLANE_RATE}, {"params": others, "lr": _RATE}]
@@ -251,6 +273,31 @@ class _Pixels:
         scale = 0.5 * float((high - low).max())
         x, y, z = centre.tolist()
         return FieldFrame(centre=(x, y, z), scale=scale, near=float(near), far=float(far))
+
+    def surface(self, count: int, seed: int) -> tuple[Floats, Floats]:
+        """Points (K, 3) of the field that depth shows, drawn evenly, and their colours in 0 to 1.
+
+        Raises
+        ------
+        DataError : no pixel has depth, or fewer have than are asked for.
+        """
+        known = self._usable
+        if self._depth is not None:
+            known = known[self._depth[known] > 0]
+        if self._depth is None or len(known) < count:
+            found = 0 if self._depth is None else len(known)
+            raise DataError(
+                f"{count} Gaussians begin where depth says, and {found} pixels have any; "
+                "megloc densify gives a map depth"
+            )
+        rows = np.sort(np.random.default_rng(seed).choice(known, count, replace=False))
+        image, rays = self._lines(rows)
+        points = self._centres[image] + rays * self._depth[rows, None]
+        frame = self.frame()
+        return (
+            ((points - frame.centre) / frame.scale).astype(np.float32),
+            self._rgb[rows].astype(np.float32) / 255,
+        )
 
     def _lines(self, rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Images (N,) of pixels, and their rays (N, 3) in the world."""
