@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.geometry.cameras import pixel_rays
+from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.nets.gaussians import DEFAULT_COUNT, Gaussians
 from megloc_kapture.nets.nerfw import NerfW
 from megloc_kapture.nets.radiance import Rays, nerf_w_loss
@@ -306,8 +306,10 @@ class _Pixels:
         camera_of = self._camera_of[image]
         for number in np.unique(camera_of):
             which = camera_of == number
-            inside = rows[which] - self._starts[image[which]]
-            rays[which] = pixel_rays(self._cameras[number])[inside]
+            camera = self._cameras[number]
+            y, x = np.divmod(rows[which] - self._starts[image[which]], camera.width)
+            # of these pixels alone: a map may have a camera for each image
+            rays[which] = bearing_rays(camera, np.stack([x + 0.5, y + 0.5], axis=1))
         return image, np.einsum("nj,njk->nk", rays, self._rotations[image])
 
     def batch(
