@@ -51,6 +51,10 @@ class TrainField(Linked, Common):
     """Of everything that is drawn."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """auto: a GPU where there is one."""
+    half_precision: bool = False
+    """Networks compute in bfloat16, which pays on a GPU."""
+    compiled: bool = False
+    """By torch.compile, which pays on a GPU: minutes at first, and it needs a C compiler."""
     force: Force = False
     """Write into a folder that has other things in it; begin again."""
 
@@ -75,6 +79,8 @@ class TrainField(Linked, Common):
                 lights=self.lights,
                 seed=self.seed,
                 device=self.device,
+                half_precision=self.half_precision,
+                compiled=self.compiled,
             )
         except ValidationError as error:
             raise OptionError(first_problem(error)) from error

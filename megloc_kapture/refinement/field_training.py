@@ -74,12 +74,18 @@ class FieldTrainingOptions(NetworkOptions):
     gaussians: int | None = Field(
         default=None, ge=16, description=f"how many, of that kind; {DEFAULT_COUNT} unless given"
     )
+    compiled: bool = Field(
+        default=False,
+        description="by torch.compile, which takes minutes at first and needs a C compiler",
+    )
     seed: int = Field(default=0, ge=0)
 
     @model_validator(mode="after")
     def _of_its_kind(self) -> FieldTrainingOptions:
         if self.gaussians is not None and self.kind != "gaussians":
             raise ValueError(f"gaussians changes nothing: the kind is {self.kind}")
+        if self.compiled and self.kind == "gaussians":
+            raise ValueError("compiled is of networks; gaussians are none")
         return self
 
 
@@ -125,6 +131,7 @@ class FieldTrainer:
                 module.place(*self._data.surface(len(module.means), options.seed))
         module = module.to(pick_device(options.device))
         self._field = NeuralField(module, self._data.frame(), images, rows)
+        self._render = torch.compile(module.render) if options.compiled else module.render
         self._held_out = [reduced_view(view, options.max_side_px) for view in held_out]
         self._optimizer = torch.optim.Adam(_groups(module), eps=1e-15, betas=(0.9, 0.99))
         self._rates = [float(group["lr"]) for group in self._optimizer.param_groups]
@@ -195,10 +202,10 @@ class FieldTrainer:
 
     def _learn(self, generator: torch.Generator) -> None:
         """One step."""
-        options, module, device = self.options, self._field.module, self._field.device
+        options, device = self.options, self._field.device
         rays, rgb = self._data.batch(self._field, options.rays_per_step, generator)
         with torch.autocast(device.type, torch.bfloat16, enabled=options.half_precision):
-            rendered = module.render(rays, generator)
+            rendered = self._render(rays, generator)
         loss = nerf_w_loss(rendered, rgb)
         if (depth := rays.depth) is not None:
             error = (rendered.depth - depth).abs() / depth.clamp_min(1e-6)

@@ -109,6 +109,7 @@ def test_gaussians_begin_where_depth_says(megloc: Any, mapping: Path, tmp_path: 
         assert np.median(found[found > 0]) == pytest.approx(np.median(known[known > 0]), rel=0.05)
     command = ("train-field", "-i", mapping, "-o", tmp_path / "other", *QUICK)
     megloc(*command, "--gaussians", "99").refused("gaussians changes nothing: the kind is triplane")
+    megloc(*command, "--kind", "gaussians", "--compiled").refused("compiled is of networks")
     megloc(*command, "--kind", "gaussians", "--gaussians", "99999").refused(
         "99999 Gaussians begin where depth says, and [0-9]+ pixels have any"
     )

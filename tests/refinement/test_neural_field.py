@@ -109,6 +109,25 @@ def test_gaussians_learn_the_room_and_begin_with_its_depth() -> None:
         train_field(views(5, depth=False), brief)
 
 
+def test_half_precision_learns_nearly_the_same() -> None:
+    half = QUICK.model_copy(update={"half_precision": True})
+    exact, near = (train_field(views(5), each)[0].module.state_dict() for each in (QUICK, half))
+    assert any(not torch.equal(exact[name], near[name]) for name in exact)
+    images = [
+        train_field(views(5), each)[0].render(SMALL, IDENTITY).image for each in (QUICK, half)
+    ]
+    assert np.abs(np.subtract(*np.float64(images))).mean() < 8
+
+
+@pytest.mark.slow
+def test_compiled_learns_the_same() -> None:
+    brief = QUICK.model_copy(update={"steps": 2})
+    compiled = brief.model_copy(update={"compiled": True})
+    one, other = (train_field(views(5), each)[0].module.state_dict() for each in (brief, compiled))
+    for name in one:
+        torch.testing.assert_close(one[name], other[name], atol=5e-3, rtol=0)
+
+
 def test_interrupted_and_resumed_is_uninterrupted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(field_training, "_KEEP_EVERY", 3)
     path, states = Path("field.state.pt"), list[bytes]()
