@@ -9,7 +9,7 @@ must be picklable.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -49,6 +49,12 @@ class PluginChoice(Options):
     @classmethod
     def _named(cls, value: Any) -> Any:
         return {"name": value} if isinstance(value, str) else value
+
+
+def chosen_by_name(known: Iterable[PluginChoice], names: Iterable[str]) -> list[dict[str, Any]]:
+    """Choices of plugins by their names, each with the settings that it is known with, if any."""
+    of_name = {one.name: one.model_dump() for one in known}
+    return [of_name.get(name, {"name": name}) for name in names]
 
 
 @runtime_checkable

@@ -14,6 +14,7 @@ from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.output_folders import staged_output
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, assigned, options_of_preset
+from megloc_kapture.plugins import chosen_by_name
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.work import Work
@@ -53,8 +54,7 @@ class StageCommand(Choosing, Working, Common):
         """Changes that choose plugins by their names, with the settings that the preset has of
         them; none without names."""
         preset = getattr(options_of_preset(self.preset or DEFAULT_PRESET), key)
-        known = {one.name: one.model_dump() for one in preset}
-        return {key: [known.get(name, {"name": name}) for name in names]} if names else {}
+        return {key: chosen_by_name(preset, names)} if names else {}
 
     @contextmanager
     def features_folder(self, output: Path, *, force: bool) -> Iterator[tuple[Path, Work]]:

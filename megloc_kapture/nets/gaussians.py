@@ -9,13 +9,15 @@ al., CVPR 2022). On a GPU gsplat, where it is installed, renders whole views.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import nn
 
-from megloc_kapture.nets.radiance import BETA_MIN, Rays, Rendered, frequencies
+from megloc_kapture.nets.radiance import Rays, Rendered, Samples, composite, frequencies
 
 DEFAULT_COUNT = 8192
 _APPEARANCE, _TRANSIENT, _HIDDEN = 8, 16, 64
@@ -86,8 +88,9 @@ class Gaussians(nn.Module):
             return self._render(rays)
 
     def _render(self, rays: Rays) -> Rendered:
-        which, there = self._along(rays)
-        whitening = self._whitening()[which]
+        whitening = self._whitening()
+        which, there = self._along(rays, whitening)
+        whitening = whitening[which]
         offset = rays.origins[:, None] - self.means[which]
         origin = (whitening @ offset[..., None])[..., 0]
         ahead = (whitening @ rays.directions[:, None, :, None])[..., 0]
@@ -101,20 +104,20 @@ class Gaussians(nn.Module):
         if appearance is None:
             appearance = self.appearance.weight.mean(0).expand(len(rays.origins), -1)
         rgb = self.colours(appearance[:, None], which)
-        passed = torch.cumprod(1 - alpha, dim=1)
-        weights = alpha * torch.cat([torch.ones_like(passed[:, :1]), passed[:, :-1]], dim=1)
-        seen, opacity = (weights[..., None] * rgb).sum(1), weights.sum(1)
-        depth = (weights * t).sum(1) / opacity.clamp_min(_EPSILON)
-        beta = torch.full_like(opacity, BETA_MIN)
+        # as pieces of a ray that stop so much of it
+        static = composite(t, torch.ones_like(t), Samples(-torch.log1p(-alpha), rgb))
         if rays.transient is None:
-            return Rendered(seen, depth, opacity, beta, weights, opacity.new_zeros(()))
+            return static
         unit = nn.functional.normalize(rays.directions, dim=1)
         entering = torch.cat([frequencies(unit, _DIRECTION_FREQUENCIES), rays.transient], dim=1)
         moving = self.moving(entering)
         hidden = torch.sigmoid(moving[:, 0] - 3.0)
-        seen = (1 - hidden)[:, None] * seen + hidden[:, None] * torch.sigmoid(moving[:, 1:4])
-        beta = beta + hidden * nn.functional.softplus(moving[:, 4] - 1.0)
-        return Rendered(seen, depth, opacity, beta, weights, hidden.mean())
+        return replace(
+            static,
+            rgb=torch.lerp(static.rgb, torch.sigmoid(moving[:, 1:4]), hidden[:, None]),
+            beta=static.beta + hidden * nn.functional.softplus(moving[:, 4] - 1.0),
+            transient_density=hidden.mean(),
+        )
 
     def rasterize(
         self,
@@ -173,13 +176,12 @@ class Gaussians(nn.Module):
         return rotation.transpose(1, 2) / self._scales()[..., None]
 
     @torch.no_grad()
-    def _along(self, rays: Rays) -> tuple[torch.Tensor, torch.Tensor]:
+    def _along(self, rays: Rays, whitening: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Gaussians (N, S) that each ray meets, the nearest first, and which of them there are.
 
         Distances and places of all Gaussians along all rays are products of two tables, for they
         are quadratic in the ray and in the Gaussian.
         """
-        whitening = self._whitening()
         precision = whitening.transpose(1, 2) @ whitening
         pull = (precision @ self.means[..., None])[..., 0]
         upper = torch.triu_indices(3, 3, device=precision.device)

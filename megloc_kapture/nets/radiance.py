@@ -15,7 +15,7 @@ from torch import nn
 
 _DEPTH_SPREAD = 0.03  # of samples about a known depth, share of it
 _EPSILON = 1e-10
-BETA_MIN = 0.03  # uncertainty of a ray that meets nothing transient
+_BETA_MIN = 0.03  # uncertainty of a ray that meets nothing transient
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +110,7 @@ def composite(t: torch.Tensor, deltas: torch.Tensor, samples: Samples) -> Render
     static = transmitted * -torch.expm1(-samples.sigma * deltas)
     weights = transmitted * -torch.expm1(-total * deltas)
     rgb = (static[..., None] * samples.rgb).sum(1)
-    beta = torch.full_like(t[:, 0], BETA_MIN)
+    beta = torch.full_like(t[:, 0], _BETA_MIN)
     density = t.new_zeros(())
     if samples.transient_sigma is not None:
         assert samples.transient_rgb is not None and samples.transient_beta is not None

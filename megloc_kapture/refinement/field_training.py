@@ -122,15 +122,16 @@ class FieldTrainer:
         images = [view.name for view in trained]
         rows = light_rows(images, options.lights)
         self._data = _Pixels(trained, options.max_side_px)
+        frame = self._data.frame()
         if module is None:
             with torch.random.fork_rng([]):
                 torch.manual_seed(options.seed)
                 sizes = len(images), max(rows) + 1, options.gaussians
                 module = build_field(options.kind, *sizes)
             if isinstance(module, Gaussians):
-                module.place(*self._data.surface(len(module.means), options.seed))
+                module.place(*self._data.surface(frame, len(module.means), options.seed))
         module = module.to(pick_device(options.device))
-        self._field = NeuralField(module, self._data.frame(), images, rows)
+        self._field = NeuralField(module, frame, images, rows)
         self._render = torch.compile(module.render) if options.compiled else module.render
         self._held_out = [reduced_view(view, options.max_side_px) for view in held_out]
         self._optimizer = torch.optim.Adam(_groups(module), eps=1e-15, betas=(0.9, 0.99))
@@ -270,8 +271,7 @@ class _Pixels:
             near, far = 0.5 * np.quantile(known, 0.01), 1.5 * np.quantile(known, 0.99)
             rows = self._usable[self._depth[self._usable] > 0]
             rows = rows[:: max(1, len(rows) // 20000)]
-            image, rays = self._lines(rows)
-            points = self._centres[image] + rays * self._depth[rows, None]
+            points = self._points(rows, self._depth)
             low = np.minimum(low, np.quantile(points, 0.005, axis=0))
             high = np.maximum(high, np.quantile(points, 0.995, axis=0))
         else:
@@ -281,7 +281,7 @@ class _Pixels:
         x, y, z = centre.tolist()
         return FieldFrame(centre=(x, y, z), scale=scale, near=float(near), far=float(far))
 
-    def surface(self, count: int, seed: int) -> tuple[Floats, Floats]:
+    def surface(self, frame: FieldFrame, count: int, seed: int) -> tuple[Floats, Floats]:
         """Points (K, 3) of the field that depth shows, drawn evenly, and their colours in 0 to 1.
 
         Raises
@@ -298,13 +298,13 @@ class _Pixels:
                 "megloc densify gives a map depth"
             )
         rows = np.sort(np.random.default_rng(seed).choice(known, count, replace=False))
+        points = (self._points(rows, self._depth) - frame.centre) / frame.scale
+        return points.astype(np.float32), self._rgb[rows].astype(np.float32) / 255
+
+    def _points(self, rows: NDArray[np.int64], depth: Floats) -> NDArray[np.float64]:
+        """Points (N, 3) of the world that the depth of pixels shows."""
         image, rays = self._lines(rows)
-        points = self._centres[image] + rays * self._depth[rows, None]
-        frame = self.frame()
-        return (
-            ((points - frame.centre) / frame.scale).astype(np.float32),
-            self._rgb[rows].astype(np.float32) / 255,
-        )
+        return np.asarray(self._centres[image] + rays * depth[rows, None])
 
     def _lines(self, rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Images (N,) of pixels, and their rays (N, 3) in the world."""

@@ -24,6 +24,7 @@ from megloc_kapture.plugins import (
     PoseRefinement,
     PoseRefiner,
     RankingScene,
+    chosen_by_name,
 )
 from megloc_kapture.refinement.consistency import (
     Consistency,
@@ -60,8 +61,7 @@ class PoseRefinementOptions(Options):
 
     def with_refiners(self, names: Sequence[str]) -> PoseRefinementOptions:
         """With these refiners, in this order, each with the options that it has here."""
-        known = {one.name: one.options for one in self.by}
-        chosen = [{"name": name, "options": known.get(name, {})} for name in names]
+        chosen = chosen_by_name(self.by, names)
         return PoseRefinementOptions.model_validate({**self.model_dump(), "by": chosen})
 
     def refines(self) -> bool:
