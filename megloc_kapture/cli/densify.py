@@ -10,7 +10,7 @@ from megloc_kapture.cli.stage_command import StageCommand, restrictions_beside
 from megloc_kapture.cli.stages import MAP
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.output_folders import staged_output
-from megloc_kapture.pipeline.executors import open_executor, single_threaded
+from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.stages.densifying import densify_map, fitted_to_poses
 from megloc_kapture.stages.fusion import fuse_depth
 from megloc_kapture.stages.work import Work
@@ -50,7 +50,7 @@ class Densify(Reading, StageCommand):
         with (
             single_threaded(),
             staged_output(self.output, kind=MAP, force=self.force) as out,
-            open_executor(self.executor, self.workers) as executor,
+            self.open_executor(out) as executor,
         ):
             work = Work(executor, console.track)
             counts = densify_map(

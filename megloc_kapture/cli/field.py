@@ -9,7 +9,15 @@ from typing import Annotated, Literal
 
 import tyro
 
-from megloc_kapture.cli.common import Common, Force, Input, Linked, Output, camera_of_text
+from megloc_kapture.cli.common import (
+    Common,
+    Force,
+    Input,
+    Linked,
+    Output,
+    Working,
+    camera_of_text,
+)
 from megloc_kapture.errors import DataError, OptionError, OutputError
 from megloc_kapture.io.images import WRITABLE_SUFFIXES
 from megloc_kapture.io.kapture.sensors import unit_quaternion
@@ -109,7 +117,7 @@ class TrainField(Linked, Common):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Render(Linked, Common):
+class Render(Linked, Working, Common):
     """Render a view of a neural field, views of a result, or views that no camera took."""
 
     field: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FIELD")]
@@ -136,15 +144,18 @@ class Render(Linked, Common):
 
     def run(self) -> int:
         """Run it."""
-        from megloc_kapture.stages.neural_field import open_field, render_along, views_between
+        from megloc_kapture.stages.neural_field import render_along, views_between
+        from megloc_kapture.stages.work import Work
 
         console = self.console()
         if sum(each is not None for each in (self.pose, self.along, self.between)) != 1:
             raise OptionError("say what to render: --pose and --camera, --along or --between")
         many = self.along or self.between
         if many is None:
-            if self.max_side is not None:
-                raise OptionError("--max-side changes nothing: it is of --along and --between")
+            for name in ("max_side", "workers", "scheduler"):
+                if getattr(self, name) is not None:
+                    flag = "--" + name.replace("_", "-")
+                    raise OptionError(f"{flag} changes nothing: it is of --along and --between")
             self._render_one()
             console.result(f"rendered: {self.output}")
             return 0
@@ -153,17 +164,22 @@ class Render(Linked, Common):
         for name in ("camera", "depth"):
             if getattr(self, name) is not None:
                 raise OptionError(f"--{name} changes nothing: it is of --pose")
-        field, data = open_field(self.field), self.kapture(many).read()
+        data = self.kapture(many).read()
         if not data.poses():
             raise DataError("no image here has a pose", path=many)
-        with single_threaded(), staged_output(self.output, kind=RENDERED, force=self.force) as out:
+        with (
+            single_threaded(),
+            staged_output(self.output, kind=RENDERED, force=self.force) as out,
+            self.open_executor(out) as executor,
+        ):
             count = render_along(
-                field,
+                self.field,
                 data if self.between is None else views_between(data),
                 out,
                 appearance=self.appearance,
                 max_side_px=self.max_side,
                 min_shown=0.0 if self.between is None else _MIN_SHOWN,
+                work=Work(executor, console.track),
             )
         console.result(f"{count} views rendered: {self.output}")
         return 0

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Annotated
@@ -27,7 +28,7 @@ from megloc_kapture.io.images import write_depth_map, write_image
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.io.weights import WeightsFile, describe, read_weights
 from megloc_kapture.mapping.pairs import PairsByPosesOptions, pairs_by_poses
-from megloc_kapture.nets.runtime import load_strictly, pick_device
+from megloc_kapture.nets.runtime import NetworkOptions, load_strictly, pick_device
 from megloc_kapture.refinement.field_training import FieldTrainer, FieldTrainingOptions
 from megloc_kapture.refinement.neural_field import (
     FieldFrame,
@@ -38,7 +39,8 @@ from megloc_kapture.refinement.neural_field import (
     light_rows,
 )
 from megloc_kapture.stages.ranking_scene import KaptureScene
-from megloc_kapture.values import Device, RigidTransform
+from megloc_kapture.stages.work import HERE, Work
+from megloc_kapture.values import Camera, Device, RigidTransform
 
 FIELD_FILE, MANIFEST_FILE = "field.safetensors", "field.json"
 STATE_FILE = "field.state.pt"  # while it is trained
@@ -186,19 +188,53 @@ def views_between(data: KaptureData) -> KaptureData:
     return found
 
 
+@dataclass(frozen=True)
+class _Renderer:
+    """Renders views of a field, in any process; attributes as of :func:`render_along`."""
+
+    field: Path
+    records: Path
+    appearance: str | None
+    max_side_px: int | None
+    min_shown: float
+    options: NetworkOptions = NetworkOptions()
+
+    def __call__(self, view: tuple[str, Camera, RigidTransform]) -> Camera | None:
+        """Write image and depth of a view; its camera, None where it shows too little."""
+        name, camera, pose = view
+        field = open_field(self.field, self.options.device)
+        light = None if self.appearance is None else field.appearance_of(self.appearance)
+        found = field.render(camera, pose, appearance=light, max_side_px=self.max_side_px)
+        if np.mean(found.depth_m > 0) < self.min_shown:
+            return None
+        image, depth = (self.records / part for part in _files_of(name))
+        image.parent.mkdir(parents=True, exist_ok=True)
+        write_image(image, found.image)
+        write_depth_map(depth, found.depth_m)
+        return found.camera
+
+
+def _files_of(name: str) -> tuple[str, str]:
+    """Rendering and depth map of an image, below ``records_data``."""
+    stem = Path(name).with_suffix("")
+    return f"{stem}.png", f"{stem}.depth"
+
+
 def render_along(
-    field: NeuralField,
+    field: Path,
     data: KaptureData,
     output: Path,
     *,
     appearance: str | None = None,
     max_side_px: int | None = None,
     min_shown: float = 0.0,
+    work: Work = HERE,
 ) -> int:
     """Render all images of a kapture that have poses, as a kapture with depth of its own.
 
     Parameters
     ----------
+    field : folder of the field.
     appearance : image that was trained on, whose light it is; the mean of all unless given.
     max_side_px : longer side of the renderings; larger cameras are reduced.
     min_shown : views in which less than this share of the pixels has depth are left out.
@@ -209,37 +245,37 @@ def render_along(
 
     Raises
     ------
-    DataError : no image has a pose, two are told apart by their endings alone, or the field does
-        not know the appearance.
+    DataError : no image has a pose, two are told apart by their endings alone, or the field is
+        damaged or does not know the appearance.
     """
     poses = data.poses()
     if not poses:
         raise DataError("no image here has a pose")
-    light = None if appearance is None else field.appearance_of(appearance)
-    written = KaptureData()
     stems = {Path(name).with_suffix(""): name for name in poses}
-    for name, pose in poses.items():
+    for name in poses:
         if (other := stems[Path(name).with_suffix("")]) != name:
             raise DataError(f"{name!r} and {other!r} would be rendered into one file")
-        timestamp, sensor = data.record_of(name)
-        rendering = field.render(
-            data.camera_of(name), pose, appearance=light, max_side_px=max_side_px
-        )
-        if np.mean(rendering.depth_m > 0) < min_shown:
+    known = open_field(field)
+    if appearance is not None:
+        known.appearance_of(appearance)
+    records = output / "sensors" / "records_data"
+    renderer = _Renderer(field.absolute(), records, appearance, max_side_px, min_shown)
+    views = [(name, data.camera_of(name), pose) for name, pose in poses.items()]
+    written = KaptureData()
+    cameras = work.map(renderer, views, "views", plugins=(renderer,))
+    for (name, _, pose), camera in zip(views, cameras, strict=True):
+        if camera is None:
             continue
-        image, depth = f"{Path(name).with_suffix('')}.png", f"{Path(name).with_suffix('')}.depth"
+        timestamp, sensor = data.record_of(name)
+        image, depth = _files_of(name)
         ids = sensor, f"{sensor}_depth"
         for one, kind in zip(ids, ("camera", "depth"), strict=True):
-            written.sensors[one] = Sensor.from_camera(rendering.camera, sensor_type=kind)
+            written.sensors[one] = Sensor.from_camera(camera, sensor_type=kind)
             written.trajectories[timestamp, one] = pose
         # kapture joins depth with an image by the rig that carries both
         same = RigidTransform.identity()
         written.rigs[f"{sensor}_with_depth"] = dict.fromkeys(ids, same)
         written.records_camera[timestamp, ids[0]] = image
         written.records_depth[timestamp, ids[1]] = depth
-        folder_of = output / "sensors" / "records_data"
-        (folder_of / image).parent.mkdir(parents=True, exist_ok=True)
-        write_image(folder_of / image, rendering.image)
-        write_depth_map(folder_of / depth, rendering.depth_m)
     write_sensors(output, written)
     return len(written.records_camera)

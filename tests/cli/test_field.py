@@ -153,6 +153,21 @@ def test_views_along_a_result(megloc: Any, mapping: Path, field: Path, tmp_path:
     megloc("render", field, "--along", one, "-o", tmp_path / "x").refused("rendered into one file")
 
 
+def test_processes_render_the_same_views(
+    megloc: Any, mapping: Path, field: Path, tmp_path: Path
+) -> None:
+    command = ("render", field, "--along", mapping, "--max-side", "32")
+    for workers in ("1", "2"):
+        assert megloc(*command, "-o", tmp_path / workers, "--workers", workers).status == 0
+    one, two = (
+        {path.relative_to(root): path.read_bytes() for path in root.rglob("*.*") if path.is_file()}
+        for root in (tmp_path / "1", tmp_path / "2")
+    )
+    assert one == two and len(one) >= 2 * len(KaptureFolder(mapping).read().poses())
+    elsewhere = ("--scheduler", "tcp://127.0.0.1:1")
+    megloc(*command, "-o", tmp_path / "x", *elsewhere).refused("without --executor dask")
+
+
 def test_the_view_shows_them_beside_the_photographs(
     megloc: Any, finished: Path, field: Path, tmp_path: Path
 ) -> None:
@@ -271,6 +286,8 @@ def test_what_is_refused(megloc: Any, mapping: Path, field: Path, tmp_path: Path
     megloc("render", field, pose, "-o", out).refused("--pose needs the --camera")
     side = ("--max-side", "9")
     megloc("render", field, pose, *camera, *side, "-o", out).refused("--max-side changes nothing")
+    workers = ("--workers", "2")
+    megloc("render", field, pose, *camera, *workers, "-o", out).refused("--workers changes nothing")
     megloc("render", field, "--along", mapping, *camera, "-o", out).refused("--camera changes")
     for wrong in ("1,0,0", "2,0,0,0,0,0,0", "1,0,0,0,0,0,nan", "x,0,0,0,0,0,0"):
         megloc("render", field, f"--pose={wrong}", *camera, "-o", out).refused("qw,qx,qy,qz,tx")

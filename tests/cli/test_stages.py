@@ -186,6 +186,17 @@ def test_unknown_global_features_are_refused(megloc: Any, scene: Path, tmp_path:
     )
 
 
+@pytest.mark.parametrize("command", ["densify", "refine-map", "refine-poses"])
+def test_a_scheduler_that_nothing_asks_is_refused(
+    megloc: Any, finished: Path, tmp_path: Path, command: str
+) -> None:
+    given: tuple[Any, ...] = (command, "-i", finished / "map", "-o", tmp_path / "out")
+    if command == "refine-poses":
+        given += ("--query", finished / "query", "--poses", finished / "localized", "--by", "icp")
+    megloc(*given, "--scheduler", "tcp://127.0.0.1:1").refused("changes nothing without --exec")
+    assert not (tmp_path / "out").exists()
+
+
 def test_output_of_another_kind_is_refused(megloc: Any, made: Made, scene: Path) -> None:
     # features where a map is
     command = ["extract-local", "-i", scene / "query", "-o", made.map, *OPTIONS, *INLINE]
