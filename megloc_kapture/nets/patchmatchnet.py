@@ -80,8 +80,8 @@ class _FeatureNet(nn.Module):
         half = self.conv4(self.conv3(self.conv2(self.conv1(self.conv0(image)))))
         quarter = self.conv7(self.conv6(self.conv5(half)))
         eighth = self.conv10(self.conv9(self.conv8(quarter)))
-        middle = _doubled(eighth) + self.inner1(quarter)
-        finest = _doubled(middle) + self.inner2(half)
+        middle = _smoothly_doubled(eighth) + self.inner1(quarter)
+        finest = _smoothly_doubled(middle) + self.inner2(half)
         return {3: self.output1(eighth), 2: self.output2(middle), 1: self.output3(finest)}
 
 
@@ -321,6 +321,10 @@ def patchmatchnet_from(tensors: Mapping[str, Tensor], where: str) -> PatchmatchN
 
 
 def _doubled(x: Tensor) -> Tensor:
+    return functional.interpolate(x, scale_factor=2.0, mode="nearest")
+
+
+def _smoothly_doubled(x: Tensor) -> Tensor:
     return functional.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False)
 
 

@@ -398,7 +398,7 @@ class Densify(PipelineStage):
     """Estimate depth of the map's images that have none."""
 
     name = "densify"
-    version = 3
+    version = 4
     uses = ("mvs",)
     writes = (MAP,)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import runpy
 from pathlib import Path
 
 import cv2
@@ -42,6 +43,34 @@ def test_the_published_checkpoint_fits_strictly(checkpoint: Path) -> None:
     del tensors["feature.inner1.bias"]
     with pytest.raises(DataError, match="feature.inner1.bias"):
         patchmatchnet_from(tensors, str(checkpoint))
+
+
+def test_depth_is_the_authors() -> None:
+    published = Path(__file__).parent / "data" / "patchmatchnet"
+    script = runpy.run_path(str(published / "make_reference.py"))
+    outputs = np.load(published / "reference.npz")
+    network = PatchmatchNet().eval()
+    shapes = {key: tuple(value.shape) for key, value in network.state_dict().items()}
+    network.load_state_dict(script["weights"](shapes), strict=True)
+    images = [torch.from_numpy(one).permute(2, 0, 1)[None] / 255 for one in outputs["images"]]
+    k, rotations, translations = (
+        outputs[name] for name in ("intrinsics", "rotations", "translations")
+    )
+    projections = []
+    for rotation, translation in zip(rotations[1:], translations[1:], strict=True):
+        turned = rotation @ rotations[0].T
+        moved = translation - turned @ translations[0]
+        parts = k @ turned @ np.linalg.inv(k), k @ moved
+        projections.append((torch.from_numpy(parts[0]), torch.from_numpy(parts[1])))
+    with torch.inference_mode():
+        depth, confidence = network(images, projections, script["LIMITS"], seed=0)
+    near, far = np.quantile(outputs["depth"], [0.1, 0.9])
+    low, high = np.quantile(outputs["confidence"], [0.1, 0.9])
+    assert far > 1.5 * near and high > low + 0.1
+    # hypotheses that differ in their last bits are scored a thousand times as far apart
+    assert np.abs(depth.numpy() - outputs["depth"]).max() < 0.02
+    assert np.median(np.abs(depth.numpy() - outputs["depth"])) < 2e-4
+    assert np.abs(confidence.numpy() - outputs["confidence"]).max() < 0.01
 
 
 def test_features_are_warped_to_where_hypotheses_project() -> None:

@@ -38,7 +38,7 @@ def random_state(shapes):
         count = int(np.prod(shape))
         bits = np.random.PCG64(number).random_raw(-(-count // 4)).astype("<u8").view("<u2")[:count]
         values = torch.from_numpy(bits.astype(np.float32).reshape(shape)).div_(2**16)  # [0, 1)
-        if len(shape) == 4:
+        if len(shape) >= 4:
             values = values.sub_(0.5).mul_((24 / np.prod(shape[1:])) ** 0.5)
         elif key.endswith("running_var"):
             values = 0.5 + 1.5 * values
