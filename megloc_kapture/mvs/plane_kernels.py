@@ -18,8 +18,45 @@ _FLAT = np.float32(1e-6)
 
 
 @compiled_loop
+def _part_score(values, weights, reach, source, u, v, ux, uy, vx, vy):
+    """Weighted ZNCC of what a source shows of a window; -2 where that is less than half of it."""
+    height, width = source.shape
+    total, r, r2, s, s2, sr = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    k = 0
+    for i in range(-reach, reach + 1):
+        for j in range(-reach, reach + 1):
+            weight, own = weights[k], values[k]
+            k += 1
+            right, below = u + ux * j + uy * i, v + vx * j + vy * i
+            if weight <= 0 or not (
+                right >= 0 and below >= 0 and right < width - 1 and below < height - 1
+            ):
+                continue
+            left, top = int(right), int(below)
+            across, down = right - left, below - top
+            upper = source[top, left] + across * (source[top, left + 1] - source[top, left])
+            lower = source[top + 1, left]
+            lower += across * (source[top + 1, left + 1] - source[top + 1, left])
+            value = upper + down * (lower - upper)
+            total += weight
+            r += weight * own
+            r2 += weight * own * own
+            s += weight * value
+            s2 += weight * value * value
+            sr += weight * own * value
+    if not total >= 0.5:
+        return np.float32(-2)
+    own_variance = r2 / total - (r / total) ** 2
+    variance = s2 / total - (s / total) ** 2
+    if not (own_variance > _FLAT and variance > _FLAT):
+        return np.float32(-2)
+    score = (sr / total - r * s / total**2) / math.sqrt(own_variance * variance)
+    return np.float32(score)
+
+
+@compiled_loop
 def _plane_score(values, weights, reach, y, x, plane, source, infinity, baseline):
-    """Weighted ZNCC of a window under a plane in one source; -2 where it is not seen whole.
+    """Weighted ZNCC of a window under a plane in one source; -2 where less than half is seen.
 
     The window is carried over by the homography's derivative at its centre: over a few pixels the
     rest is far below what bilinear interpolation leaves.
@@ -40,8 +77,10 @@ def _plane_score(values, weights, reach, y, x, plane, source, infinity, baseline
     vy = (h[1, 1] + baseline[1] * wy - v * down_y) * inverse
     height, width = source.shape
     wide, high = reach * (abs(ux) + abs(uy)), reach * (abs(vx) + abs(vy))
-    if not (u >= wide and v >= high and u + wide < width - 1 and v + high < height - 1):
+    if not (u >= 0 and v >= 0 and u < width - 1 and v < height - 1):
         return np.float32(-2)
+    if not (u >= wide and v >= high and u + wide < width - 1 and v + high < height - 1):
+        return _part_score(values, weights, reach, source, u, v, ux, uy, vx, vy)
     ux, uy, vx, vy = np.float32(ux), np.float32(uy), np.float32(vx), np.float32(vy)
     s, s2, sr = np.float32(0), np.float32(0), np.float32(0)
     k = 0
@@ -88,21 +127,21 @@ def _plane_cost(values, weights, reach, y, x, plane, sources, infinities, baseli
 def _window(reference, reach, y, x, tone, values, weights):
     """Values and weights of a window, normalised: weights sum to 1, values have mean 0, spread 1.
 
-    Weights fall with the distance in tone (bilateral), so that a window stays on its surface.
-    False where the window leaves the image or is flat.
+    Weights fall with the distance in tone (bilateral), so that a window stays on its surface; they
+    are 0 outside the image. False where the window is flat.
     """
     height, width = reference.shape
-    if y < reach or x < reach or y >= height - reach or x >= width - reach:
-        return False
     centre = reference[y, x]
     k, total = 0, np.float32(0)
     scale = np.float32(0.5) / np.float32(reach * reach)
     for i in range(-reach, reach + 1):
         for j in range(-reach, reach + 1):
-            value = reference[y + i, x + j]
-            weight = np.float32(
-                math.exp(-abs(value - centre) / tone - scale * np.float32(i * i + j * j))
-            )
+            value, weight = centre, np.float32(0)
+            if 0 <= y + i < height and 0 <= x + j < width:
+                value = reference[y + i, x + j]
+                weight = np.float32(
+                    math.exp(-abs(value - centre) / tone - scale * np.float32(i * i + j * j))
+                )
             values[k], weights[k] = value, weight
             total += weight
             k += 1
@@ -228,26 +267,30 @@ def plane_deviations(
     for y in range(height):
         for x in range(width):
             out[y, x] = np.float32(0)
-            if y <= reach or x <= reach or y >= height - reach - 1 or x >= width - reach - 1:
-                continue
             if not _window(reference, reach, y, x, tone, values, weights):
                 continue
             gxx, gxy, gyy, variance, mean = 0.0, 0.0, 0.0, 0.0, 0.0
             k = 0
             for i in range(-reach, reach + 1):
                 for j in range(-reach, reach + 1):
-                    mean += weights[k] * reference[y + i, x + j]
+                    if weights[k] > 0:
+                        mean += weights[k] * reference[y + i, x + j]
                     k += 1
             k = 0
             for i in range(-reach, reach + 1):
                 for j in range(-reach, reach + 1):
-                    gx = 0.5 * (reference[y + i, x + j + 1] - reference[y + i, x + j - 1])
-                    gy = 0.5 * (reference[y + i + 1, x + j] - reference[y + i - 1, x + j])
-                    gxx += weights[k] * gx * gx
-                    gxy += weights[k] * gx * gy
-                    gyy += weights[k] * gy * gy
-                    variance += weights[k] * (reference[y + i, x + j] - mean) ** 2
+                    weight, row, column = weights[k], y + i, x + j
                     k += 1
+                    if weight <= 0:
+                        continue
+                    left, right = max(column - 1, 0), min(column + 1, width - 1)
+                    top, bottom = max(row - 1, 0), min(row + 1, height - 1)
+                    gx = (reference[row, right] - reference[row, left]) / (right - left)
+                    gy = (reference[bottom, column] - reference[top, column]) / (bottom - top)
+                    gxx += weight * gx * gx
+                    gxy += weight * gx * gy
+                    gyy += weight * gy * gy
+                    variance += weight * (reference[row, column] - mean) ** 2
             plane = planes[y, x]
             known, moved, seen = 0.0, 0.0, 0
             for s in range(len(sources)):
