@@ -9,11 +9,8 @@ from megloc_kapture.cli.common import Force, Input, Output, Reading
 from megloc_kapture.cli.stage_command import StageCommand, restrictions_beside
 from megloc_kapture.cli.stages import MAP
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.io.output_folders import staged_output
-from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.stages.densifying import densify_map, fitted_to_poses
 from megloc_kapture.stages.fusion import fuse_depth
-from megloc_kapture.stages.work import Work
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,12 +44,7 @@ class Densify(Reading, StageCommand):
             chosen["estimator"] = {"name": self.by}
         options = self.options({"mvs": chosen}).mvs
         source = self.kapture(self.input)
-        with (
-            single_threaded(),
-            staged_output(self.output, kind=MAP, force=self.force) as out,
-            self.open_executor(out) as executor,
-        ):
-            work = Work(executor, console.track)
+        with self.staged(self.output, MAP, force=self.force) as (out, work):
             counts = densify_map(
                 source, out, options, restrictions=restrictions_beside(self.input), work=work
             )

@@ -9,10 +9,7 @@ from megloc_kapture.cli.common import Force, Input, Output, Reading
 from megloc_kapture.cli.stage_command import StageCommand
 from megloc_kapture.cli.stages import MAP
 from megloc_kapture.io.files import read_json_model
-from megloc_kapture.io.output_folders import staged_output
-from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.stages.map_refinement import REPORT_FILE, RefinementReport, refine_map
-from megloc_kapture.stages.work import Work
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,12 +37,8 @@ class RefineMap(Reading, StageCommand):
         changes: dict[str, object] = {"refinement": {"ply": True}} if self.ply else {}
         options = self.options(changes).refinement
         source = self.kapture(self.input)
-        with (
-            single_threaded(),
-            staged_output(self.output, kind=MAP, force=self.force) as out,
-            self.open_executor(out) as executor,
-        ):
-            refine_map(source, out, options, work=Work(executor, console.track))
+        with self.staged(self.output, MAP, force=self.force) as (out, work):
+            refine_map(source, out, options, work=work)
         for row in report_lines(self.output):
             console.say(row)
         return 0

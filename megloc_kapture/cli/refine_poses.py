@@ -11,14 +11,11 @@ from megloc_kapture.cli.common import Force, Input, Linked, Output
 from megloc_kapture.cli.stage_command import StageCommand, restrictions_beside
 from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.report.refinement import consistency_sentence
-from megloc_kapture.io.output_folders import staged_output
 from megloc_kapture.io.tables import CONSISTENCY_FILE, read_consistency
-from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.plugin_loading import plugin_names
 from megloc_kapture.plugins import POSE_REFINERS
 from megloc_kapture.stages.layout import LOCALIZED
 from megloc_kapture.stages.pose_refinement import refine_poses
-from megloc_kapture.stages.work import Work
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,11 +48,7 @@ class RefinePoses(Linked, StageCommand):
         if not options.refines():
             names = ", ".join(plugin_names(POSE_REFINERS))
             raise OptionError(f"no pose refiner is chosen; --by takes: {names}")
-        with (
-            single_threaded(),
-            staged_output(self.output, kind=LOCALIZED, force=self.force) as out,
-            self.open_executor(out) as executor,
-        ):
+        with self.staged(self.output, LOCALIZED, force=self.force) as (out, work):
             counts = refine_poses(
                 self.kapture(self.input),
                 self.kapture(self.query),
@@ -63,7 +56,7 @@ class RefinePoses(Linked, StageCommand):
                 out,
                 options,
                 restrictions=restrictions_beside(self.query),
-                work=Work(executor, console.track),
+                work=work,
             )
         accepted = ", ".join(
             f"{count:g} accepted by {name.removeprefix('accepted_by_')}"

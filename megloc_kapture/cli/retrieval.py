@@ -17,7 +17,6 @@ from megloc_kapture.cli.stage_command import (
 )
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, write_pairs
-from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.retrieval.fusion import FusionMethod
 from megloc_kapture.stages.candidates import Retrieval
 from megloc_kapture.stages.global_features import extract_global_features
@@ -114,13 +113,14 @@ class PairsMapping(Reading, StageCommand):
         retrieval = None
         if "retrieval" in self.by:
             retrieval = _retrieval(mapping, self.features, self.fusion, chosen)
-        with single_threaded():
+        with self.working(self.output) as work:
             pairs = pair_map_images(
                 mapping,
                 options,
                 retrieval=retrieval,
                 restrictions=restrictions_beside(self.input),
                 covisible=None if covisible is None else self.kapture(covisible),
+                work=work,
             )
         _write_pairs(self.output, pairs, force=self.force)
         self.console().say(f"{len(pairs)} pairs")
@@ -179,13 +179,14 @@ class PairsQuery(Reading, StageCommand):
         retrieval = None
         if not self.exhaustive:
             retrieval = _retrieval(mapping, self.features, self.fusion, options)
-        with single_threaded():
+        with self.working(self.output) as work:
             pairs = pair_queries(
                 mapping,
                 query,
                 options.query_pairs,
                 retrieval=retrieval,
                 restrictions=restrictions_beside(self.query),
+                work=work,
             )
         if self.rerank is not None and self.matches_dir is not None:
             pairs = self._rerank(mapping, query, pairs, self.rerank, self.matches_dir, options)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -57,14 +57,23 @@ class StageCommand(Choosing, Working, Common):
         return {key: chosen_by_name(preset, names)} if names else {}
 
     @contextmanager
-    def features_folder(self, output: Path, *, force: bool) -> Iterator[tuple[Path, Work]]:
+    def working(self, output: Path) -> Iterator[Work]:
+        """What to work with, by the flags; all workers must see the folder of the output."""
+        folder = output if output.is_dir() else output.absolute().parent
+        with single_threaded(), self.open_executor(folder) as executor:
+            yield Work(executor, self.console().track)
+
+    @contextmanager
+    def staged(self, output: Path, kind: str, *, force: bool) -> Iterator[tuple[Path, Work]]:
+        """Where to write an output of a kind until it is whole, and what to work with."""
+        with staged_output(output, kind=kind, force=force) as out, self.working(out) as work:
+            yield out, work
+
+    def features_folder(
+        self, output: Path, *, force: bool
+    ) -> AbstractContextManager[tuple[Path, Work]]:
         """Where to write features or matches, and what to work with."""
-        with (
-            single_threaded(),
-            staged_output(output, kind=FEATURES, force=force) as out,
-            self.open_executor(out) as executor,
-        ):
-            yield out, Work(executor, self.console().track)
+        return self.staged(output, FEATURES, force=force)
 
 
 def only_type(folder: KaptureFolder, kind: str, asked: str | None) -> str:

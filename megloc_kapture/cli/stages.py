@@ -13,7 +13,6 @@ from megloc_kapture.cli.common import Force, Input, Linked, Output, Reading
 from megloc_kapture.cli.stage_command import StageCommand, only_type
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs
-from megloc_kapture.io.output_folders import staged_output
 from megloc_kapture.pipeline.executors import available_cores
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import MATCHERS
@@ -156,7 +155,7 @@ class Triangulate(Reading, StageCommand):
         pairs = None if self.pairs is None else read_pairs(self.pairs)
         if pairs is not None and self.pairs is not None:
             _check_images_of(pairs, mapping, mapping, self.pairs)
-        with staged_output(self.output, kind=MAP, force=self.force) as out:
+        with self.staged(self.output, MAP, force=self.force) as (out, work):
             counts = triangulate_map(
                 mapping,
                 mapping,
@@ -165,6 +164,7 @@ class Triangulate(Reading, StageCommand):
                 self.options().triangulation,
                 pairs=pairs,
                 num_threads=self.workers or available_cores(),
+                work=work,
             )
         for type_name in sorted(set(local_types)) if len(set(local_types)) > 1 else ():
             points, seen = counts[f"points_{type_name}"], counts[f"observations_{type_name}"]

@@ -186,15 +186,28 @@ def test_unknown_global_features_are_refused(megloc: Any, scene: Path, tmp_path:
     )
 
 
-@pytest.mark.parametrize("command", ["densify", "refine-map", "refine-poses"])
+@pytest.mark.parametrize(
+    "command",
+    ["densify", "refine-map", "refine-poses", "triangulate", "pairs-mapping", "pairs-query"],
+)
 def test_a_scheduler_that_nothing_asks_is_refused(
     megloc: Any, finished: Path, tmp_path: Path, command: str
 ) -> None:
-    given: tuple[Any, ...] = (command, "-i", finished / "map", "-o", tmp_path / "out")
+    out, query = tmp_path / "out", ("--query", finished / "query")
+    given: tuple[Any, ...] = (command, "-i", finished / "map", "-o", out)
     if command == "refine-poses":
-        given += ("--query", finished / "query", "--poses", finished / "localized", "--by", "icp")
+        given += (*query, "--poses", finished / "localized", "--by", "icp")
+    if command == "pairs-query":
+        given += (*query, "--exhaustive")
+    if command == "pairs-mapping":
+        given += ("--by", "poses")
+    if command == "triangulate":
+        given += ("--features-dir", finished / "matches" / "mapping")
     megloc(*given, "--scheduler", "tcp://127.0.0.1:1").refused("changes nothing without --exec")
-    assert not (tmp_path / "out").exists()
+    assert not out.exists()
+    if command in ("pairs-query", "pairs-mapping"):
+        assert megloc(*given, "--workers", "2").status == 0
+        assert megloc(*given[:-1], given[-1], "-f", "--workers", "0").status == 2
 
 
 def test_output_of_another_kind_is_refused(megloc: Any, made: Made, scene: Path) -> None:
