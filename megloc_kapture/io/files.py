@@ -84,6 +84,17 @@ def read_text(path: Path | str, max_bytes: int | None = None) -> str:
     return text
 
 
+@contextlib.contextmanager
+def named(path: Path | str, line: int | None = None) -> Iterator[None]:
+    """A DataError of the block that names no file gets this one, and the line."""
+    try:
+        yield
+    except DataError as error:
+        if error.path is not None:
+            raise
+        raise DataError(error.message, path=path, line=line) from error.__cause__
+
+
 # -------------------------------------------------------------------------------- temporary names
 
 

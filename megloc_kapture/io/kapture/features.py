@@ -22,10 +22,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from megloc_kapture.errors import DataError, OutputError
-from megloc_kapture.io.files import write_bytes
+from megloc_kapture.io.files import named, write_bytes
 from megloc_kapture.io.kapture.blobs import BlobSource, FolderBlobs, FolderBlobWriter
 from megloc_kapture.io.kapture.tars import TarBlobs, TarBlobWriter
-from megloc_kapture.io.kapture.text import format_table, named, read_rows
+from megloc_kapture.io.kapture.text import check_columns, format_table, read_rows
 from megloc_kapture.io.paths import (
     Roots,
     check_component,
@@ -133,23 +133,19 @@ def read_config(path: Path, kind: ArrayKind) -> FeatureConfig:
     ------
     DataError : names file and line.
     """
-    rows = list(read_rows(path))
-    if len(rows) != 1:
-        raise DataError(f"expected one row, got {len(rows)}", path=path)
-    line, fields = rows[0]
-    expected = CONFIG_HEADER[kind].count(",") + 1
-    if len(fields) != expected:
-        raise DataError(f"expected {expected} columns, got {len(fields)}", path=path, line=line)
-    name, dtype, dsize, *rest = fields
-    if dtype not in DTYPES:
-        known = ", ".join(DTYPES)
-        raise DataError(f"dtype {dtype!r} is not one of {known}", path=path, line=line)
-    if not re.fullmatch("[0-9]{1,9}", dsize) or int(dsize) == 0:
-        raise DataError(f"dsize {dsize!r} is not a positive integer", path=path, line=line)
-    keypoints_type = None
-    if kind == "descriptors":
-        with named(path, line):
-            keypoints_type = check_component(rest[0])
+    with read_rows(path) as rows:
+        found = list(rows)
+    if len(found) != 1:
+        raise DataError(f"expected one row, got {len(found)}", path=path)
+    line, fields = found[0]
+    with named(path, line):
+        check_columns(fields, CONFIG_HEADER[kind].count(",") + 1)
+        name, dtype, dsize, *rest = fields
+        if dtype not in DTYPES:
+            raise DataError(f"dtype {dtype!r} is not one of {', '.join(DTYPES)}")
+        if not re.fullmatch("[0-9]{1,9}", dsize) or int(dsize) == 0:
+            raise DataError(f"dsize {dsize!r} is not a positive integer")
+        keypoints_type = check_component(rest[0]) if kind == "descriptors" else None
     metric_type = rest[-1] if rest else None
     return FeatureConfig(name, DTYPES[dtype], int(dsize), keypoints_type, metric_type)
 

@@ -25,7 +25,7 @@ from megloc_kapture.io.kapture.features import (
     feature_folder,
 )
 from megloc_kapture.io.kapture.tars import TarBlobWriter
-from megloc_kapture.io.kapture.text import format_table, named, parse_float, read_rows
+from megloc_kapture.io.kapture.text import check_columns, format_table, parse_float, read_rows
 from megloc_kapture.io.paths import Roots, check_output, check_relative
 
 _BETWEEN = ".overlapping/"
@@ -218,20 +218,16 @@ def read_pairs(path: Path | str) -> list[ImagePair]:
     ------
     DataError : names file and line.
     """
-    path = Path(path)
     pairs: list[ImagePair] = []
     seen: set[tuple[str, str]] = set()
-    for line, fields in read_rows(path):
-        if len(fields) != 3:
-            raise DataError(f"expected 3 columns, got {len(fields)}", path=path, line=line)
-        query, map_image = fields[:2]
-        with named(path, line):
-            check_relative(query)
-            check_relative(map_image)
-        score = parse_float(fields[2], "score", path, line)
-        if (query, map_image) not in seen:
-            seen.add((query, map_image))
-            pairs.append(ImagePair(query, map_image, score))
+    with read_rows(Path(path)) as rows:
+        for _, fields in rows:
+            check_columns(fields, 3)
+            pair = check_relative(fields[0]), check_relative(fields[1])
+            score = parse_float(fields[2], "score")
+            if pair not in seen:
+                seen.add(pair)
+                pairs.append(ImagePair(*pair, score))
     return pairs
 
 

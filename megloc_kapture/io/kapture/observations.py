@@ -22,13 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.files import atomic_write
+from megloc_kapture.io.files import atomic_write, named
 from megloc_kapture.io.kapture.features import check_field
 from megloc_kapture.io.kapture.text import (
     BYTE_ORDER_MARK,
     FORMAT_LINE,
     check_version,
-    named,
     parse_integer,
     read_rows,
     split_fields,
@@ -90,13 +89,14 @@ def read_observations(
 def read_observations_strictly(path: Path) -> dict[str, Observations]:
     """The grammar of ``observations.txt`` in plain Python: slow."""
     lists: dict[str, tuple[list[int], list[str], list[int]]] = {}
-    for line, fields in read_rows(path):
-        point, keypoints_type, pairs = _row(fields, path, line)
-        points, images, keypoints = lists.setdefault(keypoints_type, ([], [], []))
-        for image, keypoint in pairs:
-            points.append(point)
-            images.append(image)
-            keypoints.append(keypoint)
+    with read_rows(path) as rows:
+        for _, fields in rows:
+            point, keypoints_type, pairs = _row(fields)
+            points, images, keypoints = lists.setdefault(keypoints_type, ([], [], []))
+            for image, keypoint in pairs:
+                points.append(point)
+                images.append(image)
+                keypoints.append(keypoint)
     found = {}
     for keypoints_type, (points, images, keypoints) in sorted(lists.items()):
         names = tuple(sorted(set(images)))
@@ -111,23 +111,20 @@ def read_observations_strictly(path: Path) -> dict[str, Observations]:
     return found
 
 
-def _row(fields: list[str], path: Path, line: int) -> tuple[int, str, list[tuple[str, int]]]:
+def _row(fields: list[str]) -> tuple[int, str, list[tuple[str, int]]]:
     if len(fields) < 2 or len(fields) % 2:
         raise DataError(
-            f"expected a point, a type and pairs of columns, got {len(fields)} columns",
-            path=path,
-            line=line,
+            f"expected a point, a type and pairs of columns, got {len(fields)} columns"
         )
-    point = parse_integer(fields[0], "point id", path, line)
+    point = parse_integer(fields[0], "point id")
     if not 0 <= point < MAX_POINT_ID:
-        raise DataError(f"point id {point} is out of range", path=path, line=line)
-    with named(path, line):
-        keypoints_type = check_component(fields[1])
-        images = [check_relative(name) for name in fields[2::2]]
-    keypoints = [parse_integer(text, "keypoint id", path, line) for text in fields[3::2]]
+        raise DataError(f"point id {point} is out of range")
+    keypoints_type = check_component(fields[1])
+    images = [check_relative(name) for name in fields[2::2]]
+    keypoints = [parse_integer(text, "keypoint id") for text in fields[3::2]]
     for keypoint in keypoints:
         if not 0 <= keypoint <= MAX_KEYPOINT_ID:
-            raise DataError(f"keypoint id {keypoint} is out of range", path=path, line=line)
+            raise DataError(f"keypoint id {keypoint} is out of range")
     return point, keypoints_type, list(zip(images, keypoints, strict=True))
 
 
@@ -135,10 +132,11 @@ def find_observation(
     path: Path, keypoints_type: str, point_id: int, image: str, keypoint_id: int
 ) -> int | None:
     """Line of ``observations.txt`` that holds an observation; slow, for error messages."""
-    for line, fields in read_rows(path):
-        point, found_type, pairs = _row(fields, path, line)
-        if (point, found_type) == (point_id, keypoints_type) and (image, keypoint_id) in pairs:
-            return line
+    with read_rows(path) as rows:
+        for line, fields in rows:
+            point, found_type, pairs = _row(fields)
+            if (point, found_type) == (point_id, keypoints_type) and (image, keypoint_id) in pairs:
+                return line
     return None
 
 
@@ -338,7 +336,8 @@ def _check_refused(path: Path, chunk: _Chunk, begin: int) -> None:
         raise DataError("not a text file in UTF-8", path=path, line=number) from None
     # a comment in another script, or a line blank but for its spaces, is no row
     if line.strip() and not line.startswith("#"):
-        _row(split_fields(line.removesuffix("\r")), path, number)
+        with named(path, number):
+            _row(split_fields(line))
 
 
 # ------------------------------------------------------------------------------------ writing

@@ -89,23 +89,24 @@ def read_points3d_strictly(path: Path) -> NDArray[np.float64]:
     """The grammar of ``points3d.txt`` in plain Python: slow, (N, 3) or (N, 6)."""
     values: list[float] = []
     columns = 0
-    for line, fields in read_rows(path):
-        columns = columns or len(fields)
-        values += _coordinates(fields, columns, path, line)
+    with read_rows(path) as rows:
+        for _, fields in rows:
+            columns = columns or len(fields)
+            values += _coordinates(fields, columns)
     return np.array(values, dtype=np.float64).reshape(-1, columns or 6)
 
 
-def _coordinates(fields: list[str], columns: int, path: Path, line: int) -> list[float]:
+def _coordinates(fields: list[str], columns: int) -> list[float]:
     if columns not in POINTS_HEADERS or len(fields) != columns:
         expected = str(columns) if columns in POINTS_HEADERS else "3 or 6"
-        raise DataError(f"expected {expected} columns, got {len(fields)}", path=path, line=line)
+        raise DataError(f"expected {expected} columns, got {len(fields)}")
     # of these characters float() accepts exactly our grammar, and is faster than a pattern
     if _NUMBER_CHARACTERS.fullmatch("".join(fields)):
         with contextlib.suppress(ValueError):
             values = [float(text) for text in fields]
             if all(map(math.isfinite, values)):
                 return values
-    return [parse_float(text, "coordinate", path, line) for text in fields]
+    return [parse_float(text, "coordinate") for text in fields]
 
 
 def write_points3d(root: Path, points: ArrayLike) -> None:
