@@ -26,15 +26,16 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.csv_table import IMAGE, TEXT, ZERO_ONE, Column, Table
+from megloc_kapture.io.csv_table import Column, ImageName, Table, flag
 from megloc_kapture.io.files import (
     check_plain,
+    named,
     read_json_model,
     read_text,
     write_bytes,
@@ -185,38 +186,6 @@ class Protocol(Options):
         return self
 
 
-class _GroupRow(NamedTuple):
-    image: str
-    condition: str
-    frame: str
-    location: str
-    scored: bool
-
-
-class _PriorRow(NamedTuple):
-    query: str
-    permitted: str
-
-
-class _NameRow(NamedTuple):
-    image: str
-    name: str
-
-
-class _UnreadableRow(NamedTuple):
-    image: str
-    reason: str
-
-
-@dataclass(frozen=True, slots=True)
-class RelocalizationPair:
-    """One row of an MLAD relocalization file: both images by their kapture names."""
-
-    file: str
-    reference: str
-    query: str
-
-
 def _word(text: str) -> str:
     if text.split() != [text]:
         raise DataError(f"a pose file cannot hold the name {text!r}")
@@ -229,21 +198,43 @@ def _not_empty(text: str) -> str:
     return text
 
 
-_GROUPS = Table(
-    _GroupRow,
-    {"image": IMAGE, "condition": TEXT, "frame": TEXT, "location": TEXT, "scored": ZERO_ONE},
-    keys=[("image",)],
-)
-_PRIORS = Table(
-    _PriorRow,
-    {"query": IMAGE, "permitted": Column("a group or an image", _not_empty)},
-    keys=[("query", "permitted")],
-)
-_NAMES = Table(
-    _NameRow, {"image": IMAGE, "name": Column("one word", _word)}, keys=[("image",), ("name",)]
-)
-_UNREADABLE = Table(_UnreadableRow, {"image": IMAGE, "reason": TEXT}, keys=[("image",)])
-_RELOCALIZATION = Table(RelocalizationPair, dict.fromkeys(("file", "reference", "query"), IMAGE))
+class _GroupRow(NamedTuple):
+    image: ImageName
+    condition: str
+    frame: str
+    location: str
+    scored: Annotated[bool, flag("1", "0")]
+
+
+class _PriorRow(NamedTuple):
+    query: ImageName
+    permitted: Annotated[str, Column("a group or an image", _not_empty)]
+
+
+class _NameRow(NamedTuple):
+    image: ImageName
+    name: Annotated[str, Column("one word", _word)]
+
+
+class _UnreadableRow(NamedTuple):
+    image: ImageName
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class RelocalizationPair:
+    """One row of an MLAD relocalization file: both images by their kapture names."""
+
+    file: ImageName
+    reference: ImageName
+    query: ImageName
+
+
+_GROUPS = Table(_GroupRow, keys=[("image",)])
+_PRIORS = Table(_PriorRow, keys=[("query", "permitted")])
+_NAMES = Table(_NameRow, keys=[("image",), ("name",)])
+_UNREADABLE = Table(_UnreadableRow, keys=[("image",)])
+_RELOCALIZATION = Table(RelocalizationPair)
 
 
 def table_path(folder: Path | str, name: str) -> Path:
@@ -261,10 +252,10 @@ def table_path(folder: Path | str, name: str) -> Path:
 def read_groups(folder: Path | str) -> dict[str, ImageGroup]:
     """Read ``groups.csv``: image -> group, sorted by image."""
     return {
-        row.image: ImageGroup(
-            condition=row.condition, frame=row.frame, location=row.location, scored=row.scored
+        image: ImageGroup(condition=condition, frame=frame, location=location, scored=scored)
+        for image, condition, frame, location, scored in sorted(
+            _GROUPS.read_if_there(table_path(folder, GROUPS_FILE))
         )
-        for row in sorted(_GROUPS.read_if_there(table_path(folder, GROUPS_FILE)))
     }
 
 
@@ -355,7 +346,7 @@ def unit_of(root: Path | str) -> str:
 
 def read_relocalization(folder: Path | str) -> list[RelocalizationPair]:
     """Read ``relocalization.csv`` in its order."""
-    return list(_RELOCALIZATION.read_if_there(table_path(folder, RELOCALIZATION_FILE)))
+    return _RELOCALIZATION.read_if_there(table_path(folder, RELOCALIZATION_FILE))
 
 
 def write_relocalization(folder: Path | str, pairs: Iterable[RelocalizationPair]) -> None:
@@ -402,12 +393,9 @@ def read_nowhere(truth: Path | str) -> tuple[str, ...]:
         name = text.strip()
         if not name or name.startswith("#"):
             continue
-        try:
-            check_relative(name)
-        except DataError as error:
-            raise DataError(error.message, path=path, line=line) from error
-        if name in names:
-            raise DataError(f"{name!r} stands on line {names[name]} as well", path=path, line=line)
+        with named(path, line):
+            if check_relative(name) in names:
+                raise DataError(f"{name!r} stands on line {names[name]} as well")
         names[name] = line
     return tuple(sorted(names))
 

@@ -113,9 +113,7 @@ def read_observations_strictly(path: Path) -> dict[str, Observations]:
 
 def _row(fields: list[str]) -> tuple[int, str, list[tuple[str, int]]]:
     if len(fields) < 2 or len(fields) % 2:
-        raise DataError(
-            f"expected a point, a type and pairs of columns, got {len(fields)} columns"
-        )
+        raise DataError(f"expected a point, a type and pairs of columns, got {len(fields)} columns")
     point = parse_integer(fields[0], "point id")
     if not 0 <= point < MAX_POINT_ID:
         raise DataError(f"point id {point} is out of range")
