@@ -172,9 +172,7 @@ def database_folder(
 ) -> Iterator[str]:
     """A folder for a database; with too little room COLMAP would end the process, so it is asked.
 
-    Raises
-    ------
-    OutputError : too little room, or COLMAP could not write.
+    Raises OutputError: too little room, or COLMAP could not write.
     """
     place = tempfile.gettempdir() if scratch is None else scratch
     # matches are written twice, keypoints as float32; the rest is what SQLite and its journal take
@@ -409,9 +407,7 @@ class DatabaseFeatures:
 def write_feature_database(path: Path, images: Iterable[DatabaseFeatures]) -> None:
     """Write COLMAP's database of images with SIFT features; equal cameras are one.
 
-    Raises
-    ------
-    OutputError : ``path`` is there already, or cannot be written.
+    Raises OutputError: ``path`` is there already, or cannot be written.
     """
     pycolmap = load_pycolmap()
     path = Path(path)

@@ -97,9 +97,7 @@ def read_map(path: Path) -> NDArray[np.float32]:
 def fuse(root: Path, *, of: MapKind = "geometric", min_views: int = 2) -> NDArray[np.float64]:
     """Fuse the maps of a workspace by COLMAP; points float64 (N, 3) in the world.
 
-    Raises
-    ------
-    DataError : its model has no points: COLMAP would then fuse nothing without a word.
+    Raises DataError: its model has no points: COLMAP would then fuse nothing without a word.
     """
     pycolmap = load_pycolmap()
     if not pycolmap.Reconstruction(str(root / "sparse")).num_points3D():

@@ -48,10 +48,8 @@ def read_csv_table(
     ``line`` is the 1-based line on which the row ends. Empty lines are passed over. Those of the
     columns that are ``optional`` may be absent, and are in no row then.
 
-    Raises
-    ------
-    DataError : the file cannot be read, its header is not made of ``columns``, a row has too many
-        or too few fields, or a quote is left open; names file and line.
+    Raises DataError: the file cannot be read, its header is not made of ``columns``, a row has too
+    many or too few fields, or a quote is left open; names file and line.
     """
     reader = csv.reader(io.StringIO(read_text(path, _MAX_BYTES), newline=""), strict=True)
     header: list[str] | None = None
@@ -238,10 +236,8 @@ class Table(Generic[RowT]):
     def read(self, path: Path | str) -> list[RowT]:
         """The records of a file, in its order.
 
-        Raises
-        ------
-        DataError : absent or broken table, a value that is not of its kind, a key given twice;
-            names file, line and column.
+        Raises DataError: absent or broken table, a value that is not of its kind, a key given
+        twice; names file, line and column.
         """
         known: set[tuple[tuple[str, ...], ...]] = set()
         rows = []

@@ -240,9 +240,8 @@ _RELOCALIZATION = Table(RelocalizationPair)
 def table_path(folder: Path | str, name: str) -> Path:
     """The path of a table, which need not exist.
 
-    Raises
-    ------
-    DataError : a link that leaves the dataset, no plain file, or far larger than any such table.
+    Raises DataError: a link that leaves the dataset, no plain file, or far larger than any such
+    table.
     """
     path = check_no_escape(Path(folder).parent, Path(folder) / name)
     check_plain(path, _MAX_BYTES)
@@ -282,10 +281,8 @@ def read_priors(folder: Path | str) -> dict[str, tuple[str, ...]]:
 def write_priors(folder: Path | str, priors: Mapping[str, Sequence[str]]) -> None:
     """Write ``priors.csv``, sorted by query and permitted name.
 
-    Raises
-    ------
-    DataError : a query has nothing (or "") permitted: the table cannot say "nothing", and a reader
-        would take an absent row for "everything".
+    Raises DataError: a query has nothing (or "") permitted: the table cannot say "nothing", and a
+    reader would take an absent row for "everything".
     """
     for query, groups in priors.items():
         if not groups or not all(groups):
@@ -297,9 +294,7 @@ def write_priors(folder: Path | str, priors: Mapping[str, Sequence[str]]) -> Non
 def read_names(folder: Path | str) -> dict[str, str]:
     """Read ``names.csv``: image -> its name in the pose file, in the table's order.
 
-    Raises
-    ------
-    DataError : broken table; an image or a name that is given twice, or holds white space.
+    Raises DataError: broken table; an image or a name that is given twice, or holds white space.
     """
     return dict(_NAMES.read_if_there(table_path(folder, NAMES_FILE)))
 
@@ -381,9 +376,7 @@ def read_nowhere(truth: Path | str) -> tuple[str, ...]:
 
     They stand in its ``nowhere.txt``, one a line; without it there is none.
 
-    Raises
-    ------
-    DataError : the file cannot be read, or a name stands in it twice; names file and line.
+    Raises DataError: the file cannot be read, or a name stands in it twice; names file and line.
     """
     path = table_path(truth, NOWHERE_FILE)
     if not path.is_file():

@@ -37,10 +37,8 @@ ModelT = TypeVar("ModelT", bound=BaseModel)
 def read_content(path: Path | str, max_bytes: int | None = None) -> bytes:
     """All bytes of a plain file.
 
-    Raises
-    ------
-    DataError : missing, not readable, larger than ``max_bytes``, or no plain file: reading a pipe
-        or a device might never end.
+    Raises DataError: missing, not readable, larger than ``max_bytes``, or no plain file: reading a
+    pipe or a device might never end.
     """
     path = Path(path)
     try:
@@ -67,10 +65,8 @@ def read_text(path: Path | str, max_bytes: int | None = None) -> str:
 
     Line ends are left as they are.
 
-    Raises
-    ------
-    DataError : see :func:`read_content`; or it is not UTF-8 or holds a NUL; names the file and the
-        line where the text breaks.
+    Raises DataError: see :func:`read_content`; or it is not UTF-8 or holds a NUL; names the file
+    and the line where the text breaks.
     """
     content = read_content(path, max_bytes)
     try:
@@ -171,9 +167,7 @@ def atomic_write(path: Path | str) -> Iterator[BinaryIO]:
     Missing parent folders are made. When the block raises, the temporary file is removed and
     ``path`` is as it was.
 
-    Raises
-    ------
-    OutputError : the file cannot be written (disk full, permission, ...); names ``path``.
+    Raises OutputError: the file cannot be written (disk full, permission, ...); names ``path``.
     """
     # plain text: a stage writes a file for each of its pairs, and a Path takes as long as writing
     folder = os.path.dirname(path)
@@ -282,10 +276,8 @@ def _new_link(link: Path) -> Iterator[None]:
 def read_json_model(path: Path | str, model: type[ModelT]) -> ModelT:
     """Read one JSON file as ``model``.
 
-    Raises
-    ------
-    DataError : the file cannot be read, is not JSON (names the line; NaN and infinity are not
-        JSON), or does not fit the model (names the field).
+    Raises DataError: the file cannot be read, is not JSON (names the line; NaN and infinity are not
+    JSON), or does not fit the model (names the field).
     """
     text = read_text(path, _MAX_JSON_BYTES)
     try:

@@ -25,9 +25,7 @@ def read_image_rgb(path: Path | str) -> NDArray[np.uint8]:
     Grey images are repeated over three channels, transparency is dropped, 16-bit images are
     scaled to 8 bit (``value / 257`` rounded).
 
-    Raises
-    ------
-    DataError : missing, not an image, or truncated.
+    Raises DataError: missing, not an image, or truncated.
     """
     return decode_image_rgb(_content(Path(path)), path)
 
@@ -63,9 +61,7 @@ def decode_image_rgb(content: bytes, path: Path | str | None = None) -> NDArray[
 def image_size(path: Path | str) -> tuple[int, int]:
     """``(width, height)`` in pixels as stored, from the header only.
 
-    Raises
-    ------
-    DataError : missing, or not an image.
+    Raises DataError: missing, or not an image.
     """
     from PIL import Image
 
@@ -180,9 +176,7 @@ def _check_complete(path: Path | str | None, content: bytes) -> None:
 def read_depth_map(path: Path | str, *, width: int, height: int) -> NDArray[np.float32]:
     """Read a depth map as float32 (H, W) in metres; the size is its depth sensor's.
 
-    Raises
-    ------
-    DataError : missing, or of another size (truncated).
+    Raises DataError: missing, or of another size (truncated).
     """
     path = Path(path)
     content = read_content(path)

@@ -106,9 +106,7 @@ def staged_output(folder: Path, *, kind: str, force: bool = False) -> Iterator[P
     block raises, ``folder`` is as it was, and gone if it was not there. What killed runs have left
     in it is cleared.
 
-    Raises
-    ------
-    OutputError : see :func:`claim_folder`.
+    Raises OutputError: see :func:`claim_folder`.
     """
     folder = Path(folder)
     claim = claim_folder(folder, kind=kind, force=force)
@@ -157,10 +155,8 @@ def replace_directory(new: Path, path: Path) -> None:
     killed here leaves either the old or the new folder at ``path``; what was there before is
     then removed. A run killed during that removal leaves a rest at ``new``'s old name.
 
-    Raises
-    ------
-    OutputError : ``path`` is a file or a link (a user's link is not ours to replace), or the
-        file system refuses; names ``path``.
+    Raises OutputError: ``path`` is a file or a link (a user's link is not ours to replace), or the
+    file system refuses; names ``path``.
     """
     new, path = Path(new), Path(path)
     if path.is_symlink() or (path.exists() and not path.is_dir()):

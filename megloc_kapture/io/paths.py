@@ -30,11 +30,9 @@ def has_control_characters(text: str) -> bool:
 def check_relative(text: str) -> str:
     """Return ``text`` if it is a plain relative path (``a/b.jpg``), else raise.
 
-    Raises
-    ------
-    DataError : empty, absolute, deeper than 250 folders, ``.`` or ``..`` or an empty component, a
-        backslash, or a control character (NUL included) in it. A ``.`` or empty component is
-        harmless, but would give one file two names, and names are identities in kapture.
+    Raises DataError: empty, absolute, deeper than 250 folders, ``.`` or ``..`` or an empty
+    component, a backslash, or a control character (NUL included) in it. A ``.`` or empty component
+    is harmless, but would give one file two names, and names are identities in kapture.
     """
     if not text:
         raise DataError("empty path")
@@ -59,9 +57,8 @@ def check_component(text: str) -> str:
 
     Used for type names (``r2d2_500``), which stand both in paths and in CSV files.
 
-    Raises
-    ------
-    DataError : what :func:`check_relative` refuses, a slash, a comma, or a space at either end.
+    Raises DataError: what :func:`check_relative` refuses, a slash, a comma, or a space at either
+    end.
     """
     check_relative(text)
     if "/" in text or "," in text or text != text.strip():
@@ -74,9 +71,7 @@ def safe_join(root: Path, relative_text: str) -> Path:
 
     The check is on the text alone: links are not looked at, the file need not exist.
 
-    Raises
-    ------
-    DataError : see :func:`check_relative`.
+    Raises DataError: see :func:`check_relative`.
     """
     return Path(root) / check_relative(relative_text)
 
@@ -84,9 +79,7 @@ def safe_join(root: Path, relative_text: str) -> Path:
 def check_no_escape(roots: Roots, path: Path) -> Path:
     """Return ``path`` if what it is after following links still lies in one of the ``roots``.
 
-    Raises
-    ------
-    DataError : a link on the way leads out of them.
+    Raises DataError: a link on the way leads out of them.
     """
     roots = (roots,) if isinstance(roots, Path) else roots
     real = os.path.realpath(path)
@@ -104,9 +97,7 @@ def check_no_escape(roots: Roots, path: Path) -> Path:
 def check_output(root: Path, path: Path) -> Path:
     """Return ``path`` if writing there stays in ``root``: no link on the way leads out of it.
 
-    Raises
-    ------
-    OutputError : one does; what it leads to is somebody else's.
+    Raises OutputError: one does; what it leads to is somebody else's.
     """
     try:
         return check_no_escape(root, path)

@@ -75,9 +75,7 @@ def guessed_camera(width: int, height: int) -> Camera:
 def read_photo(path: Path | str) -> Photo:
     """Read the header of a photograph.
 
-    Raises
-    ------
-    DataError : missing, empty, or of a format that is not read.
+    Raises DataError: missing, empty, or of a format that is not read.
     """
     from PIL import Image
 

@@ -41,7 +41,7 @@ from megloc_kapture.io.kapture.features import DTYPES, read_config
 from megloc_kapture.io.kapture.observations import Observations, read_observations
 from megloc_kapture.io.kapture.points import read_points3d
 from megloc_kapture.io.kapture.sensors import read_kapture_data
-from megloc_kapture.io.kapture.tars import TarBlobs
+from megloc_kapture.io.kapture.blobs import TarBlobs
 from megloc_kapture.io.mat_file import read_mat, read_mat_array
 from megloc_kapture.io.tables import (
     read_clusters,

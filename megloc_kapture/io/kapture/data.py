@@ -31,10 +31,8 @@ class Sensor:
     def camera(self) -> Camera:
         """The intrinsics of a sensor of type camera or depth.
 
-        Raises
-        ------
-        DataError : another type of sensor, an uncalibrated one (``UNKNOWN_CAMERA``), or
-            parameters that :class:`Camera` refuses.
+        Raises DataError: another type of sensor, an uncalibrated one (``UNKNOWN_CAMERA``), or
+        parameters that :class:`Camera` refuses.
         """
         if self.sensor_type not in CAMERA_SENSOR_TYPES:
             raise DataError(f"a sensor of type {self.sensor_type!r} has no camera model")
@@ -98,9 +96,7 @@ class KaptureData:
     def record_of(self, image: str) -> tuple[int, str]:
         """``(timestamp, sensor id)`` of an image.
 
-        Raises
-        ------
-        DataError : no such image, or two records of that name.
+        Raises DataError: no such image, or two records of that name.
         """
         index = self._record_by_image
         key = None if index is None else index.get(image)
@@ -124,9 +120,7 @@ class KaptureData:
     def camera_of(self, image: str) -> Camera:
         """Intrinsics of the camera that took an image.
 
-        Raises
-        ------
-        DataError : no such image or sensor, or see :meth:`Sensor.camera`.
+        Raises DataError: no such image or sensor, or see :meth:`Sensor.camera`.
         """
         sensor_id = self.record_of(image)[1]
         if sensor_id not in self.sensors:

@@ -13,18 +13,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from megloc_kapture.errors import DataError, OutputError
 from megloc_kapture.io.files import named, write_bytes
-from megloc_kapture.io.kapture.blobs import BlobSource, FolderBlobs, FolderBlobWriter
-from megloc_kapture.io.kapture.tars import TarBlobs, TarBlobWriter
+from megloc_kapture.io.kapture.blobs import BlobSource, FolderBlobs, TarBlobs, TarBlobWriter
 from megloc_kapture.io.kapture.text import check_columns, format_table, read_rows
 from megloc_kapture.io.paths import (
     Roots,
@@ -32,6 +30,7 @@ from megloc_kapture.io.paths import (
     check_no_escape,
     check_output,
     check_relative,
+    safe_join,
 )
 
 FeatureKind = Literal["keypoints", "descriptors", "global_features", "matches"]
@@ -91,23 +90,21 @@ class FeatureConfig:
 def feature_folder(root: Path, kind: FeatureKind, type_name: str, *, orphan: bool) -> Path:
     """The folder of one type, inside a kapture or below a features folder (``orphan``).
 
-    Raises
-    ------
-    DataError : the type name cannot be the name of a folder.
+    Raises DataError where the type name cannot be the name of a folder.
     """
-    check_component(type_name)
+    parent = _types_folder(root, kind, orphan) / check_component(type_name)
+    return parent / kind if orphan else parent
+
+
+def _types_folder(root: Path, kind: FeatureKind, orphan: bool) -> Path:
     if not orphan:
-        return Path(root) / "reconstruction" / kind / type_name
-    group = "global_features" if kind == "global_features" else "local_features"
-    return Path(root) / group / type_name / kind
+        return Path(root) / "reconstruction" / kind
+    return Path(root) / ("global_features" if kind == "global_features" else "local_features")
 
 
 def list_types(root: Path, kind: FeatureKind, *, orphan: bool) -> list[str]:
     """Type names of one kind that a kapture or features folder holds, sorted."""
-    if orphan:
-        parent = Path(root) / ("global_features" if kind == "global_features" else "local_features")
-    else:
-        parent = Path(root) / "reconstruction" / kind
+    parent = _types_folder(root, kind, orphan)
     try:
         names = sorted(entry.name for entry in parent.iterdir())
     except (FileNotFoundError, NotADirectoryError):
@@ -127,12 +124,7 @@ def list_types(root: Path, kind: FeatureKind, *, orphan: bool) -> list[str]:
 
 
 def read_config(path: Path, kind: ArrayKind) -> FeatureConfig:
-    """Read one configuration file.
-
-    Raises
-    ------
-    DataError : names file and line.
-    """
+    """Read one configuration file; DataError names file and line."""
     with read_rows(path) as rows:
         found = list(rows)
     if len(found) != 1:
@@ -164,12 +156,9 @@ def format_config(kind: ArrayKind, config: FeatureConfig) -> bytes:
 
 def blob_sources(roots: Roots, folder: Path, kind: FeatureKind) -> list[BlobSource]:
     """The tar of a type's folder, where there is one, before its loose files."""
-    sources: list[BlobSource] = []
+    sources: list[BlobSource] = [FolderBlobs(roots, folder, SUFFIX[kind])]
     tar = folder / f"{kind}.tar"
-    if tar.is_file():
-        sources.append(TarBlobs(roots, tar, SUFFIX[kind]))
-    sources.append(FolderBlobs(roots, folder, SUFFIX[kind]))
-    return sources
+    return [TarBlobs(roots, tar, SUFFIX[kind]), *sources] if tar.is_file() else sources
 
 
 class FeatureReader:
@@ -183,9 +172,8 @@ class FeatureReader:
     ) -> None:
         """``folders``: (roots that links may not leave, folder of the type), in order.
 
-        Raises
-        ------
-        DataError : no folder, a broken configuration, or folders whose dtypes or sizes differ.
+        Raises DataError without a folder, for a broken configuration, or folders whose dtypes or
+        sizes differ.
         """
         if not folders:
             raise DataError(f"no {kind} of type {type_name!r}")
@@ -219,21 +207,15 @@ class FeatureReader:
         return isinstance(image, str) and self._find(image) is not None
 
     def length(self, image: str) -> int:
-        """Number of rows of an image, from the size of its file alone.
-
-        Raises
-        ------
-        DataError : no features of that image, or a size that no number of rows gives.
-        """
+        """Number of rows of an image, from the size of its file alone; raises as `read` does."""
         source, name = self._source(image)
         return self._rows(source, name, source.size(name))
 
     def read(self, image: str) -> NDArray[Any]:
         """The array of an image, (N, dsize); (dsize,) for global features. Writable.
 
-        Raises
-        ------
-        DataError : no features of that image, a truncated file, or values that are not finite.
+        Raises DataError: no features of that image, a truncated file, or values that are not
+        finite.
         """
         source, name = self._source(image)
         content = source.read(name)
@@ -324,7 +306,43 @@ class FeatureReader:
         return found
 
 
-class FeatureWriter(AbstractContextManager["FeatureWriter"]):
+class BlobWriter:
+    """Writes blobs below a folder, each atomically as a file, or into its ``STEM.tar``."""
+
+    def __init__(self, folder: Path, stem: str, *, tar: bool) -> None:
+        self._folder = folder
+        self._tar = TarBlobWriter(folder / f"{stem}.tar") if tar else None
+
+    def has(self, name: str) -> bool:
+        """True where a blob is written already."""
+        if self._tar is not None:
+            return name in self._tar
+        try:
+            return safe_join(self._folder, name).is_file()
+        except OSError:
+            return False  # too long a name, or a folder closed to us: writing will say so
+
+    def put(self, name: str, content: bytes) -> Path:
+        """Write one; returns the file that holds it."""
+        if self._tar is not None:
+            return self._tar.write(name, content)
+        path = safe_join(self._folder, name)
+        write_bytes(path, content)
+        return path
+
+    def close(self) -> None:
+        """Finish the tar; the writer is of no use afterwards."""
+        if self._tar is not None:
+            self._tar.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class FeatureWriter(BlobWriter):
     """Write the features of one kind and type; each image's file is atomic.
 
     Opening writes the configuration, or checks that the one there is the same, so that a stopped
@@ -341,11 +359,8 @@ class FeatureWriter(AbstractContextManager["FeatureWriter"]):
         tar: bool = False,
         orphan: bool = False,
     ) -> None:
-        """
-        Raises
-        ------
-        DataError : a name or configuration that kapture cannot hold.
-        OutputError : cannot be written, or another configuration stands there.
+        """Raises DataError for a name or configuration that kapture cannot hold, OutputError where
+        it cannot be written or another configuration stands there.
         """
         self.kind = kind
         self.type_name = type_name
@@ -359,11 +374,10 @@ class FeatureWriter(AbstractContextManager["FeatureWriter"]):
                 raise OutputError(f"{path}: holds another configuration; remove its folder first")
         else:
             write_bytes(path, content)
-        self._blobs: FolderBlobWriter | TarBlobWriter
-        self._blobs = TarBlobWriter(folder / f"{kind}.tar") if tar else FolderBlobWriter(folder)
+        super().__init__(folder, kind, tar=tar)
 
     def __contains__(self, image: str) -> bool:
-        return image + SUFFIX[self.kind] in self._blobs
+        return self.has(image + SUFFIX[self.kind])
 
     def write(self, image: str, array: ArrayLike) -> tuple[Path, Path]:
         """Write one image's array, (N, dsize), or (dsize,) for global features.
@@ -389,14 +403,7 @@ class FeatureWriter(AbstractContextManager["FeatureWriter"]):
         if not np.can_cast(given.dtype, self.config.dtype, casting="same_kind"):
             raise ValueError(f"cannot store {given.dtype} as {self.config.dtype.name}")
         content = np.ascontiguousarray(given, dtype=self.config.dtype).tobytes()
-        return self._path, self._blobs.write(check_field(image) + SUFFIX[self.kind], content)
-
-    def close(self) -> None:
-        """Finish the tar; the writer is of no use afterwards."""
-        self._blobs.close()
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+        return self._path, self.put(check_field(image) + SUFFIX[self.kind], content)
 
 
 def check_field(image: str) -> str:

@@ -78,9 +78,7 @@ class KaptureFolder:
         They may share both where they are the same file. Features that cannot be read are left to
         those who need them.
 
-        Raises
-        ------
-        DataError : names the image and the features.
+        Raises DataError: names the image and the features.
         """
         for image in sorted(set(self.read().image_names()) & set(other.read().image_names())):
             if _same_content(self.image_path(image), other.image_path(image)):
@@ -99,9 +97,7 @@ class KaptureFolder:
     def read(self) -> KaptureData:
         """Sensors, rigs, trajectories and records; parsed once.
 
-        Raises
-        ------
-        DataError : names file and line.
+        Raises DataError: names file and line.
         """
         if self._data is None:
             self._data = read_kapture_data(self.root, allow_links_below=self._roots()[1:])
@@ -110,9 +106,7 @@ class KaptureFolder:
     def image_path(self, image: str) -> Path:
         """Path of an image; checked as text, the file need not exist and may be a link.
 
-        Raises
-        ------
-        DataError : the name leads out of ``records_data``.
+        Raises DataError: the name leads out of ``records_data``.
         """
         return safe_join(self.root / "sensors" / "records_data", image)
 
@@ -128,12 +122,7 @@ class KaptureFolder:
         return sorted(found)
 
     def keypoints(self, type_name: str) -> FeatureReader:
-        """Keypoints of a type.
-
-        Raises
-        ------
-        DataError : no such type, or a broken configuration.
-        """
+        """Keypoints of a type. Raises DataError: no such type, or a broken configuration."""
         return self._features("keypoints", type_name)
 
     def descriptors(self, type_name: str) -> FeatureReader:
@@ -160,9 +149,7 @@ class KaptureFolder:
 
         Read once; the array is shared and cannot be written to.
 
-        Raises
-        ------
-        DataError : missing or broken; names file and line.
+        Raises DataError: missing or broken; names file and line.
         """
         if self._points is None:
             points = read_points3d(check_no_escape(self._roots(), self._points_path()))
@@ -177,9 +164,7 @@ class KaptureFolder:
         the points, keypoint ids against the keypoints of every image that has some (an image
         without is kapture's way to say that it was taken out of the map).
 
-        Raises
-        ------
-        DataError : missing or broken, or ids out of range; names file and line.
+        Raises DataError: missing or broken, or ids out of range; names file and line.
         """
         if self._observations is None:
             path = check_no_escape(self._roots(), self._observations_path())
@@ -203,9 +188,7 @@ class KaptureFolder:
         observations against points and keypoints. With ``deep`` also every image is decoded and
         compared with its camera's size, and every match checked against the keypoints.
 
-        Raises
-        ------
-        DataError : the first thing found wrong.
+        Raises DataError: the first thing found wrong.
         """
         self.read()
         readers = {kind: self._readers(kind) for kind in _ARRAY_KINDS}

@@ -8,7 +8,6 @@ order is found too. Pairs files are kapture-localization's: query image, map ima
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,14 +16,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.files import output_error, write_bytes
-from megloc_kapture.io.kapture.blobs import BlobSource, FolderBlobWriter
+from megloc_kapture.io.kapture.blobs import BlobSource
 from megloc_kapture.io.kapture.features import (
     SUFFIX,
+    BlobWriter,
     blob_sources,
     check_field,
     feature_folder,
 )
-from megloc_kapture.io.kapture.tars import TarBlobWriter
 from megloc_kapture.io.kapture.text import check_columns, format_table, parse_float, read_rows
 from megloc_kapture.io.paths import Roots, check_output, check_relative
 
@@ -40,9 +39,7 @@ class MatchesReader:
     def __init__(self, type_name: str, folders: Sequence[tuple[Roots, Path]]) -> None:
         """``folders``: (roots that links may not leave, folder of the type), in order.
 
-        Raises
-        ------
-        DataError : no folder.
+        Raises DataError: no folder.
         """
         if not folders:
             raise DataError(f"no matches of type {type_name!r}")
@@ -56,9 +53,7 @@ class MatchesReader:
     def pairs(self) -> list[tuple[str, str]]:
         """Matched pairs ``(a, b)`` with ``a < b``, sorted.
 
-        Raises
-        ------
-        DataError : a file that names no pair, or an image with itself.
+        Raises DataError: a file that names no pair, or an image with itself.
         """
         if self._pairs is None:
             found = set()
@@ -127,7 +122,7 @@ class MatchesReader:
         return None
 
 
-class MatchesWriter(AbstractContextManager["MatchesWriter"]):
+class MatchesWriter(BlobWriter):
     """Write matches of one keypoints type; each pair's file is atomic.
 
     ``(a, b) in writer`` tells what is written already. Use as a context manager.
@@ -150,11 +145,10 @@ class MatchesWriter(AbstractContextManager["MatchesWriter"]):
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise output_error(folder, error) from error
-        self._blobs: FolderBlobWriter | TarBlobWriter
-        self._blobs = TarBlobWriter(folder / "matches.tar") if tar else FolderBlobWriter(folder)
+        super().__init__(folder, "matches", tar=tar)
 
     def __contains__(self, pair: tuple[str, str]) -> bool:
-        return _name(min(pair), max(pair)) in self._blobs
+        return self.has(_name(min(pair), max(pair)))
 
     def write(self, a: str, b: str, indices: ArrayLike, scores: ArrayLike) -> Path:
         """Write one pair: integer indices (M, 2) in the order ``a``, ``b``, and scores (M,).
@@ -185,14 +179,7 @@ class MatchesWriter(AbstractContextManager["MatchesWriter"]):
         rows[:, :2] = pairs if a < b else pairs[:, ::-1]
         rows[:, 2] = values
         name = _name(check_field(min(a, b)), check_field(max(a, b)))
-        return self._blobs.write(name, rows.tobytes())
-
-    def close(self) -> None:
-        """Finish the tar; the writer is of no use afterwards."""
-        self._blobs.close()
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+        return self.put(name, rows.tobytes())
 
 
 def _name(first: str, second: str) -> str:
@@ -214,9 +201,7 @@ class ImagePair:
 def read_pairs(path: Path | str) -> list[ImagePair]:
     """Read a pairs file, in the order of the file; a repeated pair counts once, where it is first.
 
-    Raises
-    ------
-    DataError : names file and line.
+    Raises DataError: names file and line.
     """
     pairs: list[ImagePair] = []
     seen: set[tuple[str, str]] = set()

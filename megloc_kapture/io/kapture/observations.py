@@ -74,12 +74,7 @@ class Observations:
 def read_observations(
     path: Path, *, large_bytes: int = LARGE_BYTES, chunk_bytes: int = _CHUNK_BYTES
 ) -> dict[str, Observations]:
-    """Read ``observations.txt``, by keypoints type.
-
-    Raises
-    ------
-    DataError : names file and line.
-    """
+    """Read ``observations.txt``, by keypoints type. Raises DataError: names file and line."""
     found = None
     if path.is_file() and path.stat().st_size >= large_bytes:
         found = _read_compiled(path, chunk_bytes)
@@ -184,9 +179,7 @@ class _Parsed(NamedTuple):
 def _read_compiled(path: Path, chunk_bytes: int) -> dict[str, Observations] | None:
     """Read with the compiled loops; None where a line or a name is unusual.
 
-    Raises
-    ------
-    DataError : a line is wrong, or the file cannot be read.
+    Raises DataError: a line is wrong, or the file cannot be read.
     """
     parts = []
     for chunk, parsed in _parsed_chunks(path, chunk_bytes):

@@ -41,9 +41,7 @@ _NUMBER_CHARACTERS = re.compile(r"[0-9eE.+\-]+")
 def read_points3d(path: Path, *, large_bytes: int = LARGE_BYTES) -> NDArray[np.float64]:
     """Read ``points3d.txt`` as float64 (N, 6): X Y Z R G B, colours 0 where there are none.
 
-    Raises
-    ------
-    DataError : names file and line.
+    Raises DataError: names file and line.
     """
     read = None
     if path.is_file() and path.stat().st_size >= large_bytes:
@@ -157,9 +155,7 @@ def write_point_covariances(root: Path, covariances: NDArray[np.float64]) -> Non
 def read_point_covariances(root: Path, num_points: int) -> NDArray[np.float64] | None:
     """The covariances (N, 6) of a map with ``num_points`` points, memory-mapped; None without any.
 
-    Raises
-    ------
-    DataError : not such an array, or not of so many points: another map's.
+    Raises DataError: not such an array, or not of so many points: another map's.
     """
     path = root / COVARIANCES_FILE
     if not path.is_file():

@@ -213,9 +213,7 @@ def unit_quaternion(
 ) -> tuple[float, float, float, float]:
     """The quaternion with length one; unchanged where it is one up to rounding.
 
-    Raises
-    ------
-    DataError : its length is off by 1e-3 or more.
+    Raises DataError: its length is off by 1e-3 or more.
     """
     norm = math.hypot(*quat_wxyz)
     if not abs(norm - 1.0) < MAX_QUATERNION_ERROR:

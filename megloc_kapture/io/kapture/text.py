@@ -35,11 +35,9 @@ def read_rows(path: Path, *, version_required: bool = False) -> Iterator[Iterato
 
     A DataError of the block that names no file gets the path and the line of the row read last.
 
-    Raises
-    ------
-    DataError : missing, not readable, not UTF-8 or with a NUL; the format version on line 1 is
-        another than 1.1, or absent although required; a line begins with blanks and "#": to kapture
-        that is no comment, and a name that could not be written again.
+    Raises DataError: missing, not readable, not UTF-8 or with a NUL; the format version on line 1
+    is another than 1.1, or absent although required; a line begins with blanks and "#": to kapture
+    that is no comment, and a name that could not be written again.
     """
     lines = read_text(path).split("\n")
     check_version(path, lines[0], required=version_required)
@@ -117,9 +115,8 @@ def writable_name(name: str) -> str:
 def format_table(header: str, rows: Iterable[Sequence[str]]) -> bytes:
     """A kapture CSV file: the version line, the column header, the rows.
 
-    Raises
-    ------
-    DataError : a field that would not be read back as it is (comma, line break, outer spaces).
+    Raises DataError: a field that would not be read back as it is (comma, line break, outer
+    spaces).
     """
     lines = [FORMAT_LINE, header]
     for row in rows:

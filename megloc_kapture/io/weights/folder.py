@@ -200,10 +200,8 @@ def read_weights(file: WeightsFile) -> dict[str, torch.Tensor]:
     Every file is read once, and what is loaded is what the checksum was taken of. Processes that
     :func:`share_weights` are the first of them to read it or have the tensors that the first read.
 
-    Raises
-    ------
-    DataError : it cannot be read, is damaged, holds objects that are never loaded, or its sha256
-        is not the one that the registry knows; names the file.
+    Raises DataError: it cannot be read, is damaged, holds objects that are never loaded, or its
+    sha256 is not the one that the registry knows; names the file.
     """
     return shared_tensors(file, partial(_read, file))
 
