@@ -13,8 +13,8 @@ import torch
 from scipy.io import loadmat, savemat
 
 from megloc_kapture.errors import DataError
+from megloc_kapture.io.weights.authors import AVERAGE_IMAGE
 from megloc_kapture.io.weights.containers import read_checkpoint
-from megloc_kapture.io.weights.netvlad import AVERAGE_IMAGE
 
 CONVOLUTIONS = (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)
 SIZE, CLUSTERS, OUTPUT = 6, 4, 5
