@@ -7,7 +7,7 @@ import tempfile
 import zlib  # noqa: F401  pycolmap 4.1.1 to 4.2.1 corrupt the heap when imported before zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from shutil import disk_usage
 from typing import TYPE_CHECKING, Any
@@ -88,14 +88,6 @@ def quiet_stderr() -> Iterator[None]:
         os.close(null)
 
 
-def _rigid3d(transform: RigidTransform) -> Any:
-    pycolmap = load_pycolmap()
-    w, x, y, z = transform.quat_wxyz
-    return pycolmap.Rigid3d(
-        pycolmap.Rotation3d(np.array([x, y, z, w])), np.array(transform.translation)
-    )
-
-
 def triangulate(
     images: Sequence[MapImage],
     matches: Mapping[tuple[int, int], NDArray[np.integer[Any]]],
@@ -143,7 +135,9 @@ def triangulate(
         cameras, camera_ids = _cameras_of(images)
         named = [(i.name, k, i.keypoints_px) for i, k in zip(images, camera_ids, strict=True)]
         write_database(database_path, cameras, named, matches)
-        reconstruction = _posed_reconstruction(cameras, camera_ids, images, offset)
+        recentre = RigidTransform((1.0, 0.0, 0.0, 0.0), (offset[0], offset[1], offset[2]))
+        recentred = [replace(i, cam_from_world=i.cam_from_world @ recentre) for i in images]
+        reconstruction = _posed_reconstruction(recentred, cameras, camera_ids)
         pipeline = pycolmap.IncrementalPipelineOptions()
         pipeline.num_threads = num_threads
         # with many residuals its threads add them up in whatever order they come: other last bits
@@ -266,27 +260,22 @@ def _verified_geometry(rows: NDArray[np.uint32]) -> Any:
 
 
 def _posed_reconstruction(
-    cameras: Sequence[Any],
-    camera_ids: Sequence[int],
-    images: Sequence[MapImage],
-    offset: NDArray[np.float64],
+    images: Sequence[MapImage], cameras: Sequence[Any], camera_ids: Sequence[int]
 ) -> Any:
-    """The reconstruction of the poses, without points."""
+    """The reconstruction of the poses, without points; images are numbered from 1 on."""
     pycolmap = load_pycolmap()
     reconstruction = pycolmap.Reconstruction()
-    recentre = RigidTransform((1.0, 0.0, 0.0, 0.0), (offset[0], offset[1], offset[2]))
     for camera in cameras:
         reconstruction.add_camera_with_trivial_rig(camera)
     for image_id, (image, camera_id) in enumerate(zip(images, camera_ids, strict=True), start=1):
+        keypoints = np.ascontiguousarray(image.keypoints_px[:, :2], dtype=np.float64)
         entry = pycolmap.Image(
-            image_id=image_id,
-            name=image.name,
-            camera_id=camera_id,
-            keypoints=np.ascontiguousarray(image.keypoints_px[:, :2], dtype=np.float64),
+            image_id=image_id, name=image.name, camera_id=camera_id, keypoints=keypoints
         )
-        reconstruction.add_image_with_trivial_frame(
-            entry, _rigid3d(image.cam_from_world @ recentre)
-        )
+        w, x, y, z = image.cam_from_world.quat_wxyz
+        rotation = pycolmap.Rotation3d(np.array([x, y, z, w]))
+        pose = pycolmap.Rigid3d(rotation, np.array(image.cam_from_world.translation))
+        reconstruction.add_image_with_trivial_frame(entry, pose)
     return reconstruction
 
 
@@ -331,20 +320,9 @@ def write_model(
     OutputError : the folder cannot be written to.
     """
     pycolmap = load_pycolmap()
-    model = pycolmap.Reconstruction()
-    camera_ids: dict[Camera, int] = {}
+    model = _posed_reconstruction(images, *_cameras_of(images))
     tracks: list[list[Any]] = [[] for _ in xyz]
-    for number, (image, (rows, points)) in enumerate(zip(images, observed, strict=True), start=1):
-        if image.camera not in camera_ids:
-            camera = new_colmap_camera(image.camera)
-            camera.camera_id = camera_ids[image.camera] = len(camera_ids) + 1
-            model.add_camera_with_trivial_rig(camera)
-        keypoints = np.ascontiguousarray(image.keypoints_px[:, :2], dtype=np.float64)
-        camera_id = camera_ids[image.camera]
-        entry = pycolmap.Image(
-            image_id=number, name=image.name, camera_id=camera_id, keypoints=keypoints
-        )
-        model.add_image_with_trivial_frame(entry, _rigid3d(image.cam_from_world))
+    for number, (rows, points) in enumerate(observed, start=1):
         for row, point in zip(rows.tolist(), points.tolist(), strict=True):
             tracks[point].append(pycolmap.TrackElement(number, row))
     rgb = np.clip(np.rint(colours), 0, 255).astype(np.uint8)

@@ -31,8 +31,7 @@ from typing import (
 from pydantic import ValidationError
 
 from megloc_kapture.errors import DataError, OutputError
-from megloc_kapture.io.files import first_problem, named, read_text, write_bytes
-from megloc_kapture.io.paths import check_relative
+from megloc_kapture.io.files import check_relative, first_problem, named, read_text, write_bytes
 from megloc_kapture.values import RigidTransform
 
 RowT = TypeVar("RowT")

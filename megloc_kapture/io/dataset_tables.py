@@ -34,14 +34,15 @@ from pydantic import Field, field_validator, model_validator
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.csv_table import Column, ImageName, Table, flag
 from megloc_kapture.io.files import (
+    check_no_escape,
     check_plain,
+    check_relative,
     named,
     read_json_model,
     read_text,
     write_bytes,
     write_json_model,
 )
-from megloc_kapture.io.paths import check_no_escape, check_relative
 from megloc_kapture.values import Options, RigidTransform
 
 SIDE_TABLES = "megloc"

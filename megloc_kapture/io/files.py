@@ -1,4 +1,7 @@
-"""Files: read whole, written atomically, linked, kept as JSON.
+"""Files: their paths checked, read whole, written atomically, linked, kept as JSON.
+
+Paths that data names (image names, type names and the like) come from files that somebody else
+wrote, and may only ever lead to something below the folder they belong to.
 
 A file is written beside its final path under a name that no reader lists and then renamed over it:
 a killed run or a full disk leaves the old state or the new one. There is no fsync: after a power
@@ -27,8 +30,11 @@ from pydantic import BaseModel, ValidationError
 from megloc_kapture.errors import DataError, OutputError
 
 _MAX_JSON_BYTES = 1 << 28
+_MAX_FOLDERS = 250  # Python makes a folder's parents one within the other
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
+# the folder that something was found in, and others that links in it may lead to
+Roots = Path | tuple[Path, ...]
 
 
 # ------------------------------------------------------------------------------------ reading
@@ -91,6 +97,81 @@ def named(path: Path | str, line: int | None = None) -> Iterator[None]:
         raise DataError(error.message, path=path, line=line) from error.__cause__
 
 
+# ------------------------------------------------------------------------------------ paths
+
+
+def has_control_characters(text: str) -> bool:
+    """True for a text with characters that no name or line should have (NUL, tab, ...)."""
+    if text.isprintable():
+        return False
+    return any(ord(c) < 32 or ord(c) == 127 or 0xD800 <= ord(c) <= 0xDFFF for c in text)
+
+
+@lru_cache(maxsize=1 << 12)  # the text alone decides, and the same names come in a row
+def check_relative(text: str) -> str:
+    """Return ``text`` if it is a plain relative path (``a/b.jpg``), else raise.
+
+    Raises DataError: empty, absolute, deeper than 250 folders, ``.`` or ``..`` or an empty
+    component, a backslash, or a control character (NUL included) in it. A ``.`` or empty component
+    is harmless, but would give one file two names, and names are identities in kapture.
+    """
+    if not text:
+        raise DataError("empty path")
+    if "\\" in text:
+        raise DataError(f"backslash in path {text!r}")
+    if has_control_characters(text):
+        raise DataError(f"control character in path {text!r}")
+    if text.count("/") > _MAX_FOLDERS:
+        raise DataError(f"path of {text.count('/')} folders: {text[:20]!r}...")
+    if text.startswith("/"):
+        raise DataError(f"absolute path {text!r}; it must be relative to its folder")
+    for component in text.split("/"):
+        if component == "..":
+            raise DataError(f"path {text!r} leads out of its folder ('..')")
+        if component in ("", "."):
+            raise DataError(f"path {text!r} has an empty or '.' component")
+    return text
+
+
+def check_component(text: str) -> str:
+    """Return ``text`` if it can be the name of one folder and one CSV field, as types have it.
+
+    Raises DataError: what :func:`check_relative` refuses, a slash, a comma, or a space at an end.
+    """
+    check_relative(text)
+    if "/" in text or "," in text or text != text.strip():
+        raise DataError(f"{text!r} cannot be a type name (slash, comma or space at the end)")
+    return text
+
+
+def safe_join(root: Path, relative_text: str) -> Path:
+    """``root / relative_text`` where :func:`check_relative` takes the text; it need not exist."""
+    return Path(root) / check_relative(relative_text)
+
+
+def check_no_escape(roots: Roots, path: Path) -> Path:
+    """Return ``path`` if it lies in one of the ``roots`` with all links followed, or DataError."""
+    roots = (roots,) if isinstance(roots, Path) else roots
+    real = os.path.realpath(path)
+    for root in roots:
+        real_root = os.path.realpath(root)
+        if real == real_root or real.startswith(real_root.rstrip(os.sep) + os.sep):
+            return path
+    raise DataError(
+        f"is or lies behind a link that leaves {roots[0]}, to {real}; images may be links to "
+        "anywhere, anything else only to below a folder that --allow-links-below names",
+        path=path,
+    )
+
+
+def check_output(root: Path, path: Path) -> Path:
+    """Return ``path`` if no link on the way leads out of ``root``, else raise OutputError."""
+    try:
+        return check_no_escape(root, path)
+    except DataError as error:
+        raise OutputError(f"{path}: not written: lies behind a link that leaves {root}") from error
+
+
 # -------------------------------------------------------------------------------- temporary names
 
 
@@ -127,8 +208,7 @@ def clear_leftovers(folder: Path) -> None:
 
 
 def clear_temporary(folder: Path) -> None:
-    """Remove what processes that died while they wrote have left below a folder; none may write
-    there any more. Raises OSError."""
+    """Remove unfinished files below a folder, which nothing may write to any more; OSError."""
     for path in list(Path(folder).rglob(".megloc-*.tmp")):
         remove(path)
 

@@ -27,7 +27,7 @@ from pydantic import Field, model_validator
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.csv_table import POSE, TEXT, Table, flag, list_of, number, or_empty
-from megloc_kapture.io.paths import check_relative
+from megloc_kapture.io.files import check_relative
 from megloc_kapture.values import ClusterPose, Options, RefinementRow, RigidTransform
 
 STATUS_FILE = "status.csv"

@@ -23,8 +23,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.files import named, output_error
-from megloc_kapture.io.paths import Roots, check_no_escape, check_relative, safe_join
+from megloc_kapture.io.files import (
+    Roots,
+    check_no_escape,
+    check_relative,
+    named,
+    output_error,
+    safe_join,
+)
 
 _TAR_BLOCK = 512
 _TAR_RECORD = 20 * _TAR_BLOCK

@@ -21,17 +21,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from megloc_kapture.errors import DataError, OutputError
-from megloc_kapture.io.files import named, write_bytes
-from megloc_kapture.io.kapture.blobs import BlobSource, FolderBlobs, TarBlobs, TarBlobWriter
-from megloc_kapture.io.kapture.text import check_columns, format_table, read_rows
-from megloc_kapture.io.paths import (
+from megloc_kapture.io.files import (
     Roots,
     check_component,
     check_no_escape,
     check_output,
     check_relative,
+    named,
     safe_join,
+    write_bytes,
 )
+from megloc_kapture.io.kapture.blobs import BlobSource, FolderBlobs, TarBlobs, TarBlobWriter
+from megloc_kapture.io.kapture.text import check_columns, format_table, read_rows
 
 FeatureKind = Literal["keypoints", "descriptors", "global_features", "matches"]
 ArrayKind = Literal["keypoints", "descriptors", "global_features"]

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
+from megloc_kapture.io.files import Roots, check_no_escape, safe_join
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture.data import KaptureData
 from megloc_kapture.io.kapture.features import (
@@ -28,7 +29,6 @@ from megloc_kapture.io.kapture.observations import (
 )
 from megloc_kapture.io.kapture.points import read_points3d
 from megloc_kapture.io.kapture.sensors import read_kapture_data
-from megloc_kapture.io.paths import Roots, check_no_escape, safe_join
 from megloc_kapture.values import RigidTransform
 
 if TYPE_CHECKING:

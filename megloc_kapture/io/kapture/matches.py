@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.files import output_error, write_bytes
+from megloc_kapture.io.files import Roots, check_output, check_relative, output_error, write_bytes
 from megloc_kapture.io.kapture.blobs import BlobSource
 from megloc_kapture.io.kapture.features import (
     SUFFIX,
@@ -25,7 +25,6 @@ from megloc_kapture.io.kapture.features import (
     feature_folder,
 )
 from megloc_kapture.io.kapture.text import check_columns, format_table, parse_float, read_rows
-from megloc_kapture.io.paths import Roots, check_output, check_relative
 
 _BETWEEN = ".overlapping/"
 _ROW_BYTES = 3 * 8

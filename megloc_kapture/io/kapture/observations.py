@@ -22,7 +22,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.files import atomic_write, named
+from megloc_kapture.io.files import (
+    atomic_write,
+    check_component,
+    check_output,
+    check_relative,
+    named,
+)
 from megloc_kapture.io.kapture.features import check_field
 from megloc_kapture.io.kapture.text import (
     BYTE_ORDER_MARK,
@@ -32,7 +38,6 @@ from megloc_kapture.io.kapture.text import (
     read_rows,
     split_fields,
 )
-from megloc_kapture.io.paths import check_component, check_output, check_relative
 
 OBSERVATIONS_HEADER = "# point3d_id, keypoints_type, [image_path, feature_id]*"
 MAX_KEYPOINT_ID = 2**31 - 1

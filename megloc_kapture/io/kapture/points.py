@@ -18,7 +18,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.files import atomic_write, read_content, write_bytes
+from megloc_kapture.io.files import (
+    atomic_write,
+    check_no_escape,
+    check_output,
+    read_content,
+    write_bytes,
+)
 from megloc_kapture.io.kapture.text import (
     BYTE_ORDER_MARK,
     FORMAT_LINE,
@@ -26,7 +32,6 @@ from megloc_kapture.io.kapture.text import (
     parse_float,
     read_rows,
 )
-from megloc_kapture.io.paths import check_no_escape, check_output
 
 POINTS_HEADERS = {3: "# X, Y, Z", 6: "# X, Y, Z, R, G, B"}
 COVARIANCES_FILE = "reconstruction/point_covariances.npy"

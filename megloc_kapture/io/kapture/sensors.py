@@ -16,7 +16,13 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.files import output_error, write_bytes
+from megloc_kapture.io.files import (
+    check_no_escape,
+    check_output,
+    check_relative,
+    output_error,
+    write_bytes,
+)
 from megloc_kapture.io.kapture.data import (
     CAMERA_SENSOR_TYPES,
     UNKNOWN_CAMERA,
@@ -30,7 +36,6 @@ from megloc_kapture.io.kapture.text import (
     parse_integer,
     read_rows,
 )
-from megloc_kapture.io.paths import check_no_escape, check_output, check_relative
 from megloc_kapture.values import RigidTransform
 
 SENSORS_HEADER = "# sensor_id, name, sensor_type, [sensor_params]+"

@@ -14,8 +14,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.files import read_text
-from megloc_kapture.io.paths import has_control_characters
+from megloc_kapture.io.files import has_control_characters, read_text
 
 FORMAT_VERSION = "1.1"
 FORMAT_LINE = f"# kapture format: {FORMAT_VERSION}"

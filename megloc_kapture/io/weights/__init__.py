@@ -1,7 +1,7 @@
 """Weights of networks: checkpoints found, checked, read safely, shared, added and converted.
 
-Their folder is MEGLOC_WEIGHTS, else ``megloc-kapture/weights`` in the user's cache. A file may lie in it or
-in a folder of it, so that a collection sorted by network will do.
+Their folder is MEGLOC_WEIGHTS, else ``megloc-kapture/weights`` in the user's cache. A file may lie
+in it or in a folder of it, so that a collection sorted by network will do.
 
 Processes of a machine share what they read: the first of them writes the tensors into a folder of
 the run; it and the others map that file into memory. What is mapped is the system's cache of the

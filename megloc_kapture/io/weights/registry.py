@@ -15,7 +15,7 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, field_validator
 
 from megloc_kapture.errors import OptionError, suggestion
-from megloc_kapture.io.paths import check_component, check_relative
+from megloc_kapture.io.files import check_component, check_relative
 
 _TABLE = Path(__file__).with_suffix(".toml")
 _Url = Annotated[str, StringConstraints(pattern=r"^https?://[\w.:-]+/\S*$")]
