@@ -34,6 +34,7 @@ from pydantic import Field, field_validator, model_validator
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.csv_table import Column, ImageName, Table, flag
 from megloc_kapture.io.files import (
+    ModelT,
     check_no_escape,
     check_plain,
     check_relative,
@@ -106,6 +107,10 @@ class SimilarityTransform(Options):
             raise ValueError("translation must be finite")
         return translation
 
+    def rotation(self) -> RigidTransform:
+        """The rotation alone."""
+        return RigidTransform(self.quat_wxyz, (0.0, 0.0, 0.0))
+
 
 class World(Options):
     """The frame the workspace works in, and the way back to the dataset's official one.
@@ -125,7 +130,7 @@ class World(Options):
     def pose_in_official(self, cam_from_local: RigidTransform) -> RigidTransform:
         """``cam_from_official`` of a ``cam_from_local``; lengths become the official ones."""
         similarity = self.official_from_local
-        local_from_official = RigidTransform(similarity.quat_wxyz, (0.0, 0.0, 0.0)).inverse()
+        local_from_official = similarity.rotation().inverse()
         rotation = RigidTransform(cam_from_local.quat_wxyz, (0.0, 0.0, 0.0)) @ local_from_official
         scaled = similarity.scale * np.array(cam_from_local.translation)
         t = scaled - rotation.rotation_matrix() @ np.array(similarity.translation)
@@ -134,10 +139,10 @@ class World(Options):
     def pose_in_local(self, cam_from_official: RigidTransform) -> RigidTransform:
         """``cam_from_local`` of a ``cam_from_official``; undoes :meth:`pose_in_official`."""
         similarity = self.official_from_local
-        rotation_only = RigidTransform(similarity.quat_wxyz, (0.0, 0.0, 0.0))
         offset = cam_from_official.rotation_matrix() @ np.array(similarity.translation)
         t = (np.array(cam_from_official.translation) + offset) / similarity.scale
-        rotation = RigidTransform(cam_from_official.quat_wxyz, (0.0, 0.0, 0.0)) @ rotation_only
+        rotation = RigidTransform(cam_from_official.quat_wxyz, (0.0, 0.0, 0.0))
+        rotation = rotation @ similarity.rotation()
         return RigidTransform(rotation.quat_wxyz, (float(t[0]), float(t[1]), float(t[2])))
 
 
@@ -241,8 +246,7 @@ _RELOCALIZATION = Table(RelocalizationPair)
 def table_path(folder: Path | str, name: str) -> Path:
     """The path of a table, which need not exist.
 
-    Raises DataError: a link that leaves the dataset, no plain file, or far larger than any such
-    table.
+    Raises DataError: a link that leaves the dataset, no plain file, or larger than any such table.
     """
     path = check_no_escape(Path(folder).parent, Path(folder) / name)
     check_plain(path, _MAX_BYTES)
@@ -251,20 +255,16 @@ def table_path(folder: Path | str, name: str) -> Path:
 
 def read_groups(folder: Path | str) -> dict[str, ImageGroup]:
     """Read ``groups.csv``: image -> group, sorted by image."""
+    rows = sorted(_GROUPS.read_if_there(table_path(folder, GROUPS_FILE)))
     return {
-        image: ImageGroup(condition=condition, frame=frame, location=location, scored=scored)
-        for image, condition, frame, location, scored in sorted(
-            _GROUPS.read_if_there(table_path(folder, GROUPS_FILE))
-        )
+        row.image: ImageGroup(**{name: getattr(row, name) for name in ImageGroup.model_fields})
+        for row in rows
     }
 
 
 def write_groups(folder: Path | str, groups: Mapping[str, ImageGroup]) -> None:
     """Write ``groups.csv``, sorted by image."""
-    rows = [
-        _GroupRow(image, g.condition, g.frame, g.location, g.scored)
-        for image, g in sorted(groups.items())
-    ]
+    rows = [_GroupRow(image, **group.model_dump()) for image, group in sorted(groups.items())]
     _GROUPS.write(Path(folder) / GROUPS_FILE, rows)
 
 
@@ -282,8 +282,7 @@ def read_priors(folder: Path | str) -> dict[str, tuple[str, ...]]:
 def write_priors(folder: Path | str, priors: Mapping[str, Sequence[str]]) -> None:
     """Write ``priors.csv``, sorted by query and permitted name.
 
-    Raises DataError: a query has nothing (or "") permitted: the table cannot say "nothing", and a
-    reader would take an absent row for "everything".
+    Raises DataError for a query with nothing (or "") permitted: an absent row is "everything".
     """
     for query, groups in priors.items():
         if not groups or not all(groups):
@@ -293,10 +292,7 @@ def write_priors(folder: Path | str, priors: Mapping[str, Sequence[str]]) -> Non
 
 
 def read_names(folder: Path | str) -> dict[str, str]:
-    """Read ``names.csv``: image -> its name in the pose file, in the table's order.
-
-    Raises DataError: broken table; an image or a name that is given twice, or holds white space.
-    """
+    """Read ``names.csv``: image -> its name in the pose file, in the table's order."""
     return dict(_NAMES.read_if_there(table_path(folder, NAMES_FILE)))
 
 
@@ -314,9 +310,8 @@ def write_unreadable(
     folder: Path | str, reasons: Mapping[str, str], name: str = UNREADABLE_FILE
 ) -> None:
     """Write ``unreadable.csv``, or another such table, sorted by image."""
-    _UNREADABLE.write(
-        Path(folder) / name, [_UnreadableRow(*row) for row in sorted(reasons.items())]
-    )
+    rows = [_UnreadableRow(*row) for row in sorted(reasons.items())]
+    _UNREADABLE.write(Path(folder) / name, rows)
 
 
 def tables_of(root: Path | str) -> Path | None:
@@ -352,8 +347,7 @@ def write_relocalization(folder: Path | str, pairs: Iterable[RelocalizationPair]
 
 def read_world(folder: Path | str) -> World:
     """Read ``world.json``."""
-    path = table_path(folder, WORLD_FILE)
-    return read_json_model(path, World) if path.exists() else World()
+    return _read_model(folder, WORLD_FILE, World)
 
 
 def write_world(folder: Path | str, world: World) -> None:
@@ -363,8 +357,12 @@ def write_world(folder: Path | str, world: World) -> None:
 
 def read_protocol(folder: Path | str) -> Protocol:
     """Read ``protocol.json``."""
-    path = table_path(folder, PROTOCOL_FILE)
-    return read_json_model(path, Protocol) if path.exists() else Protocol()
+    return _read_model(folder, PROTOCOL_FILE, Protocol)
+
+
+def _read_model(folder: Path | str, name: str, model: type[ModelT]) -> ModelT:
+    path = table_path(folder, name)
+    return read_json_model(path, model) if path.exists() else model()
 
 
 def write_protocol(folder: Path | str, protocol: Protocol) -> None:
@@ -373,9 +371,7 @@ def write_protocol(folder: Path | str, protocol: Protocol) -> None:
 
 
 def read_nowhere(truth: Path | str) -> tuple[str, ...]:
-    """Queries of which the folder of the true poses says that they show nothing of the map.
-
-    They stand in its ``nowhere.txt``, one a line; without it there is none.
+    """Queries that show nothing of the map, one a line in ``nowhere.txt`` beside the true poses.
 
     Raises DataError: the file cannot be read, or a name stands in it twice; names file and line.
     """

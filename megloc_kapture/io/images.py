@@ -216,10 +216,7 @@ def read_depth_map(path: Path | str, *, width: int, height: int) -> NDArray[np.f
 def write_depth_map(path: Path | str, depth_m: ArrayLike) -> None:
     """Write a depth map (H, W) in metres, atomically.
 
-    Raises
-    ------
-    ValueError : not a two-dimensional array.
-    OutputError : cannot be written.
+    Raises ValueError: not a two-dimensional array; OutputError: cannot be written.
     """
     pixels = np.asarray(depth_m, dtype="<f4")
     if pixels.ndim != 2:

@@ -136,8 +136,7 @@ class KaptureData:
         None where the trajectories say nothing. Of several rigs with a pose at that time, the
         first by id counts.
         """
-        timestamp, sensor_id = self.record_of(image)
-        return self.device_from_world(timestamp, sensor_id)
+        return self.device_from_world(*self.record_of(image))
 
     def device_from_world(self, timestamp: int, device_id: str) -> RigidTransform | None:
         """Pose of a sensor or rig at a time, own or through rigs; None where there is none."""
@@ -145,12 +144,8 @@ class KaptureData:
 
     def poses(self) -> dict[str, RigidTransform]:
         """``cam_from_world`` of every image that has one, by image name, sorted."""
-        found = {}
-        for image in self.image_names():
-            pose = self.cam_from_world(image)
-            if pose is not None:
-                found[image] = pose
-        return found
+        poses = {image: self.cam_from_world(image) for image in self.image_names()}
+        return {image: pose for image, pose in poses.items() if pose is not None}
 
     def _device_from_world(
         self, timestamp: int, device_id: str, seen: frozenset[str]

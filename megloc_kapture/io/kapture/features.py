@@ -6,7 +6,7 @@ tar. ``T``, the folder's name, is the type name by which they are found; the ``n
 inside the configuration file may differ and means nothing here.
 
 Arrays are raw, little-endian, row-major, without a header: only the size of a file can be checked
-against its configuration, and is.
+against its configuration.
 """
 
 from __future__ import annotations
@@ -173,13 +173,9 @@ class FeatureReader:
     ) -> None:
         """``folders``: (roots that links may not leave, folder of the type), in order.
 
-        Raises DataError without a folder, for a broken configuration, or folders whose dtypes or
-        sizes differ.
+        Raises DataError: a broken configuration, or folders whose dtypes or sizes differ.
         """
-        if not folders:
-            raise DataError(f"no {kind} of type {type_name!r}")
-        self.kind = kind
-        self.type_name = type_name
+        self.kind, self.type_name = kind, type_name
         self._sources: list[BlobSource] = []
         configs: list[tuple[Path, FeatureConfig]] = []
         for roots, folder in folders:
@@ -363,9 +359,7 @@ class FeatureWriter(BlobWriter):
         """Raises DataError for a name or configuration that kapture cannot hold, OutputError where
         it cannot be written or another configuration stands there.
         """
-        self.kind = kind
-        self.type_name = type_name
-        self.config = config
+        self.kind, self.type_name, self.config = kind, type_name, config
         folder = feature_folder(Path(root), kind, type_name, orphan=orphan)
         check_output(Path(root), folder)
         self._path = path = folder / f"{kind}.txt"

@@ -36,12 +36,7 @@ class MatchesReader:
     """The matches of one keypoints type, from one or several folders; the first one counts."""
 
     def __init__(self, type_name: str, folders: Sequence[tuple[Roots, Path]]) -> None:
-        """``folders``: (roots that links may not leave, folder of the type), in order.
-
-        Raises DataError: no folder.
-        """
-        if not folders:
-            raise DataError(f"no matches of type {type_name!r}")
+        """``folders``: (roots that links may not leave, folder of the type), in order."""
         self.type_name = type_name
         self._sources: list[BlobSource] = []
         for roots, folder in folders:
@@ -66,9 +61,7 @@ class MatchesReader:
         return list(self._pairs)
 
     def __contains__(self, pair: object) -> bool:
-        if not isinstance(pair, tuple) or len(pair) != 2:
-            return False
-        return self._find(str(pair[0]), str(pair[1])) is not None
+        return isinstance(pair, tuple) and len(pair) == 2 and self._find(*pair) is not None
 
     def length(self, a: str, b: str) -> int:
         """Number of matches of a pair, from the size of its file alone; 0 where there is none."""
@@ -112,11 +105,9 @@ class MatchesReader:
         return columns.astype(np.int64), rows[:, 2].copy()
 
     def _find(self, a: str, b: str) -> tuple[BlobSource, str, bool] | None:
-        first, second = min(a, b), max(a, b)
         for source in self._sources:
-            for left, right in ((first, second), (second, first)):
-                name = f"{left}{_BETWEEN}{right}{SUFFIX['matches']}"
-                if name in source:
+            for left, right in (sorted((a, b)), sorted((a, b), reverse=True)):
+                if (name := _name(left, right)) in source:
                     return source, name, left != a
         return None
 
@@ -130,11 +121,8 @@ class MatchesWriter(BlobWriter):
     def __init__(
         self, root: Path, type_name: str, *, tar: bool = False, orphan: bool = False
     ) -> None:
-        """
-        Raises
-        ------
-        DataError : the type name cannot be the name of a folder.
-        OutputError : cannot be written.
+        """Raises DataError: the type name cannot be the name of a folder; OutputError: cannot be
+        written.
         """
         self.type_name = type_name
         folder = feature_folder(Path(root), "matches", type_name, orphan=orphan)
