@@ -190,9 +190,7 @@ def connected_models(reconstruction: Any, sensors: Sequence[str]) -> list[Model]
     """
     reconstruction.update_point_3d_errors()  # the global mapper's are of rays
     points = [point for _, point in sorted(reconstruction.points3D.items())]
-    images = [
-        reconstruction.images[image_id] for image_id in sorted(reconstruction.reg_image_ids())
-    ]
+    images = [reconstruction.images[number] for number in sorted(reconstruction.reg_image_ids())]
     if not images or not points:
         return []
     row_of = {image.image_id: row for row, image in enumerate(images)}
@@ -211,28 +209,19 @@ def connected_models(reconstruction: Any, sensors: Sequence[str]) -> list[Model]
     for part in range(num_parts):
         inside = part_of == part
         kept = np.flatnonzero(seen @ inside.astype(np.int64) >= 2)
-        if len(kept):
-            model_images = [images[row] for row in np.flatnonzero(inside)]
-            errors_px = [points[row].error for row in kept]
-            models.append(
-                Model(
-                    {
-                        sensors[image.camera_id - 1]: Camera.from_colmap(
-                            reconstruction.cameras[image.camera_id]
-                        )
-                        for image in model_images
-                    },
-                    {image.name: _cam_from_world(image) for image in model_images},
-                    len(kept),
-                    float(np.mean(errors_px)),
-                )
+        if not len(kept):
+            continue
+        cameras, poses = {}, {}
+        for image in (images[row] for row in np.flatnonzero(inside)):
+            camera = reconstruction.cameras[image.camera_id]
+            cameras[sensors[image.camera_id - 1]] = Camera.from_colmap(camera)
+            found = image.cam_from_world()
+            poses[image.name] = RigidTransform.from_matrix(
+                found.rotation.matrix(), np.asarray(found.translation)
             )
+        error_px = float(np.mean([points[row].error for row in kept]))
+        models.append(Model(cameras, poses, len(kept), error_px))
     return models
-
-
-def _cam_from_world(image: Any) -> RigidTransform:
-    found = image.cam_from_world()
-    return RigidTransform.from_matrix(found.rotation.matrix(), np.asarray(found.translation))
 
 
 def _why_none(seen: Sequence[tuple[Any, float]]) -> str:

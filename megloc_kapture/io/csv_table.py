@@ -191,11 +191,6 @@ _BY_TYPE: dict[Any, Column] = {
 }
 
 
-def _columns_of(row: Callable[..., Any]) -> dict[str, Column]:
-    hints = get_type_hints(row, include_extras=True)
-    return {name: _column(hints[name]) for name in inspect.signature(row).parameters}
-
-
 def _column(hint: Any) -> Column:
     """The column that stands in the annotation of a field, else that of its type."""
     arguments = get_args(hint)
@@ -230,7 +225,10 @@ class Table(Generic[RowT]):
         later: Sequence[str] = (),
     ) -> None:
         self._row, self._keys, self._later = row, keys, later
-        self._columns = _columns_of(row) if columns is None else columns
+        if columns is None:
+            hints = get_type_hints(row, include_extras=True)
+            columns = {name: _column(hints[name]) for name in inspect.signature(row).parameters}
+        self._columns = columns
 
     def read(self, path: Path | str) -> list[RowT]:
         """The records of a file, in its order.
@@ -282,8 +280,7 @@ class Table(Generic[RowT]):
             known.add((key, value))
 
     def _value(self, name: str, text: str) -> Any:
-        column = self._columns[name]
         try:
-            return column.read(text)
+            return self._columns[name].read(text)
         except ValueError as error:
-            raise DataError(f"{name} {text!r} is not {column.expected}") from error
+            raise DataError(f"{name} {text!r} is not {self._columns[name].expected}") from error

@@ -265,15 +265,10 @@ def atomic_write(path: Path | str) -> Iterator[BinaryIO]:
                 os.unlink(temporary)
             raise
     except OSError as error:
-        if error.filename is not None and not _concerns(error, Path(path), Path(temporary)):
+        ours = {os.fspath(path), temporary, *map(os.fspath, Path(path).parents)}
+        if error.filename is not None and os.fspath(error.filename) not in ours:
             raise  # not from writing: the block met it while reading something else
         raise output_error(path, error) from error
-
-
-def _concerns(error: OSError, path: Path, temporary: Path) -> bool:
-    named = os.fspath(error.filename)
-    ours = {os.fspath(path), os.fspath(temporary), *map(os.fspath, path.parents)}
-    return named in ours
 
 
 def write_bytes(path: Path | str, content: bytes) -> None:
@@ -359,9 +354,13 @@ def read_json_model(path: Path | str, model: type[ModelT]) -> ModelT:
     Raises DataError: the file cannot be read, is not JSON (names the line; NaN and infinity are not
     JSON), or does not fit the model (names the field).
     """
+
+    def refuse(name: str) -> NoReturn:
+        raise ValueError(f"{name} is not a number in JSON")
+
     text = read_text(path, _MAX_JSON_BYTES)
     try:
-        content = json.loads(text, parse_constant=_refuse_constant)
+        content = json.loads(text, parse_constant=refuse)
     except json.JSONDecodeError as error:
         raise DataError(f"not JSON: {error.msg}", path=path, line=error.lineno) from error
     except (ValueError, RecursionError) as error:
@@ -392,12 +391,7 @@ def write_json(path: Path | str, content: Any) -> None:
 def first_problem(error: ValidationError) -> str:
     """The first problem of a validation in one line: ``field: what is wrong``."""
     problem = error.errors(include_url=False)[0]
-    field = ".".join(str(part) for part in problem["loc"])
+    field = ".".join(map(str, problem["loc"]))
     message = problem["msg"].removeprefix("Value error, ")
     more = error.error_count() - 1
-    tail = f" (and {more} more)" if more else ""
-    return f"{field}: {message}{tail}" if field else f"{message}{tail}"
-
-
-def _refuse_constant(name: str) -> NoReturn:
-    raise ValueError(f"{name} is not a number in JSON")
+    return (f"{field}: " if field else "") + message + (f" (and {more} more)" if more else "")

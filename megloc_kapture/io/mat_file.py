@@ -87,11 +87,9 @@ def read_mat(content: bytes) -> dict[str, MatValue]:
 
 
 def read_mat_array(path: Path | str, name: str) -> NDArray[np.float64]:
-    """Read the array ``name`` of real numbers; other variables are neither unpacked nor kept.
+    """Read the array ``name`` of real numbers, float64 and of the shape it has in MATLAB.
 
-    Returns
-    -------
-    float64, of the shape it has in MATLAB.
+    Other variables are neither unpacked nor kept.
 
     Raises
     ------
@@ -106,7 +104,10 @@ def read_mat_array(path: Path | str, name: str) -> NDArray[np.float64]:
             with _variable_at(offset):
                 if kind not in (_MATRIX, _COMPRESSED):
                     raise _BrokenError(f"data type {kind}, not an array")
-                head = _head(body if kind == _MATRIX else _first_bytes(body), order)
+                start = body
+                if kind == _COMPRESSED:  # the array's beginning, behind the element's tag
+                    start = memoryview(zlib.decompressobj().decompress(body, 8 + _HEAD_BYTES))[8:]
+                head = _head(start, order)
                 if head.name != name:
                     names.append(head.name)
                     continue
@@ -194,11 +195,6 @@ def _element(data: memoryview, at: int, order: str) -> tuple[int, memoryview, in
     if start + size > len(data):
         raise _BrokenError(f"it ends too early: {size} bytes announced, {len(data) - start} there")
     return kind, data[start : start + size], after
-
-
-def _first_bytes(packed: memoryview) -> memoryview:
-    """The beginning of the array in a packed element, without its tag."""
-    return memoryview(zlib.decompressobj().decompress(packed, 8 + _HEAD_BYTES))[8:]
 
 
 def _unpacked(packed: memoryview, order: str) -> memoryview:

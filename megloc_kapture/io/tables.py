@@ -143,17 +143,7 @@ def write_clusters(
 ) -> None:
     """Write the clusters of every query: (image, its clusters, number of the chosen one)."""
     records = [
-        ClusterRow(
-            image=image,
-            cluster=index,
-            chosen="yes" if index == chosen else "no",
-            num_matches=cluster.num_matches,
-            num_inliers=cluster.num_inliers,
-            score=cluster.score,
-            reason=cluster.reason,
-            images=cluster.images,
-            cam_from_world=cluster.cam_from_world,
-        )
+        ClusterRow(image, index, "yes" if index == chosen else "no", **vars(cluster))
         for image, clusters, chosen in sorted(rows, key=lambda row: row[0])
         for index, cluster in enumerate(clusters)
     ]

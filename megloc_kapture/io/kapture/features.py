@@ -377,9 +377,7 @@ class FeatureWriter(BlobWriter):
     def write(self, image: str, array: ArrayLike) -> tuple[Path, Path]:
         """Write one image's array, (N, dsize), or (dsize,) for global features.
 
-        Returns
-        -------
-        The files that say what it is and hold it.
+        Returns the files that say what it is and hold it.
 
         Raises
         ------

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import filecmp
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -187,9 +187,12 @@ class KaptureFolder:
         Raises DataError: the first thing found wrong.
         """
         self.read()
-        readers = {kind: self._readers(kind) for kind in _ARRAY_KINDS}
-        for kind in _ARRAY_KINDS:
-            for reader in readers[kind].values():
+        readers = {
+            kind: {name: self._features(kind, name) for name in self.types(kind)}
+            for kind in _ARRAY_KINDS
+        }
+        for of_kind in readers.values():
+            for reader in of_kind.values():
                 for image in reader.names:
                     reader.read(image)
         for descriptors in readers["descriptors"].values():
@@ -208,9 +211,6 @@ class KaptureFolder:
 
     def _features(self, kind: ArrayKind, type_name: str) -> FeatureReader:
         return FeatureReader(kind, type_name, self._folders(kind, type_name))
-
-    def _readers(self, kind: ArrayKind) -> dict[str, FeatureReader]:
-        return {name: self._features(kind, name) for name in self.types(kind)}
 
     def _roots(self, first: Path | None = None) -> tuple[Path, ...]:
         """Folders that links may lead to; the one they are found in comes first, for messages."""
@@ -278,27 +278,24 @@ class KaptureFolder:
             return
         first = int(np.flatnonzero(wrong)[0])
         point = int(observations.point_ids[first])
-        image = observations.image_names[int(observations.image_ids[first])]
+        index = int(observations.image_ids[first])
+        image = observations.image_names[index]
         keypoint = int(observations.keypoint_ids[first])
-        line = find_observation(path, keypoints_type, point, image, keypoint)
-        if past_points[first]:
-            raise DataError(
-                f"point id {point}, but there are {num_points} points", path=path, line=line
-            )
-        raise DataError(
-            f"keypoint id {keypoint}, but {image!r} has "
-            f"{int(limit[observations.image_ids[first]])} keypoints of type {keypoints_type!r}",
-            path=path,
-            line=line,
+        problem = (
+            f"point id {point}, but there are {num_points} points"
+            if past_points[first]
+            else f"keypoint id {keypoint}, but {image!r} has {limit[index]} keypoints of type "
+            f"{keypoints_type!r}"
         )
+        line = find_observation(path, keypoints_type, point, image, keypoint)
+        raise DataError(problem, path=path, line=line)
 
     def _check_images(self) -> None:
         data = self.read()
         for image in data.image_names():
             path = self.image_path(image)
-            pixels = read_image_rgb(path)
+            size = read_image_rgb(path).shape[1::-1]
             sensor = data.sensors[data.record_of(image)[1]]
-            size = (pixels.shape[1], pixels.shape[0])
             expected = (int(float(sensor.params[1])), int(float(sensor.params[2])))
             if size != expected:
                 raise DataError(
@@ -335,7 +332,7 @@ def to_kapture(source: KaptureData | KaptureFolder | Path | str) -> kapture.Kapt
             sensor.sensor_type, list(sensor.params), sensor.name or None
         )
     rigs = {(rig, sensor): p for rig, members in data.rigs.items() for sensor, p in members.items()}
-    parts = {
+    parts: dict[str, tuple[Any, Mapping[Any, Any]]] = {
         "rigs": (kapture.Rigs(), rigs),
         "trajectories": (kapture.Trajectories(), data.trajectories),
         "records_camera": (kapture.RecordsCamera(), data.records_camera),

@@ -138,11 +138,7 @@ class MatchesWriter(BlobWriter):
         return self.has(_name(min(pair), max(pair)))
 
     def write(self, a: str, b: str, indices: ArrayLike, scores: ArrayLike) -> Path:
-        """Write one pair: integer indices (M, 2) in the order ``a``, ``b``, and scores (M,).
-
-        Returns
-        -------
-        The file that holds it.
+        """Write a pair: integer indices (M, 2) in the order ``a``, ``b``, scores (M,); its file.
 
         Raises
         ------

@@ -80,9 +80,8 @@ def read_observations(
     path: Path, *, large_bytes: int = LARGE_BYTES, chunk_bytes: int = _CHUNK_BYTES
 ) -> dict[str, Observations]:
     """Read ``observations.txt``, by keypoints type. Raises DataError: names file and line."""
-    found = None
-    if path.is_file() and path.stat().st_size >= large_bytes:
-        found = _read_compiled(path, chunk_bytes)
+    is_large = path.is_file() and path.stat().st_size >= large_bytes
+    found = _read_compiled(path, chunk_bytes) if is_large else None
     return read_observations_strictly(path) if found is None else found
 
 
@@ -148,11 +147,8 @@ def sorted_observations(
     """Observations sorted by point, in the given order among equals."""
     if (point_ids[1:] < point_ids[:-1]).any():
         order = np.argsort(point_ids, kind="stable")
-        point_ids, image_ids, keypoint_ids = (
-            point_ids[order],
-            image_ids[order],
-            keypoint_ids[order],
-        )
+        point_ids, image_ids = point_ids[order], image_ids[order]
+        keypoint_ids = keypoint_ids[order]
     return Observations(keypoints_type, image_names, point_ids, image_ids, keypoint_ids)
 
 
@@ -364,7 +360,16 @@ def write_observations(
 
 def _texts(observations: Mapping[str, Observations], large: int) -> Iterator[bytes]:
     """Text of the rows; that of several types, which is rare, always by the plain writer."""
-    parts = [_sorted_part(name, observations[name]) for name in sorted(observations)]
+    parts = [
+        sorted_observations(
+            name,
+            of_type.image_names,
+            np.asarray(of_type.point_ids, dtype=np.int64),
+            np.asarray(of_type.image_ids, dtype=np.int32),
+            np.asarray(of_type.keypoint_ids, dtype=np.int32),
+        )
+        for name, of_type in sorted(observations.items())
+    ]
     if len(parts) == 1 and len(parts[0]) >= large:
         from megloc_kapture.io.kapture.observation_kernels import written_rows
 
@@ -372,16 +377,6 @@ def _texts(observations: Mapping[str, Observations], large: int) -> Iterator[byt
     elif parts:
         for text in _plain_texts(parts):
             yield text.encode()
-
-
-def _sorted_part(keypoints_type: str, of_type: Observations) -> Observations:
-    return sorted_observations(
-        keypoints_type,
-        of_type.image_names,
-        np.asarray(of_type.point_ids, dtype=np.int64),
-        np.asarray(of_type.image_ids, dtype=np.int32),
-        np.asarray(of_type.keypoint_ids, dtype=np.int32),
-    )
 
 
 def _plain_texts(of_types: Sequence[Observations]) -> Iterator[str]:

@@ -340,17 +340,15 @@ def prove(
 
 
 def convert_weights(source: Path, output: Path, *, force: bool = False) -> int:
-    """Write all tensors of a checkpoint, with its sha256; the same file gives the same bytes.
+    """Write all tensors of a checkpoint, with its sha256, and return their number.
+
+    The same file gives the same bytes.
 
     Parameters
     ----------
     source : the checkpoint; never changed. Names and layouts of its tensors are kept.
     output : the file to write, ``.safetensors``.
     force : replace a file that stands there.
-
-    Returns
-    -------
-    int : the number of tensors.
 
     Raises
     ------

@@ -36,6 +36,8 @@ def read_checkpoint(
 ) -> dict[str, torch.Tensor]:
     """All tensors of a checkpoint by name, on the processor.
 
+    Names are without the prefix ``module.`` of parallel training.
+
     Parameters
     ----------
     content : the file's bytes: of torch (also with ``state_dict``, ``model_state`` or ``model`` in
@@ -44,10 +46,6 @@ def read_checkpoint(
     where : the file; its ending says what it is, save for tars and torch's files.
     read_beside : content of the file beside it whose name ends otherwise than in
         ``.index``.
-
-    Returns
-    -------
-    dict : names without the prefix ``module.`` of parallel training.
 
     Raises
     ------

@@ -62,17 +62,15 @@ class _Entry:
 def read_tensor_bundle(
     index: bytes, read_shard: Callable[[str], bytes], where: str
 ) -> dict[str, NDArray[Any]]:
-    """All variables of a checkpoint by name; texts are left out.
+    """All variables of a checkpoint by name, in the machine's byte order; texts are left out.
+
+    bfloat16 becomes float32, which is exact.
 
     Parameters
     ----------
     index : content of the ``.index`` file.
     read_shard : the content of a data file by the end of its name, ``.data-00000-of-00001``.
     where : the ``.index`` file, for messages.
-
-    Returns
-    -------
-    dict of arrays in the machine's byte order; bfloat16 becomes float32, which is exact.
 
     Raises
     ------

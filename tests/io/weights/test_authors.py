@@ -255,7 +255,7 @@ def pca(kind: type, **attributes: Any) -> Any:
     return made
 
 
-def saved_apgem(whitenings: Any, *, legacy: bool = False, **parts: Any) -> bytes:
+def pickled(whitenings: Any, *, legacy: bool = False, **parts: Any) -> bytes:
     out = io.BytesIO()
     state = {"module.fc.weight": torch.arange(6.0).reshape(2, 3), "module.fc.bias": torch.ones(2)}
     content = {"state_dict": state, "model_options": OPTIONS, "preprocess": PREPROCESS}
@@ -270,9 +270,7 @@ def read_apgem(content: bytes) -> dict[str, torch.Tensor]:
 
 @pytest.mark.parametrize("legacy", [False, True])
 def test_weights_and_arrays(kind: type, legacy: bool) -> None:
-    content = saved_apgem(
-        {"Landmarks_clean": pca(kind), "b": pca(kind, whiten=False)}, legacy=legacy
-    )
+    content = pickled({"Landmarks_clean": pca(kind), "b": pca(kind, whiten=False)}, legacy=legacy)
     if legacy:  # written with numpy 1, where the module had another name
         content = content.replace(b"numpy._core.multiarray", b"numpy.core.multiarray")
     found = read_apgem(content)
@@ -293,17 +291,17 @@ def test_weights_and_arrays(kind: type, legacy: bool) -> None:
 
 
 def test_options_and_statistics_may_be_missing(kind: type) -> None:
-    content = saved_apgem({"a": pca(kind)}, model_options=None, preprocess=None)
+    content = pickled({"a": pca(kind)}, model_options=None, preprocess=None)
     assert {name.split(".")[0] for name in read_apgem(content)} == {"fc", "pca"}
-    content = saved_apgem({"a": pca(kind)}, preprocess={"mean": np.array([0.1, 0.2, 0.3])})
+    content = pickled({"a": pca(kind)}, preprocess={"mean": np.array([0.1, 0.2, 0.3])})
     assert read_apgem(content)["preprocess.mean"].tolist() == [0.1, 0.2, 0.3]
-    normalised = saved_apgem({"a": pca(kind)}, model_options=OPTIONS | {"norm_features": True})
+    normalised = pickled({"a": pca(kind)}, model_options=OPTIONS | {"norm_features": True})
     assert read_apgem(normalised)["model_options.norm_features"]
 
 
 def test_converted_it_is_the_same(kind: type, tmp_path: Path) -> None:
     source, place = tmp_path / "x.pt", tmp_path / "x.safetensors"
-    source.write_bytes(saved_apgem({"Landmarks_clean": pca(kind)}))
+    source.write_bytes(pickled({"Landmarks_clean": pca(kind)}))
     convert_weights(source, place)
     before, after = (read_weights(describe(p.name, p)) for p in (source, place))
     assert before.keys() == after.keys() and "pca.Landmarks_clean.components" in after
@@ -316,7 +314,7 @@ def test_code_is_not_run(kind: type, tmp_path: Path, legacy: bool, where: str) -
     evil = Runs(tmp_path / "made")
     whitenings = {"a": pca(kind, mean_=evil) if where == "inside" else pca(kind)}
     parts = {"optimizer": evil} if where == "beside" else {}
-    content = saved_apgem(whitenings, legacy=legacy, **parts)
+    content = pickled(whitenings, legacy=legacy, **parts)
     with pytest.raises(DataError, match=r"holds objects that are never loaded \(posix\.mkdir\)"):
         read_apgem(content)
     assert not (tmp_path / "made").exists()
@@ -325,7 +323,7 @@ def test_code_is_not_run(kind: type, tmp_path: Path, legacy: bool, where: str) -
 
 
 def test_other_classes_of_the_library_are_refused(kind: type) -> None:
-    content = saved_apgem({"a": pca(kind)}).replace(b"\nPCA\n", b"\nABC\n")
+    content = pickled({"a": pca(kind)}).replace(b"\nPCA\n", b"\nABC\n")
     with pytest.raises(DataError, match=r"never loaded \(sklearn\.decomposition\.\w+\.ABC\)"):
         read_apgem(content)
 
@@ -349,7 +347,7 @@ WRONG = {
 @pytest.mark.parametrize(("attributes", "message"), WRONG.values(), ids=WRONG)
 def test_arrays_of_other_things(kind: type, attributes: dict[str, Any], message: str) -> None:
     with pytest.raises(DataError, match=rf"^x\.pt: its {message}"):
-        read_apgem(saved_apgem({"a": pca(kind, **attributes)}))
+        read_apgem(pickled({"a": pca(kind, **attributes)}))
 
 
 @pytest.mark.parametrize(
@@ -364,13 +362,13 @@ def test_arrays_of_other_things(kind: type, attributes: dict[str, Any], message:
 )
 def test_other_networks_are_refused(kind: type, changed: dict[str, Any], message: str) -> None:
     with pytest.raises(DataError, match=f"model_options are not supported: {message}"):
-        read_apgem(saved_apgem({"a": pca(kind)}, model_options=OPTIONS | changed))
+        read_apgem(pickled({"a": pca(kind)}, model_options=OPTIONS | changed))
 
 
 def test_tables_of_other_things_are_refused(kind: type) -> None:
     with pytest.raises(DataError, match="no table of PCA objects"):
-        read_apgem(saved_apgem([pca(kind)]))
+        read_apgem(pickled([pca(kind)]))
     with pytest.raises(DataError, match="'b', which is no PCA object"):
-        read_apgem(saved_apgem({"a": pca(kind), "b": 3}))
+        read_apgem(pickled({"a": pca(kind), "b": 3}))
     with pytest.raises(DataError, match=r"'a\.b', which is no PCA object by a name"):
-        read_apgem(saved_apgem({"a.b": pca(kind)}))
+        read_apgem(pickled({"a.b": pca(kind)}))
