@@ -198,10 +198,9 @@ def _cameras_of(images: Sequence[MapImage]) -> tuple[list[Any], list[int]]:
 
 def numbered_cameras(cameras: Iterable[Camera]) -> list[Any]:
     """COLMAP's cameras, numbered from 1 on."""
-    found = []
-    for camera_id, camera in enumerate(cameras, start=1):
-        found.append(new_colmap_camera(camera))
-        found[-1].camera_id = camera_id
+    found = [new_colmap_camera(camera) for camera in cameras]
+    for camera_id, camera in enumerate(found, start=1):
+        camera.camera_id = camera_id
     return found
 
 
@@ -245,18 +244,15 @@ def write_database(
                 continue
             rows = np.ascontiguousarray(pairs, dtype=np.uint32)
             database.write_matches(i + 1, j + 1, rows)
-            found = _verified_geometry(rows) if geometry is None else geometry(i, j, rows)
+            if geometry is None:
+                found = pycolmap.TwoViewGeometry()
+                found.inlier_matches = rows
+                # left UNDEFINED, pycolmap 4.2 triangulates nothing, silently
+                found.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+            else:
+                found = geometry(i, j, rows)
             database.write_two_view_geometry(i + 1, j + 1, found)
     database.close()
-
-
-def _verified_geometry(rows: NDArray[np.uint32]) -> Any:
-    pycolmap = load_pycolmap()
-    geometry = pycolmap.TwoViewGeometry()
-    geometry.inlier_matches = rows
-    # left UNDEFINED, pycolmap 4.2 triangulates nothing, silently
-    geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
-    return geometry
 
 
 def _posed_reconstruction(
@@ -280,20 +276,18 @@ def _posed_reconstruction(
 
 
 def _collect(reconstruction: Any, offset: NDArray[np.float64]) -> TriangulatedPoints:
-    xyz, errors, rows = [], [], []
-    for point in (reconstruction.points3D[i] for i in sorted(reconstruction.points3D)):
-        track = sorted((e.image_id - 1, e.point2D_idx) for e in point.track.elements)
-        rows.append(track)
-        xyz.append(point.xyz)
-        errors.append(point.error)
     # COLMAP numbers points in an order that depends on its threads; order them by their tracks
-    order = sorted(range(len(rows)), key=lambda k: rows[k])
-    lengths = np.array([len(rows[k]) for k in order], dtype=np.int64)
-    flat = np.array([e for k in order for e in rows[k]], dtype=np.int64).reshape(-1, 2)
+    found = [
+        (sorted((e.image_id - 1, e.point2D_idx) for e in point.track.elements), point)
+        for _, point in sorted(reconstruction.points3D.items())
+    ]
+    found.sort(key=lambda pair: pair[0])
+    lengths = np.array([len(track) for track, _ in found], dtype=np.int64)
+    flat = np.array([e for track, _ in found for e in track], dtype=np.int64).reshape(-1, 2)
     return TriangulatedPoints(
-        xyz=np.array([xyz[k] for k in order], dtype=np.float64).reshape(-1, 3) + offset,
-        errors_px=np.array([errors[k] for k in order], dtype=np.float64),
-        point_ids=np.repeat(np.arange(len(order), dtype=np.int64), lengths),
+        xyz=np.array([p.xyz for _, p in found], dtype=np.float64).reshape(-1, 3) + offset,
+        errors_px=np.array([p.error for _, p in found], dtype=np.float64),
+        point_ids=np.repeat(np.arange(len(found), dtype=np.int64), lengths),
         image_ids=flat[:, 0],
         keypoint_ids=flat[:, 1],
     )

@@ -136,22 +136,16 @@ def _pose_text(pose: RigidTransform) -> str:
 
 def flag(yes: str, no: str) -> Column:
     """A bool by its two texts."""
-    values = {yes: True, no: False}
-    return Column(f"{no} or {yes}", _lookup(values), lambda value: yes if value else no)
+    return _choice({no: False, yes: True}, lambda value: yes if value else no)
 
 
-def one_of(*texts: str) -> Column:
-    """One of some texts."""
-    return Column(" or ".join(texts), _lookup({text: text for text in texts}))
-
-
-def _lookup(values: Mapping[str, Any]) -> Callable[[str], Any]:
+def _choice(values: Mapping[str, Any], write: Callable[[Any], str] = str) -> Column:
     def read(text: str) -> Any:
         if text not in values:
             raise ValueError
         return values[text]
 
-    return read
+    return Column(" or ".join(values), read, write)
 
 
 def list_of(separator: str) -> Column:
@@ -198,7 +192,7 @@ def _column(hint: Any) -> Column:
         columns = [part for part in arguments if isinstance(part, Column)]
         return columns[0] if columns else _column(arguments[0])
     if get_origin(hint) is Literal:
-        return one_of(*arguments)
+        return _choice({text: text for text in arguments})
     if type(None) in arguments:
         return or_empty(_column(arguments[0]))
     return _BY_TYPE[hint]

@@ -102,9 +102,9 @@ def named(path: Path | str, line: int | None = None) -> Iterator[None]:
 
 def has_control_characters(text: str) -> bool:
     """True for a text with characters that no name or line should have (NUL, tab, ...)."""
-    if text.isprintable():
-        return False
-    return any(ord(c) < 32 or ord(c) == 127 or 0xD800 <= ord(c) <= 0xDFFF for c in text)
+    return not text.isprintable() and any(
+        ord(c) < 32 or ord(c) == 127 or 0xD800 <= ord(c) <= 0xDFFF for c in text
+    )
 
 
 @lru_cache(maxsize=1 << 12)  # the text alone decides, and the same names come in a row

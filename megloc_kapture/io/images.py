@@ -167,13 +167,14 @@ def _encoded(path: Path, image: NDArray[np.uint8], jpeg_quality: int) -> bytes:
 def check_image_file(path: Path) -> None:
     """Raise DataError where there is no plain file; its content is not looked at."""
     try:
-        present, plain = path.exists(), path.is_file()
+        if path.is_file():
+            return
+        present = path.exists()
     except OSError as error:
         raise DataError(f"cannot read: {error.strerror}", path=path) from error
-    if not present:
-        raise DataError("no such image", path=path)
-    if not plain:  # reading a pipe or a device might never end
-        raise DataError("not an image but a folder, pipe or device", path=path)
+    # reading a pipe or a device might never end
+    problem = "not an image but a folder, pipe or device" if present else "no such image"
+    raise DataError(problem, path=path)
 
 
 def _check_complete(path: Path | str | None, content: bytes) -> None:

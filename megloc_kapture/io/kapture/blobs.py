@@ -91,8 +91,13 @@ class FolderBlobs:
             if descriptor is None:
                 continue
             try:
-                for k, _ in group:
-                    sizes[k] = self._read_row(descriptor, names[k], rows[k].data)
+                for k, name in group:
+                    size = _read_file_row(descriptor, name.rpartition("/")[2], rows[k].data)
+                    if size is None:  # a link: where it leads to is checked
+                        size = self.size(name) if name in self else -1
+                        if size == rows.shape[1]:
+                            rows[k].data[:] = self.read(name)
+                    sizes[k] = size
             except OSError as error:
                 raise _unreadable(self._folder / above, error) from error
             finally:
@@ -101,14 +106,6 @@ class FolderBlobs:
 
     def where(self, name: str) -> str:
         return str(self._folder / name)
-
-    def _read_row(self, folder: int, name: str, row: memoryview) -> int:
-        size = _read_file_row(folder, name.rpartition("/")[2], row)
-        if size is None:  # a link: where it leads to is checked
-            size = self.size(name) if name in self else -1
-            if size == len(row):
-                row[:] = self.read(name)
-        return size
 
     def _open_folder(self, relative: str) -> int | None:
         path = check_no_escape(self._roots, self._folder / relative)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.kapture.text import parse_float
@@ -61,6 +62,9 @@ class Sensor:
         return cls(name, sensor_type, params + tuple(_shortest(p) for p in camera.params))
 
 
+_INDEX: dict[str, Any] = {"default_factory": dict, "init": False, "repr": False, "compare": False}
+
+
 @dataclass
 class KaptureData:
     """Sensors, rigs, trajectories and image records of one kapture.
@@ -81,12 +85,8 @@ class KaptureData:
     trajectories: dict[tuple[int, str], RigidTransform] = field(default_factory=dict)
     records_camera: dict[tuple[int, str], str] = field(default_factory=dict)
     records_depth: dict[tuple[int, str], str] = field(default_factory=dict)
-    _record_by_image: dict[str, tuple[int, str]] | None = field(
-        default=None, init=False, repr=False, compare=False
-    )
-    _rigs_of: dict[str, list[str]] | None = field(
-        default=None, init=False, repr=False, compare=False
-    )
+    _record_by_image: dict[str, tuple[int, str]] = field(**_INDEX)
+    _rigs_of: dict[str, list[str]] = field(**_INDEX)
     _num_rigs: int = field(default=0, init=False, repr=False, compare=False)
 
     def image_names(self) -> list[str]:
@@ -99,12 +99,12 @@ class KaptureData:
         Raises DataError: no such image, or two records of that name.
         """
         index = self._record_by_image
-        key = None if index is None else index.get(image)
+        key = index.get(image)
         # the entry proves itself; the index is built again after any change that matters
         if (
-            index is None
+            key is None
             or len(index) != len(self.records_camera)
-            or (key is None or self.records_camera.get(key) != image)
+            or self.records_camera.get(key) != image
         ):
             index = {}
             for record, name in self.records_camera.items():
@@ -162,7 +162,7 @@ class KaptureData:
         return None
 
     def _parents(self) -> dict[str, list[str]]:
-        if self._rigs_of is None or self._num_rigs != len(self.rigs):
+        if self._num_rigs != len(self.rigs):
             self._rigs_of = {}
             self._num_rigs = len(self.rigs)
             for rig_id in sorted(self.rigs):

@@ -11,9 +11,10 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
+from typing import Any
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.files import (
@@ -38,12 +39,6 @@ from megloc_kapture.io.kapture.text import (
 )
 from megloc_kapture.values import RigidTransform
 
-SENSORS_HEADER = "# sensor_id, name, sensor_type, [sensor_params]+"
-RIGS_HEADER = "# rig_id, sensor_id, qw, qx, qy, qz, tx, ty, tz"
-TRAJECTORIES_HEADER = "# timestamp, device_id, qw, qx, qy, qz, tx, ty, tz"
-RECORDS_CAMERA_HEADER = "# timestamp, device_id, image_path"
-RECORDS_DEPTH_HEADER = "# timestamp, device_id, depth_map_path"
-
 # |q| may be off by this much (texts with few digits), and is then normalised
 MAX_QUATERNION_ERROR = 1e-3
 # below this |q| is one up to rounding: normalising again would only change the last bits
@@ -66,23 +61,23 @@ def read_kapture_data(root: Path, *, allow_links_below: Sequence[Path] = ()) -> 
     """
     if not root.is_dir():
         raise DataError("no such kapture folder", path=root)
-    folder, roots = root / "sensors", (root, *allow_links_below)
+    roots = (root, *allow_links_below)
 
-    def present(name: str) -> Path | None:
-        path = folder / name
-        return check_no_escape(roots, path) if path.exists() or path.is_symlink() else None
+    def read(name: str, reader: Callable[..., dict[Any, Any]], *known: Any) -> dict[Any, Any]:
+        path = root / "sensors" / name
+        if not (path.exists() or path.is_symlink() or name == "sensors.txt"):
+            return {}
+        return reader(check_no_escape(roots, path), *known)
 
-    data = KaptureData()
-    data.sensors = read_sensors(check_no_escape(roots, folder / "sensors.txt"))
-    if path := present("rigs.txt"):
-        data.rigs = read_rigs(path, data.sensors)
-    if path := present("trajectories.txt"):
-        data.trajectories = read_trajectories(path, {*data.sensors, *data.rigs})
-    if path := present("records_camera.txt"):
-        data.records_camera = read_records(path, data.sensors, "camera")
-    if path := present("records_depth.txt"):
-        data.records_depth = read_records(path, data.sensors, "depth")
-    return data
+    sensors = read("sensors.txt", read_sensors)
+    rigs = read("rigs.txt", read_rigs, sensors)
+    return KaptureData(
+        sensors,
+        rigs,
+        read("trajectories.txt", read_trajectories, {*sensors, *rigs}),
+        read("records_camera.txt", read_records, sensors, "camera"),
+        read("records_depth.txt", read_records, sensors, "depth"),
+    )
 
 
 def read_sensors(path: Path) -> dict[str, Sensor]:
@@ -259,17 +254,18 @@ def write_sensors(root: Path, data: KaptureData) -> None:
     """
     root = Path(root)
     folder = check_output(root, root / "sensors")
+    pose = "qw, qx, qy, qz, tx, ty, tz"
     tables = {
-        "sensors.txt": (SENSORS_HEADER, _sensor_rows(data)),
-        "rigs.txt": (RIGS_HEADER, _rig_rows(data)),
-        "trajectories.txt": (TRAJECTORIES_HEADER, _trajectory_rows(data)),
-        "records_camera.txt": (RECORDS_CAMERA_HEADER, _record_rows(data, "camera")),
-        "records_depth.txt": (RECORDS_DEPTH_HEADER, _record_rows(data, "depth")),
+        "sensors": ("sensor_id, name, sensor_type, [sensor_params]+", _sensor_rows(data)),
+        "rigs": (f"rig_id, sensor_id, {pose}", _rig_rows(data)),
+        "trajectories": (f"timestamp, device_id, {pose}", _trajectory_rows(data)),
+        "records_camera": ("timestamp, device_id, image_path", _record_rows(data, "camera")),
+        "records_depth": ("timestamp, device_id, depth_map_path", _record_rows(data, "depth")),
     }
     for name, (header, rows) in tables.items():
-        path = folder / name
-        if rows or name == "sensors.txt":
-            write_bytes(path, format_table(header, rows))
+        path = folder / f"{name}.txt"
+        if rows or name == "sensors":
+            write_bytes(path, format_table(f"# {header}", rows))
         else:
             try:
                 path.unlink(missing_ok=True)
