@@ -25,8 +25,8 @@ from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.report.renderers import REPORT_HTML
 from megloc_kapture.evaluation.report.reports import RECALL_JSON
 from megloc_kapture.io.colmap_mapping import Mapper
+from megloc_kapture.io.images import guessed_camera, photo_of, read_photo, turned_upright
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.io.photos import guessed_camera, photo_of, read_photo, turned_upright
 from megloc_kapture.pipeline.colmap_maps import kapture_of
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation, plan_map
 from megloc_kapture.pipeline.executors import open_executor, single_threaded

@@ -121,7 +121,7 @@ class Camera:
         ------
         DataError : missing, or not an image.
         """
-        from megloc_kapture.io.photos import read_photo
+        from megloc_kapture.io.images import read_photo
 
         return read_photo(path).camera
 

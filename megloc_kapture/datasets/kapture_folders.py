@@ -34,10 +34,9 @@ from megloc_kapture.io.dataset_tables import (
     write_relocalization,
     write_world,
 )
-from megloc_kapture.io.files import link_images, output_error
+from megloc_kapture.io.files import check_relative, link_images, output_error
 from megloc_kapture.io.images import image_size
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
-from megloc_kapture.io.paths import check_relative
 from megloc_kapture.values import Camera, RigidTransform
 
 MAPPING, QUERY, QUERY_GT = "mapping", "query", "query_gt"

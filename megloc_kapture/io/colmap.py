@@ -7,7 +7,7 @@ import tempfile
 import zlib  # noqa: F401  pycolmap 4.1.1 to 4.2.1 corrupt the heap when imported before zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from shutil import disk_usage
 from typing import TYPE_CHECKING, Any
@@ -88,14 +88,6 @@ def quiet_stderr() -> Iterator[None]:
         os.close(null)
 
 
-def _rigid3d(transform: RigidTransform) -> Any:
-    pycolmap = load_pycolmap()
-    w, x, y, z = transform.quat_wxyz
-    return pycolmap.Rigid3d(
-        pycolmap.Rotation3d(np.array([x, y, z, w])), np.array(transform.translation)
-    )
-
-
 def triangulate(
     images: Sequence[MapImage],
     matches: Mapping[tuple[int, int], NDArray[np.integer[Any]]],
@@ -143,7 +135,9 @@ def triangulate(
         cameras, camera_ids = _cameras_of(images)
         named = [(i.name, k, i.keypoints_px) for i, k in zip(images, camera_ids, strict=True)]
         write_database(database_path, cameras, named, matches)
-        reconstruction = _posed_reconstruction(cameras, camera_ids, images, offset)
+        recentre = RigidTransform((1.0, 0.0, 0.0, 0.0), (offset[0], offset[1], offset[2]))
+        recentred = [replace(i, cam_from_world=i.cam_from_world @ recentre) for i in images]
+        reconstruction = _posed_reconstruction(recentred, cameras, camera_ids)
         pipeline = pycolmap.IncrementalPipelineOptions()
         pipeline.num_threads = num_threads
         # with many residuals its threads add them up in whatever order they come: other last bits
@@ -172,9 +166,7 @@ def database_folder(
 ) -> Iterator[str]:
     """A folder for a database; with too little room COLMAP would end the process, so it is asked.
 
-    Raises
-    ------
-    OutputError : too little room, or COLMAP could not write.
+    Raises OutputError: too little room, or COLMAP could not write.
     """
     place = tempfile.gettempdir() if scratch is None else scratch
     # matches are written twice, keypoints as float32; the rest is what SQLite and its journal take
@@ -206,10 +198,9 @@ def _cameras_of(images: Sequence[MapImage]) -> tuple[list[Any], list[int]]:
 
 def numbered_cameras(cameras: Iterable[Camera]) -> list[Any]:
     """COLMAP's cameras, numbered from 1 on."""
-    found = []
-    for camera_id, camera in enumerate(cameras, start=1):
-        found.append(new_colmap_camera(camera))
-        found[-1].camera_id = camera_id
+    found = [new_colmap_camera(camera) for camera in cameras]
+    for camera_id, camera in enumerate(found, start=1):
+        camera.camera_id = camera_id
     return found
 
 
@@ -253,60 +244,50 @@ def write_database(
                 continue
             rows = np.ascontiguousarray(pairs, dtype=np.uint32)
             database.write_matches(i + 1, j + 1, rows)
-            found = _verified_geometry(rows) if geometry is None else geometry(i, j, rows)
+            if geometry is None:
+                found = pycolmap.TwoViewGeometry()
+                found.inlier_matches = rows
+                # left UNDEFINED, pycolmap 4.2 triangulates nothing, silently
+                found.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+            else:
+                found = geometry(i, j, rows)
             database.write_two_view_geometry(i + 1, j + 1, found)
     database.close()
 
 
-def _verified_geometry(rows: NDArray[np.uint32]) -> Any:
-    pycolmap = load_pycolmap()
-    geometry = pycolmap.TwoViewGeometry()
-    geometry.inlier_matches = rows
-    # left UNDEFINED, pycolmap 4.2 triangulates nothing, silently
-    geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
-    return geometry
-
-
 def _posed_reconstruction(
-    cameras: Sequence[Any],
-    camera_ids: Sequence[int],
-    images: Sequence[MapImage],
-    offset: NDArray[np.float64],
+    images: Sequence[MapImage], cameras: Sequence[Any], camera_ids: Sequence[int]
 ) -> Any:
-    """The reconstruction of the poses, without points."""
+    """The reconstruction of the poses, without points; images are numbered from 1 on."""
     pycolmap = load_pycolmap()
     reconstruction = pycolmap.Reconstruction()
-    recentre = RigidTransform((1.0, 0.0, 0.0, 0.0), (offset[0], offset[1], offset[2]))
     for camera in cameras:
         reconstruction.add_camera_with_trivial_rig(camera)
     for image_id, (image, camera_id) in enumerate(zip(images, camera_ids, strict=True), start=1):
+        keypoints = np.ascontiguousarray(image.keypoints_px[:, :2], dtype=np.float64)
         entry = pycolmap.Image(
-            image_id=image_id,
-            name=image.name,
-            camera_id=camera_id,
-            keypoints=np.ascontiguousarray(image.keypoints_px[:, :2], dtype=np.float64),
+            image_id=image_id, name=image.name, camera_id=camera_id, keypoints=keypoints
         )
-        reconstruction.add_image_with_trivial_frame(
-            entry, _rigid3d(image.cam_from_world @ recentre)
-        )
+        w, x, y, z = image.cam_from_world.quat_wxyz
+        rotation = pycolmap.Rotation3d(np.array([x, y, z, w]))
+        pose = pycolmap.Rigid3d(rotation, np.array(image.cam_from_world.translation))
+        reconstruction.add_image_with_trivial_frame(entry, pose)
     return reconstruction
 
 
 def _collect(reconstruction: Any, offset: NDArray[np.float64]) -> TriangulatedPoints:
-    xyz, errors, rows = [], [], []
-    for point in (reconstruction.points3D[i] for i in sorted(reconstruction.points3D)):
-        track = sorted((e.image_id - 1, e.point2D_idx) for e in point.track.elements)
-        rows.append(track)
-        xyz.append(point.xyz)
-        errors.append(point.error)
     # COLMAP numbers points in an order that depends on its threads; order them by their tracks
-    order = sorted(range(len(rows)), key=lambda k: rows[k])
-    lengths = np.array([len(rows[k]) for k in order], dtype=np.int64)
-    flat = np.array([e for k in order for e in rows[k]], dtype=np.int64).reshape(-1, 2)
+    found = [
+        (sorted((e.image_id - 1, e.point2D_idx) for e in point.track.elements), point)
+        for _, point in sorted(reconstruction.points3D.items())
+    ]
+    found.sort(key=lambda pair: pair[0])
+    lengths = np.array([len(track) for track, _ in found], dtype=np.int64)
+    flat = np.array([e for track, _ in found for e in track], dtype=np.int64).reshape(-1, 2)
     return TriangulatedPoints(
-        xyz=np.array([xyz[k] for k in order], dtype=np.float64).reshape(-1, 3) + offset,
-        errors_px=np.array([errors[k] for k in order], dtype=np.float64),
-        point_ids=np.repeat(np.arange(len(order), dtype=np.int64), lengths),
+        xyz=np.array([p.xyz for _, p in found], dtype=np.float64).reshape(-1, 3) + offset,
+        errors_px=np.array([p.error for _, p in found], dtype=np.float64),
+        point_ids=np.repeat(np.arange(len(found), dtype=np.int64), lengths),
         image_ids=flat[:, 0],
         keypoint_ids=flat[:, 1],
     )
@@ -333,20 +314,9 @@ def write_model(
     OutputError : the folder cannot be written to.
     """
     pycolmap = load_pycolmap()
-    model = pycolmap.Reconstruction()
-    camera_ids: dict[Camera, int] = {}
+    model = _posed_reconstruction(images, *_cameras_of(images))
     tracks: list[list[Any]] = [[] for _ in xyz]
-    for number, (image, (rows, points)) in enumerate(zip(images, observed, strict=True), start=1):
-        if image.camera not in camera_ids:
-            camera = new_colmap_camera(image.camera)
-            camera.camera_id = camera_ids[image.camera] = len(camera_ids) + 1
-            model.add_camera_with_trivial_rig(camera)
-        keypoints = np.ascontiguousarray(image.keypoints_px[:, :2], dtype=np.float64)
-        camera_id = camera_ids[image.camera]
-        entry = pycolmap.Image(
-            image_id=number, name=image.name, camera_id=camera_id, keypoints=keypoints
-        )
-        model.add_image_with_trivial_frame(entry, _rigid3d(image.cam_from_world))
+    for number, (rows, points) in enumerate(observed, start=1):
         for row, point in zip(rows.tolist(), points.tolist(), strict=True):
             tracks[point].append(pycolmap.TrackElement(number, row))
     rgb = np.clip(np.rint(colours), 0, 255).astype(np.uint8)
@@ -409,9 +379,7 @@ class DatabaseFeatures:
 def write_feature_database(path: Path, images: Iterable[DatabaseFeatures]) -> None:
     """Write COLMAP's database of images with SIFT features; equal cameras are one.
 
-    Raises
-    ------
-    OutputError : ``path`` is there already, or cannot be written.
+    Raises OutputError: ``path`` is there already, or cannot be written.
     """
     pycolmap = load_pycolmap()
     path = Path(path)

@@ -100,13 +100,11 @@ def focal_from_matches(
 ) -> float | None:
     """Focal length in pixels of a camera of which the rest is known: P4Pf in a RANSAC.
 
+    None where no pose agrees with enough matches.
+
     Parameters
     ----------
     points_px, points : (N, 2) and (N, 3), matched; not finite ones count as none.
-
-    Returns
-    -------
-    None where no pose agrees with enough matches.
     """
     usable = np.isfinite(points_px).all(axis=1) & np.isfinite(points).all(axis=1)
     if np.count_nonzero(usable) < 4:

@@ -2,24 +2,36 @@
 
 Comma separated, UTF-8, a header row that names the columns, fields quoted where they hold a comma,
 a quote or a line end. A reader takes the columns in any order, so that a table edited by hand in a
-spreadsheet still reads. A :class:`Table` joins a record type with its columns; what is wrong with a
-file is told by file, line, column and what was expected.
+spreadsheet still reads. A :class:`Table` takes its columns from the annotations of a record type.
+
+Readers raise DataError, which names file, line, column and what was expected; writers OutputError
+where the file cannot be written.
 """
 
 from __future__ import annotations
 
 import csv
+import inspect
 import io
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import (
+    Annotated,
+    Any,
+    Generic,
+    Literal,
+    NamedTuple,
+    TypeVar,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from pydantic import ValidationError
 
 from megloc_kapture.errors import DataError, OutputError
-from megloc_kapture.io.files import first_problem, read_text, write_bytes
-from megloc_kapture.io.paths import check_relative
+from megloc_kapture.io.files import check_relative, first_problem, named, read_text, write_bytes
 from megloc_kapture.values import RigidTransform
 
 RowT = TypeVar("RowT")
@@ -35,32 +47,20 @@ def read_csv_table(
     ``line`` is the 1-based line on which the row ends. Empty lines are passed over. Those of the
     columns that are ``optional`` may be absent, and are in no row then.
 
-    Raises
-    ------
-    DataError : the file cannot be read, its header is not made of ``columns``, a row has too many
-        or too few fields, or a quote is left open; names file and line.
+    Raises DataError: the file cannot be read, its header is not made of ``columns``, a row has too
+    many or too few fields, or a quote is left open; names file and line.
     """
     reader = csv.reader(io.StringIO(read_text(path, _MAX_BYTES), newline=""), strict=True)
     header: list[str] | None = None
     try:
-        for fields in reader:
-            if not fields:
-                continue
-            problem = None
-            if header is None:
-                header = fields
-                needed = set(columns).difference(optional)
-                unique = len(set(header)) == len(header)
-                if unique and needed <= set(header) <= set(columns):
+        for fields in filter(None, reader):
+            with named(path, reader.line_num):
+                if header is None:
+                    header = fields
+                    _check_header(header, columns, optional)
                     continue
-                problem = (
-                    f"the header must name the columns {','.join(columns)}; "
-                    f"it reads {' '.join(','.join(header).split())}"
-                )
-            elif len(fields) != len(header):
-                problem = f"{len(fields)} fields where the header names {len(header)}"
-            if problem:
-                raise DataError(problem, path=path, line=reader.line_num)
+                if len(fields) != len(header):
+                    raise DataError(f"{len(fields)} fields where the header names {len(header)}")
             yield reader.line_num, dict(zip(header, fields, strict=True))
     except csv.Error as error:
         raise DataError(f"broken CSV: {error}", path=path, line=reader.line_num) from error
@@ -68,14 +68,22 @@ def read_csv_table(
         raise DataError(f"empty; expected the header {','.join(columns)}", path=path)
 
 
+def _check_header(header: list[str], columns: Sequence[str], optional: Sequence[str]) -> None:
+    needed = set(columns).difference(optional)
+    if len(set(header)) != len(header) or not needed <= set(header) <= set(columns):
+        raise DataError(
+            f"the header must name the columns {','.join(columns)}; "
+            f"it reads {' '.join(','.join(header).split())}"
+        )
+
+
 def write_csv_table(
     path: Path | str, columns: Sequence[str], rows: Iterable[Sequence[str]]
 ) -> None:
     """Write header and rows, atomically, with ``\\n`` line ends.
 
-    Raises
-    ------
-    OutputError : the file cannot be written, or a field is longer than a CSV reader takes.
+    Raises OutputError where the file cannot be written, or a field is longer than a CSV reader
+    takes.
     """
     longest = csv.field_size_limit()
     lines = [",".join(columns)]
@@ -97,6 +105,9 @@ def _quoted(field: str) -> str:
     return field
 
 
+# ------------------------------------------------------------------------------------ columns
+
+
 class Column(NamedTuple):
     """The text of one field of a record; ``read`` raises ValueError where a cell is no such."""
 
@@ -105,13 +116,96 @@ class Column(NamedTuple):
     write: Callable[[Any], str] = str
 
 
+def _count(text: str) -> int:
+    if not text.isdecimal():
+        raise ValueError
+    return int(text)
+
+
+def _pose(text: str) -> RigidTransform:
+    w, x, y, z, a, b, c = (float(value) for value in text.split(" "))
+    if not math.isfinite(a + b + c) or not abs(math.hypot(w, x, y, z) - 1.0) < _MAX_UNIT_ERROR:
+        raise ValueError
+    return RigidTransform((w, x, y, z), (a, b, c))
+
+
+def _pose_text(pose: RigidTransform) -> str:
+    """Quaternion, w first, and translation; every digit, so that it reads back the same."""
+    return " ".join(repr(float(value)) for value in (*pose.quat_wxyz, *pose.translation))
+
+
+def flag(yes: str, no: str) -> Column:
+    """A bool by its two texts."""
+    return _choice({no: False, yes: True}, lambda value: yes if value else no)
+
+
+def _choice(values: Mapping[str, Any], write: Callable[[Any], str] = str) -> Column:
+    def read(text: str) -> Any:
+        if text not in values:
+            raise ValueError
+        return values[text]
+
+    return Column(" or ".join(values), read, write)
+
+
+def list_of(separator: str) -> Column:
+    """A tuple of texts in one cell, which must not hold the separator."""
+    return Column(
+        f"a list separated by {separator!r}",
+        lambda text: tuple(text.split(separator)) if text else (),
+        separator.join,
+    )
+
+
+def number(format_spec: str) -> Column:
+    """A float, written as the format says."""
+    return Column("a number", float, lambda value: format(value, format_spec))
+
+
+def or_empty(column: Column, empty: Any = None) -> Column:
+    """The same, or nothing: an empty cell stands for ``empty`` (None or NaN)."""
+    return Column(
+        f"{column.expected}, or empty",
+        lambda text: column.read(text) if text else empty,
+        lambda value: "" if value is None or value != value else column.write(value),
+    )
+
+
+TEXT = Column("text")
+POSE = Column(
+    "a pose qw qx qy qz tx ty tz: a unit quaternion and finite numbers", _pose, _pose_text
+)
+ImageName = Annotated[str, Column("a plain relative path", check_relative, check_relative)]
+_BY_TYPE: dict[Any, Column] = {
+    str: TEXT,
+    int: Column("a whole number from 0 on", _count),
+    # the comma is the one character that kapture allows in no image name
+    tuple[str, ...]: list_of(","),
+    RigidTransform: POSE,
+}
+
+
+def _column(hint: Any) -> Column:
+    """The column that stands in the annotation of a field, else that of its type."""
+    arguments = get_args(hint)
+    if get_origin(hint) is Annotated:
+        columns = [part for part in arguments if isinstance(part, Column)]
+        return columns[0] if columns else _column(arguments[0])
+    if get_origin(hint) is Literal:
+        return _choice({text: text for text in arguments})
+    if type(None) in arguments:
+        return or_empty(_column(arguments[0]))
+    return _BY_TYPE[hint]
+
+
 class Table(Generic[RowT]):
     """A CSV table whose rows are records of one type.
 
     Parameters
     ----------
     row : makes a record of the values by column: a dataclass, a named tuple or a pydantic model.
-    columns : by the name of the column, which is that of the record's attribute.
+    columns : by the name of the column, which is that of the record's attribute; without them a
+        field's column is in its annotation, or follows from its type.
     keys : groups of columns; no two rows may have the same in all columns of one.
     later : columns that older files lack; the record's own defaults stand for them.
     """
@@ -119,36 +213,38 @@ class Table(Generic[RowT]):
     def __init__(
         self,
         row: Callable[..., RowT],
-        columns: Mapping[str, Column],
+        columns: Mapping[str, Column] | None = None,
         *,
         keys: Sequence[tuple[str, ...]] = (),
         later: Sequence[str] = (),
     ) -> None:
-        self._row, self._columns, self._keys, self._later = row, columns, keys, later
+        self._row, self._keys, self._later = row, keys, later
+        if columns is None:
+            hints = get_type_hints(row, include_extras=True)
+            columns = {name: _column(hints[name]) for name in inspect.signature(row).parameters}
+        self._columns = columns
 
-    def read(self, path: Path | str) -> Iterator[RowT]:
+    def read(self, path: Path | str) -> list[RowT]:
         """The records of a file, in its order.
 
-        Raises
-        ------
-        DataError : absent or broken table, a value that is not of its kind, a key given twice;
-            names file, line and column.
+        Raises DataError: absent or broken table, a value that is not of its kind, a key given
+        twice; names file, line and column.
         """
         known: set[tuple[tuple[str, ...], ...]] = set()
+        rows = []
         for line, cells in read_csv_table(path, tuple(self._columns), optional=self._later):
-            try:
-                row = self._row(**{name: self._value(name, text) for name, text in cells.items()})
+            with named(path, line):
+                values = {name: self._value(name, text) for name, text in cells.items()}
+                try:
+                    rows.append(self._row(**values))
+                except ValidationError as error:
+                    raise DataError(first_problem(error)) from error
                 self._check_keys(cells, known)
-            except ValidationError as error:
-                raise DataError(first_problem(error), path=path, line=line) from error
-            except DataError as error:
-                raise DataError(error.message, path=path, line=line) from error
-            yield row
+        return rows
 
-    def read_if_there(self, path: Path) -> Iterator[RowT]:
+    def read_if_there(self, path: Path) -> list[RowT]:
         """The records of a file, none of one that is absent; see :meth:`read`."""
-        if path.exists():
-            yield from self.read(path)
+        return self.read(path) if path.exists() else []
 
     def write(self, path: Path | str, rows: Iterable[RowT]) -> None:
         """Write the records in the order given.
@@ -178,82 +274,7 @@ class Table(Generic[RowT]):
             known.add((key, value))
 
     def _value(self, name: str, text: str) -> Any:
-        column = self._columns[name]
         try:
-            return column.read(text)
+            return self._columns[name].read(text)
         except ValueError as error:
-            raise DataError(f"{name} {text!r} is not {column.expected}") from error
-
-
-def _count(text: str) -> int:
-    if not text.isdecimal():
-        raise ValueError
-    return int(text)
-
-
-def _pose(text: str) -> RigidTransform:
-    w, x, y, z, a, b, c = (float(value) for value in text.split(" "))
-    if not math.isfinite(a + b + c) or not abs(math.hypot(w, x, y, z) - 1.0) < _MAX_UNIT_ERROR:
-        raise ValueError
-    return RigidTransform((w, x, y, z), (a, b, c))
-
-
-def _pose_text(pose: RigidTransform) -> str:
-    """Quaternion, w first, and translation; every digit, so that it reads back the same."""
-    return " ".join(repr(float(value)) for value in (*pose.quat_wxyz, *pose.translation))
-
-
-def flag(yes: str, no: str) -> Column:
-    """A bool by its two texts."""
-
-    def read(text: str) -> bool:
-        if text not in (yes, no):
-            raise ValueError
-        return text == yes
-
-    return Column(f"{no} or {yes}", read, lambda value: yes if value else no)
-
-
-def one_of(*texts: str) -> Column:
-    """One of some texts."""
-
-    def read(text: str) -> str:
-        if text not in texts:
-            raise ValueError
-        return text
-
-    return Column(" or ".join(texts), read)
-
-
-def list_of(separator: str) -> Column:
-    """A tuple of texts in one cell, which must not hold the separator."""
-    return Column(
-        f"a list separated by {separator!r}",
-        lambda text: tuple(text.split(separator)) if text else (),
-        separator.join,
-    )
-
-
-def number(format_spec: str) -> Column:
-    """A float, written as the format says."""
-    return Column("a number", float, lambda value: format(value, format_spec))
-
-
-def or_empty(column: Column, empty: Any = None) -> Column:
-    """The same, or nothing: an empty cell stands for ``empty`` (None or NaN)."""
-    return Column(
-        f"{column.expected}, or empty",
-        lambda text: column.read(text) if text else empty,
-        lambda value: "" if value is None or value != value else column.write(value),
-    )
-
-
-TEXT = Column("text")
-IMAGE = Column("a plain relative path", check_relative, check_relative)
-COUNT = Column("a whole number from 0 on", _count)
-ZERO_ONE, YES_NO = flag("1", "0"), flag("yes", "no")
-# the comma is the one character that kapture allows in no image name
-IMAGES = list_of(",")
-POSE = Column(
-    "a pose qw qx qy qz tx ty tz: a unit quaternion and finite numbers", _pose, _pose_text
-)
+            raise DataError(f"{name} {text!r} is not {self._columns[name].expected}") from error

@@ -26,21 +26,24 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.csv_table import IMAGE, TEXT, ZERO_ONE, Column, Table
+from megloc_kapture.io.csv_table import Column, ImageName, Table, flag
 from megloc_kapture.io.files import (
+    ModelT,
+    check_no_escape,
     check_plain,
+    check_relative,
+    named,
     read_json_model,
     read_text,
     write_bytes,
     write_json_model,
 )
-from megloc_kapture.io.paths import check_no_escape, check_relative
 from megloc_kapture.values import Options, RigidTransform
 
 SIDE_TABLES = "megloc"
@@ -104,6 +107,10 @@ class SimilarityTransform(Options):
             raise ValueError("translation must be finite")
         return translation
 
+    def rotation(self) -> RigidTransform:
+        """The rotation alone."""
+        return RigidTransform(self.quat_wxyz, (0.0, 0.0, 0.0))
+
 
 class World(Options):
     """The frame the workspace works in, and the way back to the dataset's official one.
@@ -123,7 +130,7 @@ class World(Options):
     def pose_in_official(self, cam_from_local: RigidTransform) -> RigidTransform:
         """``cam_from_official`` of a ``cam_from_local``; lengths become the official ones."""
         similarity = self.official_from_local
-        local_from_official = RigidTransform(similarity.quat_wxyz, (0.0, 0.0, 0.0)).inverse()
+        local_from_official = similarity.rotation().inverse()
         rotation = RigidTransform(cam_from_local.quat_wxyz, (0.0, 0.0, 0.0)) @ local_from_official
         scaled = similarity.scale * np.array(cam_from_local.translation)
         t = scaled - rotation.rotation_matrix() @ np.array(similarity.translation)
@@ -132,10 +139,10 @@ class World(Options):
     def pose_in_local(self, cam_from_official: RigidTransform) -> RigidTransform:
         """``cam_from_local`` of a ``cam_from_official``; undoes :meth:`pose_in_official`."""
         similarity = self.official_from_local
-        rotation_only = RigidTransform(similarity.quat_wxyz, (0.0, 0.0, 0.0))
         offset = cam_from_official.rotation_matrix() @ np.array(similarity.translation)
         t = (np.array(cam_from_official.translation) + offset) / similarity.scale
-        rotation = RigidTransform(cam_from_official.quat_wxyz, (0.0, 0.0, 0.0)) @ rotation_only
+        rotation = RigidTransform(cam_from_official.quat_wxyz, (0.0, 0.0, 0.0))
+        rotation = rotation @ similarity.rotation()
         return RigidTransform(rotation.quat_wxyz, (float(t[0]), float(t[1]), float(t[2])))
 
 
@@ -185,38 +192,6 @@ class Protocol(Options):
         return self
 
 
-class _GroupRow(NamedTuple):
-    image: str
-    condition: str
-    frame: str
-    location: str
-    scored: bool
-
-
-class _PriorRow(NamedTuple):
-    query: str
-    permitted: str
-
-
-class _NameRow(NamedTuple):
-    image: str
-    name: str
-
-
-class _UnreadableRow(NamedTuple):
-    image: str
-    reason: str
-
-
-@dataclass(frozen=True, slots=True)
-class RelocalizationPair:
-    """One row of an MLAD relocalization file: both images by their kapture names."""
-
-    file: str
-    reference: str
-    query: str
-
-
 def _word(text: str) -> str:
     if text.split() != [text]:
         raise DataError(f"a pose file cannot hold the name {text!r}")
@@ -229,29 +204,49 @@ def _not_empty(text: str) -> str:
     return text
 
 
-_GROUPS = Table(
-    _GroupRow,
-    {"image": IMAGE, "condition": TEXT, "frame": TEXT, "location": TEXT, "scored": ZERO_ONE},
-    keys=[("image",)],
-)
-_PRIORS = Table(
-    _PriorRow,
-    {"query": IMAGE, "permitted": Column("a group or an image", _not_empty)},
-    keys=[("query", "permitted")],
-)
-_NAMES = Table(
-    _NameRow, {"image": IMAGE, "name": Column("one word", _word)}, keys=[("image",), ("name",)]
-)
-_UNREADABLE = Table(_UnreadableRow, {"image": IMAGE, "reason": TEXT}, keys=[("image",)])
-_RELOCALIZATION = Table(RelocalizationPair, dict.fromkeys(("file", "reference", "query"), IMAGE))
+class _GroupRow(NamedTuple):
+    image: ImageName
+    condition: str
+    frame: str
+    location: str
+    scored: Annotated[bool, flag("1", "0")]
+
+
+class _PriorRow(NamedTuple):
+    query: ImageName
+    permitted: Annotated[str, Column("a group or an image", _not_empty)]
+
+
+class _NameRow(NamedTuple):
+    image: ImageName
+    name: Annotated[str, Column("one word", _word)]
+
+
+class _UnreadableRow(NamedTuple):
+    image: ImageName
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class RelocalizationPair:
+    """One row of an MLAD relocalization file: both images by their kapture names."""
+
+    file: ImageName
+    reference: ImageName
+    query: ImageName
+
+
+_GROUPS = Table(_GroupRow, keys=[("image",)])
+_PRIORS = Table(_PriorRow, keys=[("query", "permitted")])
+_NAMES = Table(_NameRow, keys=[("image",), ("name",)])
+_UNREADABLE = Table(_UnreadableRow, keys=[("image",)])
+_RELOCALIZATION = Table(RelocalizationPair)
 
 
 def table_path(folder: Path | str, name: str) -> Path:
     """The path of a table, which need not exist.
 
-    Raises
-    ------
-    DataError : a link that leaves the dataset, no plain file, or far larger than any such table.
+    Raises DataError: a link that leaves the dataset, no plain file, or larger than any such table.
     """
     path = check_no_escape(Path(folder).parent, Path(folder) / name)
     check_plain(path, _MAX_BYTES)
@@ -260,20 +255,16 @@ def table_path(folder: Path | str, name: str) -> Path:
 
 def read_groups(folder: Path | str) -> dict[str, ImageGroup]:
     """Read ``groups.csv``: image -> group, sorted by image."""
+    rows = sorted(_GROUPS.read_if_there(table_path(folder, GROUPS_FILE)))
     return {
-        row.image: ImageGroup(
-            condition=row.condition, frame=row.frame, location=row.location, scored=row.scored
-        )
-        for row in sorted(_GROUPS.read_if_there(table_path(folder, GROUPS_FILE)))
+        row.image: ImageGroup(**{name: getattr(row, name) for name in ImageGroup.model_fields})
+        for row in rows
     }
 
 
 def write_groups(folder: Path | str, groups: Mapping[str, ImageGroup]) -> None:
     """Write ``groups.csv``, sorted by image."""
-    rows = [
-        _GroupRow(image, g.condition, g.frame, g.location, g.scored)
-        for image, g in sorted(groups.items())
-    ]
+    rows = [_GroupRow(image, **group.model_dump()) for image, group in sorted(groups.items())]
     _GROUPS.write(Path(folder) / GROUPS_FILE, rows)
 
 
@@ -291,10 +282,7 @@ def read_priors(folder: Path | str) -> dict[str, tuple[str, ...]]:
 def write_priors(folder: Path | str, priors: Mapping[str, Sequence[str]]) -> None:
     """Write ``priors.csv``, sorted by query and permitted name.
 
-    Raises
-    ------
-    DataError : a query has nothing (or "") permitted: the table cannot say "nothing", and a reader
-        would take an absent row for "everything".
+    Raises DataError for a query with nothing (or "") permitted: an absent row is "everything".
     """
     for query, groups in priors.items():
         if not groups or not all(groups):
@@ -304,12 +292,7 @@ def write_priors(folder: Path | str, priors: Mapping[str, Sequence[str]]) -> Non
 
 
 def read_names(folder: Path | str) -> dict[str, str]:
-    """Read ``names.csv``: image -> its name in the pose file, in the table's order.
-
-    Raises
-    ------
-    DataError : broken table; an image or a name that is given twice, or holds white space.
-    """
+    """Read ``names.csv``: image -> its name in the pose file, in the table's order."""
     return dict(_NAMES.read_if_there(table_path(folder, NAMES_FILE)))
 
 
@@ -327,9 +310,8 @@ def write_unreadable(
     folder: Path | str, reasons: Mapping[str, str], name: str = UNREADABLE_FILE
 ) -> None:
     """Write ``unreadable.csv``, or another such table, sorted by image."""
-    _UNREADABLE.write(
-        Path(folder) / name, [_UnreadableRow(*row) for row in sorted(reasons.items())]
-    )
+    rows = [_UnreadableRow(*row) for row in sorted(reasons.items())]
+    _UNREADABLE.write(Path(folder) / name, rows)
 
 
 def tables_of(root: Path | str) -> Path | None:
@@ -355,7 +337,7 @@ def unit_of(root: Path | str) -> str:
 
 def read_relocalization(folder: Path | str) -> list[RelocalizationPair]:
     """Read ``relocalization.csv`` in its order."""
-    return list(_RELOCALIZATION.read_if_there(table_path(folder, RELOCALIZATION_FILE)))
+    return _RELOCALIZATION.read_if_there(table_path(folder, RELOCALIZATION_FILE))
 
 
 def write_relocalization(folder: Path | str, pairs: Iterable[RelocalizationPair]) -> None:
@@ -365,8 +347,7 @@ def write_relocalization(folder: Path | str, pairs: Iterable[RelocalizationPair]
 
 def read_world(folder: Path | str) -> World:
     """Read ``world.json``."""
-    path = table_path(folder, WORLD_FILE)
-    return read_json_model(path, World) if path.exists() else World()
+    return _read_model(folder, WORLD_FILE, World)
 
 
 def write_world(folder: Path | str, world: World) -> None:
@@ -376,8 +357,12 @@ def write_world(folder: Path | str, world: World) -> None:
 
 def read_protocol(folder: Path | str) -> Protocol:
     """Read ``protocol.json``."""
-    path = table_path(folder, PROTOCOL_FILE)
-    return read_json_model(path, Protocol) if path.exists() else Protocol()
+    return _read_model(folder, PROTOCOL_FILE, Protocol)
+
+
+def _read_model(folder: Path | str, name: str, model: type[ModelT]) -> ModelT:
+    path = table_path(folder, name)
+    return read_json_model(path, model) if path.exists() else model()
 
 
 def write_protocol(folder: Path | str, protocol: Protocol) -> None:
@@ -386,13 +371,9 @@ def write_protocol(folder: Path | str, protocol: Protocol) -> None:
 
 
 def read_nowhere(truth: Path | str) -> tuple[str, ...]:
-    """Queries of which the folder of the true poses says that they show nothing of the map.
+    """Queries that show nothing of the map, one a line in ``nowhere.txt`` beside the true poses.
 
-    They stand in its ``nowhere.txt``, one a line; without it there is none.
-
-    Raises
-    ------
-    DataError : the file cannot be read, or a name stands in it twice; names file and line.
+    Raises DataError: the file cannot be read, or a name stands in it twice; names file and line.
     """
     path = table_path(truth, NOWHERE_FILE)
     if not path.is_file():
@@ -402,12 +383,9 @@ def read_nowhere(truth: Path | str) -> tuple[str, ...]:
         name = text.strip()
         if not name or name.startswith("#"):
             continue
-        try:
-            check_relative(name)
-        except DataError as error:
-            raise DataError(error.message, path=path, line=line) from error
-        if name in names:
-            raise DataError(f"{name!r} stands on line {names[name]} as well", path=path, line=line)
+        with named(path, line):
+            if check_relative(name) in names:
+                raise DataError(f"{name!r} stands on line {names[name]} as well")
         names[name] = line
     return tuple(sorted(names))
 

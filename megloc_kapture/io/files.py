@@ -1,4 +1,7 @@
-"""Files: read whole, written atomically, linked, kept as JSON.
+"""Files: their paths checked, read whole, written atomically, linked, kept as JSON.
+
+Paths that data names (image names, type names and the like) come from files that somebody else
+wrote, and may only ever lead to something below the folder they belong to.
 
 A file is written beside its final path under a name that no reader lists and then renamed over it:
 a killed run or a full disk leaves the old state or the new one. There is no fsync: after a power
@@ -27,8 +30,11 @@ from pydantic import BaseModel, ValidationError
 from megloc_kapture.errors import DataError, OutputError
 
 _MAX_JSON_BYTES = 1 << 28
+_MAX_FOLDERS = 250  # Python makes a folder's parents one within the other
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
+# the folder that something was found in, and others that links in it may lead to
+Roots = Path | tuple[Path, ...]
 
 
 # ------------------------------------------------------------------------------------ reading
@@ -37,10 +43,8 @@ ModelT = TypeVar("ModelT", bound=BaseModel)
 def read_content(path: Path | str, max_bytes: int | None = None) -> bytes:
     """All bytes of a plain file.
 
-    Raises
-    ------
-    DataError : missing, not readable, larger than ``max_bytes``, or no plain file: reading a pipe
-        or a device might never end.
+    Raises DataError: missing, not readable, larger than ``max_bytes``, or no plain file: reading a
+    pipe or a device might never end.
     """
     path = Path(path)
     try:
@@ -67,10 +71,8 @@ def read_text(path: Path | str, max_bytes: int | None = None) -> str:
 
     Line ends are left as they are.
 
-    Raises
-    ------
-    DataError : see :func:`read_content`; or it is not UTF-8 or holds a NUL; names the file and the
-        line where the text breaks.
+    Raises DataError: see :func:`read_content`; or it is not UTF-8 or holds a NUL; names the file
+    and the line where the text breaks.
     """
     content = read_content(path, max_bytes)
     try:
@@ -82,6 +84,92 @@ def read_text(path: Path | str, max_bytes: int | None = None) -> str:
         line = text.count("\n", 0, text.index("\0")) + 1
         raise DataError("a NUL character in a text file", path=path, line=line)
     return text
+
+
+@contextlib.contextmanager
+def named(path: Path | str, line: int | None = None) -> Iterator[None]:
+    """A DataError of the block that names no file gets this one, and the line."""
+    try:
+        yield
+    except DataError as error:
+        if error.path is not None:
+            raise
+        raise DataError(error.message, path=path, line=line) from error.__cause__
+
+
+# ------------------------------------------------------------------------------------ paths
+
+
+def has_control_characters(text: str) -> bool:
+    """True for a text with characters that no name or line should have (NUL, tab, ...)."""
+    return not text.isprintable() and any(
+        ord(c) < 32 or ord(c) == 127 or 0xD800 <= ord(c) <= 0xDFFF for c in text
+    )
+
+
+@lru_cache(maxsize=1 << 12)  # the text alone decides, and the same names come in a row
+def check_relative(text: str) -> str:
+    """Return ``text`` if it is a plain relative path (``a/b.jpg``), else raise.
+
+    Raises DataError: empty, absolute, deeper than 250 folders, ``.`` or ``..`` or an empty
+    component, a backslash, or a control character (NUL included) in it. A ``.`` or empty component
+    is harmless, but would give one file two names, and names are identities in kapture.
+    """
+    if not text:
+        raise DataError("empty path")
+    if "\\" in text:
+        raise DataError(f"backslash in path {text!r}")
+    if has_control_characters(text):
+        raise DataError(f"control character in path {text!r}")
+    if text.count("/") > _MAX_FOLDERS:
+        raise DataError(f"path of {text.count('/')} folders: {text[:20]!r}...")
+    if text.startswith("/"):
+        raise DataError(f"absolute path {text!r}; it must be relative to its folder")
+    for component in text.split("/"):
+        if component == "..":
+            raise DataError(f"path {text!r} leads out of its folder ('..')")
+        if component in ("", "."):
+            raise DataError(f"path {text!r} has an empty or '.' component")
+    return text
+
+
+def check_component(text: str) -> str:
+    """Return ``text`` if it can be the name of one folder and one CSV field, as types have it.
+
+    Raises DataError: what :func:`check_relative` refuses, a slash, a comma, or a space at an end.
+    """
+    check_relative(text)
+    if "/" in text or "," in text or text != text.strip():
+        raise DataError(f"{text!r} cannot be a type name (slash, comma or space at the end)")
+    return text
+
+
+def safe_join(root: Path, relative_text: str) -> Path:
+    """``root / relative_text`` where :func:`check_relative` takes the text; it need not exist."""
+    return Path(root) / check_relative(relative_text)
+
+
+def check_no_escape(roots: Roots, path: Path) -> Path:
+    """Return ``path`` if it lies in one of the ``roots`` with all links followed, or DataError."""
+    roots = (roots,) if isinstance(roots, Path) else roots
+    real = os.path.realpath(path)
+    for root in roots:
+        real_root = os.path.realpath(root)
+        if real == real_root or real.startswith(real_root.rstrip(os.sep) + os.sep):
+            return path
+    raise DataError(
+        f"is or lies behind a link that leaves {roots[0]}, to {real}; images may be links to "
+        "anywhere, anything else only to below a folder that --allow-links-below names",
+        path=path,
+    )
+
+
+def check_output(root: Path, path: Path) -> Path:
+    """Return ``path`` if no link on the way leads out of ``root``, else raise OutputError."""
+    try:
+        return check_no_escape(root, path)
+    except DataError as error:
+        raise OutputError(f"{path}: not written: lies behind a link that leaves {root}") from error
 
 
 # -------------------------------------------------------------------------------- temporary names
@@ -120,8 +208,7 @@ def clear_leftovers(folder: Path) -> None:
 
 
 def clear_temporary(folder: Path) -> None:
-    """Remove what processes that died while they wrote have left below a folder; none may write
-    there any more. Raises OSError."""
+    """Remove unfinished files below a folder, which nothing may write to any more; OSError."""
     for path in list(Path(folder).rglob(".megloc-*.tmp")):
         remove(path)
 
@@ -160,9 +247,7 @@ def atomic_write(path: Path | str) -> Iterator[BinaryIO]:
     Missing parent folders are made. When the block raises, the temporary file is removed and
     ``path`` is as it was.
 
-    Raises
-    ------
-    OutputError : the file cannot be written (disk full, permission, ...); names ``path``.
+    Raises OutputError: the file cannot be written (disk full, permission, ...); names ``path``.
     """
     # plain text: a stage writes a file for each of its pairs, and a Path takes as long as writing
     folder = os.path.dirname(path)
@@ -180,15 +265,10 @@ def atomic_write(path: Path | str) -> Iterator[BinaryIO]:
                 os.unlink(temporary)
             raise
     except OSError as error:
-        if error.filename is not None and not _concerns(error, Path(path), Path(temporary)):
+        ours = {os.fspath(path), temporary, *map(os.fspath, Path(path).parents)}
+        if error.filename is not None and os.fspath(error.filename) not in ours:
             raise  # not from writing: the block met it while reading something else
         raise output_error(path, error) from error
-
-
-def _concerns(error: OSError, path: Path, temporary: Path) -> bool:
-    named = os.fspath(error.filename)
-    ours = {os.fspath(path), os.fspath(temporary), *map(os.fspath, path.parents)}
-    return named in ours
 
 
 def write_bytes(path: Path | str, content: bytes) -> None:
@@ -271,14 +351,16 @@ def _new_link(link: Path) -> Iterator[None]:
 def read_json_model(path: Path | str, model: type[ModelT]) -> ModelT:
     """Read one JSON file as ``model``.
 
-    Raises
-    ------
-    DataError : the file cannot be read, is not JSON (names the line; NaN and infinity are not
-        JSON), or does not fit the model (names the field).
+    Raises DataError: the file cannot be read, is not JSON (names the line; NaN and infinity are not
+    JSON), or does not fit the model (names the field).
     """
+
+    def refuse(name: str) -> NoReturn:
+        raise ValueError(f"{name} is not a number in JSON")
+
     text = read_text(path, _MAX_JSON_BYTES)
     try:
-        content = json.loads(text, parse_constant=_refuse_constant)
+        content = json.loads(text, parse_constant=refuse)
     except json.JSONDecodeError as error:
         raise DataError(f"not JSON: {error.msg}", path=path, line=error.lineno) from error
     except (ValueError, RecursionError) as error:
@@ -309,12 +391,7 @@ def write_json(path: Path | str, content: Any) -> None:
 def first_problem(error: ValidationError) -> str:
     """The first problem of a validation in one line: ``field: what is wrong``."""
     problem = error.errors(include_url=False)[0]
-    field = ".".join(str(part) for part in problem["loc"])
+    field = ".".join(map(str, problem["loc"]))
     message = problem["msg"].removeprefix("Value error, ")
     more = error.error_count() - 1
-    tail = f" (and {more} more)" if more else ""
-    return f"{field}: {message}{tail}" if field else f"{message}{tail}"
-
-
-def _refuse_constant(name: str) -> NoReturn:
-    raise ValueError(f"{name} is not a number in JSON")
+    return (f"{field}: " if field else "") + message + (f" (and {more} more)" if more else "")

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.files import read_content, write_bytes
+from megloc_kapture.io.files import named, read_content, write_bytes
 
 MatValue: TypeAlias = "NDArray[Any] | str | list[MatValue] | dict[str, MatValue] | None"
 """Numbers (MATLAB's shape), text, a cell or an array of structs, one struct; None: not read."""
@@ -62,23 +62,22 @@ class _Head(NamedTuple):
     values_at: int
 
 
-def read_mat(content: bytes, where: str) -> dict[str, MatValue]:
+def read_mat(content: bytes) -> dict[str, MatValue]:
     """All variables of a MAT file by name; nothing of the file is run.
 
     Parameters
     ----------
     content : the file's bytes. Arrays of a file that is not compressed are views of them.
-    where : the file, for messages.
 
     Raises
     ------
-    DataError : no MAT file of level 5, damaged, or larger unpacked than 2 GiB; names the file and
-        the byte where the broken variable begins.
+    DataError : no MAT file of level 5, damaged, or larger unpacked than 2 GiB; names the byte where
+        the broken variable begins.
     """
-    order = _byte_order(content, where)
+    order = _byte_order(content)
     found: dict[str, MatValue] = {}
-    for offset, kind, body in _variables(content, order, where):
-        with _variable_at(offset, where):
+    for offset, kind, body in _variables(content, order):
+        with _variable_at(offset):
             if kind == _COMPRESSED:
                 kind, body, _ = _element(_unpacked(body, order), 0, order)
             if kind == _MATRIX:
@@ -88,37 +87,37 @@ def read_mat(content: bytes, where: str) -> dict[str, MatValue]:
 
 
 def read_mat_array(path: Path | str, name: str) -> NDArray[np.float64]:
-    """Read the array ``name`` of real numbers; other variables are neither unpacked nor kept.
+    """Read the array ``name`` of real numbers, float64 and of the shape it has in MATLAB.
 
-    Returns
-    -------
-    float64, of the shape it has in MATLAB.
+    Other variables are neither unpacked nor kept.
 
     Raises
     ------
     DataError : missing, truncated, another format, no such variable, or it is no array of real
         numbers; names the file, and the byte where the variable begins.
     """
-    path = Path(path)
     content = read_content(path)
-    order = _byte_order(content, path)
     names = []
-    for offset, kind, body in _variables(content, order, path):
-        with _variable_at(offset, path):
-            if kind not in (_MATRIX, _COMPRESSED):
-                raise _BrokenError(f"data type {kind}, not an array")
-            head = _head(body if kind == _MATRIX else _first_bytes(body), order)
-            if head.name != name:
-                names.append(head.name)
-                continue
-            if head.kind not in _NUMBERS or head.is_complex:
-                raise _BrokenError(f"no array of real numbers (class {head.kind})")
-            if kind == _COMPRESSED:
-                _, body, _ = _element(_unpacked(body, order), 0, order)
-            values = _numbers(body, head.values_at, order, head.shape)
-            return values.astype(np.float64)
-    there = ", ".join(map(repr, names[:5])) or "none"
-    raise DataError(f"no variable {name!r}; it has {there}", path=path)
+    with named(path):
+        order = _byte_order(content)
+        for offset, kind, body in _variables(content, order):
+            with _variable_at(offset):
+                if kind not in (_MATRIX, _COMPRESSED):
+                    raise _BrokenError(f"data type {kind}, not an array")
+                start = body
+                if kind == _COMPRESSED:  # the array's beginning, behind the element's tag
+                    start = memoryview(zlib.decompressobj().decompress(body, 8 + _HEAD_BYTES))[8:]
+                head = _head(start, order)
+                if head.name != name:
+                    names.append(head.name)
+                    continue
+                if head.kind not in _NUMBERS or head.is_complex:
+                    raise _BrokenError(f"no array of real numbers (class {head.kind})")
+                if kind == _COMPRESSED:
+                    _, body, _ = _element(_unpacked(body, order), 0, order)
+                return _numbers(body, head.values_at, order, head.shape).astype(np.float64)
+        there = ", ".join(map(repr, names[:5])) or "none"
+        raise DataError(f"no variable {name!r}; it has {there}")
 
 
 def write_mat_arrays(path: Path | str, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -141,18 +140,17 @@ def write_mat_arrays(path: Path | str, arrays: Mapping[str, NDArray[Any]]) -> No
 
 
 @contextlib.contextmanager
-def _variable_at(offset: int, where: Path | str) -> Iterator[None]:
-    """A DataError that names the variable, of all that may be wrong with its bytes."""
+def _variable_at(offset: int) -> Iterator[None]:
+    """Name the variable in a DataError, of all that may be wrong with its bytes."""
     try:
         yield
-    except (_BrokenError, struct.error, ValueError, zlib.error) as error:
+    except (ValueError, struct.error, zlib.error) as error:
         raise DataError(
-            f"not a MAT file that can be read: {error}, in the variable at byte {offset}",
-            path=where,
+            f"not a MAT file that can be read: {error}, in the variable at byte {offset}"
         ) from error
 
 
-def _byte_order(content: bytes, where: Path | str) -> str:
+def _byte_order(content: bytes) -> str:
     problem = None
     order = _ENDIAN.get(content[_HEADER - 2 : _HEADER], "")
     version = struct.unpack_from(order + "H", content, _HEADER - 4)[0] if order else None
@@ -167,18 +165,16 @@ def _byte_order(content: bytes, where: Path | str) -> str:
     elif version != _LEVEL_5:
         problem = f"its level is {version:#x}, not {_LEVEL_5:#x}"
     if problem:
-        raise DataError(f"not a MAT file that can be read: {problem}", path=where)
+        raise DataError(f"not a MAT file that can be read: {problem}")
     return order
 
 
-def _variables(
-    content: bytes, order: str, where: Path | str
-) -> Iterator[tuple[int, int, memoryview]]:
+def _variables(content: bytes, order: str) -> Iterator[tuple[int, int, memoryview]]:
     """Offset, type and bytes of the elements of a file."""
     at, view = _HEADER, memoryview(content)
     while at < len(content):
         offset = at
-        with _variable_at(offset, where):
+        with _variable_at(offset):
             kind, body, at = _element(view, at, order)
         yield offset, kind, body
 
@@ -199,11 +195,6 @@ def _element(data: memoryview, at: int, order: str) -> tuple[int, memoryview, in
     if start + size > len(data):
         raise _BrokenError(f"it ends too early: {size} bytes announced, {len(data) - start} there")
     return kind, data[start : start + size], after
-
-
-def _first_bytes(packed: memoryview) -> memoryview:
-    """The beginning of the array in a packed element, without its tag."""
-    return memoryview(zlib.decompressobj().decompress(packed, 8 + _HEAD_BYTES))[8:]
 
 
 def _unpacked(packed: memoryview, order: str) -> memoryview:

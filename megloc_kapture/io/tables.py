@@ -5,12 +5,14 @@ status.csv           the outcome of every query, beside the localized poses
 clusters.csv         the clusters of candidates that every query was tried in
 refinement.csv       the outcome of refining each query's pose, step by step
 map_consistency.csv  how far a map's own images would move, by coordinate frame
+depth.csv            depth of the map's images by stereo
 match_counts.csv     matches of each pair, found and verified, beside the matches of a type
 masked.csv           keypoints that masks removed, by image, beside the features of a type
 ==================== =============================================================================
 
 Readers raise DataError, which names file, line and column (see :meth:`.csv_table.Table.read`);
-writers OutputError where the file cannot be written.
+writers OutputError where the file cannot be written. All take the file itself and keep its order,
+where nothing else is said.
 """
 
 from __future__ import annotations
@@ -19,24 +21,13 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import Field, model_validator
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.csv_table import (
-    COUNT,
-    IMAGES,
-    POSE,
-    TEXT,
-    YES_NO,
-    Table,
-    list_of,
-    number,
-    one_of,
-    or_empty,
-)
-from megloc_kapture.io.paths import check_relative
+from megloc_kapture.io.csv_table import POSE, TEXT, Table, flag, list_of, number, or_empty
+from megloc_kapture.io.files import check_relative
 from megloc_kapture.values import ClusterPose, Options, RefinementRow, RigidTransform
 
 STATUS_FILE = "status.csv"
@@ -74,7 +65,7 @@ class QueryStatus(Options):
     reason: str = ""
     num_matches: int = Field(default=0, ge=0)
     num_inliers: int = Field(default=0, ge=0)
-    confidence: float | None = Field(default=None, ge=0, le=1)
+    confidence: Annotated[float | None, or_empty(number(".4f")), Field(ge=0, le=1)] = None
     cluster: int | None = Field(default=None, ge=0)
     fallback: Fallback = "none"
     candidates: tuple[str, ...] = ()
@@ -98,24 +89,7 @@ class QueryStatus(Options):
         return self
 
 
-_STATUS = Table(
-    QueryStatus,
-    {
-        "image": TEXT,
-        "status": TEXT,
-        "reason": TEXT,
-        "num_matches": COUNT,
-        "num_inliers": COUNT,
-        "confidence": or_empty(number(".4f")),
-        "cluster": or_empty(COUNT),
-        "fallback": TEXT,
-        "candidates": IMAGES,
-        "refinement": TEXT,
-        "remarks": TEXT,
-    },
-    keys=[("image",)],
-    later=("confidence", "remarks"),
-)
+_STATUS = Table(QueryStatus, keys=[("image",)], later=("confidence", "remarks"))
 
 
 def read_status(path: Path | str) -> dict[str, QueryStatus]:
@@ -147,26 +121,13 @@ class ClusterRow:
     chosen: Literal["yes", "no"]
     num_matches: int
     num_inliers: int
-    score: float | None
+    score: Annotated[float | None, or_empty(number(".6g"))]
     reason: str
     images: tuple[str, ...]
     cam_from_world: RigidTransform | None
 
 
-_CLUSTERS = Table(
-    ClusterRow,
-    {
-        "image": TEXT,
-        "cluster": COUNT,
-        "chosen": one_of("yes", "no"),
-        "num_matches": COUNT,
-        "num_inliers": COUNT,
-        "score": or_empty(number(".6g")),
-        "reason": TEXT,
-        "images": IMAGES,
-        "cam_from_world": or_empty(POSE),
-    },
-)
+_CLUSTERS = Table(ClusterRow)
 
 
 def read_clusters(path: Path | str) -> dict[str, list[ClusterRow]]:
@@ -182,17 +143,7 @@ def write_clusters(
 ) -> None:
     """Write the clusters of every query: (image, its clusters, number of the chosen one)."""
     records = [
-        ClusterRow(
-            image=image,
-            cluster=index,
-            chosen="yes" if index == chosen else "no",
-            num_matches=cluster.num_matches,
-            num_inliers=cluster.num_inliers,
-            score=cluster.score,
-            reason=cluster.reason,
-            images=cluster.images,
-            cam_from_world=cluster.cam_from_world,
-        )
+        ClusterRow(image, index, "yes" if index == chosen else "no", **vars(cluster))
         for image, clusters, chosen in sorted(rows, key=lambda row: row[0])
         for index, cluster in enumerate(clusters)
     ]
@@ -211,7 +162,7 @@ _REFINEMENT = Table(
     {
         "image": TEXT,
         "method": TEXT,
-        "accepted": YES_NO,
+        "accepted": flag("yes", "no"),
         "reason": TEXT,
         "moved_m": number(".6f"),
         "turned_deg": number(".6f"),
@@ -226,14 +177,15 @@ def refinement_text(rows: Sequence[RefinementRow]) -> str:
     return "; ".join(f"{row.method}: {'accepted' if row.accepted else row.reason}" for row in rows)
 
 
-def read_refinement(path: Path | str) -> list[RefinementRow]:
-    """Read ``refinement.csv`` (the file itself), in its order."""
-    return list(_REFINEMENT.read(path))
+read_refinement = _REFINEMENT.read
 
 
 def write_refinement(path: Path, rows: Iterable[RefinementRow]) -> None:
     """Write ``refinement.csv`` (the file itself) by image; the steps of one stay in order."""
     _REFINEMENT.write(path, sorted(rows, key=lambda row: row.image))
+
+
+_Median = Annotated[float, or_empty(number(".6g"), math.nan)]
 
 
 @dataclass(frozen=True)
@@ -252,42 +204,17 @@ class ConsistencyRow:
     method: str
     images: int
     contradicting: int
-    moved_m: float
-    turned_deg: float
-    moved_px: float
-    claimed_m: float
-    claimed_deg: float
-    squared_distance: float
+    moved_m: _Median
+    turned_deg: _Median
+    moved_px: _Median
+    claimed_m: _Median
+    claimed_deg: _Median
+    squared_distance: _Median
     reason: str
 
 
-_MEDIAN = or_empty(number(".6g"), math.nan)
-_CONSISTENCY = Table(
-    ConsistencyRow,
-    {
-        "frame": TEXT,
-        "method": TEXT,
-        "images": COUNT,
-        "contradicting": COUNT,
-        "moved_m": _MEDIAN,
-        "turned_deg": _MEDIAN,
-        "moved_px": _MEDIAN,
-        "claimed_m": _MEDIAN,
-        "claimed_deg": _MEDIAN,
-        "squared_distance": _MEDIAN,
-        "reason": TEXT,
-    },
-)
-
-
-def read_consistency(path: Path | str) -> list[ConsistencyRow]:
-    """Read ``map_consistency.csv`` (the file itself), in its order."""
-    return list(_CONSISTENCY.read(path))
-
-
-def write_consistency(path: Path, rows: Iterable[ConsistencyRow]) -> None:
-    """Write ``map_consistency.csv`` (the file itself), in the order given."""
-    _CONSISTENCY.write(path, rows)
+_CONSISTENCY = Table(ConsistencyRow)
+read_consistency, write_consistency = _CONSISTENCY.read, _CONSISTENCY.write
 
 
 @dataclass(frozen=True)
@@ -304,33 +231,14 @@ class DepthRow:
 
     image: str
     sources: tuple[str, ...]
-    near_m: float
-    far_m: float
-    fill: float
+    near_m: Annotated[float, number(".6g")]
+    far_m: Annotated[float, number(".6g")]
+    fill: Annotated[float, number(".4f")]
     reason: str
 
 
-_DEPTH = Table(
-    DepthRow,
-    {
-        "image": TEXT,
-        "sources": IMAGES,
-        "near_m": number(".6g"),
-        "far_m": number(".6g"),
-        "fill": number(".4f"),
-        "reason": TEXT,
-    },
-)
-
-
-def read_depth_rows(path: Path | str) -> list[DepthRow]:
-    """Read ``depth.csv`` (the file itself), in its order."""
-    return list(_DEPTH.read(path))
-
-
-def write_depth_rows(path: Path, rows: Iterable[DepthRow]) -> None:
-    """Write ``depth.csv`` (the file itself), in the order given."""
-    _DEPTH.write(path, rows)
+_DEPTH = Table(DepthRow)
+read_depth_rows, write_depth_rows = _DEPTH.read, _DEPTH.write
 
 
 @dataclass(frozen=True)
@@ -343,9 +251,7 @@ class PairCount:
     verified: int
 
 
-_MATCH_COUNTS = Table(
-    PairCount, {"image": TEXT, "other": TEXT, "matches": COUNT, "verified": COUNT}
-)
+_MATCH_COUNTS = Table(PairCount)
 
 
 def match_counts_path(features_dir: Path, type_name: str) -> Path:
@@ -355,7 +261,7 @@ def match_counts_path(features_dir: Path, type_name: str) -> Path:
 
 def read_match_counts(features_dir: Path, type_name: str) -> list[PairCount]:
     """Read ``match_counts.csv`` of a keypoints type, in its order."""
-    return list(_MATCH_COUNTS.read(match_counts_path(features_dir, type_name)))
+    return _MATCH_COUNTS.read(match_counts_path(features_dir, type_name))
 
 
 def write_match_counts(features_dir: Path, type_name: str, counts: Iterable[PairCount]) -> None:
@@ -370,7 +276,7 @@ class MaskCount(NamedTuple):
     num_masked: int
 
 
-_MASK_COUNTS = Table(MaskCount, {"image": TEXT, "num_masked": COUNT})
+_MASK_COUNTS = Table(MaskCount)
 
 
 def mask_counts_path(features_dir: Path, type_name: str) -> Path:
@@ -381,10 +287,10 @@ def mask_counts_path(features_dir: Path, type_name: str) -> Path:
 def read_mask_counts(features_dir: Path, type_name: str) -> dict[str, int]:
     """Read ``masked.csv`` of a keypoints type: image -> keypoints; empty where there is none."""
     path = mask_counts_path(features_dir, type_name)
-    return {row.image: row.num_masked for row in _MASK_COUNTS.read(path)} if path.is_file() else {}
+    return dict(_MASK_COUNTS.read_if_there(path))
 
 
 def write_mask_counts(features_dir: Path, type_name: str, counts: Mapping[str, int]) -> None:
     """Write ``masked.csv`` of a keypoints type: image that has a mask -> keypoints it removed."""
-    rows = (MaskCount(image, count) for image, count in sorted(counts.items()))
+    rows = (MaskCount(*row) for row in sorted(counts.items()))
     _MASK_COUNTS.write(mask_counts_path(features_dir, type_name), rows)

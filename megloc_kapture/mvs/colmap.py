@@ -10,7 +10,7 @@ import numpy as np
 
 from megloc_kapture.errors import PluginError
 from megloc_kapture.io.colmap import MapImage
-from megloc_kapture.io.colmap_stereo import (
+from megloc_kapture.io.colmap_mapping import (
     has_cuda,
     map_path,
     read_map,

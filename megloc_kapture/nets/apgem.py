@@ -2,7 +2,7 @@
 
 A ResNet, generalized-mean pooling with a learnt power, a fully connected layer, unit length. What
 comes beside the trunk and this head is read from the checkpoint where it is known there, under
-names of our own, see :mod:`megloc_kapture.io.weights.apgem`.
+names of our own, see :mod:`megloc_kapture.io.weights.authors`.
 """
 
 from __future__ import annotations

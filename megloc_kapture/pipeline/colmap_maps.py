@@ -1,7 +1,7 @@
 """COLMAP models where a kapture map is expected: imported once, kept in the user's cache.
 
 A model is imported again when one of its files, or its database, has another size or time. Weights
-lie in the same cache, see :mod:`megloc_kapture.io.weights.folder`.
+lie in the same cache, see :mod:`megloc_kapture.io.weights`.
 """
 
 from __future__ import annotations

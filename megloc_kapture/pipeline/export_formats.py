@@ -30,7 +30,7 @@ from megloc_kapture.geometry.cameras import principal_point_px
 from megloc_kapture.geometry.earth import earth_from_enu, geodetic
 from megloc_kapture.io.colmap import MapImage, write_model
 from megloc_kapture.io.files import write_bytes
-from megloc_kapture.io.ply import write_ply
+from megloc_kapture.io.kapture import write_ply
 from megloc_kapture.values import ONE_FOCAL_MODELS, Camera, RigidTransform
 
 _MAP_COLOUR, _QUERY_COLOUR = (120, 120, 120), (220, 50, 32)

@@ -19,8 +19,8 @@ from typing import Any
 from pydantic import Field
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.file_states import FileState
 from megloc_kapture.io.files import read_json_model
+from megloc_kapture.io.output_folders import FileState
 from megloc_kapture.values import Options
 
 _CHUNK_BYTES = 1 << 20

@@ -9,12 +9,18 @@ from pathlib import Path
 
 from megloc_kapture.datasets.kapture_folders import check_image_size
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.io.files import hard_link, link_file, owned_name
-from megloc_kapture.io.images import WRITABLE_SUFFIXES, read_image_rgb, write_image
+from megloc_kapture.io.files import check_relative, hard_link, link_file, owned_name
+from megloc_kapture.io.images import (
+    UNREAD_SUFFIXES,
+    VIDEO_SUFFIXES,
+    WRITABLE_SUFFIXES,
+    extract_frames,
+    read_image_rgb,
+    read_photo,
+    turned_upright,
+    write_image,
+)
 from megloc_kapture.io.kapture import KaptureData, Sensor, writable_name
-from megloc_kapture.io.paths import check_relative
-from megloc_kapture.io.photos import UNREAD_SUFFIXES, read_photo, turned_upright
-from megloc_kapture.io.video import VIDEO_SUFFIXES, extract_frames
 from megloc_kapture.pipeline.kapture_queries import Unit
 from megloc_kapture.pipeline.queries import Query
 from megloc_kapture.values import Camera, RigidTransform

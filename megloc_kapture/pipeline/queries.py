@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.io.images import read_image_rgb
-from megloc_kapture.io.photos import turned_upright
+from megloc_kapture.io.images import read_image_rgb, turned_upright
 from megloc_kapture.localization.focal_length import estimate_remark
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import (

@@ -30,9 +30,8 @@ from megloc_kapture.io.dataset_tables import (
     read_unreadable,
     read_world,
 )
-from megloc_kapture.io.files import write_bytes
+from megloc_kapture.io.files import safe_join, write_bytes
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder
-from megloc_kapture.io.paths import safe_join
 from megloc_kapture.io.tables import STATUS_FILE, QueryStatus, read_status
 from megloc_kapture.pipeline.datasets import KAPTURE, SYNTHETIC, TWIN_PREFIX, dataset_names
 from megloc_kapture.pipeline.manifests import read_manifest

@@ -9,8 +9,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.file_states import FileState, state_if_unchanged, state_of
 from megloc_kapture.io.files import output_error, read_content, write_bytes
+from megloc_kapture.io.output_folders import FileState, state_if_unchanged, state_of
 
 Files = dict[str, FileState]  # by path in the workspace
 
@@ -53,7 +53,7 @@ def changed_file(record: Path, root: Path, *, verify: bool = False) -> str:
 
     Parameters
     ----------
-    verify : hash all of them, see :func:`~megloc_kapture.io.file_states.state_if_unchanged`.
+    verify : hash all of them, see :func:`~megloc_kapture.io.output_folders.state_if_unchanged`.
     """
     files = written_files(record)
     touched = False

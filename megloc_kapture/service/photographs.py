@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, MeglocError
-from megloc_kapture.io.images import decode_image_rgb
-from megloc_kapture.io.photos import GUESS_DEVIATION, Photo, photo_of
+from megloc_kapture.io.images import GUESS_DEVIATION, Photo, decode_image_rgb, photo_of
 
 _PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 _JPEG = b"\xff\xd8\xff"

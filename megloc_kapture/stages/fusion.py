@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.io.ply import write_ply
+from megloc_kapture.io.kapture import KaptureFolder, write_ply
 from megloc_kapture.mvs.consistency import AgreementOptions, agreeing_views
 from megloc_kapture.mvs.views import pinhole_matrix, stereo_view
 from megloc_kapture.plugins import StereoView

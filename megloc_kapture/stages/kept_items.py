@@ -22,10 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, OutputError
-from megloc_kapture.io.file_states import FileState, state_if_unchanged, state_of
-from megloc_kapture.io.files import hard_link, output_error
+from megloc_kapture.io.files import check_relative, hard_link, output_error
 from megloc_kapture.io.kapture import FeatureReader, KaptureFolder
-from megloc_kapture.io.paths import check_relative
+from megloc_kapture.io.output_folders import FileState, state_if_unchanged, state_of
 
 Digest = Callable[[Path], str]
 """Hash of a file's content; raises DataError where it cannot be read."""
@@ -74,7 +73,7 @@ class KeptItems:
     journal : lines are added as items are done.
     sources : folders that may have items, and their journals; the first that has one counts.
     verify : hash all files that are taken over, see
-        :func:`~megloc_kapture.io.file_states.state_if_unchanged`.
+        :func:`~megloc_kapture.io.output_folders.state_if_unchanged`.
     """
 
     def __init__(

@@ -21,11 +21,11 @@ from megloc_kapture.io.images import read_depth_map
 from megloc_kapture.io.kapture import (
     KaptureFolder,
     write_observations,
+    write_ply,
     write_points3d,
     write_sensors,
 )
 from megloc_kapture.io.kapture.points import write_point_covariances
-from megloc_kapture.io.ply import write_ply
 from megloc_kapture.mapping.depth import DepthVerificationOptions, contradicted_by_depth
 from megloc_kapture.mapping.rejection import (
     ConsistencyOptions,

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.files import link_images, link_records
+from megloc_kapture.io.files import link_images, link_records, safe_join
 from megloc_kapture.io.images import read_depth_map
 from megloc_kapture.io.kapture import (
     KaptureData,
@@ -30,7 +30,6 @@ from megloc_kapture.io.kapture import (
     write_point_covariances,
     write_points3d,
 )
-from megloc_kapture.io.paths import safe_join
 from megloc_kapture.io.tables import read_depth_rows
 from megloc_kapture.mvs.views import stereo_camera
 from megloc_kapture.stages.rigs import DepthRecord

@@ -37,11 +37,11 @@ from megloc_kapture.io.dataset_tables import (
 )
 from megloc_kapture.io.images import image_size, read_image_rgb
 from megloc_kapture.io.kapture import read_pairs, read_point_covariances, write_pairs
+from megloc_kapture.io.kapture.blobs import TarBlobs
 from megloc_kapture.io.kapture.features import DTYPES, read_config
 from megloc_kapture.io.kapture.observations import Observations, read_observations
 from megloc_kapture.io.kapture.points import read_points3d
 from megloc_kapture.io.kapture.sensors import read_kapture_data
-from megloc_kapture.io.kapture.tars import TarBlobs
 from megloc_kapture.io.mat_file import read_mat, read_mat_array
 from megloc_kapture.io.tables import (
     read_clusters,
@@ -153,7 +153,7 @@ def read_tar(path: Path) -> None:
 def read_mats(path: Path) -> None:
     content = path.read_bytes()
     with suppress(DataError):
-        read_mat(content, path.name)
+        read_mat(content)
     found = read_mat_array(path, "XYZ")
     assert found.dtype == np.float64 and found.size * 8 <= len(content) * 1032
 

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.geometry.cameras import project
-from megloc_kapture.io.photos import guessed_camera
+from megloc_kapture.io.images import guessed_camera
 from megloc_kapture.localization.absolute_pose import center_deviation, rig_pose
 from megloc_kapture.localization.estimation import (
     AbsolutePoseOptions,

@@ -11,7 +11,7 @@ from corner import CAMERA, WALLS, depth_m, pose_at, render
 from megloc_kapture.errors import DataError, PluginError
 from megloc_kapture.geometry.cameras import bearing_rays, project
 from megloc_kapture.io.colmap import MapImage
-from megloc_kapture.io.colmap_stereo import (
+from megloc_kapture.io.colmap_mapping import (
     fuse,
     has_cuda,
     map_path,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch.nn import functional as F
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.weights.netvlad import AVERAGE_IMAGE
+from megloc_kapture.io.weights.authors import AVERAGE_IMAGE
 from megloc_kapture.nets.netvlad import NetVladLayer, Order, VggNetVlad, netvlad, openibl
 
 KEYS = Path(__file__).parent / "keys" / "openibl.txt"

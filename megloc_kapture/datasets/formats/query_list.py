@@ -11,8 +11,7 @@ from pathlib import Path
 
 from megloc_kapture.datasets.formats.text_lines import Line, read_lines
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.files import write_bytes
-from megloc_kapture.io.paths import check_relative
+from megloc_kapture.io.files import check_relative, write_bytes
 from megloc_kapture.values import Camera
 
 _SIZE_END = 10**9

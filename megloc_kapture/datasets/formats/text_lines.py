@@ -24,9 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.files import read_text
+from megloc_kapture.io.files import check_relative, read_text
 from megloc_kapture.io.kapture.text import FLOAT_PATTERN
-from megloc_kapture.io.paths import check_relative
 from megloc_kapture.values import RigidTransform
 
 # larger distances are broken and would overflow further on; ECEF coordinates are below 1e7

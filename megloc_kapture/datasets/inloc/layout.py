@@ -22,8 +22,8 @@ from megloc_kapture.datasets.kapture_folders import MAPPING, QUERY
 from megloc_kapture.datasets.kapture_form import kapture_parent
 from megloc_kapture.datasets.official import Missing
 from megloc_kapture.errors import DataError
+from megloc_kapture.io.files import has_control_characters
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.io.paths import has_control_characters
 from megloc_kapture.values import RigidTransform
 
 FLOORS = ("DUC1", "DUC2")

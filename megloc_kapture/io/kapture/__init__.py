@@ -24,6 +24,7 @@ from megloc_kapture.io.kapture.matches import (
 from megloc_kapture.io.kapture.observations import Observations, write_observations
 from megloc_kapture.io.kapture.points import (
     read_point_covariances,
+    write_ply,
     write_point_covariances,
     write_points3d,
 )
@@ -51,6 +52,7 @@ __all__ = [
     "unit_quaternion",
     "write_observations",
     "write_pairs",
+    "write_ply",
     "write_point_covariances",
     "write_points3d",
     "write_sensors",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.kapture.text import parse_float
@@ -31,10 +32,8 @@ class Sensor:
     def camera(self) -> Camera:
         """The intrinsics of a sensor of type camera or depth.
 
-        Raises
-        ------
-        DataError : another type of sensor, an uncalibrated one (``UNKNOWN_CAMERA``), or
-            parameters that :class:`Camera` refuses.
+        Raises DataError: another type of sensor, an uncalibrated one (``UNKNOWN_CAMERA``), or
+        parameters that :class:`Camera` refuses.
         """
         if self.sensor_type not in CAMERA_SENSOR_TYPES:
             raise DataError(f"a sensor of type {self.sensor_type!r} has no camera model")
@@ -63,6 +62,9 @@ class Sensor:
         return cls(name, sensor_type, params + tuple(_shortest(p) for p in camera.params))
 
 
+_INDEX: dict[str, Any] = {"default_factory": dict, "init": False, "repr": False, "compare": False}
+
+
 @dataclass
 class KaptureData:
     """Sensors, rigs, trajectories and image records of one kapture.
@@ -83,12 +85,8 @@ class KaptureData:
     trajectories: dict[tuple[int, str], RigidTransform] = field(default_factory=dict)
     records_camera: dict[tuple[int, str], str] = field(default_factory=dict)
     records_depth: dict[tuple[int, str], str] = field(default_factory=dict)
-    _record_by_image: dict[str, tuple[int, str]] | None = field(
-        default=None, init=False, repr=False, compare=False
-    )
-    _rigs_of: dict[str, list[str]] | None = field(
-        default=None, init=False, repr=False, compare=False
-    )
+    _record_by_image: dict[str, tuple[int, str]] = field(**_INDEX)
+    _rigs_of: dict[str, list[str]] = field(**_INDEX)
     _num_rigs: int = field(default=0, init=False, repr=False, compare=False)
 
     def image_names(self) -> list[str]:
@@ -98,17 +96,15 @@ class KaptureData:
     def record_of(self, image: str) -> tuple[int, str]:
         """``(timestamp, sensor id)`` of an image.
 
-        Raises
-        ------
-        DataError : no such image, or two records of that name.
+        Raises DataError: no such image, or two records of that name.
         """
         index = self._record_by_image
-        key = None if index is None else index.get(image)
+        key = index.get(image)
         # the entry proves itself; the index is built again after any change that matters
         if (
-            index is None
+            key is None
             or len(index) != len(self.records_camera)
-            or (key is None or self.records_camera.get(key) != image)
+            or self.records_camera.get(key) != image
         ):
             index = {}
             for record, name in self.records_camera.items():
@@ -124,9 +120,7 @@ class KaptureData:
     def camera_of(self, image: str) -> Camera:
         """Intrinsics of the camera that took an image.
 
-        Raises
-        ------
-        DataError : no such image or sensor, or see :meth:`Sensor.camera`.
+        Raises DataError: no such image or sensor, or see :meth:`Sensor.camera`.
         """
         sensor_id = self.record_of(image)[1]
         if sensor_id not in self.sensors:
@@ -142,8 +136,7 @@ class KaptureData:
         None where the trajectories say nothing. Of several rigs with a pose at that time, the
         first by id counts.
         """
-        timestamp, sensor_id = self.record_of(image)
-        return self.device_from_world(timestamp, sensor_id)
+        return self.device_from_world(*self.record_of(image))
 
     def device_from_world(self, timestamp: int, device_id: str) -> RigidTransform | None:
         """Pose of a sensor or rig at a time, own or through rigs; None where there is none."""
@@ -151,12 +144,8 @@ class KaptureData:
 
     def poses(self) -> dict[str, RigidTransform]:
         """``cam_from_world`` of every image that has one, by image name, sorted."""
-        found = {}
-        for image in self.image_names():
-            pose = self.cam_from_world(image)
-            if pose is not None:
-                found[image] = pose
-        return found
+        poses = {image: self.cam_from_world(image) for image in self.image_names()}
+        return {image: pose for image, pose in poses.items() if pose is not None}
 
     def _device_from_world(
         self, timestamp: int, device_id: str, seen: frozenset[str]
@@ -173,7 +162,7 @@ class KaptureData:
         return None
 
     def _parents(self) -> dict[str, list[str]]:
-        if self._rigs_of is None or self._num_rigs != len(self.rigs):
+        if self._num_rigs != len(self.rigs):
             self._rigs_of = {}
             self._num_rigs = len(self.rigs)
             for rig_id in sorted(self.rigs):

@@ -6,33 +6,33 @@ tar. ``T``, the folder's name, is the type name by which they are found; the ``n
 inside the configuration file may differ and means nothing here.
 
 Arrays are raw, little-endian, row-major, without a header: only the size of a file can be checked
-against its configuration, and is.
+against its configuration.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from megloc_kapture.errors import DataError, OutputError
-from megloc_kapture.io.files import write_bytes
-from megloc_kapture.io.kapture.blobs import BlobSource, FolderBlobs, FolderBlobWriter
-from megloc_kapture.io.kapture.tars import TarBlobs, TarBlobWriter
-from megloc_kapture.io.kapture.text import format_table, named, read_rows
-from megloc_kapture.io.paths import (
+from megloc_kapture.io.files import (
     Roots,
     check_component,
     check_no_escape,
     check_output,
     check_relative,
+    named,
+    safe_join,
+    write_bytes,
 )
+from megloc_kapture.io.kapture.blobs import BlobSource, FolderBlobs, TarBlobs, TarBlobWriter
+from megloc_kapture.io.kapture.text import check_columns, format_table, read_rows
 
 FeatureKind = Literal["keypoints", "descriptors", "global_features", "matches"]
 ArrayKind = Literal["keypoints", "descriptors", "global_features"]
@@ -91,23 +91,21 @@ class FeatureConfig:
 def feature_folder(root: Path, kind: FeatureKind, type_name: str, *, orphan: bool) -> Path:
     """The folder of one type, inside a kapture or below a features folder (``orphan``).
 
-    Raises
-    ------
-    DataError : the type name cannot be the name of a folder.
+    Raises DataError where the type name cannot be the name of a folder.
     """
-    check_component(type_name)
+    parent = _types_folder(root, kind, orphan) / check_component(type_name)
+    return parent / kind if orphan else parent
+
+
+def _types_folder(root: Path, kind: FeatureKind, orphan: bool) -> Path:
     if not orphan:
-        return Path(root) / "reconstruction" / kind / type_name
-    group = "global_features" if kind == "global_features" else "local_features"
-    return Path(root) / group / type_name / kind
+        return Path(root) / "reconstruction" / kind
+    return Path(root) / ("global_features" if kind == "global_features" else "local_features")
 
 
 def list_types(root: Path, kind: FeatureKind, *, orphan: bool) -> list[str]:
     """Type names of one kind that a kapture or features folder holds, sorted."""
-    if orphan:
-        parent = Path(root) / ("global_features" if kind == "global_features" else "local_features")
-    else:
-        parent = Path(root) / "reconstruction" / kind
+    parent = _types_folder(root, kind, orphan)
     try:
         names = sorted(entry.name for entry in parent.iterdir())
     except (FileNotFoundError, NotADirectoryError):
@@ -127,29 +125,20 @@ def list_types(root: Path, kind: FeatureKind, *, orphan: bool) -> list[str]:
 
 
 def read_config(path: Path, kind: ArrayKind) -> FeatureConfig:
-    """Read one configuration file.
-
-    Raises
-    ------
-    DataError : names file and line.
-    """
-    rows = list(read_rows(path))
-    if len(rows) != 1:
-        raise DataError(f"expected one row, got {len(rows)}", path=path)
-    line, fields = rows[0]
-    expected = CONFIG_HEADER[kind].count(",") + 1
-    if len(fields) != expected:
-        raise DataError(f"expected {expected} columns, got {len(fields)}", path=path, line=line)
-    name, dtype, dsize, *rest = fields
-    if dtype not in DTYPES:
-        known = ", ".join(DTYPES)
-        raise DataError(f"dtype {dtype!r} is not one of {known}", path=path, line=line)
-    if not re.fullmatch("[0-9]{1,9}", dsize) or int(dsize) == 0:
-        raise DataError(f"dsize {dsize!r} is not a positive integer", path=path, line=line)
-    keypoints_type = None
-    if kind == "descriptors":
-        with named(path, line):
-            keypoints_type = check_component(rest[0])
+    """Read one configuration file; DataError names file and line."""
+    with read_rows(path) as rows:
+        found = list(rows)
+    if len(found) != 1:
+        raise DataError(f"expected one row, got {len(found)}", path=path)
+    line, fields = found[0]
+    with named(path, line):
+        check_columns(fields, CONFIG_HEADER[kind].count(",") + 1)
+        name, dtype, dsize, *rest = fields
+        if dtype not in DTYPES:
+            raise DataError(f"dtype {dtype!r} is not one of {', '.join(DTYPES)}")
+        if not re.fullmatch("[0-9]{1,9}", dsize) or int(dsize) == 0:
+            raise DataError(f"dsize {dsize!r} is not a positive integer")
+        keypoints_type = check_component(rest[0]) if kind == "descriptors" else None
     metric_type = rest[-1] if rest else None
     return FeatureConfig(name, DTYPES[dtype], int(dsize), keypoints_type, metric_type)
 
@@ -168,12 +157,9 @@ def format_config(kind: ArrayKind, config: FeatureConfig) -> bytes:
 
 def blob_sources(roots: Roots, folder: Path, kind: FeatureKind) -> list[BlobSource]:
     """The tar of a type's folder, where there is one, before its loose files."""
-    sources: list[BlobSource] = []
+    sources: list[BlobSource] = [FolderBlobs(roots, folder, SUFFIX[kind])]
     tar = folder / f"{kind}.tar"
-    if tar.is_file():
-        sources.append(TarBlobs(roots, tar, SUFFIX[kind]))
-    sources.append(FolderBlobs(roots, folder, SUFFIX[kind]))
-    return sources
+    return [TarBlobs(roots, tar, SUFFIX[kind]), *sources] if tar.is_file() else sources
 
 
 class FeatureReader:
@@ -187,14 +173,9 @@ class FeatureReader:
     ) -> None:
         """``folders``: (roots that links may not leave, folder of the type), in order.
 
-        Raises
-        ------
-        DataError : no folder, a broken configuration, or folders whose dtypes or sizes differ.
+        Raises DataError: a broken configuration, or folders whose dtypes or sizes differ.
         """
-        if not folders:
-            raise DataError(f"no {kind} of type {type_name!r}")
-        self.kind = kind
-        self.type_name = type_name
+        self.kind, self.type_name = kind, type_name
         self._sources: list[BlobSource] = []
         configs: list[tuple[Path, FeatureConfig]] = []
         for roots, folder in folders:
@@ -223,21 +204,15 @@ class FeatureReader:
         return isinstance(image, str) and self._find(image) is not None
 
     def length(self, image: str) -> int:
-        """Number of rows of an image, from the size of its file alone.
-
-        Raises
-        ------
-        DataError : no features of that image, or a size that no number of rows gives.
-        """
+        """Number of rows of an image, from the size of its file alone; raises as `read` does."""
         source, name = self._source(image)
         return self._rows(source, name, source.size(name))
 
     def read(self, image: str) -> NDArray[Any]:
         """The array of an image, (N, dsize); (dsize,) for global features. Writable.
 
-        Raises
-        ------
-        DataError : no features of that image, a truncated file, or values that are not finite.
+        Raises DataError: no features of that image, a truncated file, or values that are not
+        finite.
         """
         source, name = self._source(image)
         content = source.read(name)
@@ -328,7 +303,43 @@ class FeatureReader:
         return found
 
 
-class FeatureWriter(AbstractContextManager["FeatureWriter"]):
+class BlobWriter:
+    """Writes blobs below a folder, each atomically as a file, or into its ``STEM.tar``."""
+
+    def __init__(self, folder: Path, stem: str, *, tar: bool) -> None:
+        self._folder = folder
+        self._tar = TarBlobWriter(folder / f"{stem}.tar") if tar else None
+
+    def has(self, name: str) -> bool:
+        """True where a blob is written already."""
+        if self._tar is not None:
+            return name in self._tar
+        try:
+            return safe_join(self._folder, name).is_file()
+        except OSError:
+            return False  # too long a name, or a folder closed to us: writing will say so
+
+    def put(self, name: str, content: bytes) -> Path:
+        """Write one; returns the file that holds it."""
+        if self._tar is not None:
+            return self._tar.write(name, content)
+        path = safe_join(self._folder, name)
+        write_bytes(path, content)
+        return path
+
+    def close(self) -> None:
+        """Finish the tar; the writer is of no use afterwards."""
+        if self._tar is not None:
+            self._tar.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class FeatureWriter(BlobWriter):
     """Write the features of one kind and type; each image's file is atomic.
 
     Opening writes the configuration, or checks that the one there is the same, so that a stopped
@@ -345,15 +356,10 @@ class FeatureWriter(AbstractContextManager["FeatureWriter"]):
         tar: bool = False,
         orphan: bool = False,
     ) -> None:
+        """Raises DataError for a name or configuration that kapture cannot hold, OutputError where
+        it cannot be written or another configuration stands there.
         """
-        Raises
-        ------
-        DataError : a name or configuration that kapture cannot hold.
-        OutputError : cannot be written, or another configuration stands there.
-        """
-        self.kind = kind
-        self.type_name = type_name
-        self.config = config
+        self.kind, self.type_name, self.config = kind, type_name, config
         folder = feature_folder(Path(root), kind, type_name, orphan=orphan)
         check_output(Path(root), folder)
         self._path = path = folder / f"{kind}.txt"
@@ -363,18 +369,15 @@ class FeatureWriter(AbstractContextManager["FeatureWriter"]):
                 raise OutputError(f"{path}: holds another configuration; remove its folder first")
         else:
             write_bytes(path, content)
-        self._blobs: FolderBlobWriter | TarBlobWriter
-        self._blobs = TarBlobWriter(folder / f"{kind}.tar") if tar else FolderBlobWriter(folder)
+        super().__init__(folder, kind, tar=tar)
 
     def __contains__(self, image: str) -> bool:
-        return image + SUFFIX[self.kind] in self._blobs
+        return self.has(image + SUFFIX[self.kind])
 
     def write(self, image: str, array: ArrayLike) -> tuple[Path, Path]:
         """Write one image's array, (N, dsize), or (dsize,) for global features.
 
-        Returns
-        -------
-        The files that say what it is and hold it.
+        Returns the files that say what it is and hold it.
 
         Raises
         ------
@@ -393,14 +396,7 @@ class FeatureWriter(AbstractContextManager["FeatureWriter"]):
         if not np.can_cast(given.dtype, self.config.dtype, casting="same_kind"):
             raise ValueError(f"cannot store {given.dtype} as {self.config.dtype.name}")
         content = np.ascontiguousarray(given, dtype=self.config.dtype).tobytes()
-        return self._path, self._blobs.write(check_field(image) + SUFFIX[self.kind], content)
-
-    def close(self) -> None:
-        """Finish the tar; the writer is of no use afterwards."""
-        self._blobs.close()
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+        return self._path, self.put(check_field(image) + SUFFIX[self.kind], content)
 
 
 def check_field(image: str) -> str:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import filecmp
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
+from megloc_kapture.io.files import Roots, check_no_escape, safe_join
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture.data import KaptureData
 from megloc_kapture.io.kapture.features import (
@@ -28,7 +29,6 @@ from megloc_kapture.io.kapture.observations import (
 )
 from megloc_kapture.io.kapture.points import read_points3d
 from megloc_kapture.io.kapture.sensors import read_kapture_data
-from megloc_kapture.io.paths import Roots, check_no_escape, safe_join
 from megloc_kapture.values import RigidTransform
 
 if TYPE_CHECKING:
@@ -62,6 +62,8 @@ class KaptureFolder:
         self.root = Path(root)
         self.features_dirs = tuple(Path(d) for d in features_dirs)
         self.allow_links_below = tuple(Path(d) for d in allow_links_below)
+        self._points_path = self.root / "reconstruction" / "points3d.txt"
+        self._observations_path = self.root / "reconstruction" / "observations.txt"
         self._data: KaptureData | None = None
         self._points: NDArray[np.float64] | None = None
         self._observations: dict[str, Observations] | None = None
@@ -78,9 +80,7 @@ class KaptureFolder:
         They may share both where they are the same file. Features that cannot be read are left to
         those who need them.
 
-        Raises
-        ------
-        DataError : names the image and the features.
+        Raises DataError: names the image and the features.
         """
         for image in sorted(set(self.read().image_names()) & set(other.read().image_names())):
             if _same_content(self.image_path(image), other.image_path(image)):
@@ -97,22 +97,15 @@ class KaptureFolder:
                         )
 
     def read(self) -> KaptureData:
-        """Sensors, rigs, trajectories and records; parsed once.
-
-        Raises
-        ------
-        DataError : names file and line.
-        """
+        """Sensors, rigs, trajectories and records; parsed once. DataError names file and line."""
         if self._data is None:
             self._data = read_kapture_data(self.root, allow_links_below=self._roots()[1:])
         return self._data
 
     def image_path(self, image: str) -> Path:
-        """Path of an image; checked as text, the file need not exist and may be a link.
+        """Path of an image; the file need not exist and may be a link.
 
-        Raises
-        ------
-        DataError : the name leads out of ``records_data``.
+        Raises DataError: the name leads out of ``records_data``.
         """
         return safe_join(self.root / "sensors" / "records_data", image)
 
@@ -128,12 +121,7 @@ class KaptureFolder:
         return sorted(found)
 
     def keypoints(self, type_name: str) -> FeatureReader:
-        """Keypoints of a type.
-
-        Raises
-        ------
-        DataError : no such type, or a broken configuration.
-        """
+        """Keypoints of a type. Raises DataError: no such type, or a broken configuration."""
         return self._features("keypoints", type_name)
 
     def descriptors(self, type_name: str) -> FeatureReader:
@@ -146,26 +134,21 @@ class KaptureFolder:
 
     def matches(self, type_name: str) -> MatchesReader:
         """Matches of a keypoints type; see :meth:`keypoints`."""
-        folders = self._folders("matches", type_name)
-        if not folders:
-            raise DataError(self._absent("matches", type_name))
-        return MatchesReader(type_name, folders)
+        return MatchesReader(type_name, self._folders("matches", type_name))
 
     def has_points(self) -> bool:
         """True where there are 3D points and observations, which localization needs."""
-        return self._points_path().is_file() and self._observations_path().is_file()
+        return self._points_path.is_file() and self._observations_path.is_file()
 
     def points3d(self) -> NDArray[np.float64]:
         """3D points, float64 (N, 6): X Y Z R G B; colours 0 where there are none.
 
         Read once; the array is shared and cannot be written to.
 
-        Raises
-        ------
-        DataError : missing or broken; names file and line.
+        Raises DataError: missing or broken; names file and line.
         """
         if self._points is None:
-            points = read_points3d(check_no_escape(self._roots(), self._points_path()))
+            points = read_points3d(check_no_escape(self._roots(), self._points_path))
             points.setflags(write=False)
             self._points = points
         return self._points
@@ -177,12 +160,10 @@ class KaptureFolder:
         the points, keypoint ids against the keypoints of every image that has some (an image
         without is kapture's way to say that it was taken out of the map).
 
-        Raises
-        ------
-        DataError : missing or broken, or ids out of range; names file and line.
+        Raises DataError: missing or broken, or ids out of range; names file and line.
         """
         if self._observations is None:
-            path = check_no_escape(self._roots(), self._observations_path())
+            path = check_no_escape(self._roots(), self._observations_path)
             found = read_observations(path)
             num_points = len(self.points3d())
             for observations in found.values():
@@ -203,37 +184,33 @@ class KaptureFolder:
         observations against points and keypoints. With ``deep`` also every image is decoded and
         compared with its camera's size, and every match checked against the keypoints.
 
-        Raises
-        ------
-        DataError : the first thing found wrong.
+        Raises DataError: the first thing found wrong.
         """
         self.read()
-        readers = {kind: self._readers(kind) for kind in _ARRAY_KINDS}
-        for kind in _ARRAY_KINDS:
-            for reader in readers[kind].values():
+        readers = {
+            kind: {name: self._features(kind, name) for name in self.types(kind)}
+            for kind in _ARRAY_KINDS
+        }
+        for of_kind in readers.values():
+            for reader in of_kind.values():
                 for image in reader.names:
                     reader.read(image)
         for descriptors in readers["descriptors"].values():
             self._check_descriptors(descriptors, readers["keypoints"])
         for type_name in self.types("matches"):
-            self._check_matches(
-                self.matches(type_name), readers["keypoints"].get(type_name), deep=deep
-            )
-        if self._observations_path().exists() or self._points_path().exists():
+            matches = self.matches(type_name)
+            pairs = matches.pairs
+            if deep:
+                self._check_matches(matches, pairs, readers["keypoints"].get(type_name))
+        if self._observations_path.exists() or self._points_path.exists():
             self.points3d()
-        if self._observations_path().exists():
+        if self._observations_path.exists():
             self.observations()
         if deep:
             self._check_images()
 
     def _features(self, kind: ArrayKind, type_name: str) -> FeatureReader:
-        folders = self._folders(kind, type_name)
-        if not folders:
-            raise DataError(self._absent(kind, type_name))
-        return FeatureReader(kind, type_name, folders)
-
-    def _readers(self, kind: ArrayKind) -> dict[str, FeatureReader]:
-        return {name: self._features(kind, name) for name in self.types(kind)}
+        return FeatureReader(kind, type_name, self._folders(kind, type_name))
 
     def _roots(self, first: Path | None = None) -> tuple[Path, ...]:
         """Folders that links may lead to; the one they are found in comes first, for messages."""
@@ -241,22 +218,16 @@ class KaptureFolder:
 
     def _folders(self, kind: FeatureKind, type_name: str) -> list[tuple[Roots, Path]]:
         candidates = [(self.root, False), *((folder, True) for folder in self.features_dirs)]
-        return [
+        found: list[tuple[Roots, Path]] = [
             (self._roots(root), feature_folder(root, kind, type_name, orphan=orphan))
             for root, orphan in candidates
             if type_name in list_types(root, kind, orphan=orphan)
         ]
-
-    def _absent(self, kind: FeatureKind, type_name: str) -> str:
-        searched = ", ".join(str(d) for d in (self.root, *self.features_dirs))
-        present = ", ".join(self.types(kind)) or "none"
-        return f"no {kind} of type {type_name!r} in {searched}; there are: {present}"
-
-    def _points_path(self) -> Path:
-        return self.root / "reconstruction" / "points3d.txt"
-
-    def _observations_path(self) -> Path:
-        return self.root / "reconstruction" / "observations.txt"
+        if not found:
+            searched = ", ".join(str(root) for root, _ in candidates)
+            present = ", ".join(self.types(kind)) or "none"
+            raise DataError(f"no {kind} of type {type_name!r} in {searched}; there are: {present}")
+        return found
 
     def _check_descriptors(
         self, descriptors: FeatureReader, keypoints_by_type: dict[str, FeatureReader]
@@ -277,11 +248,11 @@ class KaptureFolder:
                 )
 
     def _check_matches(
-        self, matches: MatchesReader, keypoints: FeatureReader | None, *, deep: bool
+        self,
+        matches: MatchesReader,
+        pairs: Sequence[tuple[str, str]],
+        keypoints: FeatureReader | None,
     ) -> None:
-        pairs = matches.pairs
-        if not deep:
-            return
         for pair in pairs:
             indices, _ = matches.read(*pair)
             for image, column in zip(pair, indices.T, strict=True):
@@ -307,27 +278,24 @@ class KaptureFolder:
             return
         first = int(np.flatnonzero(wrong)[0])
         point = int(observations.point_ids[first])
-        image = observations.image_names[int(observations.image_ids[first])]
+        index = int(observations.image_ids[first])
+        image = observations.image_names[index]
         keypoint = int(observations.keypoint_ids[first])
-        line = find_observation(path, keypoints_type, point, image, keypoint)
-        if past_points[first]:
-            raise DataError(
-                f"point id {point}, but there are {num_points} points", path=path, line=line
-            )
-        raise DataError(
-            f"keypoint id {keypoint}, but {image!r} has "
-            f"{int(limit[observations.image_ids[first]])} keypoints of type {keypoints_type!r}",
-            path=path,
-            line=line,
+        problem = (
+            f"point id {point}, but there are {num_points} points"
+            if past_points[first]
+            else f"keypoint id {keypoint}, but {image!r} has {limit[index]} keypoints of type "
+            f"{keypoints_type!r}"
         )
+        line = find_observation(path, keypoints_type, point, image, keypoint)
+        raise DataError(problem, path=path, line=line)
 
     def _check_images(self) -> None:
         data = self.read()
         for image in data.image_names():
             path = self.image_path(image)
-            pixels = read_image_rgb(path)
+            size = read_image_rgb(path).shape[1::-1]
             sensor = data.sensors[data.record_of(image)[1]]
-            size = (pixels.shape[1], pixels.shape[0])
             expected = (int(float(sensor.params[1])), int(float(sensor.params[2])))
             if size != expected:
                 raise DataError(
@@ -363,27 +331,18 @@ def to_kapture(source: KaptureData | KaptureFolder | Path | str) -> kapture.Kapt
         sensors[sensor_id] = kapture.create_sensor(
             sensor.sensor_type, list(sensor.params), sensor.name or None
         )
-
-    def transform(pose: RigidTransform) -> kapture.PoseTransform:
-        return kapture.PoseTransform(list(pose.quat_wxyz), list(pose.translation))
-
-    rigs = kapture.Rigs()
-    for rig_id, members in sorted(data.rigs.items()):
-        for sensor_id, pose in sorted(members.items()):
-            rigs[rig_id, sensor_id] = transform(pose)
-    trajectories = kapture.Trajectories()
-    for (timestamp, device_id), pose in sorted(data.trajectories.items()):
-        trajectories[int(timestamp), device_id] = transform(pose)
-    records_camera = kapture.RecordsCamera()
-    for (timestamp, sensor_id), name in sorted(data.records_camera.items()):
-        records_camera[int(timestamp), sensor_id] = name
-    records_depth = kapture.RecordsDepth()
-    for (timestamp, sensor_id), name in sorted(data.records_depth.items()):
-        records_depth[int(timestamp), sensor_id] = name
+    rigs = {(rig, sensor): p for rig, members in data.rigs.items() for sensor, p in members.items()}
+    parts: dict[str, tuple[Any, Mapping[Any, Any]]] = {
+        "rigs": (kapture.Rigs(), rigs),
+        "trajectories": (kapture.Trajectories(), data.trajectories),
+        "records_camera": (kapture.RecordsCamera(), data.records_camera),
+        "records_depth": (kapture.RecordsDepth(), data.records_depth),
+    }
+    for container, values in parts.values():
+        for key, value in sorted(values.items()):
+            if isinstance(value, RigidTransform):
+                value = kapture.PoseTransform(list(value.quat_wxyz), list(value.translation))
+            container[key] = value
     return kapture.Kapture(
-        sensors=sensors,
-        rigs=rigs or None,
-        trajectories=trajectories or None,
-        records_camera=records_camera or None,
-        records_depth=records_depth or None,
+        sensors=sensors, **{name: container or None for name, (container, _) in parts.items()}
     )

@@ -8,7 +8,6 @@ order is found too. Pairs files are kapture-localization's: query image, map ima
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,17 +15,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.files import output_error, write_bytes
-from megloc_kapture.io.kapture.blobs import BlobSource, FolderBlobWriter
+from megloc_kapture.io.files import Roots, check_output, check_relative, output_error, write_bytes
+from megloc_kapture.io.kapture.blobs import BlobSource
 from megloc_kapture.io.kapture.features import (
     SUFFIX,
+    BlobWriter,
     blob_sources,
     check_field,
     feature_folder,
 )
-from megloc_kapture.io.kapture.tars import TarBlobWriter
-from megloc_kapture.io.kapture.text import format_table, named, parse_float, read_rows
-from megloc_kapture.io.paths import Roots, check_output, check_relative
+from megloc_kapture.io.kapture.text import check_columns, format_table, parse_float, read_rows
 
 _BETWEEN = ".overlapping/"
 _ROW_BYTES = 3 * 8
@@ -38,14 +36,7 @@ class MatchesReader:
     """The matches of one keypoints type, from one or several folders; the first one counts."""
 
     def __init__(self, type_name: str, folders: Sequence[tuple[Roots, Path]]) -> None:
-        """``folders``: (roots that links may not leave, folder of the type), in order.
-
-        Raises
-        ------
-        DataError : no folder.
-        """
-        if not folders:
-            raise DataError(f"no matches of type {type_name!r}")
+        """``folders``: (roots that links may not leave, folder of the type), in order."""
         self.type_name = type_name
         self._sources: list[BlobSource] = []
         for roots, folder in folders:
@@ -56,9 +47,7 @@ class MatchesReader:
     def pairs(self) -> list[tuple[str, str]]:
         """Matched pairs ``(a, b)`` with ``a < b``, sorted.
 
-        Raises
-        ------
-        DataError : a file that names no pair, or an image with itself.
+        Raises DataError: a file that names no pair, or an image with itself.
         """
         if self._pairs is None:
             found = set()
@@ -72,9 +61,7 @@ class MatchesReader:
         return list(self._pairs)
 
     def __contains__(self, pair: object) -> bool:
-        if not isinstance(pair, tuple) or len(pair) != 2:
-            return False
-        return self._find(str(pair[0]), str(pair[1])) is not None
+        return isinstance(pair, tuple) and len(pair) == 2 and self._find(*pair) is not None
 
     def length(self, a: str, b: str) -> int:
         """Number of matches of a pair, from the size of its file alone; 0 where there is none."""
@@ -118,16 +105,14 @@ class MatchesReader:
         return columns.astype(np.int64), rows[:, 2].copy()
 
     def _find(self, a: str, b: str) -> tuple[BlobSource, str, bool] | None:
-        first, second = min(a, b), max(a, b)
         for source in self._sources:
-            for left, right in ((first, second), (second, first)):
-                name = f"{left}{_BETWEEN}{right}{SUFFIX['matches']}"
-                if name in source:
+            for left, right in (sorted((a, b)), sorted((a, b), reverse=True)):
+                if (name := _name(left, right)) in source:
                     return source, name, left != a
         return None
 
 
-class MatchesWriter(AbstractContextManager["MatchesWriter"]):
+class MatchesWriter(BlobWriter):
     """Write matches of one keypoints type; each pair's file is atomic.
 
     ``(a, b) in writer`` tells what is written already. Use as a context manager.
@@ -136,11 +121,8 @@ class MatchesWriter(AbstractContextManager["MatchesWriter"]):
     def __init__(
         self, root: Path, type_name: str, *, tar: bool = False, orphan: bool = False
     ) -> None:
-        """
-        Raises
-        ------
-        DataError : the type name cannot be the name of a folder.
-        OutputError : cannot be written.
+        """Raises DataError: the type name cannot be the name of a folder; OutputError: cannot be
+        written.
         """
         self.type_name = type_name
         folder = feature_folder(Path(root), "matches", type_name, orphan=orphan)
@@ -150,18 +132,13 @@ class MatchesWriter(AbstractContextManager["MatchesWriter"]):
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise output_error(folder, error) from error
-        self._blobs: FolderBlobWriter | TarBlobWriter
-        self._blobs = TarBlobWriter(folder / "matches.tar") if tar else FolderBlobWriter(folder)
+        super().__init__(folder, "matches", tar=tar)
 
     def __contains__(self, pair: tuple[str, str]) -> bool:
-        return _name(min(pair), max(pair)) in self._blobs
+        return self.has(_name(min(pair), max(pair)))
 
     def write(self, a: str, b: str, indices: ArrayLike, scores: ArrayLike) -> Path:
-        """Write one pair: integer indices (M, 2) in the order ``a``, ``b``, and scores (M,).
-
-        Returns
-        -------
-        The file that holds it.
+        """Write a pair: integer indices (M, 2) in the order ``a``, ``b``, scores (M,); its file.
 
         Raises
         ------
@@ -185,14 +162,7 @@ class MatchesWriter(AbstractContextManager["MatchesWriter"]):
         rows[:, :2] = pairs if a < b else pairs[:, ::-1]
         rows[:, 2] = values
         name = _name(check_field(min(a, b)), check_field(max(a, b)))
-        return self._blobs.write(name, rows.tobytes())
-
-    def close(self) -> None:
-        """Finish the tar; the writer is of no use afterwards."""
-        self._blobs.close()
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+        return self.put(name, rows.tobytes())
 
 
 def _name(first: str, second: str) -> str:
@@ -214,24 +184,18 @@ class ImagePair:
 def read_pairs(path: Path | str) -> list[ImagePair]:
     """Read a pairs file, in the order of the file; a repeated pair counts once, where it is first.
 
-    Raises
-    ------
-    DataError : names file and line.
+    Raises DataError: names file and line.
     """
-    path = Path(path)
     pairs: list[ImagePair] = []
     seen: set[tuple[str, str]] = set()
-    for line, fields in read_rows(path):
-        if len(fields) != 3:
-            raise DataError(f"expected 3 columns, got {len(fields)}", path=path, line=line)
-        query, map_image = fields[:2]
-        with named(path, line):
-            check_relative(query)
-            check_relative(map_image)
-        score = parse_float(fields[2], "score", path, line)
-        if (query, map_image) not in seen:
-            seen.add((query, map_image))
-            pairs.append(ImagePair(query, map_image, score))
+    with read_rows(Path(path)) as rows:
+        for _, fields in rows:
+            check_columns(fields, 3)
+            pair = check_relative(fields[0]), check_relative(fields[1])
+            score = parse_float(fields[2], "score")
+            if pair not in seen:
+                seen.add(pair)
+                pairs.append(ImagePair(*pair, score))
     return pairs
 
 

@@ -22,18 +22,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.files import atomic_write
+from megloc_kapture.io.files import (
+    atomic_write,
+    check_component,
+    check_output,
+    check_relative,
+    named,
+)
 from megloc_kapture.io.kapture.features import check_field
 from megloc_kapture.io.kapture.text import (
     BYTE_ORDER_MARK,
     FORMAT_LINE,
     check_version,
-    named,
     parse_integer,
     read_rows,
     split_fields,
 )
-from megloc_kapture.io.paths import check_component, check_output, check_relative
 
 OBSERVATIONS_HEADER = "# point3d_id, keypoints_type, [image_path, feature_id]*"
 MAX_KEYPOINT_ID = 2**31 - 1
@@ -75,28 +79,23 @@ class Observations:
 def read_observations(
     path: Path, *, large_bytes: int = LARGE_BYTES, chunk_bytes: int = _CHUNK_BYTES
 ) -> dict[str, Observations]:
-    """Read ``observations.txt``, by keypoints type.
-
-    Raises
-    ------
-    DataError : names file and line.
-    """
-    found = None
-    if path.is_file() and path.stat().st_size >= large_bytes:
-        found = _read_compiled(path, chunk_bytes)
+    """Read ``observations.txt``, by keypoints type. Raises DataError: names file and line."""
+    is_large = path.is_file() and path.stat().st_size >= large_bytes
+    found = _read_compiled(path, chunk_bytes) if is_large else None
     return read_observations_strictly(path) if found is None else found
 
 
 def read_observations_strictly(path: Path) -> dict[str, Observations]:
     """The grammar of ``observations.txt`` in plain Python: slow."""
     lists: dict[str, tuple[list[int], list[str], list[int]]] = {}
-    for line, fields in read_rows(path):
-        point, keypoints_type, pairs = _row(fields, path, line)
-        points, images, keypoints = lists.setdefault(keypoints_type, ([], [], []))
-        for image, keypoint in pairs:
-            points.append(point)
-            images.append(image)
-            keypoints.append(keypoint)
+    with read_rows(path) as rows:
+        for _, fields in rows:
+            point, keypoints_type, pairs = _row(fields)
+            points, images, keypoints = lists.setdefault(keypoints_type, ([], [], []))
+            for image, keypoint in pairs:
+                points.append(point)
+                images.append(image)
+                keypoints.append(keypoint)
     found = {}
     for keypoints_type, (points, images, keypoints) in sorted(lists.items()):
         names = tuple(sorted(set(images)))
@@ -111,23 +110,18 @@ def read_observations_strictly(path: Path) -> dict[str, Observations]:
     return found
 
 
-def _row(fields: list[str], path: Path, line: int) -> tuple[int, str, list[tuple[str, int]]]:
+def _row(fields: list[str]) -> tuple[int, str, list[tuple[str, int]]]:
     if len(fields) < 2 or len(fields) % 2:
-        raise DataError(
-            f"expected a point, a type and pairs of columns, got {len(fields)} columns",
-            path=path,
-            line=line,
-        )
-    point = parse_integer(fields[0], "point id", path, line)
+        raise DataError(f"expected a point, a type and pairs of columns, got {len(fields)} columns")
+    point = parse_integer(fields[0], "point id")
     if not 0 <= point < MAX_POINT_ID:
-        raise DataError(f"point id {point} is out of range", path=path, line=line)
-    with named(path, line):
-        keypoints_type = check_component(fields[1])
-        images = [check_relative(name) for name in fields[2::2]]
-    keypoints = [parse_integer(text, "keypoint id", path, line) for text in fields[3::2]]
+        raise DataError(f"point id {point} is out of range")
+    keypoints_type = check_component(fields[1])
+    images = [check_relative(name) for name in fields[2::2]]
+    keypoints = [parse_integer(text, "keypoint id") for text in fields[3::2]]
     for keypoint in keypoints:
         if not 0 <= keypoint <= MAX_KEYPOINT_ID:
-            raise DataError(f"keypoint id {keypoint} is out of range", path=path, line=line)
+            raise DataError(f"keypoint id {keypoint} is out of range")
     return point, keypoints_type, list(zip(images, keypoints, strict=True))
 
 
@@ -135,10 +129,11 @@ def find_observation(
     path: Path, keypoints_type: str, point_id: int, image: str, keypoint_id: int
 ) -> int | None:
     """Line of ``observations.txt`` that holds an observation; slow, for error messages."""
-    for line, fields in read_rows(path):
-        point, found_type, pairs = _row(fields, path, line)
-        if (point, found_type) == (point_id, keypoints_type) and (image, keypoint_id) in pairs:
-            return line
+    with read_rows(path) as rows:
+        for line, fields in rows:
+            point, found_type, pairs = _row(fields)
+            if (point, found_type) == (point_id, keypoints_type) and (image, keypoint_id) in pairs:
+                return line
     return None
 
 
@@ -152,11 +147,8 @@ def sorted_observations(
     """Observations sorted by point, in the given order among equals."""
     if (point_ids[1:] < point_ids[:-1]).any():
         order = np.argsort(point_ids, kind="stable")
-        point_ids, image_ids, keypoint_ids = (
-            point_ids[order],
-            image_ids[order],
-            keypoint_ids[order],
-        )
+        point_ids, image_ids = point_ids[order], image_ids[order]
+        keypoint_ids = keypoint_ids[order]
     return Observations(keypoints_type, image_names, point_ids, image_ids, keypoint_ids)
 
 
@@ -188,9 +180,7 @@ class _Parsed(NamedTuple):
 def _read_compiled(path: Path, chunk_bytes: int) -> dict[str, Observations] | None:
     """Read with the compiled loops; None where a line or a name is unusual.
 
-    Raises
-    ------
-    DataError : a line is wrong, or the file cannot be read.
+    Raises DataError: a line is wrong, or the file cannot be read.
     """
     parts = []
     for chunk, parsed in _parsed_chunks(path, chunk_bytes):
@@ -338,7 +328,8 @@ def _check_refused(path: Path, chunk: _Chunk, begin: int) -> None:
         raise DataError("not a text file in UTF-8", path=path, line=number) from None
     # a comment in another script, or a line blank but for its spaces, is no row
     if line.strip() and not line.startswith("#"):
-        _row(split_fields(line.removesuffix("\r")), path, number)
+        with named(path, number):
+            _row(split_fields(line))
 
 
 # ------------------------------------------------------------------------------------ writing
@@ -369,7 +360,16 @@ def write_observations(
 
 def _texts(observations: Mapping[str, Observations], large: int) -> Iterator[bytes]:
     """Text of the rows; that of several types, which is rare, always by the plain writer."""
-    parts = [_sorted_part(name, observations[name]) for name in sorted(observations)]
+    parts = [
+        sorted_observations(
+            name,
+            of_type.image_names,
+            np.asarray(of_type.point_ids, dtype=np.int64),
+            np.asarray(of_type.image_ids, dtype=np.int32),
+            np.asarray(of_type.keypoint_ids, dtype=np.int32),
+        )
+        for name, of_type in sorted(observations.items())
+    ]
     if len(parts) == 1 and len(parts[0]) >= large:
         from megloc_kapture.io.kapture.observation_kernels import written_rows
 
@@ -377,16 +377,6 @@ def _texts(observations: Mapping[str, Observations], large: int) -> Iterator[byt
     elif parts:
         for text in _plain_texts(parts):
             yield text.encode()
-
-
-def _sorted_part(keypoints_type: str, of_type: Observations) -> Observations:
-    return sorted_observations(
-        keypoints_type,
-        of_type.image_names,
-        np.asarray(of_type.point_ids, dtype=np.int64),
-        np.asarray(of_type.image_ids, dtype=np.int32),
-        np.asarray(of_type.keypoint_ids, dtype=np.int32),
-    )
 
 
 def _plain_texts(of_types: Sequence[Observations]) -> Iterator[str]:

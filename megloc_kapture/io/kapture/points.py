@@ -1,4 +1,4 @@
-"""``reconstruction/points3d.txt``, the 3D points of a map, and how uncertain they are.
+"""``reconstruction/points3d.txt``, the 3D points of a map, how uncertain they are, and PLY files.
 
 pandas reads the plain form of the grammar, each number as Python's ``float`` does (from version
 3.1 on; before, the last bit could differ). It also takes what the grammar does not know (missing
@@ -12,13 +12,20 @@ import contextlib
 import io
 import math
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.files import atomic_write, read_content, write_bytes
+from megloc_kapture.io.files import (
+    atomic_write,
+    check_no_escape,
+    check_output,
+    read_content,
+    write_bytes,
+)
 from megloc_kapture.io.kapture.text import (
     BYTE_ORDER_MARK,
     FORMAT_LINE,
@@ -26,7 +33,6 @@ from megloc_kapture.io.kapture.text import (
     parse_float,
     read_rows,
 )
-from megloc_kapture.io.paths import check_no_escape, check_output
 
 POINTS_HEADERS = {3: "# X, Y, Z", 6: "# X, Y, Z, R, G, B"}
 COVARIANCES_FILE = "reconstruction/point_covariances.npy"
@@ -35,24 +41,20 @@ COVARIANCES_FILE = "reconstruction/point_covariances.npy"
 LARGE_BYTES = 1 << 22
 _ROWS_AT_ONCE = 1 << 16
 _PLAIN, _ASCII = b"0123456789+-.eE, \t\r\n", bytes(range(1, 128))
+_PLY_TYPES = {"<f8": "double", "<f4": "float", "|u1": "uchar"}
 _NUMBER_CHARACTERS = re.compile(r"[0-9eE.+\-]+")
 
 
 def read_points3d(path: Path, *, large_bytes: int = LARGE_BYTES) -> NDArray[np.float64]:
     """Read ``points3d.txt`` as float64 (N, 6): X Y Z R G B, colours 0 where there are none.
 
-    Raises
-    ------
-    DataError : names file and line.
+    Raises DataError: names file and line.
     """
-    read = None
-    if path.is_file() and path.stat().st_size >= large_bytes:
-        read = _read_plain(path)
+    is_large = path.is_file() and path.stat().st_size >= large_bytes
+    read = _read_plain(path) if is_large else None
     if read is None:
         read = read_points3d_strictly(path)
-    if read.shape[1] == 6:
-        return read
-    return np.concatenate([read, np.zeros((len(read), 3))], axis=1)
+    return read if read.shape[1] == 6 else np.pad(read, ((0, 0), (0, 3)))
 
 
 def _read_plain(path: Path) -> NDArray[np.float64] | None:
@@ -89,23 +91,24 @@ def read_points3d_strictly(path: Path) -> NDArray[np.float64]:
     """The grammar of ``points3d.txt`` in plain Python: slow, (N, 3) or (N, 6)."""
     values: list[float] = []
     columns = 0
-    for line, fields in read_rows(path):
-        columns = columns or len(fields)
-        values += _coordinates(fields, columns, path, line)
+    with read_rows(path) as rows:
+        for _, fields in rows:
+            columns = columns or len(fields)
+            values += _coordinates(fields, columns)
     return np.array(values, dtype=np.float64).reshape(-1, columns or 6)
 
 
-def _coordinates(fields: list[str], columns: int, path: Path, line: int) -> list[float]:
+def _coordinates(fields: list[str], columns: int) -> list[float]:
     if columns not in POINTS_HEADERS or len(fields) != columns:
         expected = str(columns) if columns in POINTS_HEADERS else "3 or 6"
-        raise DataError(f"expected {expected} columns, got {len(fields)}", path=path, line=line)
+        raise DataError(f"expected {expected} columns, got {len(fields)}")
     # of these characters float() accepts exactly our grammar, and is faster than a pattern
     if _NUMBER_CHARACTERS.fullmatch("".join(fields)):
         with contextlib.suppress(ValueError):
             values = [float(text) for text in fields]
             if all(map(math.isfinite, values)):
                 return values
-    return [parse_float(text, "coordinate", path, line) for text in fields]
+    return [parse_float(text, "coordinate") for text in fields]
 
 
 def write_points3d(root: Path, points: ArrayLike) -> None:
@@ -113,10 +116,7 @@ def write_points3d(root: Path, points: ArrayLike) -> None:
 
     Each number is the shortest that reads back as the same float64.
 
-    Raises
-    ------
-    ValueError : another shape, or values that are not finite.
-    OutputError : cannot be written.
+    Raises ValueError: another shape, or values that are not finite; OutputError: cannot be written.
     """
     rows = np.asarray(points, dtype=np.float64)
     if rows.ndim != 2 or rows.shape[1] not in POINTS_HEADERS:
@@ -156,9 +156,7 @@ def write_point_covariances(root: Path, covariances: NDArray[np.float64]) -> Non
 def read_point_covariances(root: Path, num_points: int) -> NDArray[np.float64] | None:
     """The covariances (N, 6) of a map with ``num_points`` points, memory-mapped; None without any.
 
-    Raises
-    ------
-    DataError : not such an array, or not of so many points: another map's.
+    Raises DataError: not such an array, or not of so many points: another map's.
     """
     path = root / COVARIANCES_FILE
     if not path.is_file():
@@ -175,3 +173,50 @@ def read_point_covariances(root: Path, num_points: int) -> NDArray[np.float64] |
             path=path,
         )
     return np.asarray(array)
+
+
+# ------------------------------------------------------------------------------------ viewers
+
+
+def write_ply(
+    path: Path,
+    xyz: ArrayLike,
+    colours: ArrayLike,
+    edges: Sequence[tuple[int, int]] = (),
+    **properties: ArrayLike,
+) -> None:
+    """Write coloured points, and lines between them, as a binary PLY file that every viewer opens.
+
+    Coordinates are float64: a map in a world frame keeps its digits.
+
+    Parameters
+    ----------
+    xyz : (N, 3).
+    colours : uint8 (N, 3), red, green, blue.
+    edges : pairs of rows that a line joins.
+    properties : further values (N,), one float32 each, by name.
+
+    Raises
+    ------
+    ValueError : arrays that differ in length.
+    OutputError : cannot be written.
+    """
+    xyz, colours = np.asarray(xyz, dtype=np.float64), np.asarray(colours, dtype=np.uint8)
+    columns = [
+        *zip("xyz", xyz.T, ["<f8"] * 3, strict=True),
+        *zip(("red", "green", "blue"), colours.T, ["|u1"] * 3, strict=True),
+        *((name, np.asarray(values), "<f4") for name, values in properties.items()),
+    ]
+    if {len(values) for _, values, _ in columns} != {len(xyz)}:
+        raise ValueError("coordinates, colours and properties differ in length")
+    rows = np.empty(len(xyz), dtype=[(name, kind) for name, _, kind in columns])
+    for name, values, _ in columns:
+        rows[name] = values
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+    header += [f"property {_PLY_TYPES[kind]} {name}" for name, _, kind in columns]
+    if edges:
+        header += [f"element edge {len(edges)}", "property int vertex1", "property int vertex2"]
+    with atomic_write(path) as file:
+        file.write("\n".join([*header, "end_header", ""]).encode())
+        file.write(rows.tobytes())
+        file.write(np.array(edges, dtype="<i4").tobytes())

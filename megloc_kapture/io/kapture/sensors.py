@@ -11,12 +11,19 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
+from typing import Any
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.files import output_error, write_bytes
+from megloc_kapture.io.files import (
+    check_no_escape,
+    check_output,
+    check_relative,
+    output_error,
+    write_bytes,
+)
 from megloc_kapture.io.kapture.data import (
     CAMERA_SENSOR_TYPES,
     UNKNOWN_CAMERA,
@@ -24,20 +31,13 @@ from megloc_kapture.io.kapture.data import (
     Sensor,
 )
 from megloc_kapture.io.kapture.text import (
+    check_columns,
     format_table,
-    named,
     parse_float,
     parse_integer,
     read_rows,
 )
-from megloc_kapture.io.paths import check_no_escape, check_output, check_relative
 from megloc_kapture.values import RigidTransform
-
-SENSORS_HEADER = "# sensor_id, name, sensor_type, [sensor_params]+"
-RIGS_HEADER = "# rig_id, sensor_id, qw, qx, qy, qz, tx, ty, tz"
-TRAJECTORIES_HEADER = "# timestamp, device_id, qw, qx, qy, qz, tx, ty, tz"
-RECORDS_CAMERA_HEADER = "# timestamp, device_id, image_path"
-RECORDS_DEPTH_HEADER = "# timestamp, device_id, depth_map_path"
 
 # |q| may be off by this much (texts with few digits), and is then normalised
 MAX_QUATERNION_ERROR = 1e-3
@@ -61,45 +61,39 @@ def read_kapture_data(root: Path, *, allow_links_below: Sequence[Path] = ()) -> 
     """
     if not root.is_dir():
         raise DataError("no such kapture folder", path=root)
-    folder, roots = root / "sensors", (root, *allow_links_below)
+    roots = (root, *allow_links_below)
 
-    def present(name: str) -> Path | None:
-        path = folder / name
-        return check_no_escape(roots, path) if path.exists() or path.is_symlink() else None
+    def read(name: str, reader: Callable[..., dict[Any, Any]], *known: Any) -> dict[Any, Any]:
+        path = root / "sensors" / name
+        if not (path.exists() or path.is_symlink() or name == "sensors.txt"):
+            return {}
+        return reader(check_no_escape(roots, path), *known)
 
-    data = KaptureData()
-    data.sensors = read_sensors(check_no_escape(roots, folder / "sensors.txt"))
-    if path := present("rigs.txt"):
-        data.rigs = read_rigs(path, data.sensors)
-    if path := present("trajectories.txt"):
-        data.trajectories = read_trajectories(path, {*data.sensors, *data.rigs})
-    if path := present("records_camera.txt"):
-        data.records_camera = read_records(path, data.sensors, "camera")
-    if path := present("records_depth.txt"):
-        data.records_depth = read_records(path, data.sensors, "depth")
-    return data
+    sensors = read("sensors.txt", read_sensors)
+    rigs = read("rigs.txt", read_rigs, sensors)
+    return KaptureData(
+        sensors,
+        rigs,
+        read("trajectories.txt", read_trajectories, {*sensors, *rigs}),
+        read("records_camera.txt", read_records, sensors, "camera"),
+        read("records_depth.txt", read_records, sensors, "depth"),
+    )
 
 
 def read_sensors(path: Path) -> dict[str, Sensor]:
-    """Read ``sensors.txt``; cameras' models and parameters are checked.
-
-    Raises
-    ------
-    DataError : names file and line.
-    """
+    """Read ``sensors.txt``; cameras' models and parameters are checked."""
     sensors: dict[str, Sensor] = {}
-    for line, fields in read_rows(path, version_required=True):
-        if len(fields) < 3:
-            raise DataError(f"expected at least 3 columns, got {len(fields)}", path=path, line=line)
-        sensor_id, name, sensor_type, *params = fields
-        if not sensor_id:
-            raise DataError("empty sensor id", path=path, line=line)
-        if sensor_id in sensors:
-            raise DataError(f"sensor {sensor_id!r} is listed twice", path=path, line=line)
-        sensor = Sensor(name, sensor_type, tuple(params))
-        with named(path, line):
-            check_sensor(sensor)
-        sensors[sensor_id] = sensor
+    with read_rows(path, version_required=True) as rows:
+        for _, fields in rows:
+            if len(fields) < 3:
+                raise DataError(f"expected at least 3 columns, got {len(fields)}")
+            sensor_id, name, sensor_type, *params = fields
+            if not sensor_id:
+                raise DataError("empty sensor id")
+            if sensor_id in sensors:
+                raise DataError(f"sensor {sensor_id!r} is listed twice")
+            sensors[sensor_id] = Sensor(name, sensor_type, tuple(params))
+            check_sensor(sensors[sensor_id])
     return sensors
 
 
@@ -117,31 +111,27 @@ def read_rigs(path: Path, sensors: Iterable[str]) -> dict[str, dict[str, RigidTr
     """Read ``rigs.txt``: rig id -> sensor or rig id -> ``sensor_from_rig``.
 
     Rows of sensors that ``sensors.txt`` does not know are left out, as kapture does: who takes
-    some cameras of a rig out of a dataset leaves rigs.txt as it was.
-
-    Raises
-    ------
-    DataError : names file and line; also for a rig that contains itself.
+    some cameras of a rig out of a dataset leaves rigs.txt as it was. A rig that contains itself is
+    refused.
     """
     known = set(sensors)
     rigs: dict[str, dict[str, RigidTransform]] = {}
     lines: dict[tuple[str, str], int] = {}
-    for line, fields in read_rows(path):
-        _expect_columns(fields, 9, path, line)
-        rig_id, sensor_id = fields[:2]
-        if not rig_id or not sensor_id:
-            raise DataError("empty rig or sensor id", path=path, line=line)
-        if rig_id in known:
-            raise DataError(f"rig id {rig_id!r} is also a sensor id", path=path, line=line)
-        if (rig_id, sensor_id) in lines:
-            raise DataError(
-                f"sensor {sensor_id!r} is in rig {rig_id!r} twice", path=path, line=line
-            )
-        lines[rig_id, sensor_id] = line
-        pose = _pose(fields[2:], path, line)
-        rig = rigs.setdefault(rig_id, {})
-        if pose is not None:
-            rig[sensor_id] = pose
+    with read_rows(path) as rows:
+        for line, fields in rows:
+            check_columns(fields, 9)
+            rig_id, sensor_id = fields[:2]
+            if not rig_id or not sensor_id:
+                raise DataError("empty rig or sensor id")
+            if rig_id in known:
+                raise DataError(f"rig id {rig_id!r} is also a sensor id")
+            if (rig_id, sensor_id) in lines:
+                raise DataError(f"sensor {sensor_id!r} is in rig {rig_id!r} twice")
+            lines[rig_id, sensor_id] = line
+            pose = _pose(fields[2:])
+            rig = rigs.setdefault(rig_id, {})
+            if pose is not None:
+                rig[sensor_id] = pose
     for members in rigs.values():
         for sensor_id in [s for s in members if s not in known and s not in rigs]:
             del members[sensor_id]
@@ -150,21 +140,18 @@ def read_rigs(path: Path, sensors: Iterable[str]) -> dict[str, dict[str, RigidTr
 
 
 def read_trajectories(path: Path, devices: Iterable[str]) -> dict[tuple[int, str], RigidTransform]:
-    """Read ``trajectories.txt``: (timestamp, device id) -> ``device_from_world``.
-
-    Raises
-    ------
-    DataError : names file and line.
-    """
+    """Read ``trajectories.txt``: (timestamp, device id) -> ``device_from_world``."""
     known = set(devices)
     poses: dict[tuple[int, str], RigidTransform] = {}
-    first_line: dict[tuple[int, str], int] = {}
-    for line, fields in read_rows(path):
-        _expect_columns(fields, 9, path, line)
-        key = _record_key(fields, known, first_line, path, line)
-        pose = _pose(fields[2:], path, line)
-        if pose is not None:
-            poses[key] = pose
+    lines: dict[tuple[int, str], int] = {}
+    with read_rows(path) as rows:
+        for line, fields in rows:
+            check_columns(fields, 9)
+            key = _record_key(fields, known, lines)
+            lines[key] = line
+            pose = _pose(fields[2:])
+            if pose is not None:
+                poses[key] = pose
     return poses
 
 
@@ -173,72 +160,52 @@ def read_records(
 ) -> dict[tuple[int, str], str]:
     """Read ``records_camera.txt`` or ``records_depth.txt``.
 
-    Raises
-    ------
-    DataError : names file and line; also for a path that is listed twice (an image name is the
-        identity of its features) and a sensor of another type.
+    A path that is listed twice is refused (an image name is the identity of its features), and so
+    is a sensor of another type.
     """
     known = set(sensors)
     records: dict[tuple[int, str], str] = {}
-    first_line: dict[tuple[int, str], int] = {}
-    lines: dict[str, int] = {}
-    for line, fields in read_rows(path):
-        _expect_columns(fields, 3, path, line)
-        key = _record_key(fields, known, first_line, path, line)
-        if sensors[key[1]].sensor_type != sensor_type:
-            raise DataError(
-                f"sensor {key[1]!r} is of type {sensors[key[1]].sensor_type!r}, "
-                f"not {sensor_type!r}",
-                path=path,
-                line=line,
-            )
-        name = fields[2]
-        with named(path, line):
-            check_relative(name)
-        if name in lines:
-            raise DataError(
-                f"{name!r} is listed twice, first in line {lines[name]}", path=path, line=line
-            )
-        lines[name] = line
-        records[key] = name
+    lines: dict[tuple[int, str], int] = {}
+    lines_of_names: dict[str, int] = {}
+    with read_rows(path) as rows:
+        for line, fields in rows:
+            check_columns(fields, 3)
+            key = _record_key(fields, known, lines)
+            lines[key] = line
+            found_type = sensors[key[1]].sensor_type
+            if found_type != sensor_type:
+                raise DataError(f"sensor {key[1]!r} is of type {found_type!r}, not {sensor_type!r}")
+            name = check_relative(fields[2])
+            if name in lines_of_names:
+                raise DataError(f"{name!r} is listed twice, first in line {lines_of_names[name]}")
+            lines_of_names[name] = line
+            records[key] = name
     return records
 
 
-def _expect_columns(fields: Sequence[str], expected: int, path: Path, line: int) -> None:
-    if len(fields) != expected:
-        raise DataError(f"expected {expected} columns, got {len(fields)}", path=path, line=line)
-
-
 def _record_key(
-    fields: Sequence[str],
-    known: set[str],
-    first_line: dict[tuple[int, str], int],
-    path: Path,
-    line: int,
+    fields: Sequence[str], known: set[str], lines: dict[tuple[int, str], int]
 ) -> tuple[int, str]:
-    key = (parse_integer(fields[0], "timestamp", path, line), fields[1])
+    """Timestamp and device of a row, of which there is none in ``lines``."""
+    key = (parse_integer(fields[0], "timestamp"), fields[1])
     if key[1] not in known:
-        raise DataError(f"unknown sensor or rig {key[1]!r}", path=path, line=line)
-    if key in first_line:
+        raise DataError(f"unknown sensor or rig {key[1]!r}")
+    if key in lines:
         raise DataError(
-            f"timestamp {key[0]} of {key[1]!r} is listed twice, first in line {first_line[key]}",
-            path=path,
-            line=line,
+            f"timestamp {key[0]} of {key[1]!r} is listed twice, first in line {lines[key]}"
         )
-    first_line[key] = line
     return key
 
 
-def _pose(fields: Sequence[str], path: Path, line: int) -> RigidTransform | None:
+def _pose(fields: Sequence[str]) -> RigidTransform | None:
     rotation, translation = fields[:4], fields[4:]
     if not any(rotation) or not any(translation):
         return None
     if not all(fields):
-        raise DataError("some but not all fields of a pose are blank", path=path, line=line)
-    qw, qx, qy, qz = (parse_float(text, "rotation", path, line) for text in rotation)
-    tx, ty, tz = (parse_float(text, "translation", path, line) for text in translation)
-    with named(path, line):
-        return RigidTransform(unit_quaternion((qw, qx, qy, qz)), (tx, ty, tz))
+        raise DataError("some but not all fields of a pose are blank")
+    qw, qx, qy, qz = (parse_float(text, "rotation") for text in rotation)
+    tx, ty, tz = (parse_float(text, "translation") for text in translation)
+    return RigidTransform(unit_quaternion((qw, qx, qy, qz)), (tx, ty, tz))
 
 
 def unit_quaternion(
@@ -246,9 +213,7 @@ def unit_quaternion(
 ) -> tuple[float, float, float, float]:
     """The quaternion with length one; unchanged where it is one up to rounding.
 
-    Raises
-    ------
-    DataError : its length is off by 1e-3 or more.
+    Raises DataError: its length is off by 1e-3 or more.
     """
     norm = math.hypot(*quat_wxyz)
     if not abs(norm - 1.0) < MAX_QUATERNION_ERROR:
@@ -289,17 +254,18 @@ def write_sensors(root: Path, data: KaptureData) -> None:
     """
     root = Path(root)
     folder = check_output(root, root / "sensors")
+    pose = "qw, qx, qy, qz, tx, ty, tz"
     tables = {
-        "sensors.txt": (SENSORS_HEADER, _sensor_rows(data)),
-        "rigs.txt": (RIGS_HEADER, _rig_rows(data)),
-        "trajectories.txt": (TRAJECTORIES_HEADER, _trajectory_rows(data)),
-        "records_camera.txt": (RECORDS_CAMERA_HEADER, _record_rows(data, "camera")),
-        "records_depth.txt": (RECORDS_DEPTH_HEADER, _record_rows(data, "depth")),
+        "sensors": ("sensor_id, name, sensor_type, [sensor_params]+", _sensor_rows(data)),
+        "rigs": (f"rig_id, sensor_id, {pose}", _rig_rows(data)),
+        "trajectories": (f"timestamp, device_id, {pose}", _trajectory_rows(data)),
+        "records_camera": ("timestamp, device_id, image_path", _record_rows(data, "camera")),
+        "records_depth": ("timestamp, device_id, depth_map_path", _record_rows(data, "depth")),
     }
     for name, (header, rows) in tables.items():
-        path = folder / name
-        if rows or name == "sensors.txt":
-            write_bytes(path, format_table(header, rows))
+        path = folder / f"{name}.txt"
+        if rows or name == "sensors":
+            write_bytes(path, format_table(f"# {header}", rows))
         else:
             try:
                 path.unlink(missing_ok=True)

@@ -14,8 +14,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.files import read_text
-from megloc_kapture.io.paths import has_control_characters
+from megloc_kapture.io.files import has_control_characters, read_text
 
 FORMAT_VERSION = "1.1"
 FORMAT_LINE = f"# kapture format: {FORMAT_VERSION}"
@@ -29,36 +28,35 @@ _INTEGER_PATTERN = re.compile(r"[+-]?[0-9]{1,40}")
 Row = tuple[int, list[str]]
 
 
-def read_lines(path: Path) -> list[str]:
-    """Lines of a UTF-8 text file without their ends (LF or CRLF); a byte order mark is dropped.
-
-    Raises
-    ------
-    DataError : missing, not readable, not UTF-8 or with a NUL (names the line).
-    """
-    lines = read_text(path).split("\n")
-    if lines[-1] == "":
-        lines.pop()
-    return [line.removesuffix("\r") for line in lines]
-
-
-def read_rows(path: Path, *, version_required: bool = False) -> Iterator[Row]:
+@contextlib.contextmanager
+def read_rows(path: Path, *, version_required: bool = False) -> Iterator[Iterator[Row]]:
     """Rows of a kapture CSV file as ``(line number, stripped fields)``; comments left out.
 
-    Raises
-    ------
-    DataError : see :func:`read_lines`; or the format version on line 1 is another than 1.1, or
-        absent although required; or a line begins with blanks and "#": to kapture that is no
-        comment, and a name that could not be written again.
+    A DataError of the block that names no file gets the path and the line of the row read last.
+
+    Raises DataError: missing, not readable, not UTF-8 or with a NUL; the format version on line 1
+    is another than 1.1, or absent although required; a line begins with blanks and "#": to kapture
+    that is no comment, and a name that could not be written again.
     """
-    lines = read_lines(path)
-    check_version(path, lines[0] if lines else "", required=version_required)
-    for number, line in enumerate(lines, start=1):
-        if line.startswith("#") or not line.strip():
-            continue
-        if line.lstrip().startswith("#"):
-            raise DataError("a comment must begin in the first column", path=path, line=number)
-        yield number, split_fields(line)
+    lines = read_text(path).split("\n")
+    check_version(path, lines[0], required=version_required)
+    number = 0
+
+    def rows() -> Iterator[Row]:
+        nonlocal number
+        for number, line in enumerate(lines, start=1):
+            if line.startswith("#") or not line.strip():
+                continue
+            if line.lstrip().startswith("#"):
+                raise DataError("a comment must begin in the first column")
+            yield number, split_fields(line)
+
+    try:
+        yield rows()
+    except DataError as error:
+        if error.path is not None:
+            raise
+        raise DataError(error.message, path=path, line=number) from error.__cause__
 
 
 def split_fields(line: str) -> list[str]:
@@ -80,32 +78,27 @@ def check_version(path: Path, first_line: str, *, required: bool) -> None:
         )
 
 
-def parse_integer(text: str, what: str, path: Path, line: int) -> int:
+def check_columns(fields: Sequence[str], expected: int) -> None:
+    """Raise DataError unless there are so many fields."""
+    if len(fields) != expected:
+        raise DataError(f"expected {expected} columns, got {len(fields)}")
+
+
+def parse_integer(text: str, what: str) -> int:
     """A decimal integer, exactly; never through float."""
     if not _INTEGER_PATTERN.fullmatch(text):
-        raise DataError(f"{what} {text!r} is not an integer", path=path, line=line)
+        raise DataError(f"{what} {text!r} is not an integer")
     return int(text)
 
 
-def parse_float(text: str, what: str, path: Path | None = None, line: int | None = None) -> float:
+def parse_float(text: str, what: str) -> float:
     """A finite decimal number."""
-    if not FLOAT_PATTERN.fullmatch(text):
-        finite = text.lower().lstrip("+-") not in ("nan", "inf", "infinity")
-        problem = "is not a number" if finite else "is not finite"
-        raise DataError(f"{what} {text!r} {problem}", path=path, line=line)
-    value = float(text)
-    if not math.isfinite(value):
-        raise DataError(f"{what} {text!r} is not finite", path=path, line=line)
-    return value
-
-
-@contextlib.contextmanager
-def named(path: Path, line: int | None = None) -> Iterator[None]:
-    """A DataError of the block gets the file and the line."""
-    try:
-        yield
-    except DataError as error:
-        raise DataError(error.message, path=path, line=line) from None
+    if FLOAT_PATTERN.fullmatch(text):
+        if math.isfinite(value := float(text)):
+            return value
+    elif text.lower().lstrip("+-") not in ("nan", "inf", "infinity"):
+        raise DataError(f"{what} {text!r} is not a number")
+    raise DataError(f"{what} {text!r} is not finite")
 
 
 def writable_name(name: str) -> str:
@@ -121,9 +114,8 @@ def writable_name(name: str) -> str:
 def format_table(header: str, rows: Iterable[Sequence[str]]) -> bytes:
     """A kapture CSV file: the version line, the column header, the rows.
 
-    Raises
-    ------
-    DataError : a field that would not be read back as it is (comma, line break, outer spaces).
+    Raises DataError: a field that would not be read back as it is (comma, line break, outer
+    spaces).
     """
     lines = [FORMAT_LINE, header]
     for row in rows:

@@ -69,9 +69,8 @@ class KaptureVectors:
         mapped = self._reader.map_rows(images)
         if mapped is not None and _are_unit(mapped):
             return mapped
-        chunks = _chunks(len(images), self._reader.config.row_bytes)
-        shape = (len(images), self.dimension)
-        rows = np.empty(shape, dtype=np.float32) if out is None else out
+        rows = np.empty((len(images), self.dimension), np.float32) if out is None else out
+        step = max(1, _CHUNK_BYTES // self._reader.config.row_bytes)
 
         def read_chunk(chunk: slice) -> None:
             _read(self._reader, images[chunk], rows[chunk])
@@ -80,7 +79,9 @@ class KaptureVectors:
                 where = self._reader.where(images[chunk][bad])
                 raise DataError("the vector has values that are not finite", path=where)
 
-        _each(read_chunk, chunks)
+        _each(
+            read_chunk, [slice(k, min(k + step, len(images))) for k in range(0, len(images), step)]
+        )
         return rows
 
 
@@ -95,13 +96,7 @@ def _each(work: Callable[[slice], None], chunks: Sequence[slice]) -> None:
             work(chunk)
         return
     with ThreadPoolExecutor(threads) as pool:
-        for _ in pool.map(work, chunks):
-            pass
-
-
-def _chunks(length: int, row_bytes: int) -> list[slice]:
-    step = max(1, _CHUNK_BYTES // row_bytes)
-    return [slice(start, min(start + step, length)) for start in range(0, length, step)]
+        list(pool.map(work, chunks))
 
 
 def _read(reader: FeatureReader, images: Sequence[str], rows: NDArray[np.float32]) -> None:

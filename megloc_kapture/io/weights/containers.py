@@ -6,19 +6,20 @@ and plain containers and refuses everything else; ``pickle`` itself is used nowh
 
 from __future__ import annotations
 
+import contextlib
 import io
 import re
 import tarfile
 import zipfile
-import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import DataError, MeglocError, OptionError
+from megloc_kapture.io.files import named
 
 if TYPE_CHECKING:
     import torch
@@ -35,6 +36,8 @@ def read_checkpoint(
 ) -> dict[str, torch.Tensor]:
     """All tensors of a checkpoint by name, on the processor.
 
+    Names are without the prefix ``module.`` of parallel training.
+
     Parameters
     ----------
     content : the file's bytes: of torch (also with ``state_dict``, ``model_state`` or ``model`` in
@@ -44,60 +47,68 @@ def read_checkpoint(
     read_beside : content of the file beside it whose name ends otherwise than in
         ``.index``.
 
-    Returns
-    -------
-    dict : names without the prefix ``module.`` of parallel training.
-
     Raises
     ------
-    DataError : no container of these, broken, or holds objects that are never loaded.
+    DataError : no container of these, broken, or holds objects that are never loaded; names the
+        file.
     OptionError : an ONNX file, and the package onnx is not installed.
     """
     ending = PurePath(where).suffix.lower()
-    if ending == ".safetensors":
-        return _of_safetensors(content, where)
-    if ending == ".npz":
-        return _of_arrays(_npz(content, where), where)
-    if ending == ".onnx":
-        return _of_arrays(_onnx(content, where), where)
-    if ending == ".mat":
-        from megloc_kapture.io.weights.netvlad import read_matlab_netvlad
+    with named(where):
+        if ending == ".mat":
+            from megloc_kapture.io.weights.authors import read_matlab_netvlad
 
-        return read_matlab_netvlad(content, where)
-    if ending == _INDEX:
-        from megloc_kapture.io.weights.tensorflow import read_tensor_bundle
+            return read_matlab_netvlad(content)
+        if ending == ".safetensors":
+            return _state_dict(_safetensors(content))
+        if ending == ".npz":
+            return _of_arrays(_npz(content))
+        if ending == ".onnx":
+            return _of_arrays(_onnx(content, where))
+        if ending == _INDEX:
+            from megloc_kapture.io.weights.tensorflow import read_tensor_bundle
 
-        return _of_arrays(read_tensor_bundle(content, read_beside, where), where)
-    if content[_TAR_MAGIC] == b"ustar" or content[:2] == b"\x1f\x8b":
-        return _of_arrays(_tar(content, where), where)
-    return _of_torch(content, where)
+            return _of_arrays(read_tensor_bundle(content, read_beside, where))
+        if content[_TAR_MAGIC] == b"ustar" or content[:2] == b"\x1f\x8b":
+            return _of_arrays(_tar(content, where))
+        return _torch(content)
 
 
-def _check_unpacked(size: int, content: bytes, where: str) -> None:
+@contextlib.contextmanager
+def _readable(kind: str) -> Iterator[None]:
+    """Make a DataError of whatever the libraries raise for broken bytes: each has its own."""
+    try:
+        yield
+    except MeglocError:
+        raise
+    except Exception as error:
+        problem = str(error).partition("\n")[0] or type(error).__name__
+        raise DataError(f"not {kind} that can be read: {problem}") from error
+
+
+def _check_unpacked(size: int, content: bytes) -> None:
     """Weights hardly shrink: refuse what says that it is very much larger when it is unpacked."""
     if size > 8 * len(content) + (1 << 26):
-        raise DataError(
-            f"{len(content)} bytes that unpack to {size} at least are no weights", path=where
-        )
+        raise DataError(f"{len(content)} bytes that unpack to {size} at least are no weights")
 
 
-def _check_zip(content: bytes, where: str) -> None:
+def _check_zip(content: bytes) -> None:
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        _check_unpacked(sum(member.file_size for member in archive.infolist()), content, where)
+        _check_unpacked(sum(member.file_size for member in archive.infolist()), content)
 
 
-def _of_torch(content: bytes, where: str) -> dict[str, torch.Tensor]:
+def _torch(content: bytes) -> dict[str, torch.Tensor]:
     from pickle import UnpicklingError  # the error that torch raises
 
     import torch
 
-    from megloc_kapture.io.weights.apgem import holds_pca, stand_ins, tensors_beside
+    from megloc_kapture.io.weights.authors import holds_pca, stand_ins, tensors_beside
 
     is_apgem = holds_pca(content)
     try:
         if content.startswith(b"PK"):
-            _check_zip(content, where)
-        with torch.serialization.safe_globals(stand_ins() if is_apgem else _dropped()):
+            _check_zip(content)
+        with torch.serialization.safe_globals(stand_ins(pca=is_apgem)):
             found = torch.load(io.BytesIO(content), weights_only=True, map_location="cpu")
     except DataError:
         raise
@@ -106,43 +117,19 @@ def _of_torch(content: bytes, where: str) -> dict[str, torch.Tensor]:
         if isinstance(error, UnpicklingError) and foreign:
             raise DataError(
                 f"holds objects that are never loaded ({', '.join(foreign)}), because loading "
-                f"them runs code; convert it once, as {CONVERTER} says",
-                path=where,
+                f"them runs code; convert it once, as {CONVERTER} says"
             ) from error
         raise DataError(
             "no file of weights that can be read (torch, safetensors, npz, ONNX, TensorFlow), "
-            "or it is damaged",
-            path=where,
+            "or it is damaged"
         ) from error
-    tensors = _state_dict(found, where)
+    tensors = _state_dict(found)
     if is_apgem and isinstance(found, Mapping):
-        tensors |= tensors_beside(found, where)
+        tensors |= tensors_beside(found)
     return tensors
 
 
-class _Dropped:
-    """Stands for an object that is not needed: takes whatever it is built of, keeps nothing."""
-
-    def __init__(self, *_: object) -> None:
-        pass
-
-    def __setstate__(self, _: object) -> None:
-        pass
-
-
-def _dropped() -> list[Any]:
-    """Stand-ins for what torch's reader would refuse though no weight depends on it.
-
-    Training scripts keep a score beside the weights (DeepLabV3+: ``best_score``), and a score of
-    numpy is pickled as a call of numpy.core.multiarray.scalar on a numpy.dtype. Allowing those two
-    would hand bytes of the file to numpy's C code; a stand-in of the same name runs nothing, and
-    the score, which is no tensor, is left out.
-    """
-    names = ("numpy.dtype", "numpy.core.multiarray.scalar", "numpy._core.multiarray.scalar")
-    return [(_Dropped, name) for name in names]
-
-
-def _state_dict(found: Any, where: str) -> dict[str, torch.Tensor]:
+def _state_dict(found: Any) -> dict[str, torch.Tensor]:
     import torch
 
     for key in _STATE_KEYS:
@@ -153,34 +140,27 @@ def _state_dict(found: Any, where: str) -> dict[str, torch.Tensor]:
         if isinstance(value, torch.Tensor):
             name = str(key).removeprefix("module.")
             if name in tensors:
-                raise DataError(f"{name} is in it twice, with and without 'module.'", path=where)
+                raise DataError(f"{name} is in it twice, with and without 'module.'")
             tensors[name] = value.detach()
     if not tensors:
-        raise DataError("holds no tensors by name", path=where)
+        raise DataError("holds no tensors by name")
     return tensors
 
 
-def _of_safetensors(content: bytes, where: str) -> dict[str, torch.Tensor]:
-    from safetensors import SafetensorError
+def _safetensors(content: bytes) -> dict[str, torch.Tensor]:
     from safetensors.torch import load
 
-    try:
-        return _state_dict(load(content), where)
-    except (SafetensorError, KeyError, ValueError) as error:  # KeyError: a type torch has not
-        raise DataError(f"not a safetensors file that can be read: {error}", path=where) from error
+    with _readable("a safetensors file"):
+        return load(content)
 
 
-def _npz(content: bytes, where: str) -> dict[str, NDArray[Any]]:
-    try:
-        _check_zip(content, where)
+def _npz(content: bytes) -> dict[str, NDArray[Any]]:
+    with _readable("an npz file"):
+        _check_zip(content)
         with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
             found = {name: arrays[name] for name in arrays.files}
-        # a member that is no array comes as its bytes
-        return {name: array for name, array in found.items() if isinstance(array, np.ndarray)}
-    except DataError:
-        raise
-    except Exception as error:  # zip, zlib and numpy's header each raise their own
-        raise DataError(f"not an npz file that can be read: {error}", path=where) from error
+    # a member that is no array comes as its bytes
+    return {name: array for name, array in found.items() if isinstance(array, np.ndarray)}
 
 
 def _onnx(content: bytes, where: str) -> dict[str, NDArray[Any]]:
@@ -193,7 +173,7 @@ def _onnx(content: bytes, where: str) -> dict[str, NDArray[Any]]:
             "pip install 'megloc-kapture[convert]'"
         ) from error
     found: dict[str, NDArray[Any]] = {}
-    try:
+    with _readable("an ONNX file"):
         model = load_model_from_string(content)
         if not model.HasField("graph"):
             raise ValueError("no graph in it")
@@ -214,9 +194,6 @@ def _onnx(content: bytes, where: str) -> dict[str, NDArray[Any]]:
                 raise ValueError(f"initialiser {tensor.name!r}: {error}") from error
             widened = tensor.data_type == TensorProto.BFLOAT16
             found[tensor.name] = array.astype(np.float32) if widened else array
-    except Exception as error:  # protobuf and onnx each raise their own
-        problem = str(error).partition("\n")[0] or type(error).__name__
-        raise DataError(f"not an ONNX file that can be read: {problem}", path=where) from error
     return found
 
 
@@ -224,50 +201,44 @@ def _tar(content: bytes, where: str) -> dict[str, NDArray[Any]]:
     """The TensorFlow checkpoint in a tar; its members are read in memory, nothing is unpacked."""
     from megloc_kapture.io.weights.tensorflow import read_tensor_bundle
 
-    try:
-        with tarfile.open(fileobj=io.BytesIO(content)) as archive:
-            members = {}
-            for member in archive:
-                _check_unpacked(member.offset_data + member.size, content, where)
-                if member.isreg():
-                    members[member.name] = member
-            # a Mac adds ._NAME beside each NAME
-            stems = [
-                name.removesuffix(_INDEX)
-                for name in sorted(members)
-                if name.endswith(_INDEX) and not PurePath(name).name.startswith("._")
-            ]
-            if len(stems) != 1:
-                some = f": {', '.join(stems)}" if stems else ""
-                raise DataError(
-                    f"{len(stems)} TensorFlow checkpoints (X.index) in it, not one{some}",
-                    path=where,
-                )
+    with (
+        _readable("a tar file"),  # of gz, bz2 and xz, tarfile tells each
+        tarfile.open(fileobj=io.BytesIO(content)) as archive,
+    ):
+        members = {}
+        for member in archive:
+            _check_unpacked(member.offset_data + member.size, content)
+            if member.isreg():
+                members[member.name] = member
+        # a Mac adds ._NAME beside each NAME
+        stems = [
+            name.removesuffix(_INDEX)
+            for name in sorted(members)
+            if name.endswith(_INDEX) and not PurePath(name).name.startswith("._")
+        ]
+        if len(stems) != 1:
+            some = f": {', '.join(stems)}" if stems else ""
+            raise DataError(f"{len(stems)} TensorFlow checkpoints (X.index) in it, not one{some}")
 
-            def read(ending: str) -> bytes:
-                member = members.get(stems[0] + ending)
-                file = None if member is None else archive.extractfile(member)
-                if file is None:
-                    raise DataError(f"no {stems[0]}{ending} in it", path=where)
-                return file.read()
+        def read(ending: str) -> bytes:
+            member = members.get(stems[0] + ending)
+            file = None if member is None else archive.extractfile(member)
+            if file is None:
+                raise DataError(f"no {stems[0]}{ending} in it")
+            return file.read()
 
-            return read_tensor_bundle(read(_INDEX), read, f"{where}/{stems[0]}{_INDEX}")
-    except (tarfile.TarError, OSError, EOFError, zlib.error, ValueError, OverflowError) as error:
-        problem = str(error).partition("\n")[0]  # of gz, bz2 and xz, tarfile tells each
-        raise DataError(f"not a tar file that can be read: {problem}", path=where) from error
+        return read_tensor_bundle(read(_INDEX), read, f"{where}/{stems[0]}{_INDEX}")
 
 
-def _of_arrays(arrays: Mapping[str, NDArray[Any]], where: str) -> dict[str, torch.Tensor]:
+def _of_arrays(arrays: Mapping[str, NDArray[Any]]) -> dict[str, torch.Tensor]:
     import torch
 
     try:
-        return _state_dict(
-            {
-                # torch wants the machine's byte order, and memory that it may write to
-                name: torch.from_numpy(np.array(a, dtype=a.dtype.newbyteorder("="), order="C"))
-                for name, a in arrays.items()
-            },
-            where,
-        )
+        # torch wants the machine's byte order, and memory that it may write to
+        tensors = {
+            name: torch.from_numpy(np.array(a, dtype=a.dtype.newbyteorder("="), order="C"))
+            for name, a in arrays.items()
+        }
     except TypeError as error:
-        raise DataError(f"holds arrays that are no numbers: {error}", path=where) from error
+        raise DataError(f"holds arrays that are no numbers: {error}") from error
+    return _state_dict(tensors)

@@ -18,6 +18,7 @@ import shutil
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 from pydantic import BaseModel
@@ -51,16 +52,12 @@ def fetch(
     sha256: str | None = None,
     watch: Watch = lambda chunks, _: chunks,
 ) -> str:
-    """Download a file; goes on with what an earlier try left beside its path.
+    """Download a file, going on with what an earlier try left beside its path; its sha256.
 
     Parameters
     ----------
     size, sha256 : what the file must have, where that is known.
     watch : sees the chunks go by, to show progress.
-
-    Returns
-    -------
-    str : the file's sha256.
 
     Raises
     ------
@@ -70,20 +67,25 @@ def fetch(
     OutputError : it cannot be written, for one because the disk is full; what has arrived stays.
     """
     part = path.with_name(f".{path.name}.part")
+    state_path = part.with_name(f"{part.name}.json")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with open(part, "a+b") as file:
             _lock(file, part, path)
             try:
-                _transfer(url, file, _state_path(part), watch, expected=size)
+                _transfer(url, file, state_path, watch, expected=size)
             except OSError as error:
-                raise _cannot_write(part, error) from error
+                failed = output_error(part, error)
+                if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+                    text = f"{failed}; make room and run the same command again to go on"
+                    failed = OutputError(text)
+                raise failed from error
             found = _check(file, url, size, sha256)
             os.replace(part, path)
-            _state_path(part).unlink(missing_ok=True)
+            state_path.unlink(missing_ok=True)
     except DataError:
         part.unlink(missing_ok=True)
-        _state_path(part).unlink(missing_ok=True)
+        state_path.unlink(missing_ok=True)
         raise
     except OSError as error:
         raise output_error(path, error) from error
@@ -95,19 +97,26 @@ def _transfer(
 ) -> None:
     """Bring the rest, or all of it where the server does not give the rest of the same state."""
     have = file.seek(0, os.SEEK_END)
-    state = _read_state(state_path, url)
-    if state is None or have > state.total:
-        have = 0
+    state = None
+    with suppress(DataError):  # not there, or not whole: begin again
+        state = read_json_model(state_path, _Partial)
+    if state is None or state.url != url or have > state.total:
+        state, have = None, 0
     elif have == state.total:
         return
     with _opened(url, have, state) as response:
-        start = _start(response, have, state)
-        if start is None:
-            state_path.unlink(missing_ok=True)
-            raise TransferError(
-                f"{url}: the server sends another part of the file than asked for; run the same "
-                "command again to begin anew"
+        start = 0
+        if response.status == http.HTTPStatus.PARTIAL_CONTENT:
+            told = re.fullmatch(
+                r"bytes (\d+)-(\d+)/(\d+)", response.headers.get("Content-Range", "")
             )
+            if not (told and state and (int(told[1]), int(told[3])) == (have, state.total)):
+                state_path.unlink(missing_ok=True)
+                raise TransferError(
+                    f"{url}: the server sends another part of the file than asked for; run the "
+                    "same command again to begin anew"
+                )
+            start = have
         if response.headers.get_content_type() == "text/html":
             raise TransferError(f"{url}: a web page came instead of the file; fetch it by hand")
         length = response.headers.get("Content-Length")
@@ -116,10 +125,11 @@ def _transfer(
         file.truncate(start)
         file.seek(start)
         _remember(state_path, url, response, total)
-        if rest is not None:
-            _need_space(file, rest)
-        chunks = watch(_chunks(response, url, total, start), -(-(rest or 0) // CHUNK))
-        for chunk in chunks:
+        free = shutil.disk_usage(os.fspath(file.name)).free
+        if rest is not None and free < rest:
+            no_space = os.strerror(errno.ENOSPC)
+            raise OSError(errno.ENOSPC, f"{no_space} ({rest} bytes, {free} are free)")
+        for chunk in watch(_chunks(response, url, total, start), -(-(rest or 0) // CHUNK)):
             file.write(chunk)
         file.flush()
 
@@ -158,36 +168,23 @@ class SafeRedirects(urllib.request.HTTPRedirectHandler):
         return super().redirect_request(req, fp, code, msg, headers, newurl)  # type: ignore[arg-type]
 
 
-def _start(response: http.client.HTTPResponse, have: int, state: _Partial | None) -> int | None:
-    """The byte at which the answer begins; None where it is not what was asked for."""
-    if response.status != http.HTTPStatus.PARTIAL_CONTENT:
-        return 0
-    told = re.fullmatch(r"bytes (\d+)-(\d+)/(\d+)", response.headers.get("Content-Range", ""))
-    if told is None or state is None or (int(told[1]), int(told[3])) != (have, state.total):
-        return None
-    return have
-
-
 def _chunks(
     response: http.client.HTTPResponse, url: str, total: int | None, start: int
 ) -> Iterator[bytes]:
-    have = start
+    have, broke = start, None
     try:
         while chunk := response.read(CHUNK):
             have += len(chunk)
             yield chunk
     except (OSError, http.client.HTTPException) as error:
-        raise _broken(url, have, total) from error
-    if total is not None and have < total:
-        # a connection that is closed early reads as the end of the file
-        raise _broken(url, have, total)
-
-
-def _broken(url: str, have: int, total: int | None) -> TransferError:
-    whole = "" if total is None else f" of {total}"
-    return TransferError(
-        f"{url}: the transfer broke after {have}{whole} bytes; run the same command again to go on"
-    )
+        broke = error
+    # a connection that is closed early reads as the end of the file
+    if broke or (total is not None and have < total):
+        whole = "" if total is None else f" of {total}"
+        raise TransferError(
+            f"{url}: the transfer broke after {have}{whole} bytes; run the same command again to "
+            "go on"
+        ) from broke
 
 
 def _remember(path: Path, url: str, response: http.client.HTTPResponse, total: int | None) -> None:
@@ -199,18 +196,6 @@ def _remember(path: Path, url: str, response: http.client.HTTPResponse, total: i
         write_json_model(path, _Partial(url=url, validator=validator, total=total))
 
 
-def _read_state(path: Path, url: str) -> _Partial | None:
-    try:
-        state = read_json_model(path, _Partial)
-    except DataError:  # not there, or not whole: begin again
-        return None
-    return state if state.url == url else None
-
-
-def _state_path(part: Path) -> Path:
-    return part.with_name(f"{part.name}.json")
-
-
 def _lock(file: io.BufferedRandom, part: Path, path: Path) -> None:
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -220,19 +205,6 @@ def _lock(file: io.BufferedRandom, part: Path, path: Path) -> None:
         ours = False
     if not ours:
         raise OutputError(f"{path}: another megloc is fetching it")
-
-
-def _need_space(file: io.BufferedRandom, rest: int) -> None:
-    free = shutil.disk_usage(os.fspath(file.name)).free
-    if free < rest:
-        raise OSError(errno.ENOSPC, f"{os.strerror(errno.ENOSPC)} ({rest} bytes, {free} are free)")
-
-
-def _cannot_write(part: Path, error: OSError) -> OutputError:
-    failed = output_error(part, error)
-    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        return OutputError(f"{failed}; make room and run the same command again to go on")
-    return failed
 
 
 def _check(file: io.BufferedRandom, url: str, size: int | None, sha256: str | None) -> str:

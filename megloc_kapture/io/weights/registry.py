@@ -12,14 +12,15 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, field_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints
 
 from megloc_kapture.errors import OptionError, suggestion
-from megloc_kapture.io.paths import check_component, check_relative
+from megloc_kapture.io.files import check_component, check_relative
 
 _TABLE = Path(__file__).with_suffix(".toml")
 _Url = Annotated[str, StringConstraints(pattern=r"^https?://[\w.:-]+/\S*$")]
 _Text = Annotated[str, StringConstraints(min_length=1)]
+_FileName = Annotated[str, AfterValidator(check_relative)]
 
 
 class _Entry(BaseModel):
@@ -38,18 +39,11 @@ class PublishedFile(_Entry):
     sha256 : hexadecimal; None: not known.
     """
 
-    name: str
-    also: tuple[str, ...] = ()
+    name: _FileName
+    also: tuple[_FileName, ...] = ()
     url: _Url | None = None
     size: Annotated[int, Field(gt=0)] | None = None
     sha256: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")] | None = None
-
-    @field_validator("name", "also")
-    @classmethod
-    def _stays_in_its_folder(cls, value: str | tuple[str, ...]) -> str | tuple[str, ...]:
-        for name in (value,) if isinstance(value, str) else value:
-            check_relative(name)
-        return value
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -70,7 +64,7 @@ class Weights(_Entry):
     unverified : what nobody has confirmed on the original file; empty: nothing.
     """
 
-    name: str
+    name: Annotated[str, AfterValidator(check_component)]
     purpose: _Text
     page: _Url
     licence: _Text
@@ -78,11 +72,6 @@ class Weights(_Entry):
     commercial: bool
     files: Annotated[tuple[PublishedFile, ...], Field(min_length=1)]
     unverified: str = ""
-
-    @field_validator("name")
-    @classmethod
-    def _is_one_word(cls, value: str) -> str:
-        return check_component(value)
 
     @property
     def converted(self) -> str:

@@ -7,6 +7,8 @@ name to type, shape and offset in the data file (tensor_bundle.proto). Variables
 names of the graph; those of object-based checkpoints end in ``/.ATTRIBUTES/VARIABLE_VALUE``.
 """
 
+# mypy: allow-untyped-defs, allow-untyped-calls, allow-untyped-decorators
+
 from __future__ import annotations
 
 import math
@@ -17,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from megloc_kapture.compiling import compiled_loop
 from megloc_kapture.errors import DataError
 
 _FOOTER_SIZE, _MAGIC = 48, 0xDB4775248B80FB57
@@ -59,17 +62,15 @@ class _Entry:
 def read_tensor_bundle(
     index: bytes, read_shard: Callable[[str], bytes], where: str
 ) -> dict[str, NDArray[Any]]:
-    """All variables of a checkpoint by name; texts are left out.
+    """All variables of a checkpoint by name, in the machine's byte order; texts are left out.
+
+    bfloat16 becomes float32, which is exact.
 
     Parameters
     ----------
     index : content of the ``.index`` file.
     read_shard : the content of a data file by the end of its name, ``.data-00000-of-00001``.
     where : the ``.index`` file, for messages.
-
-    Returns
-    -------
-    dict of arrays in the machine's byte order; bfloat16 becomes float32, which is exact.
 
     Raises
     ------
@@ -285,7 +286,22 @@ def varint(message: memoryview, at: int) -> tuple[int, int]:
 
 def crc32c(content: bytes | memoryview) -> int:
     """CRC-32C (Castagnoli) of some bytes; zlib's checksum has another polynomial."""
-    # numba: only where a checkpoint is read
-    from megloc_kapture.io.weights.crc32c import update
+    return int(_crc32c(np.frombuffer(content, np.uint8)))
 
-    return int(update(np.frombuffer(content, np.uint8)))
+
+def _crc32c_table() -> NDArray[np.uint32]:
+    crc = np.arange(256, dtype=np.uint32)
+    for _ in range(8):  # the polynomial's bits reversed (RFC 3720, section 12.1)
+        crc = np.where(crc & 1, (crc >> 1) ^ np.uint32(0x82F63B78), crc >> 1)
+    return crc.astype(np.uint32)
+
+
+_CRC32C_TABLE = _crc32c_table()
+
+
+@compiled_loop
+def _crc32c(content):
+    crc = np.uint32(0xFFFFFFFF)
+    for byte in content:
+        crc = _CRC32C_TABLE[(crc ^ byte) & np.uint32(0xFF)] ^ (crc >> np.uint32(8))
+    return crc ^ np.uint32(0xFFFFFFFF)

@@ -17,9 +17,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from megloc_kapture.errors import DataError, OutputError
-from megloc_kapture.io.kapture import tars
-from megloc_kapture.io.kapture.blobs import FolderBlobs
-from megloc_kapture.io.kapture.tars import TarBlobs, TarBlobWriter, index_tar
+from megloc_kapture.io.kapture import blobs
+from megloc_kapture.io.kapture.blobs import FolderBlobs, TarBlobs, TarBlobWriter, index_tar
 
 CONTENTS = {
     "a.kpt": b"x" * 1000,
@@ -172,7 +171,7 @@ LOOP = """
 import sys
 from pathlib import Path
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.kapture.tars import index_tar
+from megloc_kapture.io.kapture.blobs import index_tar
 try:
     index_tar(Path(sys.argv[1]))
 except DataError as error:
@@ -368,7 +367,7 @@ def test_damage_is_met_as_tarfile_alone_meets_it(
 
     found = outcome()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tars, "_plain_members", lambda *_: [])
+        patch.setattr(blobs, "_plain_members", lambda *_: [])
         assert found == outcome()
 
 

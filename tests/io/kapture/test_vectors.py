@@ -101,7 +101,7 @@ def test_vectors_of_another_size_are_named(tmp_path: Path, tar: bool, change: in
             tmp_path, "global_features", "G", FeatureConfig("g", np.dtype("f4"), 5), tar=True
         ) as writer:
             writer.write("a.jpg", np.ones(5, dtype=np.float32))
-            writer._blobs.write("b.jpg.gfeat", bytes(20 + change))
+            writer.put("b.jpg.gfeat", bytes(20 + change))
     else:
         write(tmp_path, ["a.jpg", "b.jpg"], vectors(count=2), tar=False)
         (tmp_path / FOLDER / "b.jpg.gfeat").write_bytes(bytes(len(other) + change))

@@ -8,13 +8,17 @@ import pickle
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
 
 from megloc_kapture.errors import DataError, MeglocError, OptionError, OutputError
+from megloc_kapture.features.global_networks import OpenIbl, OpenIblOptions
+from megloc_kapture.io import weights as weights_module
 from megloc_kapture.io.weights import (
     SOURCE_KEY,
     MissingWeightsError,
@@ -24,9 +28,12 @@ from megloc_kapture.io.weights import (
     find_weights,
     read_weights,
     sha256_of,
+    share_weights,
     weights_folder,
 )
 from megloc_kapture.io.weights.registry import registry
+from megloc_kapture.nets.netvlad import VggNetVlad
+from megloc_kapture.pipeline.executors import open_executor
 
 BUNDLE = Path(__file__).parent / "data" / "tensor_bundle"
 COUNTS = {
@@ -334,3 +341,77 @@ def test_convert_refuses(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="stands there; -f replaces it"):
         convert_weights(source, place)
     convert_weights(source, place, force=True)
+
+
+# ------------------------------------------------------ shared by the processes of a machine
+
+CLUSTERS, OUTPUT = 64, 1024
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """OpenIBL's layout with random weights, 190 MB of them."""
+    torch.manual_seed(0)
+    net = VggNetVlad(order="kd", mean_rgb=(0, 0, 0), num_clusters=CLUSTERS, output_size=OUTPUT)
+    path = tmp_path_factory.mktemp("weights") / "openibl.pth"
+    torch.save(net.state_dict(), path)
+    return path
+
+
+def described(path: Path) -> tuple[np.ndarray, int, int]:
+    """A vector; bytes of the process, pages of several divided among them, before and after."""
+    before = _proportional_bytes()
+    image = np.random.default_rng(0).integers(0, 256, (32, 32, 3), dtype=np.uint8)
+    options = OpenIblOptions(weights=str(path), max_size_px=32, device="cpu")
+    found = OpenIbl(options).describe(image)
+    time.sleep(1.0)  # the other one has it as well
+    return found, before, _proportional_bytes()
+
+
+def _proportional_bytes() -> int:
+    lines = Path("/proc/self/smaps_rollup").read_text().splitlines()
+    return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("Pss:"))
+
+
+@pytest.mark.skipif(not Path("/proc/self/smaps_rollup").is_file(), reason="Linux tells it")
+def test_workers_have_one_copy(checkpoint: Path) -> None:
+    alone, _, _ = described(checkpoint)
+    with open_executor("processes", 2) as executor:
+        assert executor is not None
+        list(executor.map(_imported, range(8)))
+        results = list(executor.map(described, [checkpoint] * 2))
+    for found, _, _ in results:
+        np.testing.assert_array_equal(found, alone)
+    taken = sum(after - before for _, before, after in results)
+    size = checkpoint.stat().st_size
+    assert taken < 1.9 * size  # with two copies 2.5 times
+
+
+def _imported(_: int) -> None:
+    import megloc_kapture.features.global_networks  # noqa: F401
+
+    torch.ones(64, 64) @ torch.ones(64, 64)
+    time.sleep(0.1)
+
+
+def test_what_was_read_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "own.pth"
+    tensors = {"a": torch.rand(3, 4), "half": torch.rand(5).half(), "t": torch.rand(4, 2).T}
+    torch.save(tensors, path)
+    monkeypatch.setattr(weights_module, "_shared_folder", None)
+    share_weights(tmp_path / "shared")
+    try:
+        file = describe("own", path)
+        first = read_weights(file)  # the folder is not there: as without
+        (tmp_path / "shared").mkdir()
+        second, third = read_weights(file), read_weights(file)
+        path.write_bytes(b"something else")
+        fourth = read_weights(file)
+    finally:
+        share_weights(None)
+    assert not getattr(first["a"], "is_shared_file", False)
+    for found in (first, second, third, fourth):
+        assert found.keys() == tensors.keys()
+        for name, tensor in tensors.items():
+            assert torch.equal(found[name], tensor) and found[name].dtype == tensor.dtype
+    assert second["a"].is_shared_file  # type: ignore[attr-defined]
