@@ -13,7 +13,6 @@ from torch.nn.utils.rnn import pad_sequence
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.weights import WeightsFile
-from megloc_kapture.nets.checkpointed import Checkpointed
 from megloc_kapture.nets.lightglue import (
     KeypointBatch,
     LightGlueNetwork,
@@ -24,7 +23,7 @@ from megloc_kapture.nets.lightglue import (
     renamed_blocks,
     require_kornia,
 )
-from megloc_kapture.nets.runtime import NetworkOptions, inference
+from megloc_kapture.nets.runtime import Checkpointed, NetworkOptions, inference
 from megloc_kapture.values import ImageFeatures
 
 Matches = tuple[NDArray[np.int64], NDArray[np.float32]]

@@ -19,7 +19,7 @@ from torch.nn import functional
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.nets.runtime import load_strictly
-from megloc_kapture.nets.sampling import corners_around, deform_conv2d, pixel_table, read_bilinear
+from megloc_kapture.nets.score_maps import corners_around, deform_conv2d, pixel_table, read_bilinear
 
 _MULTIPLE = 32  # image sides are padded to multiples of it, the coarsest level's stride
 _STRIP_ROWS = 2  # of the image, at once in the score head's first layer: what a cache holds

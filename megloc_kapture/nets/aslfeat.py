@@ -23,7 +23,7 @@ from torch.nn import functional
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.nets.runtime import load_strictly
-from megloc_kapture.nets.sampling import deform_conv2d
+from megloc_kapture.nets.score_maps import deform_conv2d
 
 DESCRIPTOR_SIZE = 128
 STRIDE = 4  # of the features; their pixel (i, j) is read at the image's (4 i, 4 j)

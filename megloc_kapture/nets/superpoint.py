@@ -271,6 +271,5 @@ def superpoint_batchnorm(tensors: Mapping[str, torch.Tensor], where: str) -> Sup
     DataError : names the keys of ``where`` that do not fit.
     """
     net = SuperPointBatchNormNet()
-    counters = [key for key in net.state_dict() if key.endswith("num_batches_tracked")]
-    load_strictly(net, tensors, where, may_lack=counters)
+    load_strictly(net, tensors, where)
     return net

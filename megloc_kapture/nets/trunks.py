@@ -27,9 +27,9 @@ from torch.nn import functional as F
 # widths of the 3x3 convolutions of each of the five stages; a pooling ends each stage
 _VGG_STAGES = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
 Depth = Literal[50, 101]
-_RESNET_BLOCKS: dict[Depth, tuple[int, int, int, int]] = {50: (3, 4, 6, 3), 101: (3, 4, 23, 3)}
-_RESNET_WIDTHS = (64, 128, 256, 512)
-_RESNET_EXPANSION = 4
+RESNET_BLOCKS: dict[Depth, tuple[int, int, int, int]] = {50: (3, 4, 6, 3), 101: (3, 4, 23, 3)}
+RESNET_DEPTHS: dict[int, Depth] = {6: 50, 23: 101}  # by the blocks of the third stage
+RESNET_WIDTHS, RESNET_EXPANSION = (64, 128, 256, 512), 4
 # of the images of ImageNet, RGB in [0, 1]
 IMAGENET_MEAN, IMAGENET_DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 # expansion, channels, blocks, stride of the first (table 2 of the paper)
@@ -47,7 +47,7 @@ _OUTPUT_STRIDE = 16
 _NUM_LOW_LEVEL = 4  # the stem and the blocks down to a quarter of the size
 MOBILENET_LOW_LEVEL_CHANNELS, MOBILENET_CHANNELS = 24, 320
 # smaller activations count as this, so that powers and their gradients stay finite
-MINIMUM = 1e-6
+_MINIMUM = 1e-6
 
 
 class AlexNetFeatures(nn.Sequential):
@@ -75,12 +75,7 @@ class AlexNetFeatures(nn.Sequential):
 
 
 class Fire(nn.Module):
-    """A fire module: 1x1 convolutions to few channels, then 1x1 and 3x3 beside each other.
-
-    Parameters
-    ----------
-    squeezed, expanded : channels between, and of each of the two halves of the result.
-    """
+    """A fire module: 1x1 convolutions to few channels, then 1x1 and 3x3 beside each other."""
 
     def __init__(self, channels: int, squeezed: int, expanded: int) -> None:
         super().__init__()
@@ -182,43 +177,58 @@ def imagenet_normalised(image: torch.Tensor) -> torch.Tensor:
 
 
 class Bottleneck(nn.Module):
-    """1x1, 3x3 and 1x1 convolution around a shortcut; the stride is on the 3x3."""
+    """1x1, 3x3 and 1x1 convolution around a shortcut; the stride is on the 3x3.
 
-    def __init__(self, channels: int, width: int, *, stride: int, dilation: int) -> None:
+    Parameters
+    ----------
+    strided_first : the stride is on the first 1x1 instead.
+    bias, epsilon : of the convolutions, and of the normalisations after them.
+    """
+
+    def __init__(
+        self,
+        channels: int,
+        width: int,
+        *,
+        stride: int,
+        dilation: int = 1,
+        strided_first: bool = False,
+        bias: bool = False,
+        epsilon: float = 1e-5,
+    ) -> None:
         super().__init__()
-        out = width * _RESNET_EXPANSION
-        self.conv1 = nn.Conv2d(channels, width, 1, bias=False)
-        self.bn1 = nn.BatchNorm2d(width)
+        out = width * RESNET_EXPANSION
+        first, middle = (stride, 1) if strided_first else (1, stride)
+        self.conv1 = nn.Conv2d(channels, width, 1, stride=first, bias=bias)
+        self.bn1 = nn.BatchNorm2d(width, eps=epsilon)
         self.conv2 = nn.Conv2d(
-            width, width, 3, stride=stride, padding=dilation, dilation=dilation, bias=False
+            width, width, 3, stride=middle, padding=dilation, dilation=dilation, bias=bias
         )
-        self.bn2 = nn.BatchNorm2d(width)
-        self.conv3 = nn.Conv2d(width, out, 1, bias=False)
-        self.bn3 = nn.BatchNorm2d(out)
-        self.downsample = (
-            None
-            if stride == 1 and channels == out
-            else nn.Sequential(
-                nn.Conv2d(channels, out, 1, stride=stride, bias=False), nn.BatchNorm2d(out)
-            )
-        )
+        self.bn2 = nn.BatchNorm2d(width, eps=epsilon)
+        self.conv3 = nn.Conv2d(width, out, 1, bias=bias)
+        self.bn3 = nn.BatchNorm2d(out, eps=epsilon)
+        self.stride = stride
+        self.downsample: nn.Module | None = None
+        if channels != out:
+            shortcut = nn.Conv2d(channels, out, 1, stride=stride, bias=bias)
+            self.downsample = nn.Sequential(shortcut, nn.BatchNorm2d(out, eps=epsilon))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         y = F.relu(self.bn1(self.conv1(x)), inplace=True)
         y = F.relu(self.bn2(self.conv2(y)), inplace=True)
         y = self.bn3(self.conv3(y))
-        y += x if self.downsample is None else self.downsample(x)
+        if self.downsample is None:
+            y += x[..., :: self.stride, :: self.stride]
+        else:
+            y += self.downsample(x)
         return F.relu(y, inplace=True)
 
 
 class ResNet(nn.Module):
     """ResNet-50 or ResNet-101 without its classifier.
 
-    Parameters
-    ----------
-    depth : 50 or 101.
-    output_stride : of the last stage. Where the strides before it have come to this, the further
-        ones become dilations: the first block of such a stage keeps the dilation before it.
+    Where the strides have come to ``output_stride`` before the last stage, the further ones become
+    dilations: the first block of such a stage keeps the dilation before it.
     """
 
     def __init__(self, depth: Depth, *, output_stride: Literal[8, 16, 32] = 32) -> None:
@@ -227,7 +237,7 @@ class ResNet(nn.Module):
         self.bn1 = nn.BatchNorm2d(64)
         channels, reached, dilation = 64, 4, 1
         for number, (width, blocks) in enumerate(
-            zip(_RESNET_WIDTHS, _RESNET_BLOCKS[depth], strict=True), 1
+            zip(RESNET_WIDTHS, RESNET_BLOCKS[depth], strict=True), 1
         ):
             stride, first = 1 if number == 1 else 2, dilation
             if reached * stride > output_stride:
@@ -243,15 +253,13 @@ class ResNet(nn.Module):
                         dilation=first if block == 0 else dilation,
                     )
                 )
-                channels = width * _RESNET_EXPANSION
+                channels = width * RESNET_EXPANSION
             self.add_module(f"layer{number}", stage)
 
     def forward(self, image: torch.Tensor) -> list[torch.Tensor]:
         """Features of the four stages, 256, 512, 1024 and 2048 channels.
 
-        Parameters
-        ----------
-        image : (B, 3, H, W), see :func:`imagenet_normalised`.
+        ``image`` is (B, 3, H, W), see :func:`imagenet_normalised`.
         """
         x = F.relu(self.bn1(self.conv1(image)), inplace=True)
         x = F.max_pool2d(x, 3, stride=2, padding=1)
@@ -325,9 +333,7 @@ class MobileNetV2(nn.Module):
     def forward(self, image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Features at a quarter and a sixteenth of the size, 24 and 320 channels.
 
-        Parameters
-        ----------
-        image : (B, 3, H, W), normalised as for ImageNet.
+        ``image`` is (B, 3, H, W), see :func:`imagenet_normalised`.
         """
         low_level = self.low_level_features(image)
         return low_level, self.high_level_features(low_level)
@@ -347,4 +353,4 @@ def generalized_mean(features: torch.Tensor, power: torch.Tensor | float) -> tor
     """
     # a third power leaves the range of half precision at 41
     values = features if features.dtype == torch.float64 else features.float()
-    return values.clamp(min=MINIMUM).pow(power).mean(dim=(2, 3)).pow(1.0 / power)
+    return values.clamp(min=_MINIMUM).pow(power).mean(dim=(2, 3)).pow(1.0 / power)

@@ -76,11 +76,8 @@ class XFeatNetwork(nn.Module):
         )
 
     def forward(self, images: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Dense maps of images.
-
-        Parameters
-        ----------
-        images : float (B, C, H, W), H and W multiples of 32; the channels are averaged.
+        """Dense maps of images, float (B, C, H, W); H and W multiples of 32; the channels are
+        averaged.
 
         Returns
         -------
@@ -98,18 +95,14 @@ class XFeatNetwork(nn.Module):
 
 
 def load_xfeat(tensors: Mapping[str, torch.Tensor], where: str) -> XFeatNetwork:
-    """The network with the tensors of a checkpoint, for inference.
+    """The network with the tensors of a checkpoint, for inference; a fine matcher in it is left
+    out.
 
-    Files without ``num_batches_tracked`` (ONNX) fit, and so do those with a fine matcher.
-
-    Raises
-    ------
-    DataError : the tensors do not fit; names their keys.
+    Raises DataError that names the keys that do not fit.
     """
     network = XFeatNetwork()
     used = {key: value for key, value in tensors.items() if not key.startswith("fine_matcher.")}
-    counters = [key for key in network.state_dict() if key.endswith("num_batches_tracked")]
-    load_strictly(network, used, where, may_lack=counters)
+    load_strictly(network, used, where)
     return network.eval()
 
 
@@ -121,21 +114,11 @@ def keypoint_scores(logits: torch.Tensor) -> torch.Tensor:
 def sample_at_pixels(
     values: torch.Tensor, xy: torch.Tensor, size: tuple[int, int], *, mode: str
 ) -> torch.Tensor:
-    """Values of a coarse map at pixels, as XFeat samples them.
+    """Values (N, C) of a coarse map (1, C, h, w) at pixels (N, 2), as XFeat samples them.
 
-    The pixel (x, y) of an image (H, W) is read at w x / (W - 1) - 0.5 and h y / (H - 1) - 0.5 of
-    the map, half a pixel of the image from where it belongs; the network was trained so.
-
-    Parameters
-    ----------
-    values : (1, C, h, w).
-    xy : (N, 2), pixels of the image, the first pixel's centre at (0, 0).
-    size : (H, W) of the image.
-    mode : "bilinear" or "bicubic".
-
-    Returns
-    -------
-    (N, C)
+    The pixel (x, y), the first one's centre at (0, 0), of an image of ``size`` (H, W) is read at w
+    x / (W - 1) - 0.5 and h y / (H - 1) - 0.5 of the map, half a pixel of the image from where it
+    belongs; the network was trained so. ``mode`` is "bilinear" or "bicubic".
     """
     height, width = size
     last = torch.tensor([width - 1, height - 1], dtype=torch.float32, device=values.device)

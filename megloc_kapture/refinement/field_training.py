@@ -20,10 +20,8 @@ from pydantic import Field, model_validator
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.nets.gaussians import DEFAULT_COUNT, Gaussians
-from megloc_kapture.nets.nerfw import NerfW
-from megloc_kapture.nets.radiance import Rays, nerf_w_loss
-from megloc_kapture.nets.runtime import NetworkOptions, pick_device
-from megloc_kapture.nets.training_state import load_state, state_bytes
+from megloc_kapture.nets.radiance import NerfW, Rays, nerf_w_loss
+from megloc_kapture.nets.runtime import NetworkOptions, load_state, pick_device, state_bytes
 from megloc_kapture.refinement.neural_field import (
     FieldFrame,
     FieldModule,

@@ -22,9 +22,7 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import pixel_rays
 from megloc_kapture.geometry.warping import WarpSource, scaled_camera, warp_to_view
 from megloc_kapture.nets.gaussians import DEFAULT_COUNT, Gaussians
-from megloc_kapture.nets.nerfw import NerfW
-from megloc_kapture.nets.radiance import Rays, Rendered
-from megloc_kapture.nets.triplane import TriPlane
+from megloc_kapture.nets.radiance import NerfW, Rays, Rendered, TriPlane
 from megloc_kapture.plugins import DepthView
 from megloc_kapture.values import Camera, Options, RigidTransform
 

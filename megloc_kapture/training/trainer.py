@@ -24,21 +24,22 @@ from torch import distributed
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.files import read_content
 from megloc_kapture.io.weights import find_weights, read_weights
-from megloc_kapture.nets.runtime import NetworkOptions, pick_device
+from megloc_kapture.nets.runtime import NetworkOptions, load_state, pick_device, state_bytes
 from megloc_kapture.nets.superglue import SuperGlueNet, superglue
-from megloc_kapture.nets.training_state import load_state, state_bytes
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import LOCAL_FEATURES, LocalFeatureExtractor, PluginChoice
 from megloc_kapture.stages.work import HERE, Work, ordered_map
-from megloc_kapture.training.held_out import AUC_DEG, HeldOutResult, held_out_result
 from megloc_kapture.training.networks import (
+    AUC_DEG,
     FrozenFeatures,
+    HeldOutResult,
     PairModel,
     PreparedPair,
     ProductHead,
     begin_at_products,
     describer_of,
     encoder_sizes,
+    held_out_result,
 )
 from megloc_kapture.training.pairs import PairOptions, PairSource
 

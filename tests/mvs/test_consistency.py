@@ -6,7 +6,7 @@ import numpy as np
 from corner import CAMERA, depth_m, pose_at
 from numpy.typing import NDArray
 
-from megloc_kapture.mvs.consistency import with_pose_errors
+from megloc_kapture.mvs.views import with_pose_errors
 from megloc_kapture.plugins import DepthEstimate, StereoView
 
 

@@ -11,7 +11,7 @@ from torch import nn
 from transformers import ResNetConfig, ResNetModel
 
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.nets.apgem import ApGemNet, Whitening, apgem_from, whitening_from
+from megloc_kapture.nets.global_descriptors import ApGemNet, Whitening, apgem_from, whitening_from
 
 KEYS = Path(__file__).parent / "keys"
 Tensors = dict[str, torch.Tensor]

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from transformers import Dinov2Config, Dinov2Model
 
-from megloc_kapture.nets.dinov2 import DinoV2
+from megloc_kapture.nets.megaloc import DinoV2
 
 CHANNELS, DEPTH, HEADS, GRID = 24, 3, 4, 5
 

@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.nets.eigenplaces import EigenPlacesNet, eigenplaces_from
+from megloc_kapture.nets.global_descriptors import EigenPlacesNet, eigenplaces_from
 from megloc_kapture.nets.trunks import Depth, ResNet
 
 KEYS = Path(__file__).parent / "keys" / "eigenplaces.txt"

@@ -17,8 +17,7 @@ from torch.nn import functional
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.weights.registry import lookup
 from megloc_kapture.nets import megaloc
-from megloc_kapture.nets.dinov2 import DinoV2
-from megloc_kapture.nets.megaloc import MegaLocNet, Salad, assignment, megaloc_from, squared
+from megloc_kapture.nets.megaloc import DinoV2, MegaLocNet, Salad, assignment, megaloc_from, squared
 
 KEYS = Path(__file__).parent / "keys" / "megaloc.txt"
 CHANNELS, CLUSTERS, SIZE, TOKEN = 6, 4, 5, 3

@@ -14,7 +14,7 @@ from torch.nn import functional as F
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.weights.netvlad import AVERAGE_IMAGE
-from megloc_kapture.nets.netvlad import NetVladLayer, Order, VggNetVlad, netvlad, openibl
+from megloc_kapture.nets.global_descriptors import NetVladLayer, Order, VggNetVlad, netvlad, openibl
 
 KEYS = Path(__file__).parent / "keys" / "openibl.txt"
 CLUSTERS, OUTPUT = 3, 10

@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.nets import sampling
-from megloc_kapture.nets.sampling import corners_around, deform_conv2d, pixel_table, read_bilinear
+from megloc_kapture.nets.score_maps import corners_around, deform_conv2d, pixel_table, read_bilinear
 
 torch_double = torch.float64
 

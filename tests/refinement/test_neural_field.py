@@ -14,7 +14,7 @@ torch = pytest.importorskip("torch")
 import room  # noqa: E402
 
 from megloc_kapture.errors import DataError  # noqa: E402
-from megloc_kapture.nets.triplane import TriPlane  # noqa: E402
+from megloc_kapture.nets.radiance import TriPlane  # noqa: E402
 from megloc_kapture.pipeline.executors import single_threaded  # noqa: E402
 from megloc_kapture.plugins import DepthView  # noqa: E402
 from megloc_kapture.refinement import field_training  # noqa: E402

@@ -11,14 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.training.held_out import (
+from megloc_kapture.training.labels import IGNORED, UNMATCHED, Labels
+from megloc_kapture.training.networks import (
+    PreparedPair,
     judged,
     pose_auc,
     pose_error_deg,
     relative_pose_error_deg,
 )
-from megloc_kapture.training.labels import IGNORED, UNMATCHED, Labels
-from megloc_kapture.training.networks import PreparedPair
 from megloc_kapture.training.pairs import PairOptions, PosedPairs
 from megloc_kapture.values import ImageFeatures, RigidTransform
 

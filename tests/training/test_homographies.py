@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from megloc_kapture.training.homographies import HomographyOptions, random_view, relit
+from megloc_kapture.training.pairs import HomographyOptions, random_view, relit
 
 
 def smooth_image() -> NDArray[np.uint8]:

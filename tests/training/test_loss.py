@@ -8,7 +8,7 @@ import torch
 
 from megloc_kapture.nets.superglue import ImageKeypoints, SuperGlueNet, log_optimal_transport
 from megloc_kapture.training.labels import IGNORED, UNMATCHED, Labels
-from megloc_kapture.training.loss import transport_loss
+from megloc_kapture.training.networks import transport_loss
 
 LABELS = Labels(
     np.array([2, UNMATCHED, IGNORED, 0, UNMATCHED]), np.array([3, IGNORED, 0, UNMATCHED])

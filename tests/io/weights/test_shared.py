@@ -12,7 +12,7 @@ import torch
 from megloc_kapture.features.global_networks import OpenIbl, OpenIblOptions
 from megloc_kapture.io.weights import describe, read_weights, share_weights
 from megloc_kapture.io.weights import shared as module
-from megloc_kapture.nets.netvlad import VggNetVlad
+from megloc_kapture.nets.global_descriptors import VggNetVlad
 from megloc_kapture.pipeline.executors import open_executor
 
 CLUSTERS, OUTPUT = 64, 1024
