@@ -41,14 +41,12 @@ from timing import table  # noqa: E402
 
 from megloc_kapture.geometry.poses import rotation_angles_deg  # noqa: E402
 from megloc_kapture.plugins import DepthView, PoseRefinement  # noqa: E402
-from megloc_kapture.refinement.acceptance import squared_distance  # noqa: E402
-from megloc_kapture.refinement.photometric import perturbed  # noqa: E402
-from megloc_kapture.refinement.references import (  # noqa: E402
-    REFERENCES,
+from megloc_kapture.refinement.acceptance import (
     RenderingOptions,  # noqa: E402
-    RenderingQuery,
-    RenderingReference,
+    squared_distance,  # noqa: E402
 )
+from megloc_kapture.refinement.photometric import perturbed  # noqa: E402
+from megloc_kapture.refinement.references import REFERENCES, RenderingQuery, RenderingReference  # noqa: E402
 from megloc_kapture.refinement.rendering import refine_by_rendering  # noqa: E402
 from megloc_kapture.values import RigidTransform  # noqa: E402
 

@@ -203,9 +203,7 @@ def refine(
 ) -> Image:
     """Move planes (H, W, 3), in place, to where they match best, by so many passes.
 
-    Returns
-    -------
-    float32 (H, W), the standard deviation of inverse depth; 0 where nothing matches.
+    Returns float32 (H, W), the standard deviation of inverse depth; 0 where nothing matches.
     """
     from megloc_kapture.mvs.plane_kernels import refine_planes
 

@@ -80,10 +80,8 @@ def stereo_view(
 ) -> StereoView:
     """An image, its distortion undone, as stereo takes it.
 
-    Parameters
-    ----------
-    image : uint8 (H, W, 3), RGB; ``camera`` any of COLMAP's models.
-    mask : bool (H, W), True = use; None without one.
+    ``image`` and ``camera``: uint8 (H, W, 3), RGB; any of COLMAP's models; ``mask``: bool (H, W),
+    True = use; None without one.
     """
     pinhole = stereo_camera(camera, max_size_px)
     size = pinhole.width, pinhole.height
@@ -196,10 +194,8 @@ def agreeing_views(
 ) -> NDArray[np.uint8]:
     """Number of other views (H, W) whose depth agrees with a view's own, forth and back.
 
-    Parameters
-    ----------
-    others : views with their depth, float32 (H, W), 0 where unknown; of a view only the camera and
-        the pose count.
+    ``others`` have depth float32 (H, W), 0 where unknown; of a view only the camera and the pose
+    count.
     """
     from megloc_kapture.mvs.kernels import count_agreeing
 
@@ -219,12 +215,10 @@ def with_pose_errors(
     depth_range_m: tuple[float, float],
     error_px: float,
 ) -> DepthEstimate:
-    """An estimate whose deviations also cover the errors of the views' poses.
+    """An estimate whose deviations also cover the errors of the poses of a view and its sources.
 
-    Parameters
-    ----------
-    sources : the views that it was made from.
-    error_px : standard deviation of where the poses put a point in a source, along an axis.
+    ``error_px`` is the standard deviation of where the poses put a point in a source, along an
+    axis.
     """
     limits = 1.0 / np.array(depth_range_m)[::-1]
     paths = [relative_projection(view, source) for source in sources]

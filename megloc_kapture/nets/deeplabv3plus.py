@@ -30,12 +30,7 @@ _DILATIONS = (6, 12, 18)
 
 
 def backbone_of(keys: Collection[str], where: str) -> Backbone:
-    """Trunk that the keys of a checkpoint are of; ``where`` names the file.
-
-    Raises
-    ------
-    DataError : they are of neither.
-    """
+    """Trunk that the keys of a checkpoint are of; raises DataError that names the file."""
     for key in keys:
         if key.startswith("backbone.layer1."):
             return "resnet101"

@@ -101,9 +101,7 @@ _NUMBERED_WORDS = ("kernel", "bias", "gamma", "beta", "moving_mean", "moving_var
 
 
 class DelgNet(nn.Module):
-    """Image to a vector at one scale; :func:`describe` joins several. The module's text has the
-    forms.
-    """
+    """Image to a vector at one scale; :func:`describe` joins several."""
 
     def __init__(self, depth: Depth, form: Form) -> None:
         super().__init__()

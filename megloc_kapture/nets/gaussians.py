@@ -121,16 +121,14 @@ class Gaussians(nn.Module):
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Render a pinhole view by gsplat, which needs a GPU.
 
+        Returns colours (H, W, 3) in 0 to 1, depths (H, W) along the optical axis in the field's
+        unit, and opacities (H, W).
+
         Parameters
         ----------
         cam_from_field, calibration : a rigid transform (4, 4), and K (3, 3).
         size_px : width and height.
         appearance : embedding (A,); the mean of all unless given.
-
-        Returns
-        -------
-        Colours (H, W, 3) in 0 to 1, depths (H, W) along the optical axis in the field's unit, and
-        opacities (H, W).
         """
         from gsplat import rasterization
 

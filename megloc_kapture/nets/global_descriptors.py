@@ -82,10 +82,8 @@ class NetVladLayer(nn.Module):
 class VggNetVlad(nn.Module):
     """VGG-16 to conv5_3, NetVLAD's layer, and whitening; keys are those of OpenIBL.
 
-    Parameters
-    ----------
-    order : of the whitening's inputs, see :class:`NetVladLayer`.
-    mean_rgb : colour of 0 to 255 that is subtracted of every pixel.
+    ``order``: of the whitening's inputs, see :class:`NetVladLayer`; ``mean_rgb``: colour of 0 to
+    255 that is subtracted of every pixel.
     """
 
     def __init__(
@@ -189,10 +187,8 @@ class GeneralizedMean(nn.Module):
 class ApGemNet(ResNet):
     """Image to a vector of unit length; 46,696,513 weights at depth 101.
 
-    Parameters
-    ----------
-    mean, deviation : of the images it was trained on, RGB in [0, 1].
-    normalised_features : scale pooled features to unit length before the last layer.
+    ``mean`` and ``deviation``: of the images it was trained on, RGB in [0, 1];
+    ``normalised_features``: scale pooled features to unit length before the last layer.
     """
 
     mean: torch.Tensor
@@ -236,12 +232,7 @@ class Whitening(nn.Module):
     weight: torch.Tensor
 
     def __init__(
-        self,
-        mean: torch.Tensor,
-        components: torch.Tensor,
-        variance: torch.Tensor,
-        *,
-        power: float,
+        self, mean: torch.Tensor, components: torch.Tensor, variance: torch.Tensor, *, power: float
     ) -> None:
         super().__init__()
         scale = variance.double().pow(-power)
@@ -282,10 +273,8 @@ def whitening_from(
 ) -> Whitening:
     """The whitening that a checkpoint keeps under a name.
 
-    Raises
-    ------
-    OptionError : there is none of this name; says which there are.
-    DataError : it is incomplete, or of other sizes than the network's vectors.
+    Raises OptionError: there is none of this name; says which there are; DataError: it is
+    incomplete, or of other sizes than the network's vectors.
     """
     known = sorted({key.split(".")[1] for key in tensors if key.startswith("pca.")})
     if name not in known:

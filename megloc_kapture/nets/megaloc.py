@@ -10,6 +10,7 @@ aggregates patches in clusters by optimal transport; what tells nothing goes to 
 from __future__ import annotations
 
 import math
+from collections import OrderedDict
 from collections.abc import Mapping
 
 import torch
@@ -31,13 +32,9 @@ _OFFSET = 0.1
 
 
 class MegaLocNet(nn.Module):
-    """An image to one vector of unit length.
+    """An image to one vector of unit length, of ``descriptor_size`` components.
 
-    Parameters
-    ----------
-    backbone : None: ViT-B/14.
-    clusters, cluster_size, token_size : of the aggregation.
-    descriptor_size : components of the vector.
+    ``backbone`` is ViT-B/14 unless given; the other sizes are those of :class:`Salad`.
     """
 
     def __init__(
@@ -51,26 +48,15 @@ class MegaLocNet(nn.Module):
     ) -> None:
         super().__init__()
         self.backbone = backbone or DinoV2()
-        salad = Salad(
-            self.backbone.channels,
-            clusters=clusters,
-            cluster_size=cluster_size,
-            token_size=token_size,
-        )
+        sizes = {"clusters": clusters, "cluster_size": cluster_size, "token_size": token_size}
+        salad = Salad(self.backbone.channels, **sizes)
         linear = nn.Linear(clusters * cluster_size + token_size, descriptor_size)
         self.aggregator = nn.ModuleDict({"agg": salad, "linear": linear})
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
-        """Describe images.
+        """Vectors, float32 (B, 8448), of RGB images (B, 3, H, W) in [0, 1].
 
-        Parameters
-        ----------
-        image : (B, 3, H, W), RGB in [0, 1], both sides multiples of 14, of more
-            patches than there are clusters.
-
-        Returns
-        -------
-        float32 (B, D), D = 8448.
+        Both sides are multiples of 14, of more patches than there are clusters.
         """
         aggregated = self.aggregator["agg"](*self.backbone(imagenet_normalised(image)))
         return functional.normalize(self.aggregator["linear"](aggregated).float(), dim=1)
@@ -90,14 +76,8 @@ def squared(image: torch.Tensor, size_px: int) -> torch.Tensor:
 def megaloc_from(tensors: Mapping[str, torch.Tensor], where: str) -> MegaLocNet:
     """The network of a checkpoint, ready to describe.
 
-    Parameters
-    ----------
-    where : the file, for messages.
-
-    Raises
-    ------
-    DataError : the tensors are not MegaLoc's; names some that are missing, unexpected or of
-        another shape.
+    Raises DataError that names the file ``where``, and tensors that are missing, unexpected or of
+    another shape.
     """
     renamed = {
         key.replace(_OLDER_TRUNK, "backbone.", 1) if key.startswith(_OLDER_TRUNK) else key: value
@@ -114,12 +94,8 @@ def megaloc_from(tensors: Mapping[str, torch.Tensor], where: str) -> MegaLocNet:
 class Salad(nn.Module):
     """Features of patches and of the whole image to one vector of unit length.
 
-    Parameters
-    ----------
-    channels : of the features that come in.
-    clusters, cluster_size, token_size : the vector has ``token_size + cluster_size * clusters``
-        components.
-    hidden : width of the layer in the middle of each projection.
+    Of ``channels`` that come in, by projections whose middle layer is ``hidden`` wide, the vector
+    has ``token_size + cluster_size * clusters`` components.
     """
 
     def __init__(
@@ -140,21 +116,11 @@ class Salad(nn.Module):
         self.dust_bin = nn.Parameter(torch.tensor(1.0))
 
     def forward(self, patches: torch.Tensor, whole: torch.Tensor) -> torch.Tensor:
-        """Aggregate (section 3.3 of the paper).
+        """Vectors float32 (B, D) of patches (B, C, h, w) and of the whole (B, C): section 3.3.
 
-        Parameters
-        ----------
-        patches : (B, C, h, w), of more patches than there are clusters.
-        whole : (B, C).
-
-        Returns
-        -------
-        float32 (B, D): the image's own part first, then the clusters', the clusters running
-        fastest; each of these parts was normalised before, and at last all of it.
-
-        Raises
-        ------
-        OptionError : too few patches.
+        The image's own part first, then the clusters', the clusters running fastest; each of these
+        parts was normalised before, and at last all of it. Raises OptionError where there are no
+        more patches than clusters.
         """
         features = self.cluster_features(patches).flatten(2)
         # in half precision a share would keep two digits after the exponentials
@@ -166,24 +132,11 @@ class Salad(nn.Module):
 
 
 def assignment(scores: torch.Tensor, dust_bin: torch.Tensor) -> torch.Tensor:
-    """Share of each patch that goes to each cluster.
+    """Share (B, K, N) of each of N patches that goes to each of K clusters, of scores (B, K, N).
 
     Sinkhorn's algorithm in the logarithm, three times. A patch gives the mass 1; a cluster takes
-    the mass 1, the dustbin takes what is left. Unlike in SuperGlue there is no dustbin for
-    clusters.
-
-    Parameters
-    ----------
-    scores : (B, K, N) of K clusters and N patches, N > K.
-    dust_bin : (), the score of going to the dustbin.
-
-    Returns
-    -------
-    (B, K, N), at least 0; the sum over the clusters is what does not go to the dustbin.
-
-    Raises
-    ------
-    OptionError : no more patches than clusters: nothing would be left for the dustbin.
+    the mass 1, the dustbin, of score ``dust_bin`` (), takes what is left. Unlike in SuperGlue there
+    is no dustbin for clusters. Raises OptionError where nothing would be left for the dustbin.
     """
     batch, clusters, patches = scores.shape
     if patches <= clusters:
@@ -212,11 +165,8 @@ def _per_patch(channels: int, hidden: int, out: int) -> nn.Sequential:
 class DinoV2(nn.Module):
     """An image to one feature per patch, and one of the whole.
 
-    Parameters
-    ----------
-    channels, depth, heads : of the transformer; the defaults are those of ViT-B.
-    grid : side, in patches, of the square image that the positions are learnt for; 37 are 518
-        pixels.
+    ``channels``, ``depth`` and ``heads`` are those of ViT-B unless given; ``grid`` is the side, in
+    patches, of the square image that the positions are learnt for (37 are 518 pixels).
     """
 
     def __init__(
@@ -234,17 +184,10 @@ class DinoV2(nn.Module):
         self.norm = nn.LayerNorm(channels, eps=_EPSILON)
 
     def forward(self, image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Normalised features of the last block.
+        """Features of the last block, of patches (B, C, H // 14, W // 14) and the whole (B, C).
 
-        Parameters
-        ----------
-        image : (B, 3, H, W), see :func:`megloc_kapture.nets.trunks.imagenet_normalised`. Pixels
-            at the right and at the bottom that fill no patch are left out.
-
-        Returns
-        -------
-        patches : (B, C, H // 14, W // 14).
-        whole : (B, C), the class token.
+        ``image`` is (B, 3, H, W), see :func:`megloc_kapture.nets.trunks.imagenet_normalised`.
+        Pixels at the right and at the bottom that fill no patch are left out.
         """
         patches = self.patch_embed["proj"](image)
         rows, columns = patches.shape[-2:]
@@ -276,6 +219,17 @@ class DinoV2(nn.Module):
         return torch.cat([learnt[:, :1], maps.flatten(2).mT], dim=1)
 
 
+class LayerScale(nn.Module):
+    """A learnt factor per channel (Touvron et al., ICCV 2021)."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.gamma = nn.Parameter(torch.ones(channels))
+
+    def forward(self, tokens: torch.Tensor) -> torch.Tensor:
+        return tokens * self.gamma
+
+
 class Block(nn.Module):
     """Attention, then a perceptron, each on normalised tokens, scaled, and added to them."""
 
@@ -285,7 +239,11 @@ class Block(nn.Module):
         self.attn = Attention(channels, heads)
         self.ls1 = LayerScale(channels)
         self.norm2 = nn.LayerNorm(channels, eps=_EPSILON)
-        self.mlp = Perceptron(channels)
+        fc1, fc2 = (
+            nn.Linear(channels, _MLP_RATIO * channels),
+            nn.Linear(_MLP_RATIO * channels, channels),
+        )
+        self.mlp = nn.Sequential(OrderedDict(fc1=fc1, activation=nn.GELU(), fc2=fc2))
         self.ls2 = LayerScale(channels)
 
     def forward(self, tokens: torch.Tensor) -> torch.Tensor:
@@ -308,26 +266,3 @@ class Attention(nn.Module):
         query, key, value = parts.unbind(0)
         read = functional.scaled_dot_product_attention(query, key, value)
         return self.proj(read.transpose(1, 2).flatten(2))
-
-
-class Perceptron(nn.Module):
-    """Two layers with the exact GELU between."""
-
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.fc1 = nn.Linear(channels, _MLP_RATIO * channels)
-        self.fc2 = nn.Linear(_MLP_RATIO * channels, channels)
-
-    def forward(self, tokens: torch.Tensor) -> torch.Tensor:
-        return self.fc2(functional.gelu(self.fc1(tokens)))
-
-
-class LayerScale(nn.Module):
-    """A learnt factor per channel (Touvron et al., ICCV 2021)."""
-
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.gamma = nn.Parameter(torch.ones(channels))
-
-    def forward(self, tokens: torch.Tensor) -> torch.Tensor:
-        return tokens * self.gamma

@@ -309,12 +309,7 @@ class PatchmatchNet(nn.Module):
 
 
 def patchmatchnet_from(tensors: Mapping[str, Tensor], where: str) -> PatchmatchNet:
-    """The network with the tensors of a checkpoint, for inference.
-
-    Raises
-    ------
-    DataError : the tensors do not fit; names their keys.
-    """
+    """The network of a checkpoint, for inference; raises DataError that names what does not fit."""
     network = PatchmatchNet()
     load_strictly(network, tensors, where)
     return network.eval()

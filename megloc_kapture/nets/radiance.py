@@ -38,24 +38,20 @@ _AXES = ((0, 1), (0, 2), (1, 2))
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """Rays of one or several images.
+    """Rays of one or several images."""
 
-    Attributes
-    ----------
-    origins, directions : float32 (N, 3), in the field's own units.
-    near, far : t at which a ray begins and ends; in the unit of the directions' z.
-    appearance, transient : embeddings (N, A) and (N, T) of the images that the rays are of; None:
-        the field's mean appearance, and nothing transient.
-    depth : float32 (N,), t at which the surface is known to be, 0 where it is not; samples are
-        taken about it.
-    """
-
+    # origins, directions: float32 (N, 3), in the field's own units
     origins: torch.Tensor
     directions: torch.Tensor
+    # near, far: t at which a ray begins and ends; in the unit of the directions' z
     near: float
     far: float
+    # appearance, transient: embeddings (N, A) and (N, T) of the images that the rays are of; None:
+    # the field's mean appearance, and nothing transient
     appearance: torch.Tensor | None = None
     transient: torch.Tensor | None = None
+    # float32 (N,), t at which the surface is known to be, 0 where it is not; samples are taken
+    # about it
     depth: torch.Tensor | None = None
 
     def points(self, t: torch.Tensor) -> torch.Tensor:
@@ -71,17 +67,13 @@ class Rays:
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """What a field says at S samples of each ray.
+    """What a field says at S samples of each ray."""
 
-    Attributes
-    ----------
-    sigma, rgb : (N, S) density of the static part, and its colour (N, S, 3) in 0 to 1.
-    transient_sigma, transient_rgb, transient_beta : the same of the transient part, and its
-        uncertainty (N, S); None where it is off.
-    """
-
+    # sigma, rgb: (N, S) density of the static part, and its colour (N, S, 3) in 0 to 1
     sigma: torch.Tensor
     rgb: torch.Tensor
+    # transient_sigma, transient_rgb, transient_beta: the same of the transient part, and its
+    # uncertainty (N, S); None where it is off
     transient_sigma: torch.Tensor | None = None
     transient_rgb: torch.Tensor | None = None
     transient_beta: torch.Tensor | None = None
@@ -89,35 +81,23 @@ class Samples:
 
 @dataclass(frozen=True, eq=False)
 class Rendered:
-    """Rays as a field renders them.
+    """Rays as a field renders them."""
 
-    Attributes
-    ----------
-    rgb : (N, 3) in 0 to 1; black where nothing is.
-    depth : (N,), mean t of what is seen; 0 where nothing is.
-    opacity : (N,), share of the light that the field stops.
-    beta : (N,), standard deviation of the colour by NeRF-W's transient part; the least one without.
-    weights : (N, S), share of each sample.
-    transient_density : mean over all samples; 0 without.
-    coarse_rgb : of a field's coarse network, or None.
-    """
-
-    rgb: torch.Tensor
-    depth: torch.Tensor
-    opacity: torch.Tensor
+    rgb: torch.Tensor  # (N, 3) in 0 to 1; black where nothing is
+    depth: torch.Tensor  # (N,), mean t of what is seen; 0 where nothing is
+    opacity: torch.Tensor  # (N,), share of the light that the field stops
+    # (N,), standard deviation of the colour by NeRF-W's transient part; the least one without
     beta: torch.Tensor
-    weights: torch.Tensor
-    transient_density: torch.Tensor
-    coarse_rgb: torch.Tensor | None = None
+    weights: torch.Tensor  # (N, S), share of each sample
+    transient_density: torch.Tensor  # mean over all samples; 0 without
+    coarse_rgb: torch.Tensor | None = None  # of a field's coarse network, or None
 
 
 def composite(t: torch.Tensor, deltas: torch.Tensor, samples: Samples) -> Rendered:
     """Composite samples along rays: NeRF's eq. 3, with a transient part NeRF-W's eqs. 8 to 10.
 
-    Parameters
-    ----------
-    t : (N, S), where the samples are, ascending.
-    deltas : (N, S), length of the piece of the ray that each stands for, in the unit of 1/density.
+    ``t`` (N, S) says where the samples are, ascending; ``deltas`` (N, S) the length of the piece of
+    the ray that each stands for, in the unit of 1/density.
     """
     total = samples.sigma
     if samples.transient_sigma is not None:
@@ -325,13 +305,8 @@ class TriPlane(nn.Module):
     2023, eq. 1); two small networks turn them into density and colour, a third into what is
     transient. Samples lie about the known depth where there is one, else where a first pass through
     the density alone finds something. Space from -1 to 1 is as it is, what lies beyond is
-    contracted.
-
-    Parameters
-    ----------
-    num_images, num_lights : see :class:`NerfW`.
-    unconstrained : the images differ in light and show what moves; without, one appearance and
-        nothing transient.
+    contracted. ``num_images`` and ``num_lights``: see :class:`NerfW`; ``unconstrained``: the images
+    differ in light and show what moves; without, one appearance and nothing transient.
     """
 
     def __init__(

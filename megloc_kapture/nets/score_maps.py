@@ -32,29 +32,19 @@ _VALUES_AT_ONCE = {"cpu": 1 << 20, "cuda": 1 << 27}
 
 @dataclass(frozen=True, eq=False)
 class SelectedPixels:
-    """Pixels of one score map, best first; ties by y, then x.
+    """Pixels of one score map, best first; ties by y, then x."""
 
-    Attributes
-    ----------
-    xy : int64 (N, 2), columns and rows of the map.
-    scores : (N,), of the map's type.
-    num_masked : pixels that would have been candidates but for the mask.
-    """
-
+    # xy, scores: int64 (N, 2), columns and rows of the map, and (N,), of the map's type
     xy: torch.Tensor
     scores: torch.Tensor
-    num_masked: int
+    num_masked: int  # pixels that would have been candidates but for the mask
 
 
 def window_maximum(values: torch.Tensor, radius: int) -> torch.Tensor:
     """Maximum over the square of side 2 radius + 1 around each pixel, clipped to the map.
 
-    Equal to a max pooling of stride 1, but separable and by doubling, so that its cost grows with
-    the logarithm of the radius.
-
-    Parameters
-    ----------
-    values : (..., H, W), floating point or bool.
+    Equal to a max pooling of stride 1 of (..., H, W), floating point or bool, but separable and by
+    doubling, so that its cost grows with the logarithm of the radius.
     """
     lowest = False if values.dtype == torch.bool else -float("inf")
     for axis in (-1, -2):
@@ -128,17 +118,9 @@ def soft_argmax(
 ) -> torch.Tensor:
     """Mean position in the square around each pixel, weighted by exp(score / temperature).
 
-    ALIKED's (Zhao et al., TIM 2023) differentiable keypoint detection.
-
-    Parameters
-    ----------
-    scores : (H, W).
-    xy : int64 (N, 2), columns and rows, no closer to the map's border than the radius.
-    radius : of the square, pixels.
-
-    Returns
-    -------
-    float (N, 2), of the scores' type; a pixel's centre is an integer.
+    ALIKED's (Zhao et al., TIM 2023) differentiable keypoint detection. ``scores`` are (H, W);
+    ``xy`` int64 (N, 2), columns and rows, lie no closer to the map's border than the radius of the
+    square. Returns (N, 2) of the scores' type; a pixel's centre is an integer.
     """
     side = torch.arange(-radius, radius + 1, device=scores.device)
     steps = torch.cartesian_prod(side, side)  # (dy, dx)
@@ -150,17 +132,9 @@ def soft_argmax(
 def parabola_peak(scores: torch.Tensor, xy: torch.Tensor) -> torch.Tensor:
     """Peak of the paraboloid through the pixels around each, at most half a pixel away per axis.
 
-    One Newton step, -H^-1 g, with the central differences of the score map (Lowe, IJCV 2004,
-    section 4); none where the Hessian is singular.
-
-    Parameters
-    ----------
-    scores : (H, W).
-    xy : int64 (N, 2), columns and rows, none at the map's border.
-
-    Returns
-    -------
-    float (N, 2), of the scores' type; a pixel's centre is an integer.
+    One Newton step, -H^-1 g, with the central differences of the score map (H, W) (Lowe, IJCV 2004,
+    section 4); none where the Hessian is singular. ``xy`` is int64 (N, 2), columns and rows, none
+    at the map's border. Returns (N, 2) of the scores' type; a pixel's centre is an integer.
     """
     x, y = xy.unbind(1)
 
@@ -191,8 +165,7 @@ def select_keypoints(
 
     Parameters
     ----------
-    xy_px : float32 (N, 2), the first pixel's centre at (0.5, 0.5).
-    scores : float32 (N,).
+    xy_px, scores : float32 (N, 2), the first pixel's centre at (0.5, 0.5), and (N,).
     size : (H, W) of the image.
     mask : bool (H, W), True where keypoints may be, or None; applied before the best are selected.
     """
@@ -210,23 +183,18 @@ def select_keypoints(
 
 
 def corners_around(
-    y: torch.Tensor,
-    x: torch.Tensor,
-    size: tuple[int, int],
-    amplitude: torch.Tensor | None = None,
+    y: torch.Tensor, x: torch.Tensor, size: tuple[int, int], amplitude: torch.Tensor | None = None
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """The four pixels around each position and their weights; what lies outside weighs nothing.
+
+    Returns ``indices`` and ``weights``: int64 (number of S, 4), row by row, always within the map;
+    and their weights, of the type of the positions.
 
     Parameters
     ----------
     y, x : any shape S, rows and columns; a pixel's centre is an integer.
     size : (H, W) of the map.
     amplitude : shape S or None, a factor on the weights.
-
-    Returns
-    -------
-    indices : int64 (number of S, 4), row by row; always within the map.
-    weights : (number of S, 4), of the type of the positions.
     """
     height, width = size
     top, left = torch.floor(y), torch.floor(x)
@@ -259,16 +227,10 @@ def read_bilinear(
     size: tuple[int, int],
     amplitude: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """Read a map bilinearly, zero outside.
+    """Readings (number of S, C) of a map, bilinear, zero outside.
 
-    Parameters
-    ----------
-    table : (H W, C), the channels of each pixel, row by row; of the type of the positions.
-    y, x, size, amplitude : see :func:`corners_around`.
-
-    Returns
-    -------
-    (number of S, C).
+    ``table`` is (H W, C), the channels of each pixel, row by row, of the type of the positions; the
+    rest is as of :func:`corners_around`.
     """
     indices, weights = corners_around(y, x, size, amplitude)
     return functional.embedding_bag(indices, table, mode="sum", per_sample_weights=weights)
@@ -293,22 +255,16 @@ def deform_conv2d(
 ) -> torch.Tensor:
     """Deformable convolution with torchvision's meaning of every argument.
 
+    Returns (B, D, H', W'). Positions and weights of the readings are never in half precision.
+    Raises DataError for shapes that do not belong together.
+
     Parameters
     ----------
     x : (B, C, H, W); fastest in channels-last memory, which is also that of the result.
     offset : (B, 2 K, H', W'), pixels of the input: (dy, dx) of one tap after the other, the K taps
         of the kernel row by row.
-    weight : (D, C, kernel height, kernel width).
-    bias : (D,) or None.
+    weight, bias : (D, C, kernel height, kernel width), and (D,) or None.
     mask : (B, K, H', W') or None, the amplitude that each reading is multiplied by.
-
-    Returns
-    -------
-    (B, D, H', W'). Places and weights of the readings are never in half precision.
-
-    Raises
-    ------
-    DataError : shapes that do not belong together.
     """
     batch, channels, height, width = x.shape
     kernel_height, kernel_width = weight.shape[2:]

@@ -53,25 +53,17 @@ _MINIMUM = 1e-6
 class AlexNetFeatures(nn.Sequential):
     """AlexNet up to the ReLU of its fifth convolution, layer 11 of torchvision's ``features``.
 
-    Takes (B, 3, H, W), at least 63 x 63 pixels. Keys of the state dict are ``{i}.weight`` and
-    ``{i}.bias`` for i of 0, 3, 6, 8, 10.
+    Takes (B, 3, H, W), at least 63 x 63 pixels.
     """
 
     def __init__(self) -> None:
-        super().__init__(
-            nn.Conv2d(3, 64, 11, stride=4, padding=2),
-            nn.ReLU(),
-            nn.MaxPool2d(3, stride=2),
-            nn.Conv2d(64, 192, 5, padding=2),
-            nn.ReLU(),
-            nn.MaxPool2d(3, stride=2),
-            nn.Conv2d(192, 384, 3, padding=1),
-            nn.ReLU(),
-            nn.Conv2d(384, 256, 3, padding=1),
-            nn.ReLU(),
-            nn.Conv2d(256, 256, 3, padding=1),
-            nn.ReLU(),
-        )
+        layers = [
+            *(nn.Conv2d(3, 64, 11, stride=4, padding=2), nn.ReLU(), nn.MaxPool2d(3, stride=2)),
+            *(nn.Conv2d(64, 192, 5, padding=2), nn.ReLU(), nn.MaxPool2d(3, stride=2)),
+        ]
+        for channels, out in ((192, 384), (384, 256), (256, 256)):
+            layers += [nn.Conv2d(channels, out, 3, padding=1), nn.ReLU()]
+        super().__init__(*layers)
 
 
 class Fire(nn.Module):
@@ -91,39 +83,24 @@ class Fire(nn.Module):
 class SqueezeNetFeatures(nn.Sequential):
     """SqueezeNet 1.1 up to its eighth fire module, layer 12 of torchvision's ``features``.
 
-    Takes (B, 3, H, W), at least 17 x 17 pixels. Keys of the state dict are ``0.weight``,
-    ``0.bias`` and ``{i}.{squeeze,expand1x1,expand3x3}.{weight,bias}`` for i of 3, 4, 6, 7, 9 to 12.
+    Takes (B, 3, H, W), at least 17 x 17 pixels.
     """
 
     def __init__(self) -> None:
-        super().__init__(
-            nn.Conv2d(3, 64, 3, stride=2),
-            nn.ReLU(),
-            nn.MaxPool2d(3, stride=2, ceil_mode=True),
-            Fire(64, 16, 64),
-            Fire(128, 16, 64),
-            nn.MaxPool2d(3, stride=2, ceil_mode=True),
-            Fire(128, 32, 128),
-            Fire(256, 32, 128),
-            nn.MaxPool2d(3, stride=2, ceil_mode=True),
-            Fire(256, 48, 192),
-            Fire(384, 48, 192),
-            Fire(384, 64, 256),
-            Fire(512, 64, 256),
-        )
+        first = nn.Conv2d(3, 64, 3, stride=2), nn.ReLU()
+        pool = nn.MaxPool2d(3, stride=2, ceil_mode=True)
+        middle = Fire(64, 16, 64), Fire(128, 16, 64), pool, Fire(128, 32, 128), Fire(256, 32, 128)
+        last = Fire(256, 48, 192), Fire(384, 48, 192), Fire(384, 64, 256), Fire(512, 64, 256)
+        super().__init__(*first, pool, *middle, pool, *last)
 
 
 class Vgg16Features(nn.Sequential):
     """VGG-16 (configuration D) up to a layer, numbered as torchvision's ``features``.
 
-    Every convolution is 3x3 with a border of zeros and a bias, followed by a ReLU; stages end in
-    a 2x2 maximum with stride 2, which drops an odd last row or column. Keys of the state dict are
-    ``{i}.weight`` and ``{i}.bias``.
-
-    Parameters
-    ----------
-    last : number of the last layer, 0 to 30: 28 is conv5_3 without its ReLU (512 channels, 1/16 of
-        the size), 29 is that ReLU, 30 is the fifth pooling.
+    Every convolution is 3x3 with a border of zeros and a bias, followed by a ReLU; stages end in a
+    2x2 maximum with stride 2, which drops an odd last row or column. Keys of the state dict are
+    ``{i}.weight`` and ``{i}.bias``. ``last``: number of the last layer, 0 to 30: 28 is conv5_3
+    without its ReLU (512 channels, 1/16 of the size), 29 is that ReLU, 30 is the fifth pooling.
     """
 
     def __init__(self, *, last: int = 30) -> None:
@@ -145,14 +122,8 @@ class Vgg16Features(nn.Sequential):
     def taps(self, x: torch.Tensor, indices: Sequence[int]) -> list[torch.Tensor]:
         """Activations (B, C, h, w) after chosen layers, in the order of the indices.
 
-        Parameters
-        ----------
-        x : (B, 3, H, W), normalised as the weights want it; stays as it is.
-        indices : numbers of layers that this trunk has; layers after the last one are not run.
-
-        Raises
-        ------
-        ValueError : an index is none of a layer's.
+        ``x`` (B, 3, H, W), normalised as the weights want it, stays as it is; layers after the last
+        one are not run. Raises ValueError for an index that is none of a layer's.
         """
         wrong = sorted(set(indices) - set(range(len(self))))
         if wrong or not indices:
@@ -179,10 +150,8 @@ def imagenet_normalised(image: torch.Tensor) -> torch.Tensor:
 class Bottleneck(nn.Module):
     """1x1, 3x3 and 1x1 convolution around a shortcut; the stride is on the 3x3.
 
-    Parameters
-    ----------
-    strided_first : the stride is on the first 1x1 instead.
-    bias, epsilon : of the convolutions, and of the normalisations after them.
+    ``strided_first``: the stride is on the first 1x1 instead; ``bias`` and ``epsilon``: of the
+    convolutions, and of the normalisations after them.
     """
 
     def __init__(
@@ -340,16 +309,10 @@ class MobileNetV2(nn.Module):
 
 
 def generalized_mean(features: torch.Tensor, power: torch.Tensor | float) -> torch.Tensor:
-    """The power mean of each channel over all pixels: 1 is the mean, infinity the maximum.
+    """The power mean (B, C) of each channel over all pixels: 1 is the mean, infinity the maximum.
 
-    Parameters
-    ----------
-    features : (B, C, H, W), of any precision; what is below 1e-6 counts as 1e-6.
-    power : one number, not 0.
-
-    Returns
-    -------
-    float32 (B, C); float64 where the features are.
+    ``features`` (B, C, H, W) may be of any precision, and count as 1e-6 below it; the result is
+    float32, float64 where they are. ``power`` is one number, not 0.
     """
     # a third power leaves the range of half precision at 41
     values = features if features.dtype == torch.float64 else features.float()

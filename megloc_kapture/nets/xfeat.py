@@ -42,12 +42,8 @@ class XFeatNetwork(nn.Module):
         super().__init__()
         self.norm = nn.InstanceNorm2d(1)
         self.skip1 = nn.Sequential(nn.AvgPool2d(4, stride=4), nn.Conv2d(1, 24, 1))
-        self.block1 = nn.Sequential(
-            BasicLayer(1, 4),
-            BasicLayer(4, 8, stride=2),
-            BasicLayer(8, 8),
-            BasicLayer(8, 24, stride=2),
-        )
+        first = BasicLayer(1, 4), BasicLayer(4, 8, stride=2)
+        self.block1 = nn.Sequential(*first, BasicLayer(8, 8), BasicLayer(8, 24, stride=2))
         self.block2 = nn.Sequential(BasicLayer(24, 24), BasicLayer(24, 24))
         self.block3 = nn.Sequential(
             BasicLayer(24, 64, stride=2), BasicLayer(64, 64), BasicLayer(64, 64, kernel=1)
@@ -76,14 +72,11 @@ class XFeatNetwork(nn.Module):
         )
 
     def forward(self, images: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Dense maps of images, float (B, C, H, W); H and W multiples of 32; the channels are
-        averaged.
+        """Dense maps of images, float (B, C, H, W), H and W multiples of 32.
 
-        Returns
-        -------
-        features : (B, 64, H/8, W/8), not normalised.
-        logits : (B, 65, H/8, W/8), of each pixel of a cell (channel 8 y + x), and of no keypoint.
-        reliability : (B, 1, H/8, W/8), in [0, 1].
+        The channels are averaged. Returns features (B, 64, H/8, W/8), not normalised; logits
+        (B, 65, H/8, W/8), of each pixel of a cell (channel 8 y + x), and of no keypoint; and
+        reliability (B, 1, H/8, W/8), in [0, 1].
         """
         grey = self.norm(images.mean(dim=1, keepdim=True))
         x3 = self.block3(self.block2(self.block1(grey) + self.skip1(grey)))
@@ -95,8 +88,7 @@ class XFeatNetwork(nn.Module):
 
 
 def load_xfeat(tensors: Mapping[str, torch.Tensor], where: str) -> XFeatNetwork:
-    """The network with the tensors of a checkpoint, for inference; a fine matcher in it is left
-    out.
+    """The network of a checkpoint, for inference; a fine matcher in it is left out.
 
     Raises DataError that names the keys that do not fit.
     """

@@ -67,10 +67,7 @@ class PreparedPair:
 class FrozenFeatures:
     """Features of an extractor, the best of each image; those of images that come again are kept.
 
-    Parameters
-    ----------
-    extractor : its keypoints carry a score as third column.
-    max_keypoints : best kept of each image.
+    Its keypoints carry a score as third column; ``max_keypoints`` are kept of each image.
     """
 
     def __init__(self, extractor: LocalFeatureExtractor, max_keypoints: int) -> None:
@@ -98,9 +95,7 @@ class FrozenFeatures:
 class SuperPointDescriber(nn.Module):
     """SuperPoint's backbone and descriptor head; its file is an option ``descriptor_weights``.
 
-    Raises
-    ------
-    DataError : the extractor's weights do not fit.
+    Raises DataError for weights of the extractor that do not fit.
     """
 
     descriptor_size = SuperPoint.descriptor_size
@@ -121,8 +116,7 @@ class SuperPointDescriber(nn.Module):
 
 
 class XFeatDescriber(nn.Module):
-    """XFeat's backbone; its file, which has all of XFeat's keys, is an option
-    ``descriptor_weights``.
+    """XFeat's backbone; its file has all of XFeat's keys, as ``descriptor_weights`` has them.
 
     Its normalisation keeps the statistics it has: pairs of one step are few.
     """
@@ -199,11 +193,9 @@ def begin_at_products(net: SuperGlueNet) -> None:
 
 
 def encoder_sizes(descriptor_size: int) -> tuple[int, ...]:
-    """Of SuperGlue's keypoint encoder, in the proportions of the official network.
+    """Sizes of SuperGlue's keypoint encoder, in the proportions of the official network.
 
-    Raises
-    ------
-    OptionError : the size is not one that four heads share.
+    Raises OptionError for a size that is not one that four heads share.
     """
     if descriptor_size % 8:
         raise OptionError(
@@ -217,7 +209,6 @@ class PairModel(nn.Module):
 
     Parameters
     ----------
-    head : the matcher.
     describer : None: the frozen features' own descriptors.
     iterations : of the optimal transport.
     deep_supervision : the loss is the mean over the head's cross-attention layers.
@@ -280,20 +271,12 @@ class PairModel(nn.Module):
 
 
 def transport_loss(log_assignment: torch.Tensor, labels: Labels) -> torch.Tensor:
-    """Negative log likelihood of labels; ignored keypoints do not count.
+    """Negative log likelihood () of labels; ignored keypoints do not count, nothing labelled is 0.
 
     SuperGlue's equation 10 (Sarlin et al., CVPR 2020), with the means of the matched and of the
     unmatched keypoints weighted alike, as LightGlue does (Lindenberger et al., ICCV 2023, equation
-    9): how many there are of each depends on the images.
-
-    Parameters
-    ----------
-    log_assignment : (N + 1, M + 1), logarithms, the dustbins last.
-    labels : of the N and M keypoints.
-
-    Returns
-    -------
-    (), 0 where nothing is labelled.
+    9): how many there are of each depends on the images. ``log_assignment`` are logarithms (N + 1,
+    M + 1), the dustbins last.
     """
     device = log_assignment.device
     rows, columns = torch.from_numpy(labels.matches()).to(device).T
@@ -307,20 +290,13 @@ def transport_loss(log_assignment: torch.Tensor, labels: Labels) -> torch.Tensor
 
 @dataclass(frozen=True)
 class HeldOutResult:
-    """What a matcher does on pairs.
-
-    Attributes
-    ----------
-    loss : mean over the pairs.
-    precision : share of right ones among all matches whose keypoints are labelled.
-    recall : share of the labelled matches that are found.
-    auc : area under the curve of the relative pose's error up to 5, 10 and 20 degrees, in [0, 1].
-    """
+    """Figures of a matcher on pairs."""
 
     pairs: int
-    loss: float
-    precision: float
-    recall: float
+    loss: float  # mean over the pairs
+    precision: float  # share of right ones among all matches whose keypoints are labelled
+    recall: float  # share of the labelled matches that are found
+    # area under the curve of the relative pose's error up to 5, 10 and 20 degrees, in [0, 1]
     auc: tuple[float, ...]
 
 

@@ -10,12 +10,12 @@ will do.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
@@ -87,19 +87,12 @@ class PairOptions(Options):
 
 @dataclass(frozen=True, eq=False)
 class TrainingPair:
-    """Two images, and how the keypoints that are found in them are labelled.
+    """Two images, and how the keypoints that are found in them are labelled."""
 
-    Attributes
-    ----------
-    images : uint8 (H, W, 3), RGB.
-    keys : of images that come again as they are; None of those that do not.
-    label : labels of keypoints (N, 2) and (M, 2) of the images.
-    views : cameras, poses and depth of a pair of posed images; None under a homography.
-    """
-
-    images: tuple[Image, Image]
-    keys: tuple[str, str] | None
-    label: Labelling
+    images: tuple[Image, Image]  # uint8 (H, W, 3), RGB
+    keys: tuple[str, str] | None  # of images that come again as they are; None of those that do not
+    label: Labelling  # labels of keypoints (N, 2) and (M, 2) of the images
+    # cameras, poses and depth of a pair of posed images; None under a homography
     views: tuple[PosedView, PosedView] | None = None
 
     @property
@@ -111,35 +104,12 @@ class TrainingPair:
         return b.cam_from_world @ a.cam_from_world.inverse()
 
 
-class PairSource(Protocol):
-    """Where pairs come from."""
-
-    folder: Path
-
-    def draw(self, rng: np.random.Generator) -> TrainingPair:
-        """A pair, by the generator's numbers; raises DataError for a broken file."""
-        ...
-
-    def files(self) -> Iterable[Path]:
-        """All files that pairs are made of, sorted."""
-        ...
-
-    def counts(self) -> dict[str, int]:
-        """What there is, for the manifest."""
-        ...
-
-
 class PosedPairs:
     """Pairs of a kapture's images that have poses and depth, by the overlap of what they show.
 
-    Parameters
-    ----------
-    measured : file of pairs with their overlap as score; it is read where it is there, else made.
-
-    Raises
-    ------
-    DataError : fewer than two images have a pose and depth, or no two overlap as asked for; or the
-        file of overlaps is of other images.
+    ``measured`` is a file of pairs with their overlap as score; it is read where it is there, else
+    made. Raises DataError where fewer than two images have a pose and depth, or no two overlap as
+    asked for, and for a file of overlaps that is of other images.
     """
 
     def __init__(
@@ -242,9 +212,7 @@ class PosedPairs:
 class Photographs:
     """Pairs of views of single photographs, of all image files below a folder.
 
-    Raises
-    ------
-    DataError : there is no such folder, or no image in it.
+    Raises DataError where there is no such folder, or no image in it.
     """
 
     def __init__(self, folder: Path, options: PairOptions) -> None:
@@ -281,6 +249,9 @@ class Photographs:
         return {"images": len(self._paths)}
 
 
+PairSource = PosedPairs | Photographs
+
+
 def reduced_size(width: int, height: int, max_size_px: int) -> tuple[int, int]:
     """Width and height of an image that is reduced to a longer side; itself where it is smaller."""
     scale = min(1.0, max_size_px / max(width, height))
@@ -305,15 +276,8 @@ def random_view(
 ) -> tuple[Image, Floats]:
     """A view of a quadrilateral of the photograph, which lies in it as a whole.
 
-    Parameters
-    ----------
-    image : uint8 (H, W, 3).
-    size : width and height of the view.
-
-    Returns
-    -------
-    view : uint8 (height, width, 3).
-    view_from_image : float64 (3, 3), of pixels whose first centre is (0.5, 0.5).
+    Returns ``view``: uint8 (height, width, 3), of ``size``, width and height; ``view_from_image``:
+    float64 (3, 3), of pixels whose first centre is (0.5, 0.5).
     """
     width, height = size
     sides = np.array([image.shape[1], image.shape[0]], np.float64)
@@ -341,9 +305,7 @@ def random_view(
 def relit(image: Image, rng: np.random.Generator, strength: float = 1.0) -> Image:
     """The photograph in other light, by another camera: gamma, exposure, cast, noise, blur, JPEG.
 
-    Parameters
-    ----------
-    strength : 0 changes nothing.
+    A ``strength`` of 0 changes nothing.
     """
     if strength <= 0:
         return image
