@@ -209,8 +209,7 @@ def aliked_from(tensors: Mapping[str, torch.Tensor], where: str) -> AlikedNet:
     except (KeyError, IndexError) as error:
         raise DataError(f"this file is no ALIKED checkpoint: {error}", path=where) from error
     net = AlikedNet((first, second, third, fourth), positions)
-    load_strictly(net, tensors, where)
-    return net.eval()
+    return load_strictly(net, tensors, where).eval()
 
 
 class DescriptorHead(nn.Module):

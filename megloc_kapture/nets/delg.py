@@ -183,9 +183,7 @@ def delg_from(tensors: Mapping[str, torch.Tensor], where: str) -> DelgNet:
             f"(ResNet-101); {_found(tensors)}",
             path=where,
         )
-    net = DelgNet(RESNET_DEPTHS[len(blocks)], form)
-    load_strictly(net, state, where)
-    return net.eval()
+    return load_strictly(DelgNet(RESNET_DEPTHS[len(blocks)], form), state, where).eval()
 
 
 def delg_state(

@@ -164,8 +164,7 @@ def _filled(
             output_size=_length(tensors, "pca_layer.bias", _OUTPUT_SIZE),
         )
     module = module.to_empty(device="cpu")
-    load_strictly(module, tensors, where)
-    return module.eval()
+    return load_strictly(module, tensors, where).eval()
 
 
 def _length(tensors: Mapping[str, torch.Tensor], key: str, default: int) -> int:
@@ -264,8 +263,7 @@ def apgem_from(tensors: Mapping[str, torch.Tensor], where: str) -> ApGemNet:
         deviation=_three(tensors, "preprocess.std", IMAGENET_DEVIATION, where),
         normalised_features=bool(tensors.get("model_options.norm_features", False)),
     )
-    load_strictly(net, state, where)
-    return net.eval()
+    return load_strictly(net, state, where).eval()
 
 
 def whitening_from(
@@ -343,5 +341,4 @@ def eigenplaces_from(tensors: Mapping[str, torch.Tensor], where: str) -> EigenPl
     if _LINEAR not in tensors or tensors[_LINEAR].ndim != 2:
         raise DataError(f"no EigenPlaces: a matrix {_LINEAR} expected", path=where)
     network = EigenPlacesNet(101 if _DEEPER in tensors else 50, len(tensors[_LINEAR]))
-    load_strictly(network, tensors, where)
-    return network.eval()
+    return load_strictly(network, tensors, where).eval()

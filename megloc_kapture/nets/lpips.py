@@ -114,5 +114,4 @@ def lpips_from(
     """
     module = Lpips(trunk)
     features = {key: value for key, value in of_trunk.items() if not key.startswith("classifier.")}
-    load_strictly(module, {**features, **of_heads}, where)
-    return module.eval()
+    return load_strictly(module, {**features, **of_heads}, where).eval()

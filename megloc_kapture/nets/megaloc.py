@@ -87,8 +87,7 @@ def megaloc_from(tensors: Mapping[str, torch.Tensor], where: str) -> MegaLocNet:
     with torch.device("meta"):  # 229 million numbers are not drawn only to be overwritten
         network = MegaLocNet()
     network.to_empty(device="cpu")
-    load_strictly(network, renamed, where)
-    return network.eval()
+    return load_strictly(network, renamed, where).eval()
 
 
 class Salad(nn.Module):

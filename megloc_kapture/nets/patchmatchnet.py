@@ -310,9 +310,7 @@ class PatchmatchNet(nn.Module):
 
 def patchmatchnet_from(tensors: Mapping[str, Tensor], where: str) -> PatchmatchNet:
     """The network of a checkpoint, for inference; raises DataError that names what does not fit."""
-    network = PatchmatchNet()
-    load_strictly(network, tensors, where)
-    return network.eval()
+    return load_strictly(PatchmatchNet(), tensors, where).eval()
 
 
 def _doubled(x: Tensor) -> Tensor:

@@ -78,9 +78,7 @@ def load_r2d2(tensors: Mapping[str, torch.Tensor], where: str) -> R2D2Network:
         raise DataError(
             "this file does not fit R2D2Network; 1 missing keys: ops.0.weight", path=where
         )
-    network = R2D2Network(base_width=len(first))
-    load_strictly(network, tensors, where)
-    return network.eval()
+    return load_strictly(R2D2Network(base_width=len(first)), tensors, where).eval()
 
 
 def pyramid_levels(image: torch.Tensor, *, min_size: int, max_size: int) -> Iterator[torch.Tensor]:

@@ -24,6 +24,7 @@ from megloc_kapture.values import Device, Options
 _computing = RLock()
 _NAMED = 5  # keys of each kind that a message names
 AnyOptions = TypeVar("AnyOptions", bound=Options)
+Net = TypeVar("Net", bound=nn.Module)
 _making = Lock()
 
 
@@ -100,13 +101,9 @@ def sized_tensor(
 
 
 def load_strictly(
-    module: nn.Module,
-    tensors: Mapping[str, torch.Tensor],
-    where: str,
-    *,
-    may_lack: Collection[str] = (),
-) -> None:
-    """Load a state dict into a module, every key and shape as the module has it.
+    module: Net, tensors: Mapping[str, torch.Tensor], where: str, *, may_lack: Collection[str] = ()
+) -> Net:
+    """The module, with a state dict loaded; every key and shape as the module has it.
 
     Counters of batch normalisation may lack, and what ``may_lack`` names. Raises DataError that
     names the file ``where`` and the keys that are missing, unexpected, or of another shape.
@@ -136,7 +133,7 @@ def load_strictly(
         )
     if not any(getattr(tensor, "is_shared_file", False) for tensor in tensors.values()):
         module.load_state_dict(dict(tensors), strict=False)
-        return
+        return module
     # the parameters are the file's own memory, which all processes that read it have once
     own = {
         key: value
@@ -145,6 +142,7 @@ def load_strictly(
         for key, value in tensors.items()
     }
     module.load_state_dict(own, strict=False, assign=True)
+    return module
 
 
 def _some(keys: Sequence[str]) -> str:

@@ -187,8 +187,7 @@ def superglue(tensors: Mapping[str, torch.Tensor], where: str) -> SuperGlueNet:
     encoder = _numbered(tensors, r"kenc\.encoder\.(\d+)\.weight", dimensions=3)
     layers = _numbered(tensors, r"gnn\.layers\.(\d+)\.attn\.merge\.weight", dimensions=3)
     net = SuperGlueNet(encoder, len(layers)) if encoder and layers else SuperGlueNet()
-    load_strictly(net, tensors, where)
-    return net
+    return load_strictly(net, tensors, where)
 
 
 def _numbered(tensors: Mapping[str, torch.Tensor], pattern: str, *, dimensions: int) -> list[int]:

@@ -101,9 +101,7 @@ class SplitSuperPoint(nn.Module):
 
 def superpoint(tensors: Mapping[str, torch.Tensor], where: str) -> SuperPointNet:
     """The network of an official checkpoint; raises DataError that names what does not fit."""
-    net = SuperPointNet()
-    load_strictly(net, tensors, where)
-    return net
+    return load_strictly(SuperPointNet(), tensors, where)
 
 
 def superpoint_with_descriptor(
@@ -229,6 +227,4 @@ def is_superpoint_batchnorm(tensors: Mapping[str, torch.Tensor]) -> bool:
 
 def superpoint_batchnorm(tensors: Mapping[str, torch.Tensor], where: str) -> SuperPointBatchNormNet:
     """The network of a checkpoint of the retraining; raises DataError as :func:`superpoint`."""
-    net = SuperPointBatchNormNet()
-    load_strictly(net, tensors, where)
-    return net
+    return load_strictly(SuperPointBatchNormNet(), tensors, where)

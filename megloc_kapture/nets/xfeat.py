@@ -94,8 +94,7 @@ def load_xfeat(tensors: Mapping[str, torch.Tensor], where: str) -> XFeatNetwork:
     """
     network = XFeatNetwork()
     used = {key: value for key, value in tensors.items() if not key.startswith("fine_matcher.")}
-    load_strictly(network, used, where)
-    return network.eval()
+    return load_strictly(network, used, where).eval()
 
 
 def keypoint_scores(logits: torch.Tensor) -> torch.Tensor:

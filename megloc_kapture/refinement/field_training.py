@@ -247,7 +247,7 @@ class _Pixels:
         spread = float(max((high - low).max(), 1e-6))
         near, far = 0.02 * spread, 20 * spread
         if self._depth is not None and (known := self._depth[self._depth > 0]).size:
-            near, far = 0.5 * np.quantile(known, 0.01), 1.5 * np.quantile(known, 0.99)
+            near, far = float(0.5 * np.quantile(known, 0.01)), float(1.5 * np.quantile(known, 0.99))
             rows = self._usable[self._depth[self._usable] > 0]
             rows = rows[:: max(1, len(rows) // 20000)]
             points = self._points(rows, self._depth)
@@ -258,7 +258,7 @@ class _Pixels:
         centre = 0.5 * (low + high)
         scale = 0.5 * float((high - low).max())
         x, y, z = centre.tolist()
-        return FieldFrame(centre=(x, y, z), scale=scale, near=float(near), far=float(far))
+        return FieldFrame(centre=(x, y, z), scale=scale, near=near, far=far)
 
     def surface(self, frame: FieldFrame, count: int, seed: int) -> tuple[Floats, Floats]:
         """Points (K, 3) of the field that depth shows, drawn evenly, and their colours in 0 to 1.

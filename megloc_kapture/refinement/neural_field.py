@@ -218,11 +218,9 @@ class NeuralField:
             rows = rows.to(self.device)
             part = replace(select(rays, rows), appearance=fitted.expand(len(rows), -1))
             # what is transient in the image must not pull on its light
-            difference = self.module.render(part).rgb - rgb[rows]
+            off = self.module.render(part).rgb - rgb[rows]
             # linear from a tenth of full scale
-            loss = torch.nn.functional.huber_loss(
-                difference, torch.zeros_like(difference), delta=0.1
-            )
+            loss = torch.nn.functional.huber_loss(off, torch.zeros_like(off), delta=0.1)
             (fitted.grad,) = torch.autograd.grad(loss, [fitted])
             optimizer.step()
         return fitted.detach()

@@ -137,7 +137,7 @@ def reference_of(name: str, scene: RankingScene) -> RenderingReference | None:
 
 @dataclass(frozen=True)
 class PyramidKind:
-    """Options of the pyramids; see :func:`~.pyramid.build_pyramid`."""
+    """Options of :func:`~.pyramid.build_pyramid`."""
 
     levels: int
     max_side_px: int
@@ -213,14 +213,7 @@ def pyramid_of(view: RenderingQuery | RenderingReference, kind: PyramidKind) -> 
         raise DataError(
             f"an image of {image.shape} does not fit a camera of {camera.width}x{camera.height}"
         )
-    return build_pyramid(
-        image,
-        view.mask,
-        levels=kind.levels,
-        max_side_px=kind.max_side_px,
-        appearance=kind.appearance,
-        features=kind.features,
-    )
+    return build_pyramid(image, view.mask, **vars(kind))
 
 
 def _content(reference: RenderingReference) -> tuple[Any, ...]:
