@@ -41,12 +41,16 @@ from timing import table  # noqa: E402
 
 from megloc_kapture.geometry.poses import rotation_angles_deg  # noqa: E402
 from megloc_kapture.plugins import DepthView, PoseRefinement  # noqa: E402
-from megloc_kapture.refinement.acceptance import (
-    RenderingOptions,  # noqa: E402
-    squared_distance,  # noqa: E402
+from megloc_kapture.refinement.acceptance import (  # noqa: E402
+    RenderingOptions,
+    squared_distance,
 )
 from megloc_kapture.refinement.photometric import perturbed  # noqa: E402
-from megloc_kapture.refinement.references import REFERENCES, RenderingQuery, RenderingReference  # noqa: E402
+from megloc_kapture.refinement.references import (  # noqa: E402
+    REFERENCES,
+    RenderingQuery,
+    RenderingReference,
+)
 from megloc_kapture.refinement.rendering import refine_by_rendering  # noqa: E402
 from megloc_kapture.values import RigidTransform  # noqa: E402
 
