@@ -247,12 +247,11 @@ def confirmed(
         levels = np.clip(levels, 0, 32767).astype(np.int16)
         cv2.filterSpeckles(levels, 0, _MIN_REGION_PX, 10)
         known &= levels > 0
-    return replace(
-        estimate,
-        depth_m=np.where(known, estimate.depth_m, np.float32(0)),
-        sigma_m=np.where(known, estimate.sigma_m, np.float32(0)),
-        normals=np.where(known[..., None], estimate.normals, np.float32(0)),
+    depth_m, sigma_m = (
+        np.where(known, each, np.float32(0)) for each in (estimate.depth_m, estimate.sigma_m)
     )
+    normals = np.where(known[..., None], estimate.normals, np.float32(0))
+    return DepthEstimate(depth_m, sigma_m, normals)
 
 
 def _inverted(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:

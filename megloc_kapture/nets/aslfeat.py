@@ -103,12 +103,8 @@ class AslFeatNet(nn.Module):
     def _scores(self, name: str, features: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
         dilation, weight = _SCORED[name]
         scale = self.get_buffer(f"tower.{name}.instance_max")
-        return torch.stack(
-            [
-                weight * resize_as_tensorflow_1(peakiness(own, dilation, scale), size)
-                for own in features
-            ]
-        )
+        peaky = (peakiness(own, dilation, scale) for own in features)
+        return torch.stack([weight * resize_as_tensorflow_1(own, size) for own in peaky])
 
 
 class _Norm(nn.Module):

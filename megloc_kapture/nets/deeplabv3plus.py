@@ -68,13 +68,9 @@ class AtrousPyramid(nn.Module):
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.convs = nn.ModuleList(
-            [
-                _activated(channels, _WIDTH, 1),
-                *(_activated(channels, _WIDTH, 3, dilation=rate) for rate in _DILATIONS),
-                Pooling(channels),
-            ]
-        )
+        branches = [_activated(channels, _WIDTH, 1)]
+        branches += [_activated(channels, _WIDTH, 3, dilation=rate) for rate in _DILATIONS]
+        self.convs = nn.ModuleList([*branches, Pooling(channels)])
         self.project = _activated(len(self.convs) * _WIDTH, _WIDTH, 1)
         self.project.append(nn.Dropout(0.1))
 

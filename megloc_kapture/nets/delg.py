@@ -44,7 +44,7 @@ from torch.nn import functional
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.nets.aslfeat import conv_same
-from megloc_kapture.nets.runtime import load_strictly
+from megloc_kapture.nets.runtime import first_few, load_strictly
 from megloc_kapture.nets.trunks import (
     RESNET_BLOCKS,
     RESNET_DEPTHS,
@@ -61,7 +61,6 @@ _POWER = 3.0  # section 3.2 of the paper: fixed
 _EPSILONS: dict[Form, float] = {"keras": 1e-3, "slim": 1e-5}
 _LEAST_PX = 5  # a smaller side leaves the pooling without margin nothing
 _ATTRIBUTE = "/.ATTRIBUTES/VARIABLE_VALUE"
-_NAMED = 8  # variables that a message names
 _WORD = r"/(?P<word>kernel|bias|gamma|beta|moving_mean|moving_variance)$"
 _OBJECTS = re.compile(
     r"(?:^|/)backbone/(?:l(?P<stage>[2-5])(?P<block>[a-z])/)?"
@@ -300,6 +299,4 @@ def _torch_layout(values: torch.Tensor) -> torch.Tensor:
 
 
 def _found(names: Iterable[str]) -> str:
-    some = sorted(names)
-    more = len(some) - _NAMED
-    return "found: " + ", ".join(some[:_NAMED]) + (f" and {more} more" if more > 0 else "")
+    return "found: " + first_few(sorted(names), 8)

@@ -117,12 +117,8 @@ def load_lightglue(
         raise DataError("this file does not fit LightGlue: it has no layers", path=where)
     projection = tensors.get("input_proj.weight")
     descriptor_size = width if projection is None else projection.shape[-1]
-    parts = _untrained(
-        input_dim=descriptor_size,
-        descriptor_dim=width,
-        n_layers=max(layers) + 1,
-        num_heads=num_heads,
-    )
+    sizes = {"input_dim": descriptor_size, "descriptor_dim": width, "num_heads": num_heads}
+    parts = _untrained(n_layers=max(layers) + 1, **sizes)
     last = f"log_assignment.{max(layers)}."
     unused = [
         key

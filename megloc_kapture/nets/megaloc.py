@@ -210,11 +210,8 @@ class DinoV2(nn.Module):
             return self.pos_embed
         learnt = self.pos_embed.float()
         maps = learnt[:, 1:].mT.reshape(1, self.channels, self.grid, self.grid)
-        maps = functional.interpolate(
-            maps,
-            scale_factor=((rows + _OFFSET) / self.grid, (columns + _OFFSET) / self.grid),
-            mode="bicubic",
-        )
+        scale = ((rows + _OFFSET) / self.grid, (columns + _OFFSET) / self.grid)
+        maps = functional.interpolate(maps, scale_factor=scale, mode="bicubic")
         return torch.cat([learnt[:, :1], maps.flatten(2).mT], dim=1)
 
 

@@ -44,10 +44,9 @@ class R2D2Network(nn.Module):
         inputs = 3
         for kernel, width, dilation in _LAYERS:
             outputs = width * base_width
+            margin = dilation * (kernel - 1) // 2
             layers += [
-                nn.Conv2d(
-                    inputs, outputs, kernel, padding=dilation * (kernel - 1) // 2, dilation=dilation
-                ),
+                nn.Conv2d(inputs, outputs, kernel, padding=margin, dilation=dilation),
                 nn.BatchNorm2d(outputs, affine=False),
             ]
             if kernel == 3:

@@ -251,13 +251,9 @@ class NerfMlp(nn.Module):
         if transient is None:
             return Samples(sigma, rgb)
         moving = self.transient_encoding(torch.cat([final, _repeated(transient, count)], dim=-1))
-        return Samples(
-            sigma,
-            rgb,
-            self.transient_sigma(moving)[..., 0],
-            self.transient_rgb(moving),
-            self.transient_beta(moving)[..., 0],
-        )
+        moving_sigma = self.transient_sigma(moving)[..., 0]
+        beta = self.transient_beta(moving)[..., 0]
+        return Samples(sigma, rgb, moving_sigma, self.transient_rgb(moving), beta)
 
 
 class NerfW(nn.Module):
@@ -360,15 +356,10 @@ class TriPlane(nn.Module):
             return composite(t, deltas, Samples(sigma, rgb))
         entering = frequencies(_contracted(points), _POINT_FREQUENCIES)
         moving = self.moving(torch.cat([entering, _repeated(rays.transient, count)], dim=-1))
-        softplus = nn.functional.softplus
-        samples = Samples(
-            sigma,
-            rgb,
-            softplus(moving[..., 0] - 3.0),
-            torch.sigmoid(moving[..., 1:4]),
-            softplus(moving[..., 4] - 1.0),
-        )
-        return composite(t, deltas, samples)
+        moving_rgb = torch.sigmoid(moving[..., 1:4])
+        moving_sigma = nn.functional.softplus(moving[..., 0] - 3.0)
+        beta = nn.functional.softplus(moving[..., 4] - 1.0)
+        return composite(t, deltas, Samples(sigma, rgb, moving_sigma, moving_rgb, beta))
 
     @torch.no_grad()
     def _where(self, rays: Rays, generator: torch.Generator | None) -> torch.Tensor:

@@ -22,7 +22,6 @@ from megloc_kapture.io.weights import WeightsFile, find_weights, read_weights, s
 from megloc_kapture.values import Device, Options
 
 _computing = RLock()
-_NAMED = 5  # keys of each kind that a message names
 AnyOptions = TypeVar("AnyOptions", bound=Options)
 Net = TypeVar("Net", bound=nn.Module)
 _making = Lock()
@@ -119,7 +118,7 @@ def load_strictly(
         if tensors[key].shape != expected[key].shape
     ]
     wrong = [
-        f"{len(keys)} {what}: {_some(keys)}"
+        f"{len(keys)} {what}: {first_few(keys)}"
         for what, keys in (
             ("missing keys", missing),
             ("unexpected keys", unexpected),
@@ -145,9 +144,10 @@ def load_strictly(
     return module
 
 
-def _some(keys: Sequence[str]) -> str:
-    more = len(keys) - _NAMED
-    return ", ".join(keys[:_NAMED]) + (f" and {more} more" if more > 0 else "")
+def first_few(keys: Sequence[str], count: int = 5) -> str:
+    """The first keys, for a message that says how many more there are."""
+    more = len(keys) - count
+    return ", ".join(keys[:count]) + (f" and {more} more" if more > 0 else "")
 
 
 class Checkpointed(Generic[AnyOptions]):

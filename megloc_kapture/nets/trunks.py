@@ -34,13 +34,8 @@ RESNET_WIDTHS, RESNET_EXPANSION = (64, 128, 256, 512), 4
 IMAGENET_MEAN, IMAGENET_DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 # expansion, channels, blocks, stride of the first (table 2 of the paper)
 _MOBILENET_STAGES = (
-    (1, 16, 1, 1),
-    (6, 24, 2, 2),
-    (6, 32, 3, 2),
-    (6, 64, 4, 2),
-    (6, 96, 3, 1),
-    (6, 160, 3, 2),
-    (6, 320, 1, 1),
+    *((1, 16, 1, 1), (6, 24, 2, 2), (6, 32, 3, 2), (6, 64, 4, 2)),
+    *((6, 96, 3, 1), (6, 160, 3, 2), (6, 320, 1, 1)),
 )
 _MOBILENET_STEM_CHANNELS = 32
 _OUTPUT_STRIDE = 16
@@ -214,14 +209,8 @@ class ResNet(nn.Module):
             reached *= stride
             stage = nn.Sequential()
             for block in range(blocks):
-                stage.append(
-                    Bottleneck(
-                        channels,
-                        width,
-                        stride=stride if block == 0 else 1,
-                        dilation=first if block == 0 else dilation,
-                    )
-                )
+                steps, reach = (1, dilation) if block else (stride, first)
+                stage.append(Bottleneck(channels, width, stride=steps, dilation=reach))
                 channels = width * RESNET_EXPANSION
             self.add_module(f"layer{number}", stage)
 
@@ -284,13 +273,10 @@ class MobileNetV2(nn.Module):
                 stride, dilation = 1, dilation * wanted
             reached *= stride
             for block in range(blocks):
+                steps, reach = (1, dilation) if block else (stride, first)
                 layers.append(
                     InvertedResidual(
-                        channels,
-                        out,
-                        expansion=expansion,
-                        stride=stride if block == 0 else 1,
-                        dilation=first if block == 0 else dilation,
+                        channels, out, expansion=expansion, stride=steps, dilation=reach
                     )
                 )
                 channels = out

@@ -260,11 +260,8 @@ def correlation(problem: LevelProblem, at: Alignment) -> float:
 def _fit(problem: LevelProblem, rows: Float64, deviation: float) -> Fit:
     squared_scale = (LOSS_SCALE * max(deviation, 1e-12)) ** 2
     system = problem.system_of(rows, squared_scale)
-    return Fit(
-        system.mean_cost / squared_scale,
-        _correlation(rows, problem.chosen, problem.num_groups),
-        system.count,
-    )
+    correlated = _correlation(rows, problem.chosen, problem.num_groups)
+    return Fit(system.mean_cost / squared_scale, correlated, system.count)
 
 
 def _correlation(rows: Float64, chosen: ChosenPoints, num_groups: int) -> float:

@@ -224,13 +224,8 @@ def _fit_levels(
         moved = found
         if reason := _reason_too_far(start, moved, options):
             return start, reason
-    found = fit_weighted(
-        levels[-1].surface,
-        pixels,
-        _noise(pixels[:, 2], options.noise),
-        moved,
-        levels[-1].max_distance_m,
-    )
+    finest, noise = levels[-1], _noise(pixels[:, 2], options.noise)
+    found = fit_weighted(finest.surface, pixels, noise, moved, finest.max_distance_m)
     if found is None:
         return start, "the surfaces do not determine the pose"
     return found, _reason_too_far(start, found, options)
@@ -341,12 +336,8 @@ def _overlaps(
         if view is None:
             continue
         points = depth_cloud(view, options.depth, step_px=_OVERLAP_STEP_PX)
-        world_from_image = scene.map_pose(name).inverse()
-        agrees = _agrees(
-            query_depth,
-            (depth_from_world @ world_from_image).apply(points),
-            options.max_distances_m[0],
-        )
+        seen = (depth_from_world @ scene.map_pose(name).inverse()).apply(points)
+        agrees = _agrees(query_depth, seen, options.max_distances_m[0])
         found.append((name, float(agrees.mean()) if len(agrees) else 0.0))
     # stable: of equals the better reference stays first
     return sorted(found, key=lambda each: -each[1])

@@ -141,11 +141,8 @@ def _inverse_depth(depth_m: NDArray[np.float32]) -> Float64:
 def _grid(camera: Camera) -> tuple[NDArray[np.int64], NDArray[np.int64], Float64]:
     """Rows (N,) and columns (N,) of the pixels looked at, and their rays (N, 3) of unit depth."""
     stride = max(1, -(-max(camera.width, camera.height) // _GRID))
-    grid = np.meshgrid(
-        np.arange(stride // 2, camera.height, stride),
-        np.arange(stride // 2, camera.width, stride),
-        indexing="ij",
-    )
+    sides = (np.arange(stride // 2, n, stride) for n in (camera.height, camera.width))
+    grid = np.meshgrid(*sides, indexing="ij")
     rows, columns = (side.ravel().astype(np.int64) for side in grid)
     rays = bearing_rays(camera, np.stack([columns + 0.5, rows + 0.5], axis=1))
     for array in (rows, columns, rays):

@@ -310,11 +310,9 @@ def judge_consistency(displacements: Iterable[Displacement | None]) -> Consisten
                 break
     if not known:
         return Consistency(0, 0, None, "no map image with depth is seen by others from elsewhere")
+    names = Displacement.__dataclass_fields__
     median = Displacement(
-        *(
-            float(np.median([getattr(each, name) for each in known]))
-            for name in Displacement.__dataclass_fields__
-        )
+        *(float(np.median([getattr(each, name) for each in known])) for name in names)
     )
     contradicting = sum(each.contradicts for each in known)
     reason = ""

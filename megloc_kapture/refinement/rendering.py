@@ -247,13 +247,9 @@ class _Refining:
 
     def _best_rotation(self, problem: LevelProblem, pose: RigidTransform) -> RigidTransform:
         """The rotation of the camera that leads to the best pose, of those that correlate best."""
+        chosen, max_deg = problem.chosen.thinned(_SEARCH_POINTS), self.options.search_deg
         starts = best_rotations(
-            problem.chosen.thinned(_SEARCH_POINTS),
-            problem.level,
-            self.camera,
-            pose,
-            max_deg=self.options.search_deg,
-            count=_MAX_STARTS,
+            chosen, problem.level, self.camera, pose, max_deg=max_deg, count=_MAX_STARTS
         )
         fewer = problem.thinned(_START_POINTS)
         return self._best(fewer, self.threads.map(fewer.nuisance_at, starts))

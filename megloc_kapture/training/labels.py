@@ -217,11 +217,6 @@ def _epipolar_error_px(
         for view, px, ray in ((a, px_a, rays[0]), (b, px_b, rays[1]))
     ]
     first, second = (grid.ravel() for grid in np.indices((len(px_a), len(px_b))))
-    error = sampson_error_px(
-        rays[0][first],
-        slopes[0][first],
-        rays[1][second],
-        slopes[1][second],
-        b.cam_from_world @ a.cam_from_world.inverse(),
-    )
+    ours, theirs = (rays[0][first], slopes[0][first]), (rays[1][second], slopes[1][second])
+    error = sampson_error_px(*ours, *theirs, b.cam_from_world @ a.cam_from_world.inverse())
     return np.where(np.isfinite(error), error, 0.0).reshape(len(px_a), len(px_b))

@@ -98,17 +98,14 @@ class SuperPointDescriber(nn.Module):
     Raises DataError for weights of the extractor that do not fit.
     """
 
-    descriptor_size = SuperPoint.descriptor_size
-
     def __init__(self, extractor: SuperPoint) -> None:
         super().__init__()
         self.options = options = extractor.options
         tensors = read_weights(find_weights(options.weights))
         if options.descriptor_weights is not None:
             tensors |= read_weights(find_weights(options.descriptor_weights))
-        self.net = SuperPointNet(detector=False)
         described = {key: value for key, value in tensors.items() if not key.startswith("convP")}
-        load_strictly(self.net, described, options.weights)
+        self.net = load_strictly(SuperPointNet(detector=False), described, options.weights)
 
     def forward(self, image: Image, xy_px: torch.Tensor) -> torch.Tensor:
         dense = self.net.describe(self.net.encode(gray_tensor(image, xy_px.device)))
@@ -120,8 +117,6 @@ class XFeatDescriber(nn.Module):
 
     Its normalisation keeps the statistics it has: pairs of one step are few.
     """
-
-    descriptor_size = XFeat.descriptor_size
 
     def __init__(self, extractor: XFeat) -> None:
         super().__init__()
@@ -312,13 +307,9 @@ def held_out_result(model: PairModel, pairs: Sequence[PreparedPair]) -> HeldOutR
         losses.append(loss)
         if pair.pair.views is not None:
             errors.append(pose_error_deg(pair, matches))
-    return HeldOutResult(
-        len(pairs),
-        float(np.mean(losses)) if losses else 0.0,
-        right / max(told, 1),
-        right / max(labelled, 1),
-        pose_auc(errors),
-    )
+    loss = float(np.mean(losses)) if losses else 0.0
+    precision, recall = right / max(told, 1), right / max(labelled, 1)
+    return HeldOutResult(len(pairs), loss, precision, recall, pose_auc(errors))
 
 
 def judged(

@@ -12,7 +12,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -164,13 +164,8 @@ class PosedPairs:
             for name, view in zip(names, (a, b), strict=True)
         ]
         keys = (str(self._kapture.image_path(names[0])), str(self._kapture.image_path(names[1])))
-        labels = self._options.labels
-        return TrainingPair(
-            (images[0], images[1]),
-            keys,
-            lambda px_a, px_b: labels_of_views(px_a, px_b, a, b, labels),
-            (a, b),
-        )
+        label = partial(labels_of_views, a=a, b=b, options=self._options.labels)
+        return TrainingPair((images[0], images[1]), keys, label, (a, b))
 
     def files(self) -> list[Path]:
         sensors = sorted((self.folder / "sensors").glob("*.txt"))
@@ -197,16 +192,10 @@ class PosedPairs:
     def _read_view(self, name: str) -> PosedView:
         camera, record = self._kapture.read().camera_of(name), self._records[name]
         size = reduced_size(camera.width, camera.height, self._options.max_size_px)
-        depth_m = read_depth_map(
-            self._kapture.depth_path(record.path),
-            width=record.camera.width,
-            height=record.camera.height,
-        )
-        return PosedView(
-            scaled_camera(camera, *size),
-            self._poses[name],
-            DepthView(record.camera, depth_m, record.image_from_depth),
-        )
+        path, sensor = self._kapture.depth_path(record.path), record.camera
+        depth_m = read_depth_map(path, width=sensor.width, height=sensor.height)
+        depth = DepthView(sensor, depth_m, record.image_from_depth)
+        return PosedView(scaled_camera(camera, *size), self._poses[name], depth)
 
 
 class Photographs:
@@ -235,12 +224,9 @@ class Photographs:
             random_view(image, size, rng, options) for _ in range(2)
         )
         b_from_a = b_from_image @ np.linalg.inv(a_from_image)
-        labels = self._options.labels
-        return TrainingPair(
-            (relit(a, rng, options.light), relit(b, rng, options.light)),
-            None,
-            lambda px_a, px_b: labels_of_homography(px_a, px_b, b_from_a, size, size, labels),
-        )
+        lit = relit(a, rng, options.light), relit(b, rng, options.light)
+        label = partial(labels_of_homography, b_from_a=b_from_a, size_a=size, size_b=size)
+        return TrainingPair(lit, None, partial(label, options=self._options.labels))
 
     def files(self) -> list[Path]:
         return self._paths
