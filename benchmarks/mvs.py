@@ -37,8 +37,7 @@ from megloc_kapture.io.files import link_records
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
 from megloc_kapture.io.tables import read_depth_rows
-from megloc_kapture.mvs.consistency import AgreementOptions, confirmed
-from megloc_kapture.mvs.views import pinhole_matrix, stereo_view
+from megloc_kapture.mvs.views import AgreementOptions, confirmed, pinhole_matrix, stereo_view
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import (

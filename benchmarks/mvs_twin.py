@@ -27,7 +27,7 @@ from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.io.files import link_records
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder, write_sensors
-from megloc_kapture.mvs.consistency import AgreementOptions
+from megloc_kapture.mvs.views import AgreementOptions
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import DEPTH_ESTIMATORS

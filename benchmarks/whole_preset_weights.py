@@ -30,12 +30,11 @@ from torch import nn
 
 from megloc_kapture.io.weights import UNVERIFIED
 from megloc_kapture.io.weights.registry import registry
-from megloc_kapture.nets.apgem import ApGemNet
 from megloc_kapture.nets.aslfeat import AslFeatNet
 from megloc_kapture.nets.deeplabv3plus import DeepLabV3Plus
 from megloc_kapture.nets.delg import DelgNet
+from megloc_kapture.nets.global_descriptors import ApGemNet, VggNetVlad
 from megloc_kapture.nets.lpips import Lpips
-from megloc_kapture.nets.netvlad import VggNetVlad
 from megloc_kapture.nets.superglue import SuperGlueNet
 from megloc_kapture.nets.superpoint import SuperPointNet
 

@@ -29,7 +29,7 @@ from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.weights import find_weights, read_weights
 from megloc_kapture.nets.aliked import AlikedNet, aliked_from
 from megloc_kapture.nets.runtime import image_tensor, inference
-from megloc_kapture.nets.sampling import deform_conv2d
+from megloc_kapture.nets.score_maps import deform_conv2d
 
 CPU = torch.device("cpu")
 

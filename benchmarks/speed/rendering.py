@@ -41,11 +41,13 @@ from timing import table  # noqa: E402
 
 from megloc_kapture.geometry.poses import rotation_angles_deg  # noqa: E402
 from megloc_kapture.plugins import DepthView, PoseRefinement  # noqa: E402
-from megloc_kapture.refinement.acceptance import squared_distance  # noqa: E402
+from megloc_kapture.refinement.acceptance import (  # noqa: E402
+    RenderingOptions,
+    squared_distance,
+)
 from megloc_kapture.refinement.photometric import perturbed  # noqa: E402
 from megloc_kapture.refinement.references import (  # noqa: E402
     REFERENCES,
-    RenderingOptions,  # noqa: E402
     RenderingQuery,
     RenderingReference,
 )

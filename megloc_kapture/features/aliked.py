@@ -12,8 +12,8 @@ from pydantic import Field
 from megloc_kapture.features.network import Images, LocalNetwork, LocalNetworkOptions, Masks
 from megloc_kapture.nets.aliked import AlikedMaps, AlikedNet, aliked_from
 from megloc_kapture.nets.runtime import image_tensor, inference
-from megloc_kapture.nets.sampling import read_bilinear
 from megloc_kapture.nets.score_maps import (
+    read_bilinear,
     select_pixels,
     soft_argmax,
     suppress_non_maxima,

@@ -21,9 +21,10 @@ from megloc_kapture.nets.aslfeat import (
     on_no_edge,
 )
 from megloc_kapture.nets.runtime import inference
-from megloc_kapture.nets.sampling import pixel_table, read_bilinear
 from megloc_kapture.nets.score_maps import (
     parabola_peak,
+    pixel_table,
+    read_bilinear,
     select_pixels,
     suppress_non_maxima,
 )

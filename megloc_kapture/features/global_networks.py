@@ -22,14 +22,19 @@ from torch import nn
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.features.network import Images
-from megloc_kapture.nets.apgem import apgem_from, whitening_from
-from megloc_kapture.nets.checkpointed import Checkpointed
 from megloc_kapture.nets.delg import delg_from, describe
-from megloc_kapture.nets.dinov2 import PATCH_PX
-from megloc_kapture.nets.eigenplaces import eigenplaces_from
-from megloc_kapture.nets.megaloc import megaloc_from, squared
-from megloc_kapture.nets.netvlad import STRIDE_PX, VggNetVlad, netvlad, openibl
+from megloc_kapture.nets.global_descriptors import (
+    STRIDE_PX,
+    VggNetVlad,
+    apgem_from,
+    eigenplaces_from,
+    netvlad,
+    openibl,
+    whitening_from,
+)
+from megloc_kapture.nets.megaloc import PATCH_PX, megaloc_from, squared
 from megloc_kapture.nets.runtime import (
+    Checkpointed,
     NetworkOptions,
     image_tensor,
     inference,

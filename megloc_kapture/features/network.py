@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.features.image_bound import BoundedOptions
-from megloc_kapture.nets.checkpointed import Checkpointed
-from megloc_kapture.nets.runtime import NetworkOptions
+from megloc_kapture.nets.runtime import Checkpointed, NetworkOptions
 from megloc_kapture.nets.score_maps import select_keypoints
 from megloc_kapture.values import LocalFeatures
 

@@ -196,7 +196,7 @@ class ConsistencyRow:
     ----------
     images, contradicting : map images whose displacement is known, and those that contradict.
     moved_m, turned_deg, moved_px, claimed_m, claimed_deg, squared_distance : their medians, as of
-        ``megloc_kapture.refinement.consistency.Displacement``; NaN where there is none.
+        ``megloc_kapture.refinement.references.Displacement``; NaN where there is none.
     reason : why poses of queries are not refined there; empty where they are.
     """
 

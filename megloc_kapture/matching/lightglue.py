@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -13,22 +13,17 @@ from torch.nn.utils.rnn import pad_sequence
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.weights import WeightsFile
-from megloc_kapture.nets.checkpointed import Checkpointed
 from megloc_kapture.nets.lightglue import (
     KeypointBatch,
-    LightGlueNetwork,
-    LightGlueShape,
     load_lighterglue,
     load_lightglue,
     mutual_matches,
-    renamed_blocks,
     require_kornia,
 )
-from megloc_kapture.nets.runtime import NetworkOptions, inference
+from megloc_kapture.nets.runtime import Checkpointed, NetworkOptions, inference
 from megloc_kapture.values import ImageFeatures
 
 Matches = tuple[NDArray[np.int64], NDArray[np.float32]]
-_SHAPE = LightGlueShape(width=256, num_heads=4)
 
 
 class PairNetworkOptions(NetworkOptions):
@@ -133,15 +128,11 @@ class LightGlueOptions(PairNetworkOptions):
     )
 
 
-def _load_lightglue(tensors: Mapping[str, torch.Tensor], where: str) -> LightGlueNetwork:
-    return load_lightglue(renamed_blocks(tensors), where, _SHAPE)
-
-
 class LightGlue(PairNetwork[LightGlueOptions]):
     """The matcher ``lightglue``, for SuperPoint's features or ALIKED's; needs kornia."""
 
     Options = LightGlueOptions
-    _load = staticmethod(_load_lightglue)
+    _load = staticmethod(load_lightglue)
 
 
 class LighterGlueOptions(PairNetworkOptions):

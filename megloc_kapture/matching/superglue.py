@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.nets.checkpointed import Checkpointed
-from megloc_kapture.nets.runtime import NetworkOptions, inference
+from megloc_kapture.nets.runtime import Checkpointed, NetworkOptions, inference
 from megloc_kapture.nets.superglue import (
     ImageKeypoints,
     mutual_matches,

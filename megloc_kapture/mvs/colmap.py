@@ -42,20 +42,15 @@ class ColmapStereo:
         """Depth of the reference; see :class:`~megloc_kapture.plugins.DepthEstimator`."""
         names = [f"{number}.png" for number in range(1 + len(sources))]
         views = (reference, *sources)
-        nothing = np.zeros(0, np.int64)
+        pixels = [view.image for view in views]
         images = [
             MapImage(name, view.camera, view.cam_from_world, np.zeros((0, 2), np.float32))
             for name, view in zip(names, views, strict=True)
         ]
+        nothing = [(np.zeros(0, np.int64), np.zeros(0, np.int64))] * len(views)
         with tempfile.TemporaryDirectory() as folder:
             root = Path(folder)
-            write_workspace(
-                root,
-                images,
-                [view.image for view in views],
-                [(nothing, nothing)] * len(views),
-                np.zeros((0, 3)),
-            )
+            write_workspace(root, images, pixels, nothing, np.zeros((0, 3)))
             run_patch_match(root, names[0], names[1:], depth_range_m)
             depth = read_map(map_path(root, "depth", names[0], "photometric"))
             normals = read_map(map_path(root, "normal", names[0], "photometric"))

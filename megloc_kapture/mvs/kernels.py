@@ -22,10 +22,8 @@ _FLAT = np.float32(1e-6)
 def window_sums(image, other, radius, row, columns, sums):
     """Sums over a window around each pixel of a row of image, image^2 and image * other.
 
-    Parameters
-    ----------
-    columns : float32 (3, W), scratch.
-    sums : float32 (3, W), filled; of windows that leave the image NaN.
+    ``columns``: float32 (3, W), scratch; ``sums``: float32 (3, W), filled; of windows that leave
+    the image NaN.
     """
     height, width = image.shape
     for x in range(width):

@@ -12,9 +12,8 @@ from pydantic import Field
 
 from megloc_kapture.mvs.sweep import as_estimate, matching_deviations, tangent_planes
 from megloc_kapture.mvs.views import relative_projection
-from megloc_kapture.nets.checkpointed import Checkpointed
 from megloc_kapture.nets.patchmatchnet import MULTIPLE, patchmatchnet_from
-from megloc_kapture.nets.runtime import image_tensor, inference
+from megloc_kapture.nets.runtime import Checkpointed, image_tensor, inference
 from megloc_kapture.plugins import DepthEstimate, StereoView
 from megloc_kapture.values import Device, Options
 

@@ -173,17 +173,7 @@ def _noise(y, x, turn, k):
 
 @compiled_loop
 def refine_planes(
-    reference,
-    sources,
-    infinities,
-    baselines,
-    planes,
-    costs,
-    reach,
-    tone,
-    turn,
-    step,
-    limits,
+    reference, sources, infinities, baselines, planes, costs, reach, tone, turn, step, limits
 ):
     """One pass of PatchMatch over slanted planes (Bleyer et al., BMVC 2011), in place.
 
@@ -255,11 +245,8 @@ def plane_deviations(
     both along the epipolar line, knows inverse depth to ``(1 - rho^2) Var / (N mean((g m)^2))``:
     the bound of least squares. What the sources know is averaged and not added up: they share the
     window's noise and its plane's misfit. To ``calibration[1]`` times the root is added a matching
-    error of ``calibration[0]`` pixels, over the motion.
-
-    Parameters
-    ----------
-    out : float32 (H, W), filled; 0 where no source sees the window.
+    error of ``calibration[0]`` pixels, over the motion. ``out``: float32 (H, W), filled; 0 where no
+    source sees the window.
     """
     height, width = reference.shape
     count = (2 * reach + 1) ** 2

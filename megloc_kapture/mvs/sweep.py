@@ -91,11 +91,8 @@ def as_estimate(camera: Camera, planes: Floats, deviations: NDArray[np.floating]
     covector = np.stack([planes[..., 1], planes[..., 2], offset], axis=-1)
     normals = -covector @ pinhole_matrix(camera)
     normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
-    return DepthEstimate(
-        depth.astype(np.float32),
-        (deviations * depth**2).astype(np.float32),
-        np.where(known[..., None], normals, 0.0).astype(np.float32),
-    )
+    sigma, normals = deviations * depth**2, np.where(known[..., None], normals, 0.0)
+    return DepthEstimate(*(one.astype(np.float32) for one in (depth, sigma, normals)))
 
 
 def planes_of(camera: Camera, depth_m: NDArray[Any], normals: NDArray[Any]) -> Floats:
@@ -160,10 +157,7 @@ def cost_volume(
                 homography = infinity.copy()
                 homography[:, 2] += inverse * baseline
                 cv2.warpPerspective(
-                    sources[s],
-                    homography,
-                    (width, height),
-                    dst=warped[s],
+                    *(sources[s], homography, (width, height), warped[s]),
                     flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
                     borderMode=cv2.BORDER_CONSTANT,
                     borderValue=float("nan"),
@@ -203,9 +197,7 @@ def refine(
 ) -> Image:
     """Move planes (H, W, 3), in place, to where they match best, by so many passes.
 
-    Returns
-    -------
-    float32 (H, W), the standard deviation of inverse depth; 0 where nothing matches.
+    Returns float32 (H, W), the standard deviation of inverse depth; 0 where nothing matches.
     """
     from megloc_kapture.mvs.plane_kernels import refine_planes
 
@@ -238,11 +230,8 @@ def matching_deviations(
 def _compared(reference: StereoView, sources: Sequence[StereoView]) -> tuple[Image, Floats, Floats]:
     """Sources as the kernels take them: images (S, H, W), ``infinity`` and ``baseline`` of each."""
     projections = [relative_projection(reference, source) for source in sources]
-    return (
-        _stacked([stereo_image(source) for source in sources]),
-        np.array([infinity for infinity, _ in projections]),
-        np.array([baseline for _, baseline in projections]),
-    )
+    infinities, baselines = (np.array(each) for each in zip(*projections, strict=True))
+    return _stacked([stereo_image(source) for source in sources]), infinities, baselines
 
 
 def _stacked(images: Sequence[Image]) -> Image:

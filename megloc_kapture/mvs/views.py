@@ -1,4 +1,4 @@
-"""Views for stereo: images without distortion at a working size, and which go together."""
+"""Views for stereo: images without distortion, which go together, and depth that they confirm."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from megloc_kapture.geometry.cameras import px_from_cam
 from megloc_kapture.geometry.warping import scaled_camera
 from megloc_kapture.io.colmap_cameras import undistorted_pinhole
-from megloc_kapture.plugins import StereoView
-from megloc_kapture.values import ONE_FOCAL_MODELS, Camera, RigidTransform
+from megloc_kapture.plugins import DepthEstimate, StereoView
+from megloc_kapture.values import ONE_FOCAL_MODELS, Camera, Options, RigidTransform
 
 Floats = NDArray[np.float64]
 Projections = Sequence[tuple[Floats, Floats]]
@@ -22,6 +23,7 @@ Projections = Sequence[tuple[Floats, Floats]]
 # surfaces look different; after Schoenberger et al., ECCV 2016, section 4.1, and MVSNet
 _BEST_ANGLES_DEG = (5.0, 20.0)
 _WIDENED = (0.8, 1.25)
+_MIN_REGION_PX = 40  # smaller islands of one surface are chance agreements
 
 
 def stereo_camera(camera: Camera, max_size_px: int) -> Camera:
@@ -78,10 +80,8 @@ def stereo_view(
 ) -> StereoView:
     """An image, its distortion undone, as stereo takes it.
 
-    Parameters
-    ----------
-    image : uint8 (H, W, 3), RGB; ``camera`` any of COLMAP's models.
-    mask : bool (H, W), True = use; None without one.
+    ``image`` and ``camera``: uint8 (H, W, 3), RGB; any of COLMAP's models; ``mask``: bool (H, W),
+    True = use; None without one.
     """
     pinhole = stereo_camera(camera, max_size_px)
     size = pinhole.width, pinhole.height
@@ -164,3 +164,96 @@ def depth_range(depths: Floats) -> tuple[float, float] | None:
         return None
     low, high = np.percentile(depths, [1, 99])
     return float(low * _WIDENED[0]), float(high * _WIDENED[1])
+
+
+class AgreementOptions(Options):
+    """Options of the consistency between views."""
+
+    min_views: int = Field(
+        default=1, ge=0, description="other views whose depth agrees, for a pixel to keep its own"
+    )
+    max_error_px: float = Field(
+        default=1.0, gt=0, description="distance at which a pixel comes back from another view"
+    )
+    max_relative_error: float = Field(
+        default=0.01, gt=0, description="difference in depth, as a share of it"
+    )
+    max_relative_sigma: float = Field(
+        default=0.03,
+        gt=0,
+        description="standard deviation of depth, as a share of it, beyond which there is none: "
+        "surfaces without texture",
+    )
+
+
+def agreeing_views(
+    view: StereoView,
+    depth_m: NDArray[np.float32],
+    others: Sequence[tuple[StereoView, NDArray[np.float32]]],
+    options: AgreementOptions,
+) -> NDArray[np.uint8]:
+    """Number of other views (H, W) whose depth agrees with a view's own, forth and back.
+
+    ``others`` have depth float32 (H, W), 0 where unknown; of a view only the camera and the pose
+    count.
+    """
+    from megloc_kapture.mvs.kernels import count_agreeing
+
+    counts = np.zeros(depth_m.shape, np.uint8)
+    inverse = _inverted(depth_m)
+    for other, other_depth_m in others:
+        forth, back = relative_projection(view, other), relative_projection(other, view)
+        limits = options.max_error_px, options.max_relative_error
+        count_agreeing(inverse, _inverted(other_depth_m), *forth, *back, *limits, counts)
+    return counts
+
+
+def with_pose_errors(
+    view: StereoView,
+    sources: Sequence[StereoView],
+    estimate: DepthEstimate,
+    depth_range_m: tuple[float, float],
+    error_px: float,
+) -> DepthEstimate:
+    """An estimate whose deviations also cover the errors of the poses of a view and its sources.
+
+    ``error_px`` is the standard deviation of where the poses put a point in a source, along an
+    axis.
+    """
+    limits = 1.0 / np.array(depth_range_m)[::-1]
+    paths = [relative_projection(view, source) for source in sources]
+    # any of the sources may have decided
+    step = np.sqrt(np.mean([pixel_step([path], view.camera, limits) ** 2 for path in paths]))
+    own = (error_px * step * np.square(estimate.depth_m.astype(np.float64))).astype(np.float32)
+    return replace(estimate, sigma_m=np.hypot(estimate.sigma_m, own))
+
+
+def confirmed(
+    view: StereoView,
+    estimate: DepthEstimate,
+    others: Sequence[tuple[StereoView, NDArray[np.float32]]],
+    options: AgreementOptions,
+) -> DepthEstimate:
+    """What of an estimate other views confirm, that is sure enough, not masked, and no island."""
+    counts = agreeing_views(view, estimate.depth_m, others, options)
+    known = (estimate.depth_m > 0) & (counts >= options.min_views)
+    known &= estimate.sigma_m <= options.max_relative_sigma * estimate.depth_m
+    if view.mask is not None:
+        known &= view.mask
+    if known.any():
+        # depths that differ by less than a hundredth are of one surface
+        logs = np.log(estimate.depth_m, out=np.zeros(known.shape), where=known)
+        levels = np.where(known, 1 + 1000 * (logs - logs[known].min()), 0)
+        levels = np.clip(levels, 0, 32767).astype(np.int16)
+        cv2.filterSpeckles(levels, 0, _MIN_REGION_PX, 10)
+        known &= levels > 0
+    depth_m, sigma_m = (
+        np.where(known, each, np.float32(0)) for each in (estimate.depth_m, estimate.sigma_m)
+    )
+    normals = np.where(known[..., None], estimate.normals, np.float32(0))
+    return DepthEstimate(depth_m, sigma_m, normals)
+
+
+def _inverted(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+    known = depth_m > 0
+    return np.where(known, 1 / np.where(known, depth_m, 1), 0).astype(np.float32)

@@ -2,16 +2,14 @@
 
 The network is run as it is defined, but nothing of its 128 channels is ever made in the image's own
 resolution: the score head's first layer is a matrix product with each pixel, so it is applied to
-every level before that is enlarged, and the descriptor head reads features where it looks for them
-(:mod:`megloc_kapture.nets.aliked`). Batch normalisation is folded into the
-convolutions, so the module is for inference only.
+every level before that is enlarged, and the descriptor head reads features where it looks for them.
+Batch normalisation is folded into the convolutions, so the module is for inference only.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import nn
@@ -19,7 +17,7 @@ from torch.nn import functional
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.nets.runtime import load_strictly
-from megloc_kapture.nets.sampling import corners_around, deform_conv2d, pixel_table, read_bilinear
+from megloc_kapture.nets.score_maps import corners_around, deform_conv2d, pixel_table, read_bilinear
 
 _MULTIPLE = 32  # image sides are padded to multiples of it, the coarsest level's stride
 _STRIP_ROWS = 2  # of the image, at once in the score head's first layer: what a cache holds
@@ -27,27 +25,17 @@ _PATCH = 3  # side of the square of pixels that says where to look, in pixels
 _VALUES_AT_ONCE = {"cpu": 1 << 23, "cuda": 1 << 28}
 
 
-@dataclass(frozen=True)
-class AlikedSizes:
-    """Sizes by which the variants differ.
+class AlikedNet(nn.Module):
+    """Image to score map and features; the keys are those of ``aliked-*.pth``.
 
-    Attributes
-    ----------
-    channels : of the four blocks; the last one is that of the descriptors.
-    positions : number of positions that a descriptor is gathered from.
+    ``channels``: of the four blocks; the last one is that of the descriptors; ``positions``: number
+    of positions that a descriptor is gathered from.
     """
 
-    channels: tuple[int, int, int, int]
-    positions: int
-
-
-class AlikedNet(nn.Module):
-    """Image to score map and features; the keys are those of ``aliked-*.pth``."""
-
-    def __init__(self, sizes: AlikedSizes) -> None:
+    def __init__(self, channels: tuple[int, int, int, int], positions: int) -> None:
         super().__init__()
-        first, *others = sizes.channels
-        self.descriptor_size = sizes.channels[-1]
+        first, *others = channels
+        self.descriptor_size = channels[-1]
         self.block1 = _Block(3, first, deformable=False, residual=False)
         self.block2 = _Block(first, others[0], deformable=False)
         self.block3 = _Block(others[0], others[1], deformable=True)
@@ -66,7 +54,7 @@ class AlikedNet(nn.Module):
             nn.SELU(inplace=True),
             nn.Conv2d(4, 1, 3, padding=1, bias=False),
         )
-        self.desc_head = DescriptorHead(self.descriptor_size, sizes.positions)
+        self.desc_head = DescriptorHead(self.descriptor_size, positions)
 
     def forward(self, images: torch.Tensor) -> list[AlikedMaps]:
         """The maps of RGB images, (B, 3, H, W) in [0, 1]."""
@@ -81,11 +69,7 @@ class AlikedNet(nn.Module):
         level4 = self.block4(functional.avg_pool2d(level3, 4))
         coarse = [
             functional.selu(tap(level), inplace=True)
-            for tap, level in (
-                (self.conv2, level2),
-                (self.conv3, level3),
-                (self.conv4, level4),
-            )
+            for tap, level in ((self.conv2, level2), (self.conv3, level3), (self.conv4, level4))
         ]
         found = []
         for k in range(len(images)):
@@ -133,12 +117,7 @@ class _Level:
 
 @dataclass(frozen=True, eq=False)
 class AlikedMaps:
-    """The maps of one image.
-
-    Attributes
-    ----------
-    scores : float32 (H, W), in (0, 1).
-    """
+    """The maps of one image: scores float32 (H, W) in (0, 1), and features, read at pixels."""
 
     _net: AlikedNet
     scores: torch.Tensor
@@ -221,9 +200,7 @@ def _folded(weight: torch.Tensor, norm: nn.BatchNorm2d) -> tuple[torch.Tensor, t
 def aliked_from(tensors: Mapping[str, torch.Tensor], where: str) -> AlikedNet:
     """The network of a checkpoint, its variant read from the shapes; in eval mode.
 
-    Raises
-    ------
-    DataError : keys are missing, unexpected or of another shape.
+    Raises DataError that names keys that are missing, unexpected or of another shape.
     """
     try:
         first = tensors["block1.conv1.weight"].shape[0]
@@ -231,22 +208,8 @@ def aliked_from(tensors: Mapping[str, torch.Tensor], where: str) -> AlikedNet:
         positions = tensors["desc_head.agg_weights"].shape[0]
     except (KeyError, IndexError) as error:
         raise DataError(f"this file is no ALIKED checkpoint: {error}", path=where) from error
-    net = AlikedNet(AlikedSizes((first, second, third, fourth), positions))
-    load_strictly(net, tensors, where)
-    return net.eval()
-
-
-class Features(Protocol):
-    """A dense map of features that is read pixel by pixel."""
-
-    @property
-    def scores(self) -> torch.Tensor:
-        """(H, W), of the map's size."""
-        ...
-
-    def features_at(self, rows: torch.Tensor, columns: torch.Tensor) -> torch.Tensor:
-        """Unit features (N, D) of pixels, int64 (N,) rows and columns."""
-        ...
+    net = AlikedNet((first, second, third, fourth), positions)
+    return load_strictly(net, tensors, where).eval()
 
 
 class DescriptorHead(nn.Module):
@@ -263,21 +226,18 @@ class DescriptorHead(nn.Module):
         )
         self.sf_conv = nn.Conv2d(size, size, 1, bias=False)
 
-    def forward(self, features: Features, xy: torch.Tensor) -> torch.Tensor:
-        """Descriptors of unit length, float32 (N, D).
+    def forward(self, maps: AlikedMaps, xy: torch.Tensor) -> torch.Tensor:
+        """Descriptors of unit length, float32 (N, D), at xy (N, 2); a pixel's centre is an integer.
 
-        Parameters
-        ----------
-        xy : float (N, 2), x and y in a map of at least 4 pixels a side; a pixel's centre is an
-            integer.
+        The map has at least 4 pixels a side.
         """
         size = self.agg_weights.shape[1]
         at_once = _VALUES_AT_ONCE[xy.device.type] // (4 * self.positions * size)
-        parts = [self._describe(features, part) for part in torch.split(xy, max(at_once, 1))]
+        parts = [self._describe(maps, part) for part in torch.split(xy, max(at_once, 1))]
         return torch.cat(parts)
 
-    def _describe(self, features: Features, xy: torch.Tensor) -> torch.Tensor:
-        height, width = features.scores.shape
+    def _describe(self, maps: AlikedMaps, xy: torch.Tensor) -> torch.Tensor:
+        height, width = maps.scores.shape
         number, size = len(xy), self.agg_weights.shape[1]
         # the patch is centred on the pixel the keypoint lies in. As published, it keeps off the
         # last row and column
@@ -286,7 +246,7 @@ class DescriptorHead(nn.Module):
         side = torch.arange(_PATCH, device=xy.device)
         rows = (top[:, None, None] + side[:, None]).expand(-1, -1, _PATCH)
         columns = (left[:, None, None] + side).expand(-1, _PATCH, -1)
-        patch = features.features_at(rows.reshape(-1), columns.reshape(-1))
+        patch = maps.features_at(rows.reshape(-1), columns.reshape(-1))
         patch = patch.view(number, _PATCH, _PATCH, size).permute(0, 3, 1, 2)
         limit = max(height, width) / 4
         offsets = (
@@ -294,7 +254,7 @@ class DescriptorHead(nn.Module):
         )
         x, y = (xy[:, :, None] + offsets).unbind(1)
         indices, weights = corners_around(y, x, (height, width))
-        corners = features.features_at(
+        corners = maps.features_at(
             indices.reshape(-1).div(width, rounding_mode="floor"), indices.reshape(-1) % width
         )
         read = torch.einsum("nkc,nk->nc", corners.view(-1, 4, size), weights)

@@ -23,7 +23,7 @@ from torch.nn import functional
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.nets.runtime import load_strictly
-from megloc_kapture.nets.sampling import deform_conv2d
+from megloc_kapture.nets.score_maps import deform_conv2d
 
 DESCRIPTOR_SIZE = 128
 STRIDE = 4  # of the features; their pixel (i, j) is read at the image's (4 i, 4 j)
@@ -32,13 +32,11 @@ _SCORED = {"conv1": (3, 1 / 6), "conv3": (2, 2 / 6), "conv6": (1, 3 / 6)}
 _DEFORMABLE = ("conv6_0", "conv6_1", "conv6")
 _NORM_EPSILON = 1e-5
 # what optimisers keep beside a variable, under its name, and beside all of them
-_SLOTS = ("Adam", "Adam_1", "Momentum", "RMSProp", "RMSProp_1", "ExponentialMovingAverage")
-_COUNTERS = ("global_step", "beta1_power", "beta2_power", "learning_rate")
-_TORCH_WORDS = {
-    "kernel": "weight",
-    "moving_mean": "running_mean",
-    "moving_variance": "running_var",
-}
+_LEFT_OUT = (
+    *("Adam", "Adam_1", "Momentum", "RMSProp", "RMSProp_1", "ExponentialMovingAverage"),
+    *("global_step", "beta1_power", "beta2_power", "learning_rate"),
+)
+_TORCH_WORDS = {"kernel": "weight", "moving_mean": "running_mean", "moving_variance": "running_var"}
 _EDGE_STEP = 3  # pixels between the samples of the second differences that tell edges
 _VALUES_AT_ONCE = {"cpu": 1 << 19, "cuda": 1 << 27}
 
@@ -47,10 +45,8 @@ _VALUES_AT_ONCE = {"cpu": 1 << 19, "cuda": 1 << 27}
 class AslFeatMaps:
     """The maps of one image.
 
-    Attributes
-    ----------
-    scores : float32 (H, W), of the image's size, not negative.
-    features : (128, ceil(ceil(H / 2) / 2), the same of W), the descriptors before normalisation.
+    ``scores`` float32 (H, W) are of its size and not negative; ``features`` (128, ceil(ceil(H / 2)
+    / 2), the same of W) are the descriptors before normalisation.
     """
 
     scores: torch.Tensor
@@ -107,12 +103,8 @@ class AslFeatNet(nn.Module):
     def _scores(self, name: str, features: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
         dilation, weight = _SCORED[name]
         scale = self.get_buffer(f"tower.{name}.instance_max")
-        return torch.stack(
-            [
-                weight * resize_as_tensorflow_1(peakiness(own, dilation, scale), size)
-                for own in features
-            ]
-        )
+        peaky = (peakiness(own, dilation, scale) for own in features)
+        return torch.stack([weight * resize_as_tensorflow_1(own, size) for own in peaky])
 
 
 class _Norm(nn.Module):
@@ -201,14 +193,10 @@ def conv_same(
 
 
 def aslfeat_state(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """A state dict for :class:`AslFeatNet` of a TensorFlow checkpoint's variables.
+    """A state dict for :class:`AslFeatNet` of a TensorFlow checkpoint's variables, name -> values.
 
     Names and layouts are changed as the module's text says, what an optimiser keeps is left out;
     a name without slashes stays as it is, so that a state dict of the module passes unchanged.
-
-    Parameters
-    ----------
-    tensors : variable name -> values.
     """
     left_out = set(optimiser_variables(tensors))
     state = {}
@@ -225,23 +213,14 @@ def aslfeat_state(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor
 
 def optimiser_variables(names: Iterable[str]) -> list[str]:
     """Those of a checkpoint's variables that only its training needs, sorted."""
-    return sorted(
-        name
-        for name in names
-        if name.rpartition("/")[2] in _SLOTS or name.rpartition("/")[2] in _COUNTERS
-    )
+    return sorted(name for name in names if name.rpartition("/")[2] in _LEFT_OUT)
 
 
 def aslfeat_from(tensors: Mapping[str, torch.Tensor], where: str) -> AslFeatNet:
     """The network of a checkpoint, in eval mode; a note in the log names what was left out.
 
-    Parameters
-    ----------
-    tensors : see :func:`aslfeat_state`.
-
-    Raises
-    ------
-    DataError : variables are missing, unexpected or of another shape, or a scale is not positive.
+    ``tensors`` are as of :func:`aslfeat_state`. Raises DataError for variables that are missing,
+    unexpected or of another shape, and for a scale that is not positive.
     """
     if left_out := optimiser_variables(tensors):
         logging.getLogger(__name__).info(
@@ -260,17 +239,14 @@ def peakiness(features: torch.Tensor, dilation: int, scale: torch.Tensor) -> tor
     """Peakiness of each pixel in space and among channels, of its best channel (eq. 6 to 8).
 
     max over channels of softplus(y - its mean over a 3x3 neighbourhood) times
-    softplus(y - its mean over the channels), where y = features / scale.
+    softplus(y - its mean over the channels), where y = features / scale. Returns (H, W), at least
+    float32.
 
     Parameters
     ----------
     features : (C, H, W), both sides longer than the dilation; fastest in channels-last memory.
     dilation : distance of the neighbours in pixels; the map is reflected at its border.
     scale : ().
-
-    Returns
-    -------
-    (H, W), at least float32.
     """
     channels, height, width = features.shape
     pixels = features.permute(1, 2, 0)
@@ -299,15 +275,10 @@ def _reflected(start: int, stop: int, size: int, device: torch.device) -> torch.
 
 
 def resize_as_tensorflow_1(values: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
-    """Bilinear resizing with TensorFlow 1's sampling: the first pixels lie on one another.
+    """Resize (h, w) to (H, W) bilinearly with TensorFlow 1's sampling.
 
     Pixel i of the result lies at i * (input / output) of the input, with no half pixels; what would
     lie beyond the last row or column is that one.
-
-    Parameters
-    ----------
-    values : (h, w).
-    size : (H, W) of the result.
     """
     for axis, wanted in enumerate(size):
         given = values.shape[axis]
@@ -324,17 +295,13 @@ def resize_as_tensorflow_1(values: torch.Tensor, size: tuple[int, int]) -> torch
 
 
 def on_no_edge(scores: torch.Tensor, xy: torch.Tensor, max_ratio: float) -> torch.Tensor:
-    """Mask of the pixels where the score map peaks both ways (Lowe, IJCV 2004, section 4.1).
+    """Mask (N,) of the pixels where the score map peaks both ways (Lowe, IJCV 2004, section 4.1).
 
     Parameters
     ----------
     scores : (H, W).
     xy : int64 (N, 2), columns and rows, 3 pixels or more from the map's border.
     max_ratio : of the larger principal curvature to the smaller.
-
-    Returns
-    -------
-    bool (N,).
     """
     x, y = xy.unbind(1)
     step = _EDGE_STEP

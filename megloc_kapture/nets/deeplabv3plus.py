@@ -30,12 +30,7 @@ _DILATIONS = (6, 12, 18)
 
 
 def backbone_of(keys: Collection[str], where: str) -> Backbone:
-    """Trunk that the keys of a checkpoint are of; ``where`` names the file.
-
-    Raises
-    ------
-    DataError : they are of neither.
-    """
+    """Trunk that the keys of a checkpoint are of; raises DataError that names the file."""
     for key in keys:
         if key.startswith("backbone.layer1."):
             return "resnet101"
@@ -73,13 +68,9 @@ class AtrousPyramid(nn.Module):
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.convs = nn.ModuleList(
-            [
-                _activated(channels, _WIDTH, 1),
-                *(_activated(channels, _WIDTH, 3, dilation=rate) for rate in _DILATIONS),
-                Pooling(channels),
-            ]
-        )
+        branches = [_activated(channels, _WIDTH, 1)]
+        branches += [_activated(channels, _WIDTH, 3, dilation=rate) for rate in _DILATIONS]
+        self.convs = nn.ModuleList([*branches, Pooling(channels)])
         self.project = _activated(len(self.convs) * _WIDTH, _WIDTH, 1)
         self.project.append(nn.Dropout(0.1))
 

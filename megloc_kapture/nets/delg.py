@@ -1,7 +1,7 @@
 """DELG's global branch (Cao et al., ECCV 2020): a ResNet, generalized-mean pooling and a layer.
 
 Two forms of its ResNet exist in TensorFlow, and which one a checkpoint is of shows in the names of
-its variables (:mod:`megloc_kapture.nets.delg`):
+its variables:
 
     keras   the authors' public training code: strides on the first 1x1 convolution of a stage and
             its shortcut, convolutions with bias, epsilon 1e-3, margins as TensorFlow's SAME, a
@@ -12,11 +12,8 @@ its variables (:mod:`megloc_kapture.nets.delg`):
 
 Both have stride 32 and 2048 channels at the end. What the training code calls ``block3_strides``
 moves a stride from two 1x1 convolutions to a subsampling before them and changes nothing here.
-The module's keys are those of torchvision's ResNet, and ``embedding`` for the last layer.
-
-The variables of DELG's TensorFlow checkpoints under the keys of our network.
-
-Three ways of naming are known, and any scope may stand before them:
+The module's keys are those of torchvision's ResNet, and ``embedding`` for the last layer. Three
+ways of naming the variables are known, and any scope may stand before them:
 
     objects   backbone/l2a/conv2a/kernel, backbone/l2a/bn_shortcut/gamma,
               backbone/embedding_layer/kernel: attributes of the objects of the public training
@@ -27,17 +24,16 @@ Three ways of naming are known, and any scope may stand before them:
     slim      resnet_v1_50/block1/unit_1/bottleneck_v1/conv1/weights, ../BatchNorm/gamma: TF-Slim's
 
 What the local branch, a classifier or an optimiser keeps is left out. The files that the authors
-publish have not been at hand. They are models of TF1: the authors' tools load them in a way in
-which what the public exporters write cannot be loaded. The public code has an option that makes its
-network compatible with TF-Slim's, so their names are expected to be of the third kind, which nobody
-has confirmed. Which scope the layer after the pooling has there is not public either; it is
-known by its shape, which nothing else in the network has.
+publish have not been at hand: they are models of TF1, of a network that is compatible with
+TF-Slim's, so names of the third kind are expected. Which scope the layer after the pooling has
+there is not public; it is known by its shape, which nothing else in the network has.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from string import ascii_lowercase
 from typing import Literal
 
@@ -48,20 +44,23 @@ from torch.nn import functional
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.nets.aslfeat import conv_same
-from megloc_kapture.nets.runtime import load_strictly
-from megloc_kapture.nets.trunks import Depth, generalized_mean
+from megloc_kapture.nets.runtime import first_few, load_strictly
+from megloc_kapture.nets.trunks import (
+    RESNET_BLOCKS,
+    RESNET_DEPTHS,
+    RESNET_EXPANSION,
+    RESNET_WIDTHS,
+    Bottleneck,
+    Depth,
+    generalized_mean,
+)
 
 Form = Literal["keras", "slim"]
 DESCRIPTOR_SIZE = 2048
 _POWER = 3.0  # section 3.2 of the paper: fixed
-_BLOCKS: dict[Depth, tuple[int, int, int, int]] = {50: (3, 4, 6, 3), 101: (3, 4, 23, 3)}
-_WIDTHS = (64, 128, 256, 512)
-_EXPANSION = 4
 _EPSILONS: dict[Form, float] = {"keras": 1e-3, "slim": 1e-5}
 _LEAST_PX = 5  # a smaller side leaves the pooling without margin nothing
 _ATTRIBUTE = "/.ATTRIBUTES/VARIABLE_VALUE"
-_NAMED = 8  # variables that a message names
-_DEPTHS: dict[int, Depth] = {6: 50, 23: 101}  # by the blocks of the third stage
 _WORD = r"/(?P<word>kernel|bias|gamma|beta|moving_mean|moving_variance)$"
 _OBJECTS = re.compile(
     r"(?:^|/)backbone/(?:l(?P<stage>[2-5])(?P<block>[a-z])/)?"
@@ -100,64 +99,25 @@ _PARTS = {
 _NUMBERED_WORDS = ("kernel", "bias", "gamma", "beta", "moving_mean", "moving_variance")
 
 
-class _Block(nn.Module):
-    """1x1, 3x3 and 1x1 convolution around a shortcut, the stride where the form has it."""
-
-    def __init__(self, channels: int, width: int, *, form: Form, stride: int) -> None:
-        super().__init__()
-        out, bias, epsilon = width * _EXPANSION, form == "keras", _EPSILONS[form]
-        first, middle = (stride, 1) if form == "keras" else (1, stride)
-        self.conv1 = nn.Conv2d(channels, width, 1, stride=first, bias=bias)
-        self.bn1 = nn.BatchNorm2d(width, eps=epsilon)
-        self.conv2 = nn.Conv2d(width, width, 3, stride=middle, padding=1, bias=bias)
-        self.bn2 = nn.BatchNorm2d(width, eps=epsilon)
-        self.conv3 = nn.Conv2d(width, out, 1, bias=bias)
-        self.bn3 = nn.BatchNorm2d(out, eps=epsilon)
-        self.stride = stride
-        self.downsample = (
-            None
-            if channels == out
-            else nn.Sequential(
-                nn.Conv2d(channels, out, 1, stride=stride, bias=bias),
-                nn.BatchNorm2d(out, eps=epsilon),
-            )
-        )
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        y = functional.relu(self.bn1(self.conv1(x)), inplace=True)
-        y = functional.relu(self.bn2(self.conv2(y)), inplace=True)
-        y = self.bn3(self.conv3(y))
-        y += (
-            x[..., :: self.stride, :: self.stride]
-            if self.downsample is None
-            else (self.downsample(x))
-        )
-        return functional.relu(y, inplace=True)
-
-
 class DelgNet(nn.Module):
-    """Image to a vector at one scale; :func:`describe` joins several.
-
-    Parameters
-    ----------
-    depth : 50 or 101.
-    form : which of the two ResNets, see the module's text.
-    """
+    """Image to a vector at one scale; :func:`describe` joins several."""
 
     def __init__(self, depth: Depth, form: Form) -> None:
         super().__init__()
         self.form = form
-        self.conv1 = nn.Conv2d(3, 64, 7, stride=2, bias=form == "keras")
-        self.bn1 = nn.BatchNorm2d(64, eps=_EPSILONS[form])
-        channels = 64
-        for stage, (width, blocks) in enumerate(zip(_WIDTHS, _BLOCKS[depth], strict=True), 1):
+        keras, epsilon = form == "keras", _EPSILONS[form]
+        self.conv1 = nn.Conv2d(3, 64, 7, stride=2, bias=keras)
+        self.bn1 = nn.BatchNorm2d(64, eps=epsilon)
+        bottleneck = partial(Bottleneck, strided_first=keras, bias=keras, epsilon=epsilon)
+        channels, blocks_of = 64, RESNET_BLOCKS[depth]
+        for stage, (width, blocks) in enumerate(zip(RESNET_WIDTHS, blocks_of, strict=True), 1):
             # a stage and the block of it that has the stride
-            strided = (stage > 1, 0) if form == "keras" else (stage < 4, blocks - 1)
+            strided = (stage > 1, 0) if keras else (stage < 4, blocks - 1)
             layers = nn.Sequential()
             for block in range(blocks):
                 stride = 2 if strided == (True, block) else 1
-                layers.append(_Block(channels, width, form=form, stride=stride))
-                channels = width * _EXPANSION
+                layers.append(bottleneck(channels, width, stride=stride))
+                channels = width * RESNET_EXPANSION
             self.add_module(f"layer{stage}", layers)
         self.embedding = nn.Linear(channels, DESCRIPTOR_SIZE)
 
@@ -187,14 +147,9 @@ class DelgNet(nn.Module):
 def describe(net: DelgNet, image: torch.Tensor, scales: Sequence[float]) -> torch.Tensor:
     """Unit vectors, float32 (B, 2048): the sum of those at several scales (section 4.1).
 
-    Parameters
-    ----------
-    image : RGB (B, 3, H, W) in 0 to 255; at each scale it is resized bilinearly, without
-        smoothing, to sides rounded to whole pixels, halves to even ones.
-
-    Raises
-    ------
-    DataError : the image is too small for the network at the least scale.
+    ``image`` is RGB (B, 3, H, W) in 0 to 255; at each scale it is resized bilinearly, without
+    smoothing, to sides rounded to whole pixels, halves to even ones. Raises DataError for an image
+    that is too small for the network at the least scale.
     """
     normalised = (image - 128.0) / 128.0
     total = image.new_zeros(len(image), DESCRIPTOR_SIZE)
@@ -214,30 +169,20 @@ def describe(net: DelgNet, image: torch.Tensor, scales: Sequence[float]) -> torc
 
 
 def delg_from(tensors: Mapping[str, torch.Tensor], where: str) -> DelgNet:
-    """The network of a checkpoint's variables, ready for inference.
+    """The network of a checkpoint's variables, name -> values, ready for inference.
 
-    Parameters
-    ----------
-    tensors : variable name -> values, as a TensorFlow checkpoint has them.
-    where : the file, for messages.
-
-    Raises
-    ------
-    DataError : the names are of no kind that is known, or variables are missing; says what was
-        found.
+    Raises DataError that names the file ``where`` and what was found: names of no kind that is
+    known, or variables that are missing.
     """
     form, state = delg_state(tensors, where)
     blocks = {key.split(".")[1] for key in state if key.startswith("layer3.")}
-    if len(blocks) not in _DEPTHS:
+    if len(blocks) not in RESNET_DEPTHS:
         raise DataError(
             f"no DELG: {len(blocks)} blocks in the third stage, not 6 (ResNet-50) or 23 "
             f"(ResNet-101); {_found(tensors)}",
             path=where,
         )
-    net = DelgNet(_DEPTHS[len(blocks)], form)
-    counters = [key for key in net.state_dict() if key.endswith(".num_batches_tracked")]
-    load_strictly(net, state, where, may_lack=counters)
-    return net.eval()
+    return load_strictly(DelgNet(RESNET_DEPTHS[len(blocks)], form), state, where).eval()
 
 
 def delg_state(
@@ -354,6 +299,4 @@ def _torch_layout(values: torch.Tensor) -> torch.Tensor:
 
 
 def _found(names: Iterable[str]) -> str:
-    some = sorted(names)
-    more = len(some) - _NAMED
-    return "found: " + ", ".join(some[:_NAMED]) + (f" and {more} more" if more > 0 else "")
+    return "found: " + first_few(sorted(names), 8)

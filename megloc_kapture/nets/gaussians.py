@@ -32,13 +32,9 @@ _EPSILON = 1e-10
 
 
 class Gaussians(nn.Module):
-    """Gaussians and the embeddings of the images.
+    """Gaussians, which lie nowhere until :meth:`place`, and the embeddings of the images.
 
-    Parameters
-    ----------
-    num_images, num_lights : rows of the transient and of the appearance embedding; as many of the
-        second as of the first unless given.
-    count : of the Gaussians, which lie nowhere until :meth:`place`.
+    ``num_images`` and ``num_lights`` are as of :class:`~megloc_kapture.nets.radiance.NerfW`.
     """
 
     def __init__(
@@ -83,7 +79,7 @@ class Gaussians(nn.Module):
         return torch.sigmoid(logits + (light * appearance[..., None, :]).sum(-1))
 
     def render(self, rays: Rays, generator: torch.Generator | None = None) -> Rendered:
-        """See :class:`~megloc_kapture.nets.radiance.RadianceField`; nothing is drawn."""
+        """Render rays as the other fields do; nothing is drawn."""
         with torch.autocast(rays.origins.device.type, enabled=False):
             return self._render(rays)
 
@@ -100,10 +96,7 @@ class Gaussians(nn.Module):
         distance = (origin * origin).sum(-1) - along * along / length
         alpha = torch.sigmoid(self.opacity_logits)[which] * torch.exp(-0.5 * distance)
         alpha = torch.where(there, alpha.clamp(max=_MOST), 0.0)
-        appearance = rays.appearance
-        if appearance is None:
-            appearance = self.appearance.weight.mean(0).expand(len(rays.origins), -1)
-        rgb = self.colours(appearance[:, None], which)
+        rgb = self.colours(rays.light(self.appearance)[:, None], which)
         # as pieces of a ray that stop so much of it
         static = composite(t, torch.ones_like(t), Samples(-torch.log1p(-alpha), rgb))
         if rays.transient is None:
@@ -128,17 +121,14 @@ class Gaussians(nn.Module):
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Render a pinhole view by gsplat, which needs a GPU.
 
+        Returns colours (H, W, 3) in 0 to 1, depths (H, W) along the optical axis in the field's
+        unit, and opacities (H, W).
+
         Parameters
         ----------
-        cam_from_field : (4, 4), a rigid transform.
-        calibration : K (3, 3).
+        cam_from_field, calibration : a rigid transform (4, 4), and K (3, 3).
         size_px : width and height.
         appearance : embedding (A,); the mean of all unless given.
-
-        Returns
-        -------
-        Colours (H, W, 3) in 0 to 1, depths (H, W) along the optical axis in the field's unit, and
-        opacities (H, W).
         """
         from gsplat import rasterization
 

@@ -51,27 +51,14 @@ _ONNX_OTHERS = {
 }
 
 
-@dataclass(frozen=True)
-class LightGlueShape:
-    """Sizes that a checkpoint's tensors do not show by themselves."""
-
-    width: int
-    num_heads: int
-
-
 @dataclass(frozen=True, eq=False)
 class KeypointBatch:
-    """Keypoints of one side of several pairs.
+    """Keypoints of one side of several pairs."""
 
-    Parameters
-    ----------
-    points : float32 (B, N, 2), normalised to [-1, 1].
-    descriptors : float32 (B, N, D).
-    present : bool (B, N, 1), False where a row is padding; None: all are there.
-    """
-
+    # points, descriptors: float32 (B, N, 2), normalised to [-1, 1], and (B, N, D)
     points: torch.Tensor
     descriptors: torch.Tensor
+    # bool (B, N, 1), False where a row is padding; None: all are there
     present: torch.Tensor | None = None
 
 
@@ -86,10 +73,7 @@ def require_kornia() -> None:
 class LightGlueNetwork(nn.Module):
     """LightGlue of kornia's layers, at full depth and width.
 
-    Parameters
-    ----------
-    parts : an instance of kornia's LightGlue.
-    descriptor_size : number of values of the descriptors it takes.
+    ``parts`` is an instance of kornia's LightGlue, ``descriptor_size`` of what it takes.
     """
 
     parts: Any
@@ -117,36 +101,24 @@ class LightGlueNetwork(nn.Module):
 
 
 def load_lightglue(
-    tensors: Mapping[str, torch.Tensor],
-    where: str,
-    shape: LightGlueShape,
+    tensors: Mapping[str, torch.Tensor], where: str, *, width: int = 256, num_heads: int = 4
 ) -> LightGlueNetwork:
     """kornia's LightGlue with the tensors of a checkpoint, for inference.
 
     The number of layers and the size of descriptors are the checkpoint's. What only early stopping
-    and pruning would use may be absent.
-
-    Parameters
-    ----------
-    tensors : by kornia's names; see :func:`renamed_blocks`.
-
-    Raises
-    ------
-    DataError : the tensors do not fit; names their keys.
-    OptionError : kornia is not installed.
+    and pruning would use may be absent. Raises DataError that names the keys that do not fit, and
+    OptionError where kornia is not installed. ``tensors``: by the official names, or by kornia's:
+    ``self_attn.3.x``, or ``transformers.3.self_attn.x``.
     """
     require_kornia()
+    tensors = {_BLOCK.sub(r"transformers.\2.\1.", key): value for key, value in tensors.items()}
     layers = {int(key.split(".")[1]) for key in tensors if key.startswith("transformers.")}
     if not layers:
         raise DataError("this file does not fit LightGlue: it has no layers", path=where)
     projection = tensors.get("input_proj.weight")
-    descriptor_size = shape.width if projection is None else projection.shape[-1]
-    parts = _untrained(
-        input_dim=descriptor_size,
-        descriptor_dim=shape.width,
-        n_layers=max(layers) + 1,
-        num_heads=shape.num_heads,
-    )
+    descriptor_size = width if projection is None else projection.shape[-1]
+    sizes = {"input_dim": descriptor_size, "descriptor_dim": width, "num_heads": num_heads}
+    parts = _untrained(n_layers=max(layers) + 1, **sizes)
     last = f"log_assignment.{max(layers)}."
     unused = [
         key
@@ -168,11 +140,6 @@ def _untrained(**conf: int) -> nn.Module:
         finally:
             cuda.enable_flash_sdp(flash)  # kornia's attention sets it for the whole process
     return parts
-
-
-def renamed_blocks(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Official checkpoints' ``self_attn.3.x`` as kornia's ``transformers.3.self_attn.x``."""
-    return {_BLOCK.sub(r"transformers.\2.\1.", key): value for key, value in tensors.items()}
 
 
 def _assignment(
@@ -222,31 +189,22 @@ def _masks(a: KeypointBatch, b: KeypointBatch) -> tuple[torch.Tensor, ...]:
     )
 
 
-_LIGHTERGLUE = LightGlueShape(width=96, num_heads=1)
-
-
 def load_lighterglue(tensors: Mapping[str, torch.Tensor], where: str) -> LightGlueNetwork:
     """The network with the tensors of a checkpoint, for inference.
 
     Takes the authors' ``xfeat-lighterglue.pt`` (6 layers, and beside them the XFeat they were
     trained with, which is left out) and ``lighterglue_L3.onnx`` (the first 3 with their assignment,
-    the same values).
-
-    Raises
-    ------
-    DataError : the tensors do not fit; names their keys.
-    OptionError : kornia is not installed.
+    the same values). Raises as :func:`load_lightglue`.
     """
     if f"{_ONNX_PREFIX}input_proj.bias" in tensors:
         named = _of_onnx(tensors, where)
     else:
-        matcher = {
+        named = {
             key.removeprefix(_MATCHER): value
             for key, value in tensors.items()
             if not key.startswith(_EXTRACTOR)
         }
-        named = renamed_blocks(matcher)
-    return load_lightglue(named, where, _LIGHTERGLUE)
+    return load_lightglue(named, where, width=96, num_heads=1)
 
 
 def _of_onnx(tensors: Mapping[str, torch.Tensor], where: str) -> dict[str, torch.Tensor]:

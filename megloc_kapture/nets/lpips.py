@@ -60,19 +60,12 @@ class Lpips(nn.Module):
             self.add_module(f"lin{number}", _Head(channels))
 
     def forward(self, a: torch.Tensor, b: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
-        """Distances of pairs of images.
+        """Distances (B,) of pairs of images; 0 for equal ones, NaN where nothing is valid.
 
         The mean over the image in the published formula is one over the valid pixels, whose share
-        in each feature's cell is its weight. Other pixels are the same in both images.
-
-        Parameters
-        ----------
-        a, b : (B, 3, H, W), RGB in [0, 1], at least 64 pixels on either side.
-        valid : (B, 1, H, W), 1 where both images count, else 0.
-
-        Returns
-        -------
-        (B,), 0 for equal images; NaN where nothing is valid.
+        in each feature's cell is its weight. Other pixels are the same in both images. ``a`` and
+        ``b``: (B, 3, H, W), RGB in [0, 1], at least 64 pixels on either side; ``valid``: (B, 1, H,
+        W), 1 where both images count, else 0.
         """
         return self.between(self.described(a, valid), self.described(b, valid), valid)
 
@@ -116,16 +109,9 @@ def lpips_from(
 ) -> Lpips:
     """LPIPS from a torchvision checkpoint of a trunk, and a published file of heads.
 
-    Parameters
-    ----------
-    of_trunk : its classifier, and layers after the last one compared, are left out.
-    where : the files, for messages.
-
-    Raises
-    ------
-    DataError : a key is missing, unexpected or of another shape; names it.
+    The trunk's classifier, and layers after the last one compared, are left out. Raises DataError
+    that names ``where``, the files, and a key that is missing, unexpected or of another shape.
     """
     module = Lpips(trunk)
     features = {key: value for key, value in of_trunk.items() if not key.startswith("classifier.")}
-    load_strictly(module, {**features, **of_heads}, where)
-    return module.eval()
+    return load_strictly(module, {**features, **of_heads}, where).eval()

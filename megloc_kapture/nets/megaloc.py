@@ -1,16 +1,16 @@
 """MegaLoc (Berton and Masone, CVPR Workshops 2025): DINOv2 ViT-B/14, SALAD, a linear layer.
 
 The keys are those of the published ``model.safetensors``. The older ``megaloc.torch`` has the
-trunk's under ``backbone.model``, and DINOv2's ``mask_token``; it is read too.
-
-SALAD's aggregation (Izquierdo and Civera, CVPR 2024): patches to clusters by optimal transport.
-
-What a patch tells goes to clusters or, where it tells nothing, to a dustbin.
+trunk's under ``backbone.model``, and DINOv2's ``mask_token``; it is read too. The trunk is DINOv2's
+vision transformer (Oquab et al., TMLR 2024) under its own keys, without registers: patches of 14
+pixels, one class token, learnt positions, layer scale. SALAD (Izquierdo and Civera, CVPR 2024)
+aggregates patches in clusters by optimal transport; what tells nothing goes to a dustbin.
 """
 
 from __future__ import annotations
 
 import math
+from collections import OrderedDict
 from collections.abc import Mapping
 
 import torch
@@ -18,22 +18,23 @@ from torch import nn
 from torch.nn import functional
 
 from megloc_kapture.errors import OptionError
-from megloc_kapture.nets.dinov2 import DinoV2
 from megloc_kapture.nets.runtime import load_strictly
 from megloc_kapture.nets.trunks import imagenet_normalised
 
 _OLDER_TRUNK = "backbone.model."
 _ITERATIONS = 3  # the network was trained with so few
+PATCH_PX = 14
+
+_EPSILON = 1e-6  # of the layer norms
+_MLP_RATIO = 4
+# in patches; it keeps a size from being rounded down, and moves every position that is read
+_OFFSET = 0.1
 
 
 class MegaLocNet(nn.Module):
-    """An image to one vector of unit length.
+    """An image to one vector of unit length, of ``descriptor_size`` components.
 
-    Parameters
-    ----------
-    backbone : None: ViT-B/14.
-    clusters, cluster_size, token_size : of the aggregation.
-    descriptor_size : components of the vector.
+    ``backbone`` is ViT-B/14 unless given; the other sizes are those of :class:`Salad`.
     """
 
     def __init__(
@@ -47,26 +48,15 @@ class MegaLocNet(nn.Module):
     ) -> None:
         super().__init__()
         self.backbone = backbone or DinoV2()
-        salad = Salad(
-            self.backbone.channels,
-            clusters=clusters,
-            cluster_size=cluster_size,
-            token_size=token_size,
-        )
+        sizes = {"clusters": clusters, "cluster_size": cluster_size, "token_size": token_size}
+        salad = Salad(self.backbone.channels, **sizes)
         linear = nn.Linear(clusters * cluster_size + token_size, descriptor_size)
         self.aggregator = nn.ModuleDict({"agg": salad, "linear": linear})
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
-        """Describe images.
+        """Vectors, float32 (B, 8448), of RGB images (B, 3, H, W) in [0, 1].
 
-        Parameters
-        ----------
-        image : (B, 3, H, W), RGB in [0, 1], both sides multiples of 14, of more
-            patches than there are clusters.
-
-        Returns
-        -------
-        float32 (B, D), D = 8448.
+        Both sides are multiples of 14, of more patches than there are clusters.
         """
         aggregated = self.aggregator["agg"](*self.backbone(imagenet_normalised(image)))
         return functional.normalize(self.aggregator["linear"](aggregated).float(), dim=1)
@@ -86,14 +76,8 @@ def squared(image: torch.Tensor, size_px: int) -> torch.Tensor:
 def megaloc_from(tensors: Mapping[str, torch.Tensor], where: str) -> MegaLocNet:
     """The network of a checkpoint, ready to describe.
 
-    Parameters
-    ----------
-    where : the file, for messages.
-
-    Raises
-    ------
-    DataError : the tensors are not MegaLoc's; names some that are missing, unexpected or of
-        another shape.
+    Raises DataError that names the file ``where``, and tensors that are missing, unexpected or of
+    another shape.
     """
     renamed = {
         key.replace(_OLDER_TRUNK, "backbone.", 1) if key.startswith(_OLDER_TRUNK) else key: value
@@ -103,19 +87,14 @@ def megaloc_from(tensors: Mapping[str, torch.Tensor], where: str) -> MegaLocNet:
     with torch.device("meta"):  # 229 million numbers are not drawn only to be overwritten
         network = MegaLocNet()
     network.to_empty(device="cpu")
-    load_strictly(network, renamed, where)
-    return network.eval()
+    return load_strictly(network, renamed, where).eval()
 
 
 class Salad(nn.Module):
     """Features of patches and of the whole image to one vector of unit length.
 
-    Parameters
-    ----------
-    channels : of the features that come in.
-    clusters, cluster_size, token_size : the vector has ``token_size + cluster_size * clusters``
-        components.
-    hidden : width of the layer in the middle of each projection.
+    Of ``channels`` that come in, by projections whose middle layer is ``hidden`` wide, the vector
+    has ``token_size + cluster_size * clusters`` components.
     """
 
     def __init__(
@@ -136,21 +115,11 @@ class Salad(nn.Module):
         self.dust_bin = nn.Parameter(torch.tensor(1.0))
 
     def forward(self, patches: torch.Tensor, whole: torch.Tensor) -> torch.Tensor:
-        """Aggregate (section 3.3 of the paper).
+        """Vectors float32 (B, D) of patches (B, C, h, w) and of the whole (B, C): section 3.3.
 
-        Parameters
-        ----------
-        patches : (B, C, h, w), of more patches than there are clusters.
-        whole : (B, C).
-
-        Returns
-        -------
-        float32 (B, D): the image's own part first, then the clusters', the clusters running
-        fastest; each of these parts was normalised before, and at last all of it.
-
-        Raises
-        ------
-        OptionError : too few patches.
+        The image's own part first, then the clusters', the clusters running fastest; each of these
+        parts was normalised before, and at last all of it. Raises OptionError where there are no
+        more patches than clusters.
         """
         features = self.cluster_features(patches).flatten(2)
         # in half precision a share would keep two digits after the exponentials
@@ -162,24 +131,11 @@ class Salad(nn.Module):
 
 
 def assignment(scores: torch.Tensor, dust_bin: torch.Tensor) -> torch.Tensor:
-    """Share of each patch that goes to each cluster.
+    """Share (B, K, N) of each of N patches that goes to each of K clusters, of scores (B, K, N).
 
     Sinkhorn's algorithm in the logarithm, three times. A patch gives the mass 1; a cluster takes
-    the mass 1, the dustbin takes what is left. Unlike in SuperGlue there is no dustbin for
-    clusters.
-
-    Parameters
-    ----------
-    scores : (B, K, N) of K clusters and N patches, N > K.
-    dust_bin : (), the score of going to the dustbin.
-
-    Returns
-    -------
-    (B, K, N), at least 0; the sum over the clusters is what does not go to the dustbin.
-
-    Raises
-    ------
-    OptionError : no more patches than clusters: nothing would be left for the dustbin.
+    the mass 1, the dustbin, of score ``dust_bin`` (), takes what is left. Unlike in SuperGlue there
+    is no dustbin for clusters. Raises OptionError where nothing would be left for the dustbin.
     """
     batch, clusters, patches = scores.shape
     if patches <= clusters:
@@ -203,3 +159,106 @@ def _per_patch(channels: int, hidden: int, out: int) -> nn.Sequential:
         nn.ReLU(),
         nn.Conv2d(hidden, out, 1),
     )
+
+
+class DinoV2(nn.Module):
+    """An image to one feature per patch, and one of the whole.
+
+    ``channels``, ``depth`` and ``heads`` are those of ViT-B unless given; ``grid`` is the side, in
+    patches, of the square image that the positions are learnt for (37 are 518 pixels).
+    """
+
+    def __init__(
+        self, *, channels: int = 768, depth: int = 12, heads: int = 12, grid: int = 37
+    ) -> None:
+        super().__init__()
+        self.channels = channels
+        self.grid = grid
+        self.cls_token = nn.Parameter(torch.zeros(1, 1, channels))
+        self.pos_embed = nn.Parameter(torch.zeros(1, 1 + grid * grid, channels))
+        self.patch_embed = nn.ModuleDict(
+            {"proj": nn.Conv2d(3, channels, PATCH_PX, stride=PATCH_PX)}
+        )
+        self.blocks = nn.ModuleList(Block(channels, heads) for _ in range(depth))
+        self.norm = nn.LayerNorm(channels, eps=_EPSILON)
+
+    def forward(self, image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Features of the last block, of patches (B, C, H // 14, W // 14) and the whole (B, C).
+
+        ``image`` is (B, 3, H, W), see :func:`megloc_kapture.nets.trunks.imagenet_normalised`.
+        Pixels at the right and at the bottom that fill no patch are left out.
+        """
+        patches = self.patch_embed["proj"](image)
+        rows, columns = patches.shape[-2:]
+        tokens = patches.flatten(2).mT
+        tokens = torch.cat([self.cls_token.expand(len(tokens), -1, -1), tokens], dim=1)
+        tokens = tokens + self.positions(rows, columns)
+        for block in self.blocks:
+            tokens = block(tokens)
+        tokens = self.norm(tokens)
+        return tokens[:, 1:].mT.reshape(patches.shape), tokens[:, 0]
+
+    def positions(self, rows: int, columns: int) -> torch.Tensor:
+        """Position embeddings of the tokens of so many patches, (1, 1 + rows * columns, C).
+
+        Learnt positions are scaled bicubically, without a filter against aliasing, as DINOv2 does
+        it: by ``(rows + 0.1) / grid``, from which the positions read follow too, instead of
+        by ``rows / grid``, as transformers does. At 23 patches of 37 they lie up to 0.16 learnt
+        positions beside those.
+        """
+        if rows == columns == self.grid:
+            return self.pos_embed
+        learnt = self.pos_embed.float()
+        maps = learnt[:, 1:].mT.reshape(1, self.channels, self.grid, self.grid)
+        scale = ((rows + _OFFSET) / self.grid, (columns + _OFFSET) / self.grid)
+        maps = functional.interpolate(maps, scale_factor=scale, mode="bicubic")
+        return torch.cat([learnt[:, :1], maps.flatten(2).mT], dim=1)
+
+
+class LayerScale(nn.Module):
+    """A learnt factor per channel (Touvron et al., ICCV 2021)."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.gamma = nn.Parameter(torch.ones(channels))
+
+    def forward(self, tokens: torch.Tensor) -> torch.Tensor:
+        return tokens * self.gamma
+
+
+class Block(nn.Module):
+    """Attention, then a perceptron, each on normalised tokens, scaled, and added to them."""
+
+    def __init__(self, channels: int, heads: int) -> None:
+        super().__init__()
+        self.norm1 = nn.LayerNorm(channels, eps=_EPSILON)
+        self.attn = Attention(channels, heads)
+        self.ls1 = LayerScale(channels)
+        self.norm2 = nn.LayerNorm(channels, eps=_EPSILON)
+        fc1, fc2 = (
+            nn.Linear(channels, _MLP_RATIO * channels),
+            nn.Linear(_MLP_RATIO * channels, channels),
+        )
+        self.mlp = nn.Sequential(OrderedDict(fc1=fc1, activation=nn.GELU(), fc2=fc2))
+        self.ls2 = LayerScale(channels)
+
+    def forward(self, tokens: torch.Tensor) -> torch.Tensor:
+        tokens = tokens + self.ls1(self.attn(self.norm1(tokens)))
+        return tokens + self.ls2(self.mlp(self.norm2(tokens)))
+
+
+class Attention(nn.Module):
+    """Every token attends to all; queries, keys and values are made in one layer, head by head."""
+
+    def __init__(self, channels: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.qkv = nn.Linear(channels, 3 * channels)
+        self.proj = nn.Linear(channels, channels)
+
+    def forward(self, tokens: torch.Tensor) -> torch.Tensor:
+        # (B, N, 3, heads, C / heads) -> three times (B, heads, N, C / heads)
+        parts = self.qkv(tokens).unflatten(2, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
+        query, key, value = parts.unbind(0)
+        read = functional.scaled_dot_product_attention(query, key, value)
+        return self.proj(read.transpose(1, 2).flatten(2))

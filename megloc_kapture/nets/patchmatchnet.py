@@ -309,15 +309,8 @@ class PatchmatchNet(nn.Module):
 
 
 def patchmatchnet_from(tensors: Mapping[str, Tensor], where: str) -> PatchmatchNet:
-    """The network with the tensors of a checkpoint, for inference.
-
-    Raises
-    ------
-    DataError : the tensors do not fit; names their keys.
-    """
-    network = PatchmatchNet()
-    load_strictly(network, tensors, where)
-    return network.eval()
+    """The network of a checkpoint, for inference; raises DataError that names what does not fit."""
+    return load_strictly(PatchmatchNet(), tensors, where).eval()
 
 
 def _doubled(x: Tensor) -> Tensor:

@@ -15,50 +15,28 @@ from torch.nn import functional
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.nets.runtime import load_strictly
+from megloc_kapture.nets.trunks import imagenet_normalised
 
 DESCRIPTOR_SIZE = 128
-_MEAN = (0.485, 0.456, 0.406)
-_DEVIATION = (0.229, 0.224, 0.225)
 # kernel, width in units of the base width, dilation; ReLU after those of 3 by 3
-_LAYERS = (
-    (3, 1, 1),
-    (3, 1, 1),
-    (3, 2, 1),
-    (3, 2, 2),
-    (3, 4, 2),
-    (3, 4, 4),
-    (2, 4, 4),
-    (2, 4, 8),
-)
+_LAYERS = ((3, 1, 1), (3, 1, 1), (3, 2, 1), (3, 2, 2), (3, 4, 2), (3, 4, 4), (2, 4, 4), (2, 4, 8))
 _STEPS_PER_OCTAVE = 4
 _TOLERANCE = 0.001  # of a scale: a side that rounding leaves a pixel short is still large enough
 
 
 class R2D2Maps(NamedTuple):
-    """Descriptors, repeatability and reliability of images (B, 3, H, W).
+    """Maps of images, each (B, C, H, W)."""
 
-    Attributes
-    ----------
-    features : (B, 128, H, W); a descriptor is one pixel of it, normalised.
-    reliability : (B, 1, H, W), in [0, 1]: how surely the pixel's descriptor will be matched.
-    repeatability : (B, 1, H, W), in [0, 1]: how surely a local maximum is found again.
-    """
-
-    features: torch.Tensor
-    reliability: torch.Tensor
-    repeatability: torch.Tensor
+    features: torch.Tensor  # C = 128; a descriptor is one pixel of it, normalised
+    reliability: torch.Tensor  # C = 1, in [0, 1]: how surely the pixel's descriptor will be matched
+    repeatability: torch.Tensor  # C = 1, in [0, 1]: how surely a local maximum is found again
 
 
 class R2D2Network(nn.Module):
     """Dense features, reliability and repeatability.
 
-    Parameters
-    ----------
-    base_width : channels of the first layer, 32 or, in the big model, 48.
+    ``base_width`` is of the first layer: 32 channels or, in the big model, 48.
     """
-
-    mean: torch.Tensor
-    deviation: torch.Tensor
 
     def __init__(self, base_width: int = 32) -> None:
         super().__init__()
@@ -66,14 +44,9 @@ class R2D2Network(nn.Module):
         inputs = 3
         for kernel, width, dilation in _LAYERS:
             outputs = width * base_width
+            margin = dilation * (kernel - 1) // 2
             layers += [
-                nn.Conv2d(
-                    inputs,
-                    outputs,
-                    kernel,
-                    padding=dilation * (kernel - 1) // 2,
-                    dilation=dilation,
-                ),
+                nn.Conv2d(inputs, outputs, kernel, padding=margin, dilation=dilation),
                 nn.BatchNorm2d(outputs, affine=False),
             ]
             if kernel == 3:
@@ -83,53 +56,37 @@ class R2D2Network(nn.Module):
         self.ops = nn.Sequential(*layers)
         self.clf = nn.Conv2d(DESCRIPTOR_SIZE, 2, 1)
         self.sal = nn.Conv2d(DESCRIPTOR_SIZE, 1, 1)
-        self.register_buffer("mean", torch.tensor(_MEAN).view(3, 1, 1), persistent=False)
-        self.register_buffer("deviation", torch.tensor(_DEVIATION).view(3, 1, 1), persistent=False)
 
     def forward(self, images: torch.Tensor) -> R2D2Maps:
         """Maps of RGB images, float (B, 3, H, W) in [0, 1]."""
-        features = self.ops((images - self.mean) / self.deviation)
+        features = self.ops(imagenet_normalised(images))
         squared = features**2
         positive = functional.softplus(self.sal(squared).float())
         return R2D2Maps(
-            features,
-            self.clf(squared).float().softmax(dim=1)[:, 1:],
-            positive / (1 + positive),
+            features, self.clf(squared).float().softmax(dim=1)[:, 1:], positive / (1 + positive)
         )
 
 
 def load_r2d2(tensors: Mapping[str, torch.Tensor], where: str) -> R2D2Network:
-    """The network with the tensors of a checkpoint, for inference; its width is the file's.
+    """The network of a checkpoint, for inference; its width is the file's.
 
-    Raises
-    ------
-    DataError : the tensors do not fit; names their keys.
+    Raises DataError that names the keys that do not fit.
     """
     first = tensors.get("ops.0.weight")
     if first is None or first.ndim != 4:
         raise DataError(
             "this file does not fit R2D2Network; 1 missing keys: ops.0.weight", path=where
         )
-    network = R2D2Network(base_width=len(first))
-    load_strictly(network, tensors, where)
-    return network.eval()
+    return load_strictly(R2D2Network(base_width=len(first)), tensors, where).eval()
 
 
 def pyramid_levels(image: torch.Tensor, *, min_size: int, max_size: int) -> Iterator[torch.Tensor]:
-    """An image at scales 1, 2^-1/4, 2^-1/2 and so on, each level resized from the one before.
+    """Yield an image at scales 1, 2^-1/4, 2^-1/2 and so on, each level resized from the one before.
 
-    This is R2D2's pyramid (Revaud et al., 2019, section 4); a pixel of one level is w'/w of the
-    pixels of another, both having their origin at the image's corner.
-
-    Parameters
-    ----------
-    image : float (B, C, H, W).
-    min_size, max_size : the levels' longer side in pixels; larger ones are made but left out. An
-        image that is itself smaller than ``min_size`` is the only level.
-
-    Yields
-    ------
-    (B, C, h, w), largest first.
+    This is R2D2's pyramid (Revaud et al., 2019, section 4), largest first; a pixel of one level is
+    w'/w of the pixels of another, both having their origin at the image's corner. ``image``: float
+    (B, C, H, W); ``min_size`` and ``max_size``: the levels' longer side in pixels; larger ones are
+    made but left out. An image that is itself smaller than ``min_size`` is the only level.
     """
     height, width = image.shape[-2:]
     longer = max(height, width)

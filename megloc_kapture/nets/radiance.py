@@ -2,13 +2,14 @@
 
 Volume rendering as in NeRF (Mildenhall et al., ECCV 2020, eq. 3), with the transient part and the
 loss of NeRF-W (Martin-Brualla et al., CVPR 2021, eqs. 8 to 13). Rays are ``origin + t direction``;
-where directions have z = 1 in their camera, t is depth along its optical axis.
+where directions have z = 1 in their camera, t is depth along its optical axis. Two fields:
+:class:`NerfW`, under the names of kwea123/nerf_pl's branch ``nerfw``, and :class:`TriPlane`, small
+enough to train on a processor.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, replace
 
 import torch
 from torch import nn
@@ -16,44 +17,63 @@ from torch import nn
 _DEPTH_SPREAD = 0.03  # of samples about a known depth, share of it
 _EPSILON = 1e-10
 _BETA_MIN = 0.03  # uncertainty of a ray that meets nothing transient
+# of NeRF-W: layers, their width, where the points come in again; frequencies of points and
+# directions; sizes of the embeddings; samples of a ray by the coarse network, and more by the fine
+_LAYERS, _WIDTH, _SKIP = 8, 256, 4
+_NERF_POINT_FREQUENCIES, _NERF_DIRECTION_FREQUENCIES = 10, 4
+_NERF_APPEARANCE, _NERF_TRANSIENT = 48, 16
+_COARSE, _FINE = 64, 64
+# of tri-planes: their sides and channels, and the same as above
+_RESOLUTIONS, _CHANNELS = (64, 128, 256), 12
+_GEOMETRY, _HIDDEN = 15, 64
+_POINT_FREQUENCIES, _DIRECTION_FREQUENCIES = 3, 2
+_APPEARANCE, _TRANSIENT = 8, 16
+# samples of a ray: to look where something is, in training and in rendering, where coarse ones
+# miss what training has made thin; then spread evenly, then where it is
+_LOOKING, _CLOSELY, _SPREAD, _THERE = 32, 96, 8, 16
+_REACH = 1.25  # beyond 1 space is contracted, to this at infinity
+_MAX_LOG_DENSITY = 12.0
+_AXES = ((0, 1), (0, 2), (1, 2))
 
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """Rays of one or several images.
+    """Rays of one or several images."""
 
-    Attributes
-    ----------
-    origins, directions : float32 (N, 3), in the field's own units.
-    near, far : t at which a ray begins and ends; in the unit of the directions' z.
-    appearance, transient : embeddings (N, A) and (N, T) of the images that the rays are of; None:
-        the field's mean appearance, and nothing transient.
-    depth : float32 (N,), t at which the surface is known to be, 0 where it is not; samples are
-        taken about it.
-    """
-
+    # origins, directions: float32 (N, 3), in the field's own units
     origins: torch.Tensor
     directions: torch.Tensor
+    # near, far: t at which a ray begins and ends; in the unit of the directions' z
     near: float
     far: float
+    # appearance, transient: embeddings (N, A) and (N, T) of the images that the rays are of; None:
+    # the field's mean appearance, and nothing transient
     appearance: torch.Tensor | None = None
     transient: torch.Tensor | None = None
+    # float32 (N,), t at which the surface is known to be, 0 where it is not; samples are taken
+    # about it
     depth: torch.Tensor | None = None
+
+    def points(self, t: torch.Tensor) -> torch.Tensor:
+        """Points (N, S, 3) at t (N, S)."""
+        return self.origins[:, None] + t[..., None] * self.directions[:, None]
+
+    def light(self, embedding: nn.Embedding) -> torch.Tensor:
+        """The appearance (N, A), or the mean of all."""
+        if self.appearance is not None:
+            return self.appearance
+        return embedding.weight.mean(0).expand(len(self.origins), -1)
 
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """What a field says at S samples of each ray.
+    """What a field says at S samples of each ray."""
 
-    Attributes
-    ----------
-    sigma, rgb : (N, S) density of the static part, and its colour (N, S, 3) in 0 to 1.
-    transient_sigma, transient_rgb, transient_beta : the same of the transient part, and its
-        uncertainty (N, S); None where it is off.
-    """
-
+    # sigma, rgb: (N, S) density of the static part, and its colour (N, S, 3) in 0 to 1
     sigma: torch.Tensor
     rgb: torch.Tensor
+    # transient_sigma, transient_rgb, transient_beta: the same of the transient part, and its
+    # uncertainty (N, S); None where it is off
     transient_sigma: torch.Tensor | None = None
     transient_rgb: torch.Tensor | None = None
     transient_beta: torch.Tensor | None = None
@@ -61,46 +81,23 @@ class Samples:
 
 @dataclass(frozen=True, eq=False)
 class Rendered:
-    """Rays as a field renders them.
+    """Rays as a field renders them."""
 
-    Attributes
-    ----------
-    rgb : (N, 3) in 0 to 1; black where nothing is.
-    depth : (N,), mean t of what is seen; 0 where nothing is.
-    opacity : (N,), share of the light that the field stops.
-    beta : (N,), standard deviation of the colour by NeRF-W's transient part; the least one without.
-    weights : (N, S), share of each sample.
-    transient_density : mean over all samples; 0 without.
-    coarse_rgb : of a field's coarse network, or None.
-    """
-
-    rgb: torch.Tensor
-    depth: torch.Tensor
-    opacity: torch.Tensor
+    rgb: torch.Tensor  # (N, 3) in 0 to 1; black where nothing is
+    depth: torch.Tensor  # (N,), mean t of what is seen; 0 where nothing is
+    opacity: torch.Tensor  # (N,), share of the light that the field stops
+    # (N,), standard deviation of the colour by NeRF-W's transient part; the least one without
     beta: torch.Tensor
-    weights: torch.Tensor
-    transient_density: torch.Tensor
-    coarse_rgb: torch.Tensor | None = None
-
-
-class RadianceField(Protocol):
-    """What trains and renders: a torch module of its images' embeddings."""
-
-    appearance: nn.Embedding | None
-    transient: nn.Embedding | None
-
-    def render(self, rays: Rays, generator: torch.Generator | None = None) -> Rendered:
-        """Render rays; samples are drawn by the generator, evenly spaced without one."""
-        ...
+    weights: torch.Tensor  # (N, S), share of each sample
+    transient_density: torch.Tensor  # mean over all samples; 0 without
+    coarse_rgb: torch.Tensor | None = None  # of a field's coarse network, or None
 
 
 def composite(t: torch.Tensor, deltas: torch.Tensor, samples: Samples) -> Rendered:
     """Composite samples along rays: NeRF's eq. 3, with a transient part NeRF-W's eqs. 8 to 10.
 
-    Parameters
-    ----------
-    t : (N, S), where the samples are, ascending.
-    deltas : (N, S), length of the piece of the ray that each stands for, in the unit of 1/density.
+    ``t`` (N, S) says where the samples are, ascending; ``deltas`` (N, S) the length of the piece of
+    the ray that each stands for, in the unit of 1/density.
     """
     total = samples.sigma
     if samples.transient_sigma is not None:
@@ -199,3 +196,202 @@ def nerf_w_loss(rendered: Rendered, rgb: torch.Tensor) -> torch.Tensor:
     if rendered.coarse_rgb is not None:
         loss = loss + 0.5 * torch.square(rendered.coarse_rgb - rgb).mean()
     return loss
+
+
+class NerfMlp(nn.Module):
+    """One of NeRF-W's two networks: eight layers, the heads for colour and for what is transient.
+
+    ``appearance_size`` and ``transient_size`` are of the embeddings; 0: not conditioned, no
+    transient head.
+    """
+
+    def __init__(self, appearance_size: int = 0, transient_size: int = 0) -> None:
+        super().__init__()
+        xyz = 3 + 6 * _NERF_POINT_FREQUENCIES
+        for layer in range(_LAYERS):
+            entering = {0: xyz, _SKIP: _WIDTH + xyz}.get(layer, _WIDTH)
+            block = nn.Sequential(nn.Linear(entering, _WIDTH), nn.ReLU())
+            setattr(self, f"xyz_encoding_{layer + 1}", block)
+        half = _WIDTH // 2
+        self.xyz_encoding_final = nn.Linear(_WIDTH, _WIDTH)
+        entering = _WIDTH + 3 + 6 * _NERF_DIRECTION_FREQUENCIES + appearance_size
+        self.dir_encoding = nn.Sequential(nn.Linear(entering, half), nn.ReLU())
+        self.static_sigma = nn.Sequential(nn.Linear(_WIDTH, 1), nn.Softplus())
+        self.static_rgb = nn.Sequential(nn.Linear(half, 3), nn.Sigmoid())
+        if transient_size:
+            layers: list[nn.Module] = []
+            for entering in (_WIDTH + transient_size, half, half, half):
+                layers += [nn.Linear(entering, half), nn.ReLU()]
+            self.transient_encoding = nn.Sequential(*layers)
+            self.transient_sigma = nn.Sequential(nn.Linear(half, 1), nn.Softplus())
+            self.transient_rgb = nn.Sequential(nn.Linear(half, 3), nn.Sigmoid())
+            self.transient_beta = nn.Sequential(nn.Linear(half, 1), nn.Softplus())
+
+    def forward(
+        self,
+        points: torch.Tensor,
+        directions: torch.Tensor,
+        appearance: torch.Tensor | None = None,
+        transient: torch.Tensor | None = None,
+    ) -> Samples:
+        """Samples at points (N, S, 3), seen along unit directions (N, 3)."""
+        count = points.shape[1]
+        xyz = frequencies(points, _NERF_POINT_FREQUENCIES)
+        hidden = xyz
+        for layer in range(_LAYERS):
+            if layer == _SKIP:
+                hidden = torch.cat([xyz, hidden], dim=-1)
+            hidden = getattr(self, f"xyz_encoding_{layer + 1}")(hidden)
+        sigma = self.static_sigma(hidden)[..., 0]
+        final = self.xyz_encoding_final(hidden)
+        beside = [_repeated(frequencies(directions, _NERF_DIRECTION_FREQUENCIES), count)]
+        if appearance is not None:
+            beside.append(_repeated(appearance, count))
+        rgb = self.static_rgb(self.dir_encoding(torch.cat([final, *beside], dim=-1)))
+        if transient is None:
+            return Samples(sigma, rgb)
+        moving = self.transient_encoding(torch.cat([final, _repeated(transient, count)], dim=-1))
+        moving_sigma = self.transient_sigma(moving)[..., 0]
+        beta = self.transient_beta(moving)[..., 0]
+        return Samples(sigma, rgb, moving_sigma, self.transient_rgb(moving), beta)
+
+
+class NerfW(nn.Module):
+    """NeRF-W's coarse and fine network, and the embeddings of the images.
+
+    A checkpoint of nerf_pl has ``nerf_coarse.*``, ``nerf_fine.*``, ``embedding_a.weight`` and
+    ``embedding_t.weight``. As there, appearance and what is transient are of the fine network
+    alone. ``num_images`` and ``num_lights`` are rows of the transient and of the appearance
+    embedding; as many of the second as of the first unless given.
+    """
+
+    def __init__(self, num_images: int, num_lights: int | None = None) -> None:
+        super().__init__()
+        self.nerf_coarse = NerfMlp()
+        self.nerf_fine = NerfMlp(_NERF_APPEARANCE, _NERF_TRANSIENT)
+        self.embedding_a = nn.Embedding(num_lights or num_images, _NERF_APPEARANCE)
+        self.embedding_t = nn.Embedding(num_images, _NERF_TRANSIENT)
+
+    @property
+    def appearance(self) -> nn.Embedding:
+        """The embeddings of light and exposure."""
+        return self.embedding_a
+
+    @property
+    def transient(self) -> nn.Embedding:
+        """The embeddings of what is in one image only."""
+        return self.embedding_t
+
+    def render(self, rays: Rays, generator: torch.Generator | None = None) -> Rendered:
+        """Render rays; samples are drawn by the generator, evenly spaced without one."""
+        unit = nn.functional.normalize(rays.directions, dim=1)
+        t = stratified(rays, _COARSE, generator)
+        coarse = composite(t, spacings(t, rays), self.nerf_coarse(rays.points(t), unit))
+        more = importance(t, coarse.weights, _FINE, generator)
+        t = torch.sort(torch.cat([t, more], dim=1), dim=1).values
+        light = rays.light(self.embedding_a)
+        samples = self.nerf_fine(rays.points(t), unit, light, rays.transient)
+        return replace(composite(t, spacings(t, rays), samples), coarse_rgb=coarse.rgb)
+
+
+class TriPlane(nn.Module):
+    """Three planes at three resolutions, and the embeddings of the images.
+
+    Features of a point are products of what three planes say (K-Planes, Fridovich-Keil et al., CVPR
+    2023, eq. 1); two small networks turn them into density and colour, a third into what is
+    transient. Samples lie about the known depth where there is one, else where a first pass through
+    the density alone finds something. Space from -1 to 1 is as it is, what lies beyond is
+    contracted. ``num_images`` and ``num_lights``: see :class:`NerfW`; ``unconstrained``: the images
+    differ in light and show what moves; without, one appearance and nothing transient.
+    """
+
+    def __init__(
+        self, num_images: int, num_lights: int | None = None, *, unconstrained: bool = True
+    ) -> None:
+        super().__init__()
+        self.planes = nn.ParameterList(
+            nn.Parameter(torch.empty(3, _CHANNELS, size, size).uniform_(0.1, 0.5))
+            for size in _RESOLUTIONS
+        )
+        self.geometry = _mlp(_CHANNELS * len(_RESOLUTIONS), 1 + _GEOMETRY)
+        appearance, transient = (_APPEARANCE, _TRANSIENT) if unconstrained else (0, 0)
+        seen = _GEOMETRY + 3 + 6 * _DIRECTION_FREQUENCIES + appearance
+        self.colour = _mlp(seen, 3)
+        self.appearance: nn.Embedding | None = None
+        self.transient: nn.Embedding | None = None
+        if unconstrained:
+            self.appearance = nn.Embedding(num_lights or num_images, appearance)
+            self.transient = nn.Embedding(num_images, transient)
+            for embedding in (self.appearance, self.transient):
+                nn.init.normal_(embedding.weight, std=0.1)
+            self.moving = _mlp(3 + 6 * _POINT_FREQUENCIES + transient, 5)
+
+    def density(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Density (N, S) at points (N, S, 3), and features (N, S, 15) of what is there."""
+        inside = _contracted(points).reshape(-1, 3) / _REACH
+        grid = torch.stack([inside[:, axes] for axes in _AXES])[:, :, None]
+        features = [
+            nn.functional.grid_sample(plane, grid, align_corners=True, padding_mode="border")
+            .squeeze(-1)
+            .prod(0)
+            for plane in self.planes
+        ]
+        found = self.geometry(torch.cat(features).T).reshape(*points.shape[:2], -1)
+        return torch.exp(found[..., 0].clamp(max=_MAX_LOG_DENSITY)), found[..., 1:]
+
+    def render(self, rays: Rays, generator: torch.Generator | None = None) -> Rendered:
+        """See :meth:`NerfW.render`."""
+        t = self._where(rays, generator)
+        count = t.shape[1]
+        points = rays.points(t)
+        deltas = spacings(t, rays)
+        sigma, features = self.density(points)
+        unit = nn.functional.normalize(rays.directions, dim=1)
+        beside = [frequencies(unit, _DIRECTION_FREQUENCIES)]
+        if self.appearance is not None:
+            beside.append(rays.light(self.appearance))
+        seen = torch.cat([features, _repeated(torch.cat(beside, dim=1), count)], dim=-1)
+        rgb = torch.sigmoid(self.colour(seen))
+        if self.transient is None or rays.transient is None:
+            return composite(t, deltas, Samples(sigma, rgb))
+        entering = frequencies(_contracted(points), _POINT_FREQUENCIES)
+        moving = self.moving(torch.cat([entering, _repeated(rays.transient, count)], dim=-1))
+        moving_rgb = torch.sigmoid(moving[..., 1:4])
+        moving_sigma = nn.functional.softplus(moving[..., 0] - 3.0)
+        beta = nn.functional.softplus(moving[..., 4] - 1.0)
+        return composite(t, deltas, Samples(sigma, rgb, moving_sigma, moving_rgb, beta))
+
+    @torch.no_grad()
+    def _where(self, rays: Rays, generator: torch.Generator | None) -> torch.Tensor:
+        """Samples (N, S) of rays, ascending."""
+        depth = rays.depth
+        spread = stratified(rays, _SPREAD, generator)
+        there = spread.new_zeros(len(spread), _THERE)
+        unknown = torch.arange(len(spread), device=spread.device)
+        if depth is not None:
+            there = about_depth(depth, there, generator)
+            unknown = torch.nonzero(depth <= 0)[:, 0]
+        if len(unknown):
+            some = Rays(rays.origins[unknown], rays.directions[unknown], rays.near, rays.far)
+            t = stratified(some, _LOOKING if generator else _CLOSELY, generator)
+            sigma = self.density(some.points(t))[0]
+            passed = torch.cumsum(sigma * spacings(t, some), dim=1)
+            left = torch.exp(-torch.cat([torch.zeros_like(passed[:, :1]), passed], dim=1))
+            there[unknown] = importance(t, left[:, :-1] - left[:, 1:], _THERE, generator)
+        return torch.sort(torch.cat([spread, there], dim=1), dim=1).values
+
+
+def _mlp(entering: int, leaving: int) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(entering, _HIDDEN), nn.ReLU(), nn.Linear(_HIDDEN, leaving))
+
+
+def _repeated(values: torch.Tensor, count: int) -> torch.Tensor:
+    return values[:, None].expand(-1, count, -1)
+
+
+def _contracted(points: torch.Tensor) -> torch.Tensor:
+    """Each coordinate beyond 1 brought below the reach, smoothly (as mip-NeRF 360, eq. 10)."""
+    size = points.abs()
+    margin = _REACH - 1.0
+    outside = _REACH - margin**2 / (size.clamp_min(1.0) - 1.0 + margin)
+    return torch.where(size <= 1.0, points, torch.sign(points) * outside)

@@ -1,11 +1,14 @@
-"""Devices, precision and inputs of networks, and their checkpoints loaded strictly by name."""
+"""Networks as they are used: devices, precision, inputs, checkpoints, and plugins made of them."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+import io
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from functools import cache
-from threading import RLock
+from functools import cache, lru_cache
+from pathlib import Path
+from threading import Lock, RLock
+from typing import Any, ClassVar, Generic, TypeVar
 
 import cv2
 import numpy as np
@@ -15,10 +18,13 @@ from pydantic import Field
 from torch import nn
 
 from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.io.weights import WeightsFile, find_weights, read_weights, sha256_of
 from megloc_kapture.values import Device, Options
 
 _computing = RLock()
-_NAMED = 5  # keys of each kind that a message names
+AnyOptions = TypeVar("AnyOptions", bound=Options)
+Net = TypeVar("Net", bound=nn.Module)
+_making = Lock()
 
 
 class NetworkOptions(Options):
@@ -94,25 +100,17 @@ def sized_tensor(
 
 
 def load_strictly(
-    module: nn.Module,
-    tensors: Mapping[str, torch.Tensor],
-    where: str,
-    *,
-    may_lack: Collection[str] = (),
-) -> None:
-    """Load a state dict into a module, every key and shape as the module has it.
+    module: Net, tensors: Mapping[str, torch.Tensor], where: str, *, may_lack: Collection[str] = ()
+) -> Net:
+    """The module, with a state dict loaded; every key and shape as the module has it.
 
-    Parameters
-    ----------
-    where : the file, for messages.
-    may_lack : keys of the module that the file need not have.
-
-    Raises
-    ------
-    DataError : names keys that are missing, unexpected, or of another shape.
+    Counters of batch normalisation may lack, and what ``may_lack`` names. Raises DataError that
+    names the file ``where`` and the keys that are missing, unexpected, or of another shape.
     """
     expected = module.state_dict()
-    missing = sorted(set(expected) - set(tensors) - set(may_lack))
+    # only training needs the counters, which torch before 0.4.1 and ONNX do not keep
+    counters = {key for key in expected if key.endswith("num_batches_tracked")}
+    missing = sorted(set(expected) - set(tensors) - set(may_lack) - counters)
     unexpected = sorted(set(tensors) - set(expected))
     reshaped = [
         f"{key} is {tuple(tensors[key].shape)}, not {tuple(expected[key].shape)}"
@@ -120,7 +118,7 @@ def load_strictly(
         if tensors[key].shape != expected[key].shape
     ]
     wrong = [
-        f"{len(keys)} {what}: {_some(keys)}"
+        f"{len(keys)} {what}: {first_few(keys)}"
         for what, keys in (
             ("missing keys", missing),
             ("unexpected keys", unexpected),
@@ -134,7 +132,7 @@ def load_strictly(
         )
     if not any(getattr(tensor, "is_shared_file", False) for tensor in tensors.values()):
         module.load_state_dict(dict(tensors), strict=False)
-        return
+        return module
     # the parameters are the file's own memory, which all processes that read it have once
     own = {
         key: value
@@ -143,8 +141,91 @@ def load_strictly(
         for key, value in tensors.items()
     }
     module.load_state_dict(own, strict=False, assign=True)
+    return module
 
 
-def _some(keys: Sequence[str]) -> str:
-    more = len(keys) - _NAMED
-    return ", ".join(keys[:_NAMED]) + (f" and {more} more" if more > 0 else "")
+def first_few(keys: Sequence[str], count: int = 5) -> str:
+    """The first keys, for a message that says how many more there are."""
+    more = len(keys) - count
+    return ", ".join(keys[:count]) + (f" and {more} more" if more > 0 else "")
+
+
+class Checkpointed(Generic[AnyOptions]):
+    """A plugin that is a network; the option ``weights`` names its file, a name or a path.
+
+    Raises MissingWeightsError for a checkpoint that is not there.
+    """
+
+    Options: ClassVar[Any]
+
+    def __init__(self, options: AnyOptions | None = None) -> None:
+        made: Any = options or self.Options()
+        self.options: AnyOptions = made
+        self._weights = find_weights(made.weights)
+        other = getattr(made, "descriptor_weights", None)
+        self._descriptor_weights: WeightsFile | None = other and find_weights(other)
+
+    def weights(self) -> dict[str, str]:
+        """sha256 of each checkpoint by its file's name."""
+        files = [file for file in (self._weights, self._descriptor_weights) if file is not None]
+        return {file.path.name: sha256_of(file) for file in files}
+
+    def network(
+        self,
+        load: Callable[..., Any],
+        *arguments: Any,
+        file: WeightsFile | None = None,
+        channels_last: bool = False,
+    ) -> tuple[Any, torch.device]:
+        """The network, made once per process, and the device it is on.
+
+        Raises DataError for a checkpoint that does not fit, OptionError for a device that is not
+        there.
+
+        Parameters
+        ----------
+        load : makes it of a checkpoint's tensors, the file's name, and the arguments.
+        file : another checkpoint than the option's.
+        channels_last : it is faster so on a processor.
+        """
+        wanted: Any = self.options
+        device = pick_device(wanted.device)
+        with _making:  # threads that share it do not make one each
+            return _made(load, file or self._weights, device, channels_last, *arguments), device
+
+
+# a run may use as many
+@lru_cache(maxsize=12)
+def _made(load: Any, file: WeightsFile, device: Any, channels_last: bool, *arguments: Any) -> Any:
+    network = load(read_weights(file), str(file.path), *arguments).eval().to(device)
+    if channels_last and device.type == "cpu":
+        network.to(memory_format=torch.channels_last)
+    return network
+
+
+def state_bytes(
+    model: torch.nn.Module, optimizer: torch.optim.Optimizer, more: Mapping[str, Any]
+) -> bytes:
+    """The state as a file; ``more`` are numbers, texts and lists of them, among them ``step``."""
+    stream = io.BytesIO()
+    content = {**more, "model": model.state_dict(), "optimizer": optimizer.state_dict()}
+    torch.save(content, stream)
+    return stream.getvalue()
+
+
+def load_state(
+    state: bytes, path: Path, model: torch.nn.Module, optimizer: torch.optim.Optimizer
+) -> dict[str, Any]:
+    """Put a state into networks and optimizer; what else it has.
+
+    Raises DataError that names the path, for a file that is damaged or of another training.
+    """
+    try:
+        content = torch.load(io.BytesIO(state), map_location="cpu", weights_only=True)
+        model.load_state_dict(content.pop("model"))
+        optimizer.load_state_dict(content.pop("optimizer"))
+        return {**content, "step": int(content["step"])}
+    except Exception as error:  # torch raises many kinds on damaged files
+        raise DataError(
+            "not the state of this training, or damaged; -f begins again", path=path
+        ) from error

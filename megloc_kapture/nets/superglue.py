@@ -36,27 +36,18 @@ _PADDING = -1e30  # nothing, but with a gradient
 
 @dataclass(frozen=True, eq=False)
 class ImageKeypoints:
-    """The keypoints of one image, as the network takes them.
+    """The keypoints of one image, as the network takes them, all float32."""
 
-    Attributes
-    ----------
-    xy : float32 (N, 2), normalised by :func:`normalise_keypoints`.
-    scores : float32 (N,), of the detector, in (0, 1].
-    descriptors : float32 (N, D).
-    """
-
-    xy: torch.Tensor
-    scores: torch.Tensor
-    descriptors: torch.Tensor
+    xy: torch.Tensor  # (N, 2), normalised by :func:`normalise_keypoints`
+    scores: torch.Tensor  # (N,), of the detector, in (0, 1]
+    descriptors: torch.Tensor  # (N, D)
 
 
 class SuperGlueNet(nn.Module):
     """The network: keypoints of pairs of images to the logarithm of their assignment.
 
-    Parameters
-    ----------
-    encoder_sizes : outputs of the keypoint encoder's layers; the last is the descriptors' size D.
-    num_layers : of the graph network; self and cross attention in turn.
+    The last of ``encoder_sizes``, the outputs of the keypoint encoder's layers, is the descriptors'
+    size D; the ``num_layers`` of the graph network are self and cross attention in turn.
     """
 
     def __init__(
@@ -74,13 +65,8 @@ class SuperGlueNet(nn.Module):
     ) -> list[torch.Tensor]:
         """Log assignments of pairs of images that have keypoints, all at once.
 
-        Parameters
-        ----------
-        iterations : of the optimal transport, which is float32 whatever the rest is.
-
-        Returns
-        -------
-        For each pair of N and M keypoints float32 (N + 1, M + 1), the dustbins last.
+        For each pair of N and M keypoints float32 (N + 1, M + 1), the dustbins last. ``iterations``
+        are of the optimal transport, which is float32 whatever the rest is.
         """
         return self.assignments(pairs, iterations, [len(self.gnn.layers)])[0]
 
@@ -196,15 +182,12 @@ class _GraphNetwork(nn.Module):
 def superglue(tensors: Mapping[str, torch.Tensor], where: str) -> SuperGlueNet:
     """The network with the weights of a checkpoint, of the sizes that the checkpoint has.
 
-    Raises
-    ------
-    DataError : names the keys of ``where`` that do not fit.
+    Raises DataError that names the keys of ``where`` that do not fit.
     """
     encoder = _numbered(tensors, r"kenc\.encoder\.(\d+)\.weight", dimensions=3)
     layers = _numbered(tensors, r"gnn\.layers\.(\d+)\.attn\.merge\.weight", dimensions=3)
     net = SuperGlueNet(encoder, len(layers)) if encoder and layers else SuperGlueNet()
-    load_strictly(net, tensors, where)
-    return net
+    return load_strictly(net, tensors, where)
 
 
 def _numbered(tensors: Mapping[str, torch.Tensor], pattern: str, *, dimensions: int) -> list[int]:
@@ -228,10 +211,7 @@ def mutual_matches(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """The matches of an assignment (N + 1, M + 1): largest of their row and of their column.
 
-    Returns
-    -------
-    matches : int64 (K, 2), sorted by row.
-    scores : (K,), larger than the threshold.
+    int64 (K, 2), sorted by row, and their scores (K,), larger than the threshold.
     """
     inner = log_assignment[:-1, :-1]
     values, columns = inner.max(dim=1)
@@ -246,16 +226,14 @@ def log_optimal_transport(
 ) -> list[torch.Tensor]:
     """Logarithms of partial assignments, by Sinkhorn's algorithm.
 
+    Returns for each matrix (N + 1, M + 1), the dustbins last. The exponential sums to 1 over every
+    row and column but the dustbins', which sum to M over the row and to N over the column.
+
     Parameters
     ----------
     scores : matrices (N, M) of any sizes, N and M at least 1, all float32 or all float64.
     bin_score : (), the score of matching nothing.
     iterations : at least 1; each normalises the rows, then the columns.
-
-    Returns
-    -------
-    For each matrix (N + 1, M + 1), the dustbins last. The exponential sums to 1 over every row and
-    column but the dustbins', which sum to M over the row and to N over the column.
     """
     like = scores[0]
     rows, columns = max(s.shape[0] for s in scores), max(s.shape[1] for s in scores)

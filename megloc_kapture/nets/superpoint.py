@@ -1,19 +1,16 @@
 """SuperPoint (DeTone, Malisiewicz and Rabinovich, CVPR workshops 2018, section 3).
 
 State-dict keys are those of Magic Leap's ``superpoint_v1.pth``. A network may lack one of its
-heads: MegLoc keeps the detector frozen and gives the descriptors a network of their own.
-
-SuperPoint with batch normalisation, the MIT-licensed retraining (rpautrat/SuperPoint).
-
-The same topology as :mod:`megloc_kapture.nets.superpoint` with a normalisation *after* each
-activation; state-dict keys are those of its own ``superpoint_v6_from_tf.pth``. Its descriptors are
+heads: MegLoc keeps the detector frozen and gives the descriptors a network of their own. The
+MIT-licensed retraining (rpautrat/SuperPoint) has the same topology with a batch normalisation
+*after* each activation, and the keys of its own ``superpoint_v6_from_tf.pth``; its descriptors are
 not those that SuperGlue's weights were trained with.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Literal, Protocol
+from typing import Literal
 
 import torch
 from torch import nn
@@ -28,23 +25,11 @@ DescriptorSampling = Literal["official", "exact"]
 _EPSILON = 1e-3  # TensorFlow's default, which it was trained with
 
 
-class PointNetwork(Protocol):
-    """Base of SuperPoint and its variants."""
-
-    official_sampling: DescriptorSampling
-    """Sampling of descriptors in the authors' own code, as :func:`sample_descriptors` names it."""
-
-    def __call__(self, gray: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Scores (B, 8h, 8w) and descriptors (B, 256, h, w) of gray images (B, 1, H, W)."""
-        ...
-
-
 class SuperPointNet(nn.Module):
     """The network: gray image to scores per pixel and descriptors per cell of 8 x 8 pixels.
 
-    Parameters
-    ----------
-    detector, descriptor : the heads it has.
+    ``detector`` and ``descriptor`` are the heads it has. ``official_sampling`` is that of
+    descriptors in the authors' own code, see :func:`sample_descriptors`.
     """
 
     official_sampling: DescriptorSampling = "official"
@@ -99,13 +84,7 @@ class SuperPointNet(nn.Module):
 
 
 class SplitSuperPoint(nn.Module):
-    """A detector and a descriptor network that share nothing (MegLoc, section on local features).
-
-    Parameters
-    ----------
-    detector : a network with the detector's head.
-    descriptor : a network with the descriptors' head.
-    """
+    """A detector and a descriptor network that share nothing (MegLoc, section "local features")."""
 
     official_sampling: DescriptorSampling = "official"
 
@@ -121,15 +100,8 @@ class SplitSuperPoint(nn.Module):
 
 
 def superpoint(tensors: Mapping[str, torch.Tensor], where: str) -> SuperPointNet:
-    """The network with the weights of an official checkpoint.
-
-    Raises
-    ------
-    DataError : names the keys of ``where`` that do not fit.
-    """
-    net = SuperPointNet()
-    load_strictly(net, tensors, where)
-    return net
+    """The network of an official checkpoint; raises DataError that names what does not fit."""
+    return load_strictly(SuperPointNet(), tensors, where)
 
 
 def superpoint_with_descriptor(
@@ -141,16 +113,10 @@ def superpoint_with_descriptor(
 ) -> SuperPointNet | SplitSuperPoint:
     """The detector of one checkpoint and the descriptors of another.
 
-    Parameters
-    ----------
-    detector : an official checkpoint; its descriptor head may be missing and is not used.
-    descriptor : the descriptor head alone, which then works on the detector's features, or the
-        head with a backbone of its own. A detector head in it is not used: that of the other file
-        is frozen.
-
-    Raises
-    ------
-    DataError : names the keys that do not fit, and the file.
+    Raises DataError that names the keys that do not fit, and the file. ``detector``: an official
+    checkpoint; its descriptor head may be missing and is not used; ``descriptor``: the descriptor
+    head alone, which then works on the detector's features, or the head with a backbone of its own.
+    A detector head in it is not used: that of the other file is frozen.
     """
     head = {key: value for key, value in descriptor.items() if not key.startswith("convP")}
     frozen = {key: value for key, value in detector.items() if not key.startswith("convD")}
@@ -179,7 +145,7 @@ def pixel_scores(logits: torch.Tensor) -> torch.Tensor:
 def sample_descriptors(
     descriptors: torch.Tensor, xy: torch.Tensor, sampling: DescriptorSampling
 ) -> torch.Tensor:
-    """Descriptors at pixels, bilinear between cells and of unit length.
+    """Descriptors float32 (N, D) at pixels, bilinear between cells and of unit length.
 
     Parameters
     ----------
@@ -188,10 +154,6 @@ def sample_descriptors(
     sampling : ``exact`` puts the centre of cell (i, j) at pixel (8 i + 3.5, 8 j + 3.5). So does
         ``official`` at the top left, but its scale is short by (w - 1) / (w - 9/16): it drifts to
         3.5 pixels at the bottom right. SuperGlue was trained with it.
-
-    Returns
-    -------
-    float32 (N, D).
     """
     size, height, width = descriptors.shape
     if len(xy) == 0:
@@ -231,7 +193,7 @@ class _Block(nn.Module):
 
 
 class SuperPointBatchNormNet(nn.Module):
-    """The network: gray image to scores per pixel and descriptors per cell of 8 x 8 pixels."""
+    """The retrained network: as :class:`SuperPointNet`, with both heads."""
 
     official_sampling: DescriptorSampling = "exact"
 
@@ -259,18 +221,10 @@ class SuperPointBatchNormNet(nn.Module):
 
 
 def is_superpoint_batchnorm(tensors: Mapping[str, torch.Tensor]) -> bool:
-    """True if the keys are those of this network."""
+    """True if the keys are those of the retrained network."""
     return any(key.startswith("backbone.") for key in tensors)
 
 
 def superpoint_batchnorm(tensors: Mapping[str, torch.Tensor], where: str) -> SuperPointBatchNormNet:
-    """The network with the weights of a checkpoint.
-
-    Raises
-    ------
-    DataError : names the keys of ``where`` that do not fit.
-    """
-    net = SuperPointBatchNormNet()
-    counters = [key for key in net.state_dict() if key.endswith("num_batches_tracked")]
-    load_strictly(net, tensors, where, may_lack=counters)
-    return net
+    """The network of a checkpoint of the retraining; raises DataError as :func:`superpoint`."""
+    return load_strictly(SuperPointBatchNormNet(), tensors, where)

@@ -27,60 +27,42 @@ from torch.nn import functional as F
 # widths of the 3x3 convolutions of each of the five stages; a pooling ends each stage
 _VGG_STAGES = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
 Depth = Literal[50, 101]
-_RESNET_BLOCKS: dict[Depth, tuple[int, int, int, int]] = {50: (3, 4, 6, 3), 101: (3, 4, 23, 3)}
-_RESNET_WIDTHS = (64, 128, 256, 512)
-_RESNET_EXPANSION = 4
+RESNET_BLOCKS: dict[Depth, tuple[int, int, int, int]] = {50: (3, 4, 6, 3), 101: (3, 4, 23, 3)}
+RESNET_DEPTHS: dict[int, Depth] = {6: 50, 23: 101}  # by the blocks of the third stage
+RESNET_WIDTHS, RESNET_EXPANSION = (64, 128, 256, 512), 4
 # of the images of ImageNet, RGB in [0, 1]
 IMAGENET_MEAN, IMAGENET_DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 # expansion, channels, blocks, stride of the first (table 2 of the paper)
 _MOBILENET_STAGES = (
-    (1, 16, 1, 1),
-    (6, 24, 2, 2),
-    (6, 32, 3, 2),
-    (6, 64, 4, 2),
-    (6, 96, 3, 1),
-    (6, 160, 3, 2),
-    (6, 320, 1, 1),
+    *((1, 16, 1, 1), (6, 24, 2, 2), (6, 32, 3, 2), (6, 64, 4, 2)),
+    *((6, 96, 3, 1), (6, 160, 3, 2), (6, 320, 1, 1)),
 )
 _MOBILENET_STEM_CHANNELS = 32
 _OUTPUT_STRIDE = 16
 _NUM_LOW_LEVEL = 4  # the stem and the blocks down to a quarter of the size
 MOBILENET_LOW_LEVEL_CHANNELS, MOBILENET_CHANNELS = 24, 320
 # smaller activations count as this, so that powers and their gradients stay finite
-MINIMUM = 1e-6
+_MINIMUM = 1e-6
 
 
 class AlexNetFeatures(nn.Sequential):
     """AlexNet up to the ReLU of its fifth convolution, layer 11 of torchvision's ``features``.
 
-    Takes (B, 3, H, W), at least 63 x 63 pixels. Keys of the state dict are ``{i}.weight`` and
-    ``{i}.bias`` for i of 0, 3, 6, 8, 10.
+    Takes (B, 3, H, W), at least 63 x 63 pixels.
     """
 
     def __init__(self) -> None:
-        super().__init__(
-            nn.Conv2d(3, 64, 11, stride=4, padding=2),
-            nn.ReLU(),
-            nn.MaxPool2d(3, stride=2),
-            nn.Conv2d(64, 192, 5, padding=2),
-            nn.ReLU(),
-            nn.MaxPool2d(3, stride=2),
-            nn.Conv2d(192, 384, 3, padding=1),
-            nn.ReLU(),
-            nn.Conv2d(384, 256, 3, padding=1),
-            nn.ReLU(),
-            nn.Conv2d(256, 256, 3, padding=1),
-            nn.ReLU(),
-        )
+        layers = [
+            *(nn.Conv2d(3, 64, 11, stride=4, padding=2), nn.ReLU(), nn.MaxPool2d(3, stride=2)),
+            *(nn.Conv2d(64, 192, 5, padding=2), nn.ReLU(), nn.MaxPool2d(3, stride=2)),
+        ]
+        for channels, out in ((192, 384), (384, 256), (256, 256)):
+            layers += [nn.Conv2d(channels, out, 3, padding=1), nn.ReLU()]
+        super().__init__(*layers)
 
 
 class Fire(nn.Module):
-    """A fire module: 1x1 convolutions to few channels, then 1x1 and 3x3 beside each other.
-
-    Parameters
-    ----------
-    squeezed, expanded : channels between, and of each of the two halves of the result.
-    """
+    """A fire module: 1x1 convolutions to few channels, then 1x1 and 3x3 beside each other."""
 
     def __init__(self, channels: int, squeezed: int, expanded: int) -> None:
         super().__init__()
@@ -96,39 +78,24 @@ class Fire(nn.Module):
 class SqueezeNetFeatures(nn.Sequential):
     """SqueezeNet 1.1 up to its eighth fire module, layer 12 of torchvision's ``features``.
 
-    Takes (B, 3, H, W), at least 17 x 17 pixels. Keys of the state dict are ``0.weight``,
-    ``0.bias`` and ``{i}.{squeeze,expand1x1,expand3x3}.{weight,bias}`` for i of 3, 4, 6, 7, 9 to 12.
+    Takes (B, 3, H, W), at least 17 x 17 pixels.
     """
 
     def __init__(self) -> None:
-        super().__init__(
-            nn.Conv2d(3, 64, 3, stride=2),
-            nn.ReLU(),
-            nn.MaxPool2d(3, stride=2, ceil_mode=True),
-            Fire(64, 16, 64),
-            Fire(128, 16, 64),
-            nn.MaxPool2d(3, stride=2, ceil_mode=True),
-            Fire(128, 32, 128),
-            Fire(256, 32, 128),
-            nn.MaxPool2d(3, stride=2, ceil_mode=True),
-            Fire(256, 48, 192),
-            Fire(384, 48, 192),
-            Fire(384, 64, 256),
-            Fire(512, 64, 256),
-        )
+        first = nn.Conv2d(3, 64, 3, stride=2), nn.ReLU()
+        pool = nn.MaxPool2d(3, stride=2, ceil_mode=True)
+        middle = Fire(64, 16, 64), Fire(128, 16, 64), pool, Fire(128, 32, 128), Fire(256, 32, 128)
+        last = Fire(256, 48, 192), Fire(384, 48, 192), Fire(384, 64, 256), Fire(512, 64, 256)
+        super().__init__(*first, pool, *middle, pool, *last)
 
 
 class Vgg16Features(nn.Sequential):
     """VGG-16 (configuration D) up to a layer, numbered as torchvision's ``features``.
 
-    Every convolution is 3x3 with a border of zeros and a bias, followed by a ReLU; stages end in
-    a 2x2 maximum with stride 2, which drops an odd last row or column. Keys of the state dict are
-    ``{i}.weight`` and ``{i}.bias``.
-
-    Parameters
-    ----------
-    last : number of the last layer, 0 to 30: 28 is conv5_3 without its ReLU (512 channels, 1/16 of
-        the size), 29 is that ReLU, 30 is the fifth pooling.
+    Every convolution is 3x3 with a border of zeros and a bias, followed by a ReLU; stages end in a
+    2x2 maximum with stride 2, which drops an odd last row or column. Keys of the state dict are
+    ``{i}.weight`` and ``{i}.bias``. ``last``: number of the last layer, 0 to 30: 28 is conv5_3
+    without its ReLU (512 channels, 1/16 of the size), 29 is that ReLU, 30 is the fifth pooling.
     """
 
     def __init__(self, *, last: int = 30) -> None:
@@ -150,14 +117,8 @@ class Vgg16Features(nn.Sequential):
     def taps(self, x: torch.Tensor, indices: Sequence[int]) -> list[torch.Tensor]:
         """Activations (B, C, h, w) after chosen layers, in the order of the indices.
 
-        Parameters
-        ----------
-        x : (B, 3, H, W), normalised as the weights want it; stays as it is.
-        indices : numbers of layers that this trunk has; layers after the last one are not run.
-
-        Raises
-        ------
-        ValueError : an index is none of a layer's.
+        ``x`` (B, 3, H, W), normalised as the weights want it, stays as it is; layers after the last
+        one are not run. Raises ValueError for an index that is none of a layer's.
         """
         wrong = sorted(set(indices) - set(range(len(self))))
         if wrong or not indices:
@@ -182,43 +143,56 @@ def imagenet_normalised(image: torch.Tensor) -> torch.Tensor:
 
 
 class Bottleneck(nn.Module):
-    """1x1, 3x3 and 1x1 convolution around a shortcut; the stride is on the 3x3."""
+    """1x1, 3x3 and 1x1 convolution around a shortcut; the stride is on the 3x3.
 
-    def __init__(self, channels: int, width: int, *, stride: int, dilation: int) -> None:
+    ``strided_first``: the stride is on the first 1x1 instead; ``bias`` and ``epsilon``: of the
+    convolutions, and of the normalisations after them.
+    """
+
+    def __init__(
+        self,
+        channels: int,
+        width: int,
+        *,
+        stride: int,
+        dilation: int = 1,
+        strided_first: bool = False,
+        bias: bool = False,
+        epsilon: float = 1e-5,
+    ) -> None:
         super().__init__()
-        out = width * _RESNET_EXPANSION
-        self.conv1 = nn.Conv2d(channels, width, 1, bias=False)
-        self.bn1 = nn.BatchNorm2d(width)
+        out = width * RESNET_EXPANSION
+        first, middle = (stride, 1) if strided_first else (1, stride)
+        self.conv1 = nn.Conv2d(channels, width, 1, stride=first, bias=bias)
+        self.bn1 = nn.BatchNorm2d(width, eps=epsilon)
         self.conv2 = nn.Conv2d(
-            width, width, 3, stride=stride, padding=dilation, dilation=dilation, bias=False
+            width, width, 3, stride=middle, padding=dilation, dilation=dilation, bias=bias
         )
-        self.bn2 = nn.BatchNorm2d(width)
-        self.conv3 = nn.Conv2d(width, out, 1, bias=False)
-        self.bn3 = nn.BatchNorm2d(out)
-        self.downsample = (
-            None
-            if stride == 1 and channels == out
-            else nn.Sequential(
-                nn.Conv2d(channels, out, 1, stride=stride, bias=False), nn.BatchNorm2d(out)
-            )
-        )
+        self.bn2 = nn.BatchNorm2d(width, eps=epsilon)
+        self.conv3 = nn.Conv2d(width, out, 1, bias=bias)
+        self.bn3 = nn.BatchNorm2d(out, eps=epsilon)
+        self.stride = stride
+        self.downsample: nn.Module | None = None
+        if channels != out:
+            shortcut = nn.Conv2d(channels, out, 1, stride=stride, bias=bias)
+            self.downsample = nn.Sequential(shortcut, nn.BatchNorm2d(out, eps=epsilon))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         y = F.relu(self.bn1(self.conv1(x)), inplace=True)
         y = F.relu(self.bn2(self.conv2(y)), inplace=True)
         y = self.bn3(self.conv3(y))
-        y += x if self.downsample is None else self.downsample(x)
+        if self.downsample is None:
+            y += x[..., :: self.stride, :: self.stride]
+        else:
+            y += self.downsample(x)
         return F.relu(y, inplace=True)
 
 
 class ResNet(nn.Module):
     """ResNet-50 or ResNet-101 without its classifier.
 
-    Parameters
-    ----------
-    depth : 50 or 101.
-    output_stride : of the last stage. Where the strides before it have come to this, the further
-        ones become dilations: the first block of such a stage keeps the dilation before it.
+    Where the strides have come to ``output_stride`` before the last stage, the further ones become
+    dilations: the first block of such a stage keeps the dilation before it.
     """
 
     def __init__(self, depth: Depth, *, output_stride: Literal[8, 16, 32] = 32) -> None:
@@ -227,7 +201,7 @@ class ResNet(nn.Module):
         self.bn1 = nn.BatchNorm2d(64)
         channels, reached, dilation = 64, 4, 1
         for number, (width, blocks) in enumerate(
-            zip(_RESNET_WIDTHS, _RESNET_BLOCKS[depth], strict=True), 1
+            zip(RESNET_WIDTHS, RESNET_BLOCKS[depth], strict=True), 1
         ):
             stride, first = 1 if number == 1 else 2, dilation
             if reached * stride > output_stride:
@@ -235,23 +209,15 @@ class ResNet(nn.Module):
             reached *= stride
             stage = nn.Sequential()
             for block in range(blocks):
-                stage.append(
-                    Bottleneck(
-                        channels,
-                        width,
-                        stride=stride if block == 0 else 1,
-                        dilation=first if block == 0 else dilation,
-                    )
-                )
-                channels = width * _RESNET_EXPANSION
+                steps, reach = (1, dilation) if block else (stride, first)
+                stage.append(Bottleneck(channels, width, stride=steps, dilation=reach))
+                channels = width * RESNET_EXPANSION
             self.add_module(f"layer{number}", stage)
 
     def forward(self, image: torch.Tensor) -> list[torch.Tensor]:
         """Features of the four stages, 256, 512, 1024 and 2048 channels.
 
-        Parameters
-        ----------
-        image : (B, 3, H, W), see :func:`imagenet_normalised`.
+        ``image`` is (B, 3, H, W), see :func:`imagenet_normalised`.
         """
         x = F.relu(self.bn1(self.conv1(image)), inplace=True)
         x = F.max_pool2d(x, 3, stride=2, padding=1)
@@ -307,13 +273,10 @@ class MobileNetV2(nn.Module):
                 stride, dilation = 1, dilation * wanted
             reached *= stride
             for block in range(blocks):
+                steps, reach = (1, dilation) if block else (stride, first)
                 layers.append(
                     InvertedResidual(
-                        channels,
-                        out,
-                        expansion=expansion,
-                        stride=stride if block == 0 else 1,
-                        dilation=first if block == 0 else dilation,
+                        channels, out, expansion=expansion, stride=steps, dilation=reach
                     )
                 )
                 channels = out
@@ -325,26 +288,18 @@ class MobileNetV2(nn.Module):
     def forward(self, image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Features at a quarter and a sixteenth of the size, 24 and 320 channels.
 
-        Parameters
-        ----------
-        image : (B, 3, H, W), normalised as for ImageNet.
+        ``image`` is (B, 3, H, W), see :func:`imagenet_normalised`.
         """
         low_level = self.low_level_features(image)
         return low_level, self.high_level_features(low_level)
 
 
 def generalized_mean(features: torch.Tensor, power: torch.Tensor | float) -> torch.Tensor:
-    """The power mean of each channel over all pixels: 1 is the mean, infinity the maximum.
+    """The power mean (B, C) of each channel over all pixels: 1 is the mean, infinity the maximum.
 
-    Parameters
-    ----------
-    features : (B, C, H, W), of any precision; what is below 1e-6 counts as 1e-6.
-    power : one number, not 0.
-
-    Returns
-    -------
-    float32 (B, C); float64 where the features are.
+    ``features`` (B, C, H, W) may be of any precision, and count as 1e-6 below it; the result is
+    float32, float64 where they are. ``power`` is one number, not 0.
     """
     # a third power leaves the range of half precision at 41
     values = features if features.dtype == torch.float64 else features.float()
-    return values.clamp(min=MINIMUM).pow(power).mean(dim=(2, 3)).pow(1.0 / power)
+    return values.clamp(min=_MINIMUM).pow(power).mean(dim=(2, 3)).pow(1.0 / power)

@@ -42,12 +42,8 @@ class XFeatNetwork(nn.Module):
         super().__init__()
         self.norm = nn.InstanceNorm2d(1)
         self.skip1 = nn.Sequential(nn.AvgPool2d(4, stride=4), nn.Conv2d(1, 24, 1))
-        self.block1 = nn.Sequential(
-            BasicLayer(1, 4),
-            BasicLayer(4, 8, stride=2),
-            BasicLayer(8, 8),
-            BasicLayer(8, 24, stride=2),
-        )
+        first = BasicLayer(1, 4), BasicLayer(4, 8, stride=2)
+        self.block1 = nn.Sequential(*first, BasicLayer(8, 8), BasicLayer(8, 24, stride=2))
         self.block2 = nn.Sequential(BasicLayer(24, 24), BasicLayer(24, 24))
         self.block3 = nn.Sequential(
             BasicLayer(24, 64, stride=2), BasicLayer(64, 64), BasicLayer(64, 64, kernel=1)
@@ -76,17 +72,11 @@ class XFeatNetwork(nn.Module):
         )
 
     def forward(self, images: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Dense maps of images.
+        """Dense maps of images, float (B, C, H, W), H and W multiples of 32.
 
-        Parameters
-        ----------
-        images : float (B, C, H, W), H and W multiples of 32; the channels are averaged.
-
-        Returns
-        -------
-        features : (B, 64, H/8, W/8), not normalised.
-        logits : (B, 65, H/8, W/8), of each pixel of a cell (channel 8 y + x), and of no keypoint.
-        reliability : (B, 1, H/8, W/8), in [0, 1].
+        The channels are averaged. Returns features (B, 64, H/8, W/8), not normalised; logits
+        (B, 65, H/8, W/8), of each pixel of a cell (channel 8 y + x), and of no keypoint; and
+        reliability (B, 1, H/8, W/8), in [0, 1].
         """
         grey = self.norm(images.mean(dim=1, keepdim=True))
         x3 = self.block3(self.block2(self.block1(grey) + self.skip1(grey)))
@@ -98,19 +88,13 @@ class XFeatNetwork(nn.Module):
 
 
 def load_xfeat(tensors: Mapping[str, torch.Tensor], where: str) -> XFeatNetwork:
-    """The network with the tensors of a checkpoint, for inference.
+    """The network of a checkpoint, for inference; a fine matcher in it is left out.
 
-    Files without ``num_batches_tracked`` (ONNX) fit, and so do those with a fine matcher.
-
-    Raises
-    ------
-    DataError : the tensors do not fit; names their keys.
+    Raises DataError that names the keys that do not fit.
     """
     network = XFeatNetwork()
     used = {key: value for key, value in tensors.items() if not key.startswith("fine_matcher.")}
-    counters = [key for key in network.state_dict() if key.endswith("num_batches_tracked")]
-    load_strictly(network, used, where, may_lack=counters)
-    return network.eval()
+    return load_strictly(network, used, where).eval()
 
 
 def keypoint_scores(logits: torch.Tensor) -> torch.Tensor:
@@ -121,21 +105,11 @@ def keypoint_scores(logits: torch.Tensor) -> torch.Tensor:
 def sample_at_pixels(
     values: torch.Tensor, xy: torch.Tensor, size: tuple[int, int], *, mode: str
 ) -> torch.Tensor:
-    """Values of a coarse map at pixels, as XFeat samples them.
+    """Values (N, C) of a coarse map (1, C, h, w) at pixels (N, 2), as XFeat samples them.
 
-    The pixel (x, y) of an image (H, W) is read at w x / (W - 1) - 0.5 and h y / (H - 1) - 0.5 of
-    the map, half a pixel of the image from where it belongs; the network was trained so.
-
-    Parameters
-    ----------
-    values : (1, C, h, w).
-    xy : (N, 2), pixels of the image, the first pixel's centre at (0, 0).
-    size : (H, W) of the image.
-    mode : "bilinear" or "bicubic".
-
-    Returns
-    -------
-    (N, C)
+    The pixel (x, y), the first one's centre at (0, 0), of an image of ``size`` (H, W) is read at w
+    x / (W - 1) - 0.5 and h y / (H - 1) - 0.5 of the map, half a pixel of the image from where it
+    belongs; the network was trained so. ``mode`` is "bilinear" or "bicubic".
     """
     height, width = size
     last = torch.tensor([width - 1, height - 1], dtype=torch.float32, device=values.device)

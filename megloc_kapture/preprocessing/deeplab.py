@@ -10,9 +10,9 @@ import torch
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.nets.checkpointed import Checkpointed
 from megloc_kapture.nets.deeplabv3plus import DeepLabV3Plus, backbone_of, most_likely
 from megloc_kapture.nets.runtime import (
+    Checkpointed,
     NetworkOptions,
     image_tensor,
     inference,

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.geometry.poses import movement
@@ -23,9 +24,8 @@ from megloc_kapture.refinement.photometric import (
     NormalEquations,
     perturbed,
 )
-from megloc_kapture.refinement.pyramid import ChosenPoints
-from megloc_kapture.refinement.references import RenderingOptions
-from megloc_kapture.values import RigidTransform
+from megloc_kapture.refinement.pyramid import Appearance, ChosenPoints
+from megloc_kapture.values import Options, RigidTransform
 
 # squared distance between two poses over the covariance of one that chance exceeds once in a
 # thousand times: the chi-squared distribution of six degrees of freedom
@@ -42,20 +42,68 @@ _BESIDE = (-4.0, -2.0, 0.0, 2.0, 4.0)
 _LEAST_CURVATURE = 1e-7
 
 
+class RenderingOptions(Options):
+    """Options of the refinement by rendering."""
+
+    appearance: Appearance = Field(
+        default="normalised",
+        description="what is compared: brightness of locally normalised contrast (day and night), "
+        "the same of each colour (colours), plain brightness (intensity), or magnitudes of its "
+        "gradient (gradients)",
+    )
+    max_references: int = Field(
+        default=4, gt=0, description="reference images with depth that are used, best first"
+    )
+    max_points: int = Field(
+        default=12000, ge=MIN_POINTS, description="points of a reference and level of its pyramid"
+    )
+    max_side_px: int = Field(
+        default=640, ge=64, description="longer side of the finest level; larger images are reduced"
+    )
+    levels: int = Field(
+        default=3, ge=1, description="of the pyramids, each of half the size; begin at the coarsest"
+    )
+    search_deg: float = Field(
+        default=4.0, ge=0, description="turns of the camera that are tried at the coarsest level"
+    )
+    max_translation_m: float = Field(
+        default=0.5, gt=0, description="a pose whose centre moves further is not accepted"
+    )
+    max_rotation_deg: float = Field(
+        default=5.0, gt=0, description="a pose that turns further is not accepted"
+    )
+    require_consistent_map: bool = Field(
+        default=True,
+        description="refine only where the map's own images, held out, would stay where they are",
+    )
+    min_significance: float = Field(
+        default=2.5,
+        ge=0,
+        description="by how many of its standard errors the robust cost must fall, parts of the "
+        "query being the observations",
+    )
+    min_correlation: float = Field(
+        default=0.12,
+        ge=-1,
+        le=1,
+        description="of the query with the warped references, below which a pose is not accepted",
+    )
+    min_overlap: float = Field(
+        default=0.2, ge=0, le=1, description="share of the query that references must cover"
+    )
+    max_overlap_loss: float = Field(
+        default=0.1, ge=0, le=1, description="share of that overlap that a new pose may lose"
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A pose that may replace the old one.
+    """A pose that may replace the old one."""
 
-    Attributes
-    ----------
-    problem : at the finest level, with all points.
-    free : the same without what something else hides.
-    alignment : of ``free``.
-    """
-
+    # problem, free: at the finest level, with all points, and without what something else hides
     problem: LevelProblem
     free: LevelProblem
-    alignment: Alignment
+    alignment: Alignment  # of ``free``
 
 
 def accept_or_keep(
@@ -66,12 +114,9 @@ def accept_or_keep(
 ) -> PoseRefinement:
     """The new pose with its covariance, or the old one and why.
 
-    Both are compared on all points, also those that something may hide.
-
-    Parameters
-    ----------
-    start : the old ``cam_from_world``.
-    overlaps : shares of the query that references cover, at the old pose and at the new one.
+    Both are compared on all points, also those that something may hide. ``start`` is the old
+    ``cam_from_world``; ``overlaps`` are shares of the query that references cover, at the old pose
+    and at the new one.
     """
     pose = found.alignment.cam_from_world
     comparison = compare_poses(found.problem, start, pose)
@@ -161,30 +206,20 @@ def _no_better(
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Fit of the query to the warped references under one pose.
+    """Fit of the query to the warped references under one pose."""
 
-    Attributes
-    ----------
-    cost : mean of the robust loss, over the square of its scale: 0 to 0.5.
-    correlation : of the query's values with the references', over all points and channels.
-    count : of points that are seen.
-    """
-
-    cost: float
-    correlation: float
-    count: int
+    cost: float  # mean of the robust loss, over the square of its scale: 0 to 0.5
+    correlation: float  # of the query's values with the references', over all points and channels
+    count: int  # of points that are seen
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """An old pose and a new one on the points that both see.
+    """An old pose and a new one on the points that both see, and how well they fit.
 
-    Attributes
-    ----------
-    before, after : how well they fit.
-    significance : by how many of its standard errors the cost falls. Cells of the query count as
-        one observation each: a pose that is better shows it in most of them, one that was tuned to
-        noise, or to what looks alike by chance, in some.
+    ``significance`` is by how many of its standard errors the cost falls. Cells of the query count
+    as one observation each: a pose that is better shows it in most of them, one that was tuned to
+    noise, or to what looks alike by chance, in some.
     """
 
     before: Fit
@@ -203,23 +238,18 @@ def compare_poses(problem: LevelProblem, old: RigidTransform, new: RigidTransfor
     for each in rows:
         each[hidden, :, 0] = np.nan
     deviation = aligned[1].deviation
-    cells = problem.cells(new, ~hidden)
     gained = _losses(rows[0][~hidden], deviation) - _losses(rows[1][~hidden], deviation)
     before, after = (_fit(problem, each, deviation) for each in rows)
-    return Comparison(before, after, _significance(gained, cells))
+    # sum of the gains over its standard error, if the cells' were independent, of mean 0
+    sums = np.bincount(problem.cells(new, ~hidden), gained)
+    error = float(np.sqrt(np.square(sums).sum()))
+    return Comparison(before, after, float(sums.sum()) / error if error > 0 else 0.0)
 
 
 def _losses(rows: Float64, deviation: float) -> Float64:
     """Robust loss of each point, over the square of its scale: 0 to 0.5."""
     squared = np.square(rows[..., 0]).mean(1) / (LOSS_SCALE * max(deviation, 1e-12)) ** 2
     return np.asarray(0.5 * squared / (1.0 + squared))
-
-
-def _significance(gained: Float64, cells: NDArray[np.int64]) -> float:
-    """Sum of the gains over its standard error, if the cells' gains were independent, of mean 0."""
-    sums = np.bincount(cells, gained)
-    error = float(np.sqrt(np.square(sums).sum()))
-    return float(sums.sum()) / error if error > 0 else 0.0
 
 
 def correlation(problem: LevelProblem, at: Alignment) -> float:
@@ -230,21 +260,14 @@ def correlation(problem: LevelProblem, at: Alignment) -> float:
 def _fit(problem: LevelProblem, rows: Float64, deviation: float) -> Fit:
     squared_scale = (LOSS_SCALE * max(deviation, 1e-12)) ** 2
     system = problem.system_of(rows, squared_scale)
-    return Fit(
-        system.mean_cost / squared_scale,
-        _correlation(rows, problem.chosen, problem.num_groups),
-        system.count,
-    )
+    correlated = _correlation(rows, problem.chosen, problem.num_groups)
+    return Fit(system.mean_cost / squared_scale, correlated, system.count)
 
 
 def _correlation(rows: Float64, chosen: ChosenPoints, num_groups: int) -> float:
     """Correlation of two sets of values whose means are those of each reference and channel."""
     seen = ~np.isnan(rows[:, 0, 0])
-    query, reference, groups = (
-        rows[seen][..., 7],
-        chosen.values[seen],
-        chosen.groups[seen],
-    )
+    query, reference, groups = rows[seen][..., 7], chosen.values[seen], chosen.groups[seen]
     together = apart_query = apart_reference = 0.0
     for group in range(num_groups):
         ours = groups == group
@@ -283,11 +306,7 @@ def covariance(problem: LevelProblem, at: Alignment) -> Float64 | None:
 
 
 def _scatter(
-    problem: LevelProblem,
-    at: Alignment,
-    rows: Float64,
-    squared_scale: float,
-    projection: Float64,
+    problem: LevelProblem, at: Alignment, rows: Float64, squared_scale: float, projection: Float64
 ) -> Float64 | None:
     """Squared scores (6, 6) of the cells; None where there are too few."""
     seen = ~np.isnan(rows[:, 0, 0])
@@ -347,9 +366,8 @@ def whitened_directions(
     -------
     steps : float64 (6, 6), in columns, each as large as half a pixel of the level; the first is
         along the direction that the image determines least.
-    change : of the weighted sum of squared residuals, by each step.
-
-    None where the image leaves a direction free.
+    change : of the weighted sum of squared residuals, by each step. None where the image leaves a
+        direction free.
     """
     reduced = system.reduced()
     if reduced is None:
@@ -373,12 +391,7 @@ def perturbed_starts(problem: LevelProblem, at: Alignment) -> list[Alignment]:
     if found is None:
         return []
     first, second = found[0][:, 0], found[0][:, 1]
-    poses = [
-        perturbed(at.cam_from_world, a * first + b * second)
-        for a in _BESIDE
-        for b in _BESIDE
-        if a or b
-    ]
-    others = [replace(at, cam_from_world=pose) for pose in poses]
+    steps = [a * first + b * second for a in _BESIDE for b in _BESIDE if a or b]
+    others = [replace(at, cam_from_world=perturbed(at.cam_from_world, step)) for step in steps]
     costs = [problem.system_at(each, scale2).mean_cost for each in others]
     return [others[k] for k in np.argsort(costs, kind="stable")]

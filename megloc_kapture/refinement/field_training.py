@@ -20,10 +20,8 @@ from pydantic import Field, model_validator
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.nets.gaussians import DEFAULT_COUNT, Gaussians
-from megloc_kapture.nets.nerfw import NerfW
-from megloc_kapture.nets.radiance import Rays, nerf_w_loss
-from megloc_kapture.nets.runtime import NetworkOptions, pick_device
-from megloc_kapture.nets.training_state import load_state, state_bytes
+from megloc_kapture.nets.radiance import NerfW, Rays, nerf_w_loss
+from megloc_kapture.nets.runtime import NetworkOptions, load_state, pick_device, state_bytes
 from megloc_kapture.refinement.neural_field import (
     FieldFrame,
     FieldModule,
@@ -93,17 +91,10 @@ class FieldTrainer:
     """A field, what it learns from, and its optimizer.
 
     The random numbers of a step depend on the seed and the step alone, so that an interrupted
-    training goes on to the bytes of one that was not.
-
-    Parameters
-    ----------
-    views : at least two, in order; of eight or more some are held out, as the options say.
-    module : of as many images as are trained on; built as the options say unless given.
-
-    Raises
-    ------
-    DataError : too few images, or one does not fit its camera; no pixel may be used; Gaussians
-        have no depth to begin with.
+    training goes on to the bytes of one that was not. Raises DataError for too few images, one that
+    does not fit its camera, masks that leave nothing, and Gaussians without depth to begin with.
+    ``views``: at least two, in order; of eight or more some are held out, as the options say;
+    ``module``: of as many images as are trained on; built as the options say unless given.
     """
 
     def __init__(
@@ -141,9 +132,8 @@ class FieldTrainer:
     def resume(self, state: bytes, path: Path) -> None:
         """Go on from what :meth:`train` gave to ``keep``.
 
-        Raises
-        ------
-        DataError : it is damaged, or of other options or images; names the path.
+        Raises DataError that names the path, for a state that is damaged, or of other options or
+        images.
         """
         found = load_state(state, path, self._field.module, self._optimizer)
         if found.get("training") != self._fingerprint:
@@ -162,16 +152,10 @@ class FieldTrainer:
         progress: Callable[[int, float, list[float]], None] | None = None,
         keep: Callable[[bytes], None] | None = None,
     ) -> tuple[NeuralField, dict[str, float]]:
-        """Train to the last step.
+        """Train to the last step: the field, and PSNR in dB of each held-out image by name.
 
-        Parameters
-        ----------
-        progress : is given the step, the seconds, and the held-out PSNR in dB of two, now and then.
-        keep : is given the state, more often.
-
-        Returns
-        -------
-        The field, and PSNR in dB of each held-out image by name.
+        ``progress`` is given the step, the seconds, and the held-out PSNR in dB of two, now and
+        then; ``keep`` is given the state, more often.
         """
         options, field = self.options, self._field
         started = time.monotonic() - self._seconds
@@ -192,8 +176,7 @@ class FieldTrainer:
             if self._step == options.steps:
                 break
             if keep is not None and self._step % _KEEP_EVERY == 0:
-                where = {"step": self._step, "seconds": self._seconds}
-                more = {**where, "training": self._fingerprint}
+                more = {"step": self._step, "seconds": self._seconds, "training": self._fingerprint}
                 keep(state_bytes(field.module, self._optimizer, more))
             if progress is not None and self._step % shown == 0:
                 scores = [field.held_out_psnr(view) for view in self._held_out[:2]]
@@ -245,12 +228,8 @@ class _Pixels:
             raise DataError("masks leave no pixel to train on")
         self._depth = None
         if any(depth is not None for *_, depth in found):
-            self._depth = np.concatenate(
-                [
-                    np.zeros(len(rgb), np.float32) if depth is None else depth
-                    for _, rgb, _, depth in found
-                ]
-            )
+            depths = [np.zeros(len(rgb), np.float32) if z is None else z for _, rgb, _, z in found]
+            self._depth = np.concatenate(depths)
         self._rotations = np.stack([pose.rotation_matrix() for pose in self._poses])
         self._centres = np.stack([pose.center() for pose in self._poses])
 
@@ -268,7 +247,7 @@ class _Pixels:
         spread = float(max((high - low).max(), 1e-6))
         near, far = 0.02 * spread, 20 * spread
         if self._depth is not None and (known := self._depth[self._depth > 0]).size:
-            near, far = 0.5 * np.quantile(known, 0.01), 1.5 * np.quantile(known, 0.99)
+            near, far = float(0.5 * np.quantile(known, 0.01)), float(1.5 * np.quantile(known, 0.99))
             rows = self._usable[self._depth[self._usable] > 0]
             rows = rows[:: max(1, len(rows) // 20000)]
             points = self._points(rows, self._depth)
@@ -279,14 +258,12 @@ class _Pixels:
         centre = 0.5 * (low + high)
         scale = 0.5 * float((high - low).max())
         x, y, z = centre.tolist()
-        return FieldFrame(centre=(x, y, z), scale=scale, near=float(near), far=float(far))
+        return FieldFrame(centre=(x, y, z), scale=scale, near=near, far=far)
 
     def surface(self, frame: FieldFrame, count: int, seed: int) -> tuple[Floats, Floats]:
         """Points (K, 3) of the field that depth shows, drawn evenly, and their colours in 0 to 1.
 
-        Raises
-        ------
-        DataError : no pixel has depth, or fewer have than are asked for.
+        Raises DataError where fewer pixels have depth than are asked for.
         """
         known = self._usable
         if self._depth is not None:

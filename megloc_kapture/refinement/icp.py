@@ -16,20 +16,20 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from megloc_kapture.geometry.cameras import focal_px, px_from_cam
 from megloc_kapture.geometry.poses import rotation_angles_deg
-from megloc_kapture.plugins import PoseRefinement, RankingScene
-from megloc_kapture.refinement.depth_points import DepthCloudOptions, depth_cloud
+from megloc_kapture.plugins import DepthView, PoseRefinement, RankingScene
 from megloc_kapture.refinement.icp_surface import (
     NORMAL_NEIGHBOURS,
-    MapCloudOptions,
+    DepthCloudOptions,
     Surface,
     SurfaceFit,
     condition_number,
+    depth_cloud,
     downsample,
     fit_covariance,
     fit_to_surface,
     fit_weighted,
-    map_cloud,
     surface_fit,
     surface_of,
 )
@@ -41,6 +41,11 @@ Floats = NDArray[np.float64]
 _STRUCTURED_LIGHT = (0.001504, -0.00152, 0.0019)
 # pixels of the query that count in the last step: more cost time and change nothing
 _MAX_PIXELS = 10000
+# pixels of a reference's depth map between those by which its overlap is measured
+_OVERLAP_STEP_PX = 8
+# views this near to each other are one view: a depth sensor's errors depend on where a surface
+# lies in its image, and only those of different views average out
+_SAME_VIEW_M, _SAME_VIEW_DEG = 0.2, 10.0
 
 
 class IcpOptions(Options):
@@ -121,6 +126,11 @@ class _Level:
     points: Floats
     max_distance_m: float
 
+    def fit(self, local_from_cam: RigidTransform, options: IcpOptions) -> SurfaceFit:
+        """Compare the points with the surface under a transform."""
+        near_m, far_m = self.max_distance_m, options.max_distances_m[0]
+        return surface_fit(self.surface, self.points, local_from_cam, near_m=near_m, far_m=far_m)
+
 
 def refine_by_icp(
     query_points: Floats,
@@ -128,20 +138,13 @@ def refine_by_icp(
     cam_from_world: RigidTransform,
     options: IcpOptions | None = None,
 ) -> PoseRefinement:
-    """Fit a query's cloud to the map's.
+    """Fit a query's cloud, float64 (N, 3) in the camera's frame, to the map's (M, 3), in metres.
 
-    Parameters
-    ----------
-    query_points : float64 (N, 3) in the camera's frame, metres.
-    map_points : float64 (M, 3) in the world, metres.
-
-    Returns
-    -------
-    PoseRefinement with ``residual_before_m`` and ``residual_after_m`` (median distance from the
-    map's planes, of points that have map within the coarsest distance), ``overlap_before`` and
-    ``overlap_after`` (share of points that have map within the finest), ``moved_m``,
-    ``moved_deg`` and ``condition``, as far as it came; accepted only if residual and overlap
-    improve and every limit of the options holds. Its covariance is that of
+    Returns PoseRefinement with ``residual_before_m`` and ``residual_after_m`` (median distance from
+    the map's planes, of points that have map within the coarsest distance), ``overlap_before`` and
+    ``overlap_after`` (share of points that have map within the finest), ``moved_m``, ``moved_deg``
+    and ``condition``, as far as it came; accepted only if residual and overlap improve and every
+    limit of the options holds. Its covariance is that of
     :func:`~megloc_kapture.refinement.icp_surface.fit_covariance`.
     """
     options = options or IcpOptions()
@@ -151,21 +154,27 @@ def refine_by_icp(
     fine_points = downsample(query_points, options.voxels_m[-1])
     fine_map = downsample(map_points - center, options.voxels_m[-1])
     if len(fine_points) < options.min_points:
-        return _kept(cam_from_world, f"the query's depth has {len(fine_points)} points only")
+        reason = f"the query's depth has {len(fine_points)} points only"
+        return PoseRefinement(cam_from_world, reason)
     if len(fine_map) < options.min_points:
-        return _kept(cam_from_world, f"the map has {len(fine_map)} points here only")
-    levels = _levels(fine_points, fine_map, options)
+        return PoseRefinement(cam_from_world, f"the map has {len(fine_map)} points here only")
+    coarser = zip(options.voxels_m[:-1], options.max_distances_m[:-1], strict=True)
+    levels = [
+        _Level(surface_of(downsample(fine_map, voxel_m)), downsample(fine_points, voxel_m), limit_m)
+        for voxel_m, limit_m in coarser
+    ]
+    levels.append(_Level(surface_of(fine_map), fine_points, options.max_distances_m[-1]))
     if reason := _reason_to_skip(levels, local_from_cam, options):
-        return _kept(cam_from_world, reason)
-    before = _fit(levels[-1], local_from_cam, options)
+        return PoseRefinement(cam_from_world, reason)
+    before = levels[-1].fit(local_from_cam, options)
     measures = {"residual_before_m": before.residual_m, "overlap_before": before.overlap}
     pixels = query_points[:: -(-len(query_points) // _MAX_PIXELS)]
     moved, reason = _fit_levels(levels, pixels, local_from_cam, options)
     if reason:
         return PoseRefinement(cam_from_world, reason, measures)
-    after = _fit(levels[-1], moved, options)
+    after = levels[-1].fit(moved, options)
     # the finest normals are noisy, which looks like structure on a bare wall
-    condition = condition_number(_fit(levels[0], moved, options))
+    condition = condition_number(levels[0].fit(moved, options))
     moved_m, moved_deg = _movement(local_from_cam, moved)
     measures |= {
         "residual_after_m": after.residual_m,
@@ -183,29 +192,6 @@ def refine_by_icp(
     )
 
 
-def _levels(fine_points: Floats, fine_map: Floats, options: IcpOptions) -> list[_Level]:
-    """Coarse to fine; the finest has the points that it is given."""
-    coarser = [
-        _Level(
-            surface_of(downsample(fine_map, voxel_m)), downsample(fine_points, voxel_m), distance_m
-        )
-        for voxel_m, distance_m in zip(
-            options.voxels_m[:-1], options.max_distances_m[:-1], strict=True
-        )
-    ]
-    return [*coarser, _Level(surface_of(fine_map), fine_points, options.max_distances_m[-1])]
-
-
-def _fit(level: _Level, local_from_cam: RigidTransform, options: IcpOptions) -> SurfaceFit:
-    return surface_fit(
-        level.surface,
-        level.points,
-        local_from_cam,
-        near_m=level.max_distance_m,
-        far_m=options.max_distances_m[0],
-    )
-
-
 def _reason_to_skip(
     levels: Sequence[_Level], local_from_cam: RigidTransform, options: IcpOptions
 ) -> str:
@@ -217,7 +203,7 @@ def _reason_to_skip(
             f"at most {limit:g} m is allowed"
         )
     # what has no map within the coarsest distance is not drawn anywhere
-    reach = _fit(levels[0], local_from_cam, options).reach
+    reach = levels[0].fit(local_from_cam, options).reach
     if reach < options.min_overlap:
         return (
             f"{100 * reach:.0f} % of the query's points are within {options.max_distances_m[0]:g} "
@@ -238,13 +224,8 @@ def _fit_levels(
         moved = found
         if reason := _reason_too_far(start, moved, options):
             return start, reason
-    found = fit_weighted(
-        levels[-1].surface,
-        pixels,
-        _noise(pixels[:, 2], options.noise),
-        moved,
-        levels[-1].max_distance_m,
-    )
+    finest, noise = levels[-1], _noise(pixels[:, 2], options.noise)
+    found = fit_weighted(finest.surface, pixels, noise, moved, finest.max_distance_m)
     if found is None:
         return start, "the surfaces do not determine the pose"
     return found, _reason_too_far(start, found, options)
@@ -298,8 +279,102 @@ def _reason_to_refuse(
     return ""
 
 
-def _kept(cam_from_world: RigidTransform, reason: str) -> PoseRefinement:
-    return PoseRefinement(cam_from_world, reason)
+def map_cloud(
+    query_depth: DepthView,
+    query_points: Floats,
+    cam_from_world: RigidTransform,
+    references: Sequence[str],
+    scene: RankingScene,
+    options: IcpOptions,
+) -> Floats:
+    """The map around a query's points under its estimated pose, float64 (M, 3) in the world.
+
+    The depth maps of the references that overlap most with the query's, of those within 0.2 m and
+    10 deg of each other only one; where no reference has depth, the points of the map that the
+    references observe. Depths that differ by less than the coarsest distance agree, and points that
+    far from the query's are kept. ``query_points``: float64 (N, 3) in the query camera's frame;
+    ``references``: map images, best first.
+    """
+    margin_m = options.max_distances_m[0]
+    low, high = query_points.min(axis=0) - margin_m, query_points.max(axis=0) + margin_m
+
+    def cropped(points: Floats) -> Floats:
+        in_camera = cam_from_world.apply(points)
+        return points[((in_camera >= low) & (in_camera <= high)).all(axis=1)]
+
+    overlaps = _overlaps(query_depth, cam_from_world, references, scene, options)
+    if not overlaps:
+        observed = [scene.map_points(name) for name in references]
+        return cropped(np.unique(np.concatenate([np.zeros((0, 3)), *observed]), axis=0))
+    clouds, voxel_m = [np.zeros((0, 3))], options.voxels_m[-1]
+    for name in _different_views(overlaps, scene, options.max_references):
+        view = scene.map_depth(name)
+        assert view is not None  # it overlaps
+        # as many pixels as half a voxel covers at the greatest depth
+        step_px = max(1, round(0.5 * voxel_m * focal_px(view.camera) / options.depth.max_depth_m))
+        camera, mask = scene.map_camera(name), scene.map_mask(name)
+        points = depth_cloud(
+            view, options.depth, image_camera=camera, image_mask=mask, step_px=step_px
+        )
+        # a vote per image and voxel: a near image has more pixels there, not more right
+        clouds.append(downsample(cropped(scene.map_pose(name).inverse().apply(points)), voxel_m))
+    return np.concatenate(clouds)
+
+
+def _overlaps(
+    query_depth: DepthView,
+    cam_from_world: RigidTransform,
+    references: Sequence[str],
+    scene: RankingScene,
+    options: IcpOptions,
+) -> list[tuple[str, float]]:
+    """References that have depth, and the share of it that agrees with the query's; most first."""
+    found = []
+    depth_from_world = query_depth.image_from_depth.inverse() @ cam_from_world
+    for name in references:
+        view = scene.map_depth(name)
+        if view is None:
+            continue
+        points = depth_cloud(view, options.depth, step_px=_OVERLAP_STEP_PX)
+        seen = (depth_from_world @ scene.map_pose(name).inverse()).apply(points)
+        agrees = _agrees(query_depth, seen, options.max_distances_m[0])
+        found.append((name, float(agrees.mean()) if len(agrees) else 0.0))
+    # stable: of equals the better reference stays first
+    return sorted(found, key=lambda each: -each[1])
+
+
+def _different_views(
+    overlaps: Sequence[tuple[str, float]], scene: RankingScene, count: int
+) -> list[str]:
+    """The first references that overlap at all and do not repeat the view of an earlier one."""
+    names: list[str] = []
+    quats, centers = np.zeros((0, 4)), np.zeros((0, 3))
+    for name, overlap in overlaps:
+        if overlap <= 0 or len(names) == count:
+            break
+        pose = scene.map_pose(name)
+        quat, center = np.array(pose.quat_wxyz), pose.center()
+        near = np.linalg.norm(centers - center, axis=1) < _SAME_VIEW_M
+        if (near & (rotation_angles_deg(quats, quat) < _SAME_VIEW_DEG)).any():
+            continue
+        names.append(name)
+        quats, centers = np.vstack([quats, quat]), np.vstack([centers, center])
+    return names
+
+
+def _agrees(view: DepthView, points_in_depth: Floats, tolerance_m: float) -> NDArray[np.bool_]:
+    """Mask (N,) of points (N, 3) in the depth camera's frame that lie near a measured depth."""
+    pixels = px_from_cam(view.camera, points_in_depth)
+    height, width = view.depth_m.shape
+    with np.errstate(invalid="ignore"):
+        inside = (pixels >= 0).all(axis=1) & (pixels < (width, height)).all(axis=1)
+    column, row = pixels[inside].astype(np.int64).T
+    depth = view.depth_m[row, column].astype(np.float64)
+    with np.errstate(invalid="ignore"):
+        near = (depth > 0) & (np.abs(points_in_depth[inside, 2] - depth) <= tolerance_m)
+    agrees = np.zeros(len(points_in_depth), bool)
+    agrees[inside] = near
+    return agrees
 
 
 class Icp:
@@ -325,30 +400,14 @@ class Icp:
     ) -> PoseRefinement:
         """Refine the pose of one query image; see :func:`refine_by_icp`.
 
-        Raises
-        ------
-        DataError : a depth map or mask that there should be cannot be read.
+        Raises DataError for a depth map or mask that there should be and that cannot be read.
         """
-        options = self.options
-        view = scene.query_depth(query)
+        options, view = self.options, scene.query_depth(query)
         if view is None:
-            return _kept(cam_from_world, "the query has no depth")
-        points = depth_cloud(
-            view, options.depth, image_camera=camera, image_mask=scene.query_mask(query)
-        )
+            return PoseRefinement(cam_from_world, "the query has no depth")
+        mask = scene.query_mask(query)
+        points = depth_cloud(view, options.depth, image_camera=camera, image_mask=mask)
         if not len(points):
-            return _kept(cam_from_world, "the query's depth has 0 points only")
-        cloud = map_cloud(
-            view,
-            points,
-            cam_from_world,
-            references,
-            scene,
-            MapCloudOptions(
-                depth=options.depth,
-                max_references=options.max_references,
-                voxel_m=options.voxels_m[-1],
-                margin_m=options.max_distances_m[0],
-            ),
-        )
+            return PoseRefinement(cam_from_world, "the query's depth has 0 points only")
+        cloud = map_cloud(view, points, cam_from_world, references, scene, options)
         return refine_by_icp(points, cloud, cam_from_world, options)

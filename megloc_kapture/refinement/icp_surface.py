@@ -1,4 +1,4 @@
-"""Clouds and surfaces of ICP: the map around a query, surfaces through it, clouds fitted to them.
+"""Clouds and surfaces of ICP: points of depth maps, surfaces through them, and how they fit.
 
 The adapter of small_gicp, with one thread throughout: with more, its voxel grid does not give the
 same points twice.
@@ -6,24 +6,23 @@ same points twice.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
 import small_gicp
 from numpy.typing import NDArray
+from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.geometry.cameras import focal_px, px_from_cam
-from megloc_kapture.geometry.poses import rotation_angles_deg
+from megloc_kapture.geometry.cameras import pixel_rays, px_from_cam
 from megloc_kapture.geometry.robust import deviation_by_median
-from megloc_kapture.plugins import DepthView, RankingScene
-from megloc_kapture.refinement.depth_points import DepthCloudOptions, depth_cloud
-from megloc_kapture.values import Camera, RigidTransform
+from megloc_kapture.plugins import DepthView
+from megloc_kapture.values import Camera, Options, RigidTransform
 
 Floats = NDArray[np.float64]
-NORMAL_NEIGHBOURS = 20
+NORMAL_NEIGHBOURS = 20  # that a normal is estimated from; small_gicp's own number
 _MAX_ITERATIONS = 20
 # a tenth of what a refined pose has to be good to
 _ROTATION_EPSILON_RAD = 1e-4
@@ -31,28 +30,91 @@ _TRANSLATION_EPSILON_M = 1e-4
 _CONVERGED = 5e-5  # radians and metres, a hundredth of what a refined pose has to be good to
 # the scale at which the Cauchy loss has 95 % of least squares' efficiency under Gaussian noise
 _CAUCHY_EFFICIENT = 2.385
-# pixels of a reference's depth map between those by which its overlap is measured
-_OVERLAP_STEP_PX = 8
-# views this near to each other are one view: a depth sensor's errors depend on where a surface
-# lies in its image, and only those of different views average out
-_SAME_VIEW_M, _SAME_VIEW_DEG = 0.2, 10.0
 
 
-"""Points that a normal is estimated from; small_gicp's own number."""
+class DepthCloudOptions(Options):
+    """Options: depths that are trusted."""
+
+    max_depth_m: float = Field(
+        default=4.0,
+        gt=0,
+        description="metres; farther ones are dropped. A structured-light sensor's noise grows "
+        "with the square of the distance and is 2.6 cm here, the end of its rated range; a "
+        "laser's does not, raise it",
+    )
+    max_jump: float = Field(
+        default=0.05,
+        gt=0,
+        description="a pixel is on an edge, and dropped, where a neighbour's depth differs by "
+        "more than this share of the smaller; on a plane at 80 degrees the steps of a sensor with "
+        "a focal length of 585 px are 0.014",
+    )
+
+
+def depth_cloud(
+    view: DepthView,
+    options: DepthCloudOptions | None = None,
+    *,
+    image_camera: Camera | None = None,
+    image_mask: NDArray[np.bool_] | None = None,
+    step_px: int = 1,
+) -> Floats:
+    """Points of a depth map, float64 (N, 3), in the frame of the image that it was taken with.
+
+    By rows of the depth map, metres. Left out are pixels without depth (0, less, or not finite),
+    beyond the greatest depth, beside a jump in depth (a sensor smears edges: Khoshelham and
+    Elberink, Sensors 12(2), 2012), and points that the image's mask hides. ``image_camera`` and
+    ``image_mask``: camera of the image, and its mask, bool (H, W), True = use; points that lie
+    outside of the image stay; ``step_px``: take every such pixel, along both axes.
+    """
+    options = options or DepthCloudOptions()
+    depth = np.asarray(view.depth_m, np.float32)
+    sampled = np.s_[step_px // 2 :: step_px, step_px // 2 :: step_px]
+    z = depth[sampled]
+    with np.errstate(invalid="ignore"):
+        trusted = (z > 0) & (z <= options.max_depth_m) & ~_on_edge(depth, sampled, options.max_jump)
+    rows = np.arange(depth.size).reshape(depth.shape)[sampled][trusted]
+    points = view.image_from_depth.apply(
+        pixel_rays(view.camera)[rows] * z[trusted].astype(np.float64)[:, None]
+    )
+    if image_camera is None or image_mask is None:
+        return points
+    return points[~_hidden(points, image_camera, image_mask)]
+
+
+def _on_edge(
+    depth: NDArray[np.float32], sampled: tuple[slice, slice], max_jump: float
+) -> NDArray[np.bool_]:
+    """Mask of the sampled pixels with one of eight neighbours far before or behind them."""
+    height, width = depth.shape
+    padded = np.pad(depth, 1)
+    z, limit = depth[sampled], np.float32(1.0 + max_jump)
+    edge = np.zeros(z.shape, bool)
+    with np.errstate(invalid="ignore"):
+        for down, right in product((0, 1, 2), (0, 1, 2)):
+            other = padded[down : down + height, right : right + width][sampled]
+            # one without depth, 0 or NaN, says nothing
+            edge |= (other > limit * z) | ((other > 0) & (limit * other < z))
+    return edge
+
+
+def _hidden(points: Floats, camera: Camera, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Points (N,) in the camera's frame that lie on False pixels of the mask."""
+    pixels = px_from_cam(camera, points)
+    with np.errstate(invalid="ignore"):
+        inside = (pixels >= 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
+    column, row = pixels[inside].astype(np.int64).T
+    hidden = np.zeros(len(points), bool)
+    hidden[inside] = ~mask[row, column]
+    return hidden
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Points on a surface, with its normals.
+    """Points on a surface, with its normals."""
 
-    Attributes
-    ----------
-    points : float64 (N, 3).
-    normals : float64 (N, 3), unit length, of either sign.
-    """
-
-    points: Floats
-    normals: Floats
+    points: Floats  # float64 (N, 3)
+    normals: Floats  # float64 (N, 3), unit length, of either sign
     _cloud: Any
     _tree: Any
 
@@ -62,10 +124,7 @@ class Surface:
         return rows[:, 0].astype(np.int64), np.sqrt(squared[:, 0])
 
     def spacing(self) -> float:
-        """Median distance from a point to the last of those that its normal comes from.
-
-        Of at least :data:`NORMAL_NEIGHBOURS` points.
-        """
+        """Median distance from a point to the last of those that its normal comes from."""
         _, squared = self._tree.batch_knn_search(self.points, NORMAL_NEIGHBOURS)
         return float(np.sqrt(np.median(squared[:, -1])))
 
@@ -81,7 +140,7 @@ def downsample(points: Floats, voxel_m: float) -> Floats:
 
 
 def surface_of(points: Floats) -> Surface:
-    """The surface through points (N, 3) near the origin, :func:`downsample`.
+    """The surface through points (N, 3) near the origin; see :func:`downsample`.
 
     Its normals are the directions in which the nearest points vary least.
     """
@@ -97,21 +156,15 @@ def fit_to_surface(
     """Move points (N, 3) onto a surface: point-to-plane ICP by Levenberg-Marquardt.
 
     Chen and Medioni, "Object modelling by registration of multiple range images", Image and Vision
-    Computing 10(3), 1992; small_gicp's ``PLANE_ICP``.
-
-    Returns
-    -------
-    surface_from_points : the better transform, or None where no point of the surface is within
-        ``max_distance_m``, or the result is not finite.
+    Computing 10(3), 1992; small_gicp's ``PLANE_ICP``. None where no point of the surface is within
+    ``max_distance_m``, or the result is not finite.
     """
     start = np.eye(4)
     start[:3, :3] = surface_from_points.rotation_matrix()
     start[:3, 3] = surface_from_points.translation
+    cloud = small_gicp.PointCloud(np.ascontiguousarray(points))
     result = small_gicp.align(
-        surface._cloud,
-        small_gicp.PointCloud(np.ascontiguousarray(points)),
-        surface._tree,
-        start,
+        *(surface._cloud, cloud, surface._tree, start),
         registration_type="PLANE_ICP",
         max_correspondence_distance=max_distance_m,
         max_iterations=_MAX_ITERATIONS,
@@ -126,24 +179,19 @@ def fit_to_surface(
 
 @dataclass(frozen=True, eq=False)
 class SurfaceFit:
-    """A cloud on a surface.
+    """A cloud on a surface."""
 
-    Attributes
-    ----------
-    overlap, reach : shares of the points with the surface within the near and the far distance.
-    residual_m : median distance from the planes, over the points with the surface within the far
-        distance; infinite where there are none.
-    points, normals : float64 (K, 3) in the cloud's frame: points that are near, and the
-        normals of their planes.
-    residuals_m : float64 (K,), their signed distances from the planes.
-    """
-
+    # overlap, reach: shares of the points with the surface within the near and the far distance
     overlap: float
     reach: float
+    # median distance from the planes, over the points with the surface within the far distance;
+    # infinite where there are none
     residual_m: float
+    # points, normals: float64 (K, 3) in the cloud's frame: points that are near, and the normals of
+    # their planes
     points: Floats
     normals: Floats
-    residuals_m: Floats
+    residuals_m: Floats  # float64 (K,), their signed distances from the planes
 
 
 def surface_fit(
@@ -207,21 +255,13 @@ def fit_weighted(
     surface_from_points: RigidTransform,
     max_distance_m: float,
 ) -> RigidTransform | None:
-    """Move points onto a surface that they are near already, point to plane.
+    """Move points (N, 3) onto a surface that they are near already, point to plane.
 
     Gauss-Newton on Cauchy's loss of the distances over their noise, whose scale follows their
     median: small_gicp's least squares give the far and noisy, and what only one of the two clouds
-    has, the same weight as the rest. Corresponding points are sought anew in every step.
-
-    Parameters
-    ----------
-    points : float64 (N, 3).
-    noise : float64 (N,), what the deviations of the points are proportional to.
-
-    Returns
-    -------
-    surface_from_points : or None where fewer than six points are within ``max_distance_m`` or they
-        do not determine the transform.
+    has, the same weight as the rest. Corresponding points are sought anew in every step. ``noise``
+    (N,) is what the deviations of the points are proportional to. None where fewer than six points
+    are within ``max_distance_m`` or they do not determine the transform.
     """
     transform = surface_from_points
     for _ in range(_MAX_ITERATIONS):
@@ -252,146 +292,3 @@ def fit_weighted(
         if np.linalg.norm(step) < _CONVERGED:
             break
     return transform
-
-
-@dataclass(frozen=True)
-class MapCloudOptions:
-    """Options of a map's cloud.
-
-    Parameters
-    ----------
-    depth : which depths are trusted.
-    max_references : depth maps that are read into the cloud.
-    voxel_m : of the cloud, metres.
-    margin_m : points this far from the query's are kept; depths that differ by less agree.
-    """
-
-    depth: DepthCloudOptions
-    max_references: int
-    voxel_m: float
-    margin_m: float
-
-
-def map_cloud(
-    query_depth: DepthView,
-    query_points: Floats,
-    cam_from_world: RigidTransform,
-    references: Sequence[str],
-    scene: RankingScene,
-    options: MapCloudOptions,
-) -> Floats:
-    """The map around a query's points under its estimated pose.
-
-    The depth maps of the references that overlap most with the query's, of those within 0.2 m and
-    10 deg of each other only one; where no reference has depth, the points of the map that the
-    references observe.
-
-    Parameters
-    ----------
-    query_points : float64 (N, 3) in the query camera's frame.
-    references : map images, best first.
-
-    Returns
-    -------
-    points : float64 (M, 3) in the world.
-    """
-    overlaps = _overlaps(query_depth, cam_from_world, references, scene, options)
-    if overlaps:
-        clouds = [np.zeros((0, 3))]
-        for name in _different_views(overlaps, scene, options.max_references):
-            cloud = _crop(
-                query_points, _depth_in_world(name, scene, options), cam_from_world, options
-            )
-            # a vote per image and voxel: a near image has more pixels there, not more right
-            clouds.append(downsample(cloud, options.voxel_m))
-        return np.concatenate(clouds)
-    observed = [scene.map_points(name) for name in references]
-    points = np.unique(np.concatenate([np.zeros((0, 3)), *observed]), axis=0)
-    return _crop(query_points, points, cam_from_world, options)
-
-
-def _overlaps(
-    query_depth: DepthView,
-    cam_from_world: RigidTransform,
-    references: Sequence[str],
-    scene: RankingScene,
-    options: MapCloudOptions,
-) -> list[tuple[str, float]]:
-    """References that have depth, and the share of it that agrees with the query's; most first."""
-    found = []
-    depth_from_world = query_depth.image_from_depth.inverse() @ cam_from_world
-    for name in references:
-        view = scene.map_depth(name)
-        if view is None:
-            continue
-        points = depth_cloud(view, options.depth, step_px=_OVERLAP_STEP_PX)
-        world_from_image = scene.map_pose(name).inverse()
-        agrees = _agrees(
-            query_depth, (depth_from_world @ world_from_image).apply(points), options.margin_m
-        )
-        found.append((name, float(agrees.mean()) if len(agrees) else 0.0))
-    # stable: of equals the better reference stays first
-    return sorted(found, key=lambda each: -each[1])
-
-
-def _different_views(
-    overlaps: Sequence[tuple[str, float]], scene: RankingScene, count: int
-) -> list[str]:
-    """The first references that overlap at all and do not repeat the view of an earlier one."""
-    names: list[str] = []
-    quats, centers = np.zeros((0, 4)), np.zeros((0, 3))
-    for name, overlap in overlaps:
-        if overlap <= 0 or len(names) == count:
-            break
-        pose = scene.map_pose(name)
-        quat, center = np.array(pose.quat_wxyz), pose.center()
-        near = np.linalg.norm(centers - center, axis=1) < _SAME_VIEW_M
-        if (near & (rotation_angles_deg(quats, quat) < _SAME_VIEW_DEG)).any():
-            continue
-        names.append(name)
-        quats, centers = np.vstack([quats, quat]), np.vstack([centers, center])
-    return names
-
-
-def _agrees(view: DepthView, points_in_depth: Floats, tolerance_m: float) -> NDArray[np.bool_]:
-    """Mask (N,) of points (N, 3) in the depth camera's frame that lie near a measured depth."""
-    pixels = px_from_cam(view.camera, points_in_depth)
-    height, width = view.depth_m.shape
-    with np.errstate(invalid="ignore"):
-        inside = (pixels >= 0).all(axis=1) & (pixels < (width, height)).all(axis=1)
-    column, row = pixels[inside].astype(np.int64).T
-    depth = view.depth_m[row, column].astype(np.float64)
-    with np.errstate(invalid="ignore"):
-        near = (depth > 0) & (np.abs(points_in_depth[inside, 2] - depth) <= tolerance_m)
-    agrees = np.zeros(len(points_in_depth), bool)
-    agrees[inside] = near
-    return agrees
-
-
-def _depth_in_world(name: str, scene: RankingScene, options: MapCloudOptions) -> Floats:
-    view = scene.map_depth(name)
-    if view is None:
-        return np.zeros((0, 3))
-    points = depth_cloud(
-        view,
-        options.depth,
-        image_camera=scene.map_camera(name),
-        image_mask=scene.map_mask(name),
-        step_px=_step_px(view.camera, options),
-    )
-    return scene.map_pose(name).inverse().apply(points)
-
-
-def _step_px(camera: Camera, options: MapCloudOptions) -> int:
-    """Pixels of a depth map that half a voxel covers at the greatest depth."""
-    return max(1, round(0.5 * options.voxel_m * focal_px(camera) / options.depth.max_depth_m))
-
-
-def _crop(
-    query_points: Floats, points: Floats, cam_from_world: RigidTransform, options: MapCloudOptions
-) -> Floats:
-    """Of points in the world, those in the box around the query's, margin included."""
-    low, high = query_points.min(axis=0), query_points.max(axis=0)
-    in_camera = cam_from_world.apply(points)
-    inside = (in_camera >= low - options.margin_m) & (in_camera <= high + options.margin_m)
-    return points[inside.all(axis=1)]

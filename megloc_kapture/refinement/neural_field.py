@@ -22,9 +22,7 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import pixel_rays
 from megloc_kapture.geometry.warping import WarpSource, scaled_camera, warp_to_view
 from megloc_kapture.nets.gaussians import DEFAULT_COUNT, Gaussians
-from megloc_kapture.nets.nerfw import NerfW
-from megloc_kapture.nets.radiance import Rays, Rendered
-from megloc_kapture.nets.triplane import TriPlane
+from megloc_kapture.nets.radiance import NerfW, Rays, Rendered, TriPlane
 from megloc_kapture.plugins import DepthView
 from megloc_kapture.values import Camera, Options, RigidTransform
 
@@ -40,12 +38,7 @@ _FIT_RATE, _FIT_STEPS, _FIT_RAYS, _FIT_OF = 0.1, 20, 512, 2048
 
 @dataclass(frozen=True, eq=False)
 class FieldView:
-    """An image to train on; shapes as of :class:`~.references.RenderingReference`.
-
-    Attributes
-    ----------
-    depth : taken with it; None where nothing was.
-    """
+    """An image to train on, as of :class:`~.references.RenderingReference`, maybe without depth."""
 
     name: str
     image: NDArray[np.uint8]
@@ -77,17 +70,11 @@ class FieldFrame(Options):
 
 @dataclass(frozen=True, eq=False)
 class FieldRendering:
-    """A view of a field.
+    """A view of a field."""
 
-    Attributes
-    ----------
-    image : uint8 (H, W, 3), RGB.
-    depth_m : float32 (H, W) along the optical axis, unit of the map; 0 where the field is mostly
-        empty.
-    camera : of the rendering: the view's, reduced.
-    """
-
+    # image, camera: uint8 (H, W, 3), RGB; the view's camera, reduced
     image: NDArray[np.uint8]
+    # float32 (H, W) along the optical axis, unit of the map; 0 where the field is mostly empty
     depth_m: Floats
     camera: Camera
 
@@ -97,10 +84,8 @@ def build_field(
 ) -> FieldModule:
     """An untrained field, its parameters drawn by torch's own generator.
 
-    Parameters
-    ----------
-    num_images, num_lights : rows of the transient and of the appearance embedding.
-    num_gaussians : of the kind of that name.
+    ``num_images`` and ``num_lights`` are rows of the transient and of the appearance embedding;
+    ``num_gaussians`` is of the kind of that name.
     """
     if kind == "gaussians":
         return Gaussians(num_images, num_lights, count=num_gaussians or DEFAULT_COUNT)
@@ -145,9 +130,7 @@ class NeuralField:
     def appearance_of(self, image: str) -> torch.Tensor | None:
         """Embedding (A,) of an image's light; None where the field has none of them.
 
-        Raises
-        ------
-        DataError : it was not trained on that image.
+        Raises DataError for an image that it was not trained on.
         """
         if image not in self.images:
             raise DataError(f"the field was not trained on an image {image!r}")
@@ -167,10 +150,8 @@ class NeuralField:
     ) -> FieldRendering:
         """Render a view, without what is transient.
 
-        Parameters
-        ----------
-        appearance : embedding (A,); the mean of all images' unless given.
-        max_side_px : of the rendering; the camera's own unless given.
+        ``appearance`` is an embedding (A,), the mean of all images' unless given; ``max_side_px``
+        of the rendering, the camera's own unless given.
         """
         camera = reduced(camera, max_side_px or max(camera.width, camera.height))
         shape = camera.height, camera.width
@@ -213,11 +194,9 @@ class NeuralField:
             if appearance is not None:
                 part = replace(part, appearance=appearance.expand(len(part.origins), -1))
             parts.append(self.module.render(part))
-        rgb, depth, opacity, beta, weights = (
-            torch.cat([getattr(one, name) for one in parts])
-            for name in ("rgb", "depth", "opacity", "beta", "weights")
-        )
-        return Rendered(rgb, depth, opacity, beta, weights, parts[0].transient_density)
+        names = ("rgb", "depth", "opacity", "beta", "weights")
+        joined = {name: torch.cat([getattr(one, name) for one in parts]) for name in names}
+        return replace(parts[0], coarse_rgb=None, **joined)
 
     def fit_appearance(
         self, rays: Rays, rgb: torch.Tensor, *, seed: int = 0
@@ -239,7 +218,9 @@ class NeuralField:
             rows = rows.to(self.device)
             part = replace(select(rays, rows), appearance=fitted.expand(len(rows), -1))
             # what is transient in the image must not pull on its light
-            loss = _huber(self.module.render(part).rgb - rgb[rows])
+            off = self.module.render(part).rgb - rgb[rows]
+            # linear from a tenth of full scale
+            loss = torch.nn.functional.huber_loss(off, torch.zeros_like(off), delta=0.1)
             (fitted.grad,) = torch.autograd.grad(loss, [fitted])
             optimizer.step()
         return fitted.detach()
@@ -273,11 +254,6 @@ class NeuralField:
 
     def _tensor(self, values: NDArray[np.floating]) -> torch.Tensor:
         return torch.from_numpy(np.asarray(values, np.float32)).to(self.device)
-
-
-def _huber(difference: torch.Tensor) -> torch.Tensor:
-    """Mean Huber loss of differences of colour, linear from a tenth of full scale."""
-    return torch.nn.functional.huber_loss(difference, torch.zeros_like(difference), delta=0.1)
 
 
 def select(rays: Rays, rows: slice | torch.Tensor) -> Rays:

@@ -46,19 +46,13 @@ _AGREES = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """A pose with what belongs to it at one level.
-
-    Attributes
-    ----------
-    cam_from_world : of the query.
-    gains, biases : float64 (G, C), of the references.
-    deviation : robust standard deviation of the residuals.
-    """
+    """A pose ``cam_from_world`` of the query with what belongs to it at one level."""
 
     cam_from_world: RigidTransform
+    # gains, biases: float64 (G, C), of the references
     gains: Float64
     biases: Float64
-    deviation: float
+    deviation: float  # robust standard deviation of the residuals
 
     @property
     def squared_scale(self) -> float:
@@ -79,8 +73,7 @@ class LevelProblem:
     Parameters
     ----------
     chosen : points of the references.
-    level : of the query.
-    camera : of the query, at its full size.
+    level, camera : of the query; the camera is at its full size.
     near : about its ``cam_from_world``, for how far away the points are.
     num_groups : references, also those of which there is no point; else as the points have them.
     """
@@ -108,27 +101,23 @@ class LevelProblem:
         scale_xy = np.array([level.scale_x, level.scale_y])
         self._query = level.values, level.valid, scale_xy, camera_of(camera)
 
+    def _of(self, chosen: ChosenPoints, level: Level) -> LevelProblem:
+        return LevelProblem(chosen, level, self.camera, self._near, num_groups=self.num_groups)
+
     def subset(self, which: NDArray[Any]) -> LevelProblem:
         """The same of some points, a mask (N,) or rows."""
-        return LevelProblem(
-            self.chosen.subset(which),
-            self.level,
-            self.camera,
-            self._near,
-            num_groups=self.num_groups,
-        )
+        return self._of(self.chosen.subset(which), self.level)
 
     def thinned(self, most: int) -> LevelProblem:
         """The same of at most so many points, still evenly spread."""
-        step = max(1, -(-len(self.chosen.points) // most))
-        return self.subset(np.arange(0, len(self.chosen.points), step)) if step > 1 else self
+        few = len(self.chosen.points) <= most
+        return self if few else self._of(self.chosen.thinned(most), self.level)
 
     def within(self, mask: NDArray[np.bool_]) -> LevelProblem:
         """The same on some pixels of the query, bool (H, W)."""
         size = self.level.valid.shape[1::-1]
         seen = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-        level = replace(self.level, valid=self.level.valid & seen)
-        return LevelProblem(self.chosen, level, self.camera, self._near, num_groups=self.num_groups)
+        return self._of(self.chosen, replace(self.level, valid=self.level.valid & seen))
 
     def rows(self, at: Alignment) -> Float64:
         """Residuals and derivatives, (N, C, 8), as ``photometric_kernels.evaluate`` has them."""
@@ -139,40 +128,26 @@ class LevelProblem:
         return out
 
     def _arguments(self, at: Alignment) -> tuple[Any, ...]:
-        return (
-            (self.chosen.points, self.chosen.values, self.chosen.groups),
-            self._query,
-            (
-                at.cam_from_world.rotation_matrix(),
-                np.array(at.cam_from_world.translation),
-                at.gains,
-                at.biases,
-            ),
-        )
+        pose = at.cam_from_world
+        placed = pose.rotation_matrix(), np.array(pose.translation), at.gains, at.biases
+        chosen = self.chosen.points, self.chosen.values, self.chosen.groups
+        return chosen, self._query, placed
 
     def nuisance_at(self, cam_from_world: RigidTransform) -> Alignment:
         """Gains, biases and deviation that fit best while the pose stays; by some of the points."""
-        return self.thinned(_NUISANCE_POINTS)._nuisance_at(cam_from_world)
-
-    def _nuisance_at(self, cam_from_world: RigidTransform) -> Alignment:
-        shape = (self.num_groups, self.chosen.values.shape[1])
+        few = self.thinned(_NUISANCE_POINTS)
+        values, groups = few.chosen.values, few.chosen.groups
+        shape = (self.num_groups, values.shape[1])
         at = Alignment(cam_from_world, np.ones(shape), np.zeros(shape), np.inf)
-        rows = self.rows(at)
+        rows = few.rows(at)
+        seen = ~np.isnan(rows[..., 0])
         for _ in range(_NUISANCE_STEPS):
-            steps = self.system_of(rows, at.squared_scale).nuisance_step()
+            steps = few.system_of(rows, at.squared_scale).nuisance_step()
             at = at.moved(cam_from_world, *steps)
-            groups = self.chosen.groups
-            rows[..., 0] = np.where(
-                np.isnan(rows[..., 0]),
-                np.nan,
-                at.gains[groups] * rows[..., 7] + at.biases[groups] - self.chosen.values,
-            )
-            at = Alignment(cam_from_world, at.gains, at.biases, _deviation(rows))
+            found = at.gains[groups] * rows[..., 7] + at.biases[groups] - values
+            rows[..., 0] = np.where(seen, found, np.nan)
+            at = replace(at, deviation=_deviation(rows))
         return at
-
-    def deviation(self, at: Alignment) -> float:
-        """Robust standard deviation of the residuals, from their median."""
-        return _deviation(self.rows(at))
 
     def system_of(self, rows: Float64, squared_scale: float) -> NormalEquations:
         """Normal equations of what :meth:`rows` gave, for the squared scale of the loss."""
@@ -217,6 +192,7 @@ def perturbed(cam_from_world: RigidTransform, step: Float64) -> RigidTransform:
 
 
 def _deviation(rows: Float64) -> float:
+    """Robust standard deviation of residuals (N, C, 8), from their median."""
     magnitudes = np.sqrt(np.square(rows[..., 0]).mean(1))
     seen = magnitudes[~np.isnan(magnitudes)]
     return float(deviation_by_median(seen)) if len(seen) else 0.0
@@ -224,21 +200,16 @@ def _deviation(rows: Float64) -> float:
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """Normal equations of pose, gains and biases.
+    """Normal equations of pose, gains and biases."""
 
-    Attributes
-    ----------
-    pose, mixed, own, pose_gradient, own_gradient : see ``photometric_kernels.normal_equations``;
-        ``pose`` is whole.
-    mean_cost : robust cost of a point.
-    count : of points that are seen.
-    """
-
+    # pose, mixed, own, pose_gradient, own_gradient: see ``photometric_kernels.normal_equations``;
+    # ``pose`` is whole
     pose: Float64
     mixed: Float64
     own: Float64
     pose_gradient: Float64
     own_gradient: Float64
+    # mean_cost, count: robust cost of a point, and of how many points that are seen
     mean_cost: float
     count: int
 
@@ -250,8 +221,10 @@ class NormalEquations:
         return cls(pose, mixed, own, pose_gradient, own_gradient, cost / max(count, 1), count)
 
     def reduced(self, damping: float = 0.0) -> tuple[Float64, Float64, Float64] | None:
-        """Matrix (6, 6) and gradient (6,) of the pose without gains and biases, and what those are
-        multiplied by, (G, C, 6, 2)."""
+        """Matrix (6, 6) and gradient (6,) of the pose without gains and biases.
+
+        Third what those are multiplied by, (G, C, 6, 2). None where a number is not finite.
+        """
         # a reference that is not seen has nothing to say: its block is still invertible
         gain, bias = _solve_pairs(self.own[:, :, None], self.mixed)
         projection = np.stack([gain, bias], axis=-1)
@@ -273,8 +246,7 @@ class NormalEquations:
             pose_step = np.asarray(np.linalg.solve(matrix, -gradient), np.float64)
         except np.linalg.LinAlgError:
             return None
-        gain_step, bias_step = self.nuisance_step(pose_step)
-        return pose_step, gain_step, bias_step
+        return pose_step, *self.nuisance_step(pose_step)
 
     def nuisance_step(self, pose_step: Float64 | None = None) -> tuple[Float64, Float64]:
         """Steps of gains and biases (G, C) beside a step of the pose (6,), or while it stays."""
@@ -305,11 +277,7 @@ def _solve_pairs(own: Float64, right: Float64) -> tuple[Float64, Float64]:
 
 
 def minimise(
-    problem: LevelProblem,
-    start: Alignment,
-    *,
-    last_step_px: float = 0.01,
-    rounds: int = 2,
+    problem: LevelProblem, start: Alignment, *, last_step_px: float, rounds: int = 2
 ) -> Alignment:
     """The alignment of least cost near one, to a step of so many pixels of the level.
 
@@ -318,7 +286,7 @@ def minimise(
     at = start
     for _ in range(rounds):
         at = _levenberg_marquardt(problem, at, last_step_px)
-        at = replace(at, deviation=problem.deviation(at))
+        at = replace(at, deviation=_deviation(problem.rows(at)))
     return at
 
 

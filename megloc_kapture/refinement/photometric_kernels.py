@@ -17,12 +17,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.compiling import compiled_loop
 from megloc_kapture.geometry.cameras import normalized_from_px
-from megloc_kapture.geometry.projection import (
-    PINHOLES,
-    distorted,
-    model_id,
-    packed_params,
-)
+from megloc_kapture.geometry.projection import PINHOLES, distorted, model_id, packed_params
 from megloc_kapture.values import Camera
 
 _ROWS = 256  # evaluated at a time
@@ -49,12 +44,9 @@ def _project(camera, r, t, points, shown_at):
     """Points in the camera of pose ``r``, ``t``, and where its image shows them.
 
     A lens' polynomial holds inside the image; past its turning point it may lead back into it. So a
-    point is shown only as far off the axis as the image reaches.
-
-    Parameters
-    ----------
-    shown_at : (11, N or more), filled with the points' coordinates there; px and py, NaN where not
-        shown; and the derivatives of px by these coordinates, and of py.
+    point is shown only as far off the axis as the image reaches. ``shown_at``: (11, N or more),
+    filled with the points' coordinates there; px and py, NaN where not shown; and the derivatives
+    of px by these coordinates, and of py.
     """
     model, p, reach2 = camera
     for k in range(len(points)):
@@ -134,8 +126,8 @@ def evaluate(chosen, query, alignment, out):
     query : a level (h, w, C), where it is valid (h, w), its pixels per pixel of the camera (2,),
         and the camera, of :func:`camera_of`.
     alignment : rotation and translation of ``cam_from_world``, gains and biases (G, C).
-    out : filled per point and channel with the residual, its six derivatives by a left
-        perturbation of the pose, rotation first, and the query's value.
+    out : filled per point and channel with the residual, its six derivatives by a left perturbation
+        of the pose, rotation first, and the query's value.
     """
     points, values, groups = chosen
     level, valid, scale_xy, camera = query
@@ -179,18 +171,15 @@ def normal_equations(rows, groups, squared_scale, sums):
 
     A point's squared length ``e^2`` is the mean of its squared residuals over channels; its cost is
     Geman and McClure's ``s^2 / 2  e^2 / (s^2 + e^2)`` and its weight ``(1 + e^2 / s^2)^-2``; with
-    an infinite scale s^2 both are those of least squares.
+    an infinite scale s^2 both are those of least squares. Returns the sum of the costs, and of how
+    many points.
 
     Parameters
     ----------
-    rows : (N, C, 8). groups : (N,).
-    sums : added to. Of the pose (6, 6), its upper half; of the pose with gain and bias
-        (G, C, 6, 2); of these, gain gain, gain bias, bias bias (G, C, 3); the gradients of the pose
-        (6,) and of gain and bias (G, C, 2).
-
-    Returns
-    -------
-    The sum of the costs, and of how many points.
+    rows, groups : (N, C, 8), and (N,).
+    sums : added to. Of the pose (6, 6), its upper half; of the pose with gain and bias (G, C, 6,
+        2); of these, gain gain, gain bias, bias bias (G, C, 3); the gradients of the pose (6,) and
+        of gain and bias (G, C, 2).
     """
     pose, mixed, own, pose_gradient, own_gradient = sums
     channels = rows.shape[1]
@@ -280,11 +269,8 @@ def splat_depths(points, camera, size_xy, cell_px, r, t, nearest, cells, depths)
 def strongest_per_cell(x, y, energy, wanted, cell_px, best):
     """Of the wanted points in each cell of a level the one where ``energy`` (h, w) is largest.
 
-    Parameters
-    ----------
-    x, y : (N,), pixels of the level. wanted : bool (N,).
-    best : int64 (rows, columns), filled with the point's index, -1 where none has any energy; of
-        equals the first.
+    ``x`` and ``y`` (N,) are pixels of the level, ``wanted`` is bool (N,). ``best``, int64 (rows,
+    columns), is filled with the point's index, -1 where none has any energy; of equals the first.
     """
     best[:] = -1
     h, w = energy.shape

@@ -1,16 +1,17 @@
-"""Images as photometric alignment compares them: pyramids of values, and the points chosen of them.
+"""Images as photometric alignment compares them: points of depth, pyramids of values, choice.
 
-What a mask leaves out never enters a value: every mean is taken over the pixels that are used
-(normalised convolution, Knutsson and Westin, CVPR 1993). A reference image is compared at points
-and not at all its pixels: those with the strongest gradient in the cells of a grid, as direct
-odometry chooses them (Engel et al., "Direct Sparse Odometry", PAMI 2018, section 3.2).
+A reference image is compared at pixels of its depth map, so that the depth camera may be another
+one than the image's; and not at all of them, but at those with the strongest gradient in the cells
+of a grid, as direct odometry chooses them (Engel et al., "Direct Sparse Odometry", PAMI 2018,
+section 3.2). What a mask leaves out never enters a value: every mean is taken over the pixels that
+are used (normalised convolution, Knutsson and Westin, CVPR 1993).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, Literal
 
 import cv2
@@ -18,10 +19,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.refinement.depth_points import DepthPoints
+from megloc_kapture.geometry.cameras import bearing_rays, project
+from megloc_kapture.plugins import DepthView
+from megloc_kapture.values import Camera, RigidTransform
 
+# depth pixels looked at along the longer side of a depth map; about four per point
+_GRID = 320
+# second difference of inverse depth, over it, from which a pixel is on an edge: planes have none
+_JUMP = 0.05
+# cells of an image in which the nearest surface hides others, along its longer side
+_CELLS = 80
+# a point hides those that are further by more than this share: a cell of slanted ground has as much
+_HIDES = 0.15
+Float64 = NDArray[np.float64]
 Appearance = Literal["normalised", "colours", "intensity", "gradients"]
 FeatureMaps = Callable[[NDArray[np.uint8]], NDArray[np.floating[Any]]]
+"""A dense network: RGB image, uint8 (H, W, 3), to feature maps (C, h, w) over the same view."""
 _BLUR_PX = 0.8  # before each halving, and of the values: bilinear reading needs smooth ones
 _WINDOW_PX = 17  # in which contrast is normalised
 # of the mean local variance, which local variances are raised by: flat areas stay flat
@@ -29,26 +42,122 @@ _FLAT = 0.1
 _SMALLEST_SIDE_PX = 16
 _HALF = 0.5  # share of a pixel that must be used
 Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 
-"""A dense network: RGB image, uint8 (H, W, 3), to feature maps (C, h, w) over the same view."""
+@dataclass(frozen=True, eq=False)
+class DepthPoints:
+    """Points (N, 3) in the world, float64, and where a reference image shows them (N, 2)."""
+
+    points: Float64
+    px: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class Visibility:
+    """Points of several references that a camera sees."""
+
+    # per reference bool (N,), the points inside the image that no other hides
+    seen: tuple[NDArray[np.bool_], ...]
+    # bool (rows, columns), the cells of the image in which there is a point
+    covered: NDArray[np.bool_]
+
+
+def lift_points(camera: Camera, cam_from_world: RigidTransform, depth: DepthView) -> DepthPoints:
+    """Points of a depth map that its image sees; none on edges of depth.
+
+    ``camera`` and ``cam_from_world`` are of the image. Raises DataError for a depth map that has
+    not the size of its camera.
+    """
+    if depth.depth_m.shape != (depth.camera.height, depth.camera.width):
+        raise DataError(
+            f"a depth map of {depth.depth_m.shape} does not fit a camera of "
+            f"{depth.camera.width}x{depth.camera.height}"
+        )
+    rows, columns, rays = _grid(depth.camera)
+    inverse = _inverse_depth(depth.depth_m)
+    middle = inverse[rows, columns]
+    bend = np.zeros_like(middle)
+    h, w = inverse.shape
+    for down, across in ((1, 0), (0, 1)):
+        # NaN, thus no point, beside a pixel without depth
+        after = inverse[np.minimum(rows + down, h - 1), np.minimum(columns + across, w - 1)]
+        before = inverse[np.maximum(rows - down, 0), np.maximum(columns - across, 0)]
+        bend = np.maximum(bend, np.abs(after + before - 2 * middle))
+    with np.errstate(invalid="ignore"):
+        smooth = bend <= _JUMP * middle
+    points = rays[smooth] / middle[smooth, None]
+    if depth.camera == camera and depth.image_from_depth == RigidTransform.identity():
+        px = np.stack([columns[smooth] + 0.5, rows[smooth] + 0.5], axis=1)
+    else:
+        points = depth.image_from_depth.apply(points)
+        px = project(camera, RigidTransform.identity(), points)
+        inside = ((px >= 0) & (px < (camera.width, camera.height))).all(1)
+        points, px = points[inside], px[inside]
+        # what the depth camera sees past an edge may be hidden from the image
+        alone = DepthPoints(points, px)
+        seen = visibility([alone], camera, RigidTransform.identity()).seen[0]
+        points, px = points[seen], px[seen]
+    return DepthPoints(cam_from_world.inverse().apply(points), px)
+
+
+def visibility(
+    references: Sequence[DepthPoints], camera: Camera, cam_from_world: RigidTransform
+) -> Visibility:
+    """Points of several references that a camera sees, by a coarse z-buffer."""
+    from megloc_kapture.refinement.photometric_kernels import camera_of, splat_depths
+
+    sides = np.array([camera.width, camera.height], np.float64)
+    cell_px = max(camera.width, camera.height) / _CELLS
+    shape = (int(np.ceil(camera.height / cell_px)), int(np.ceil(camera.width / cell_px)))
+    nearest = np.full(shape, np.inf)
+    rotation, translation = cam_from_world.rotation_matrix(), np.array(cam_from_world.translation)
+    seen_by, splats = (camera_of(camera), sides, cell_px, rotation, translation), []
+    for reference in references:
+        count = len(reference.points)
+        cells, depths = np.empty(count, np.int64), np.empty(count)
+        splat_depths(reference.points, *seen_by, nearest, cells, depths)
+        splats.append((cells, depths))
+    limit = nearest.ravel() * (1.0 + _HIDES)
+    seen = tuple((cells >= 0) & (depths <= limit[cells]) for cells, depths in splats)
+    return Visibility(seen, np.isfinite(nearest))
+
+
+def usable_cells(valid: NDArray[np.bool_], shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """Mask (rows, columns) of the cells of an image that are valid in their middle."""
+    h, w = valid.shape
+    rows = ((np.arange(shape[0]) + 0.5) * h / shape[0]).astype(np.int64)
+    columns = ((np.arange(shape[1]) + 0.5) * w / shape[1]).astype(np.int64)
+    return valid[np.ix_(rows, columns)]
+
+
+def _inverse_depth(depth_m: NDArray[np.float32]) -> Float64:
+    """1/m, NaN where nothing is known."""
+    depth = depth_m.astype(np.float64)
+    known = np.isfinite(depth) & (depth > 0)
+    return np.where(known, 1.0 / np.where(known, depth, 1.0), np.nan)
+
+
+@lru_cache(maxsize=4)
+def _grid(camera: Camera) -> tuple[NDArray[np.int64], NDArray[np.int64], Float64]:
+    """Rows (N,) and columns (N,) of the pixels looked at, and their rays (N, 3) of unit depth."""
+    stride = max(1, -(-max(camera.width, camera.height) // _GRID))
+    sides = (np.arange(stride // 2, n, stride) for n in (camera.height, camera.width))
+    grid = np.meshgrid(*sides, indexing="ij")
+    rows, columns = (side.ravel().astype(np.int64) for side in grid)
+    rays = bearing_rays(camera, np.stack([columns + 0.5, rows + 0.5], axis=1))
+    for array in (rows, columns, rays):
+        array.setflags(write=False)
+    return rows, columns, rays
 
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """One level of an image's pyramid.
+    """One level of an image's pyramid."""
 
-    Attributes
-    ----------
-    values : float32 (h, w, C).
-    valid : bool (h, w), where the values may be used.
-    scale_x, scale_y : pixels of the level per pixel of the image: a pixel (u, v) of the image, the
-        first pixel's centre at (0.5, 0.5), is (u scale_x, v scale_y) of the level.
-    """
-
-    values: Float32
-    valid: NDArray[np.bool_]
+    values: Float32  # float32 (h, w, C)
+    valid: NDArray[np.bool_]  # bool (h, w), where the values may be used
+    # scale_x, scale_y: pixels of the level per pixel of the image: a pixel (u, v) of the image, the
+    # first pixel's centre at (0.5, 0.5), is (u scale_x, v scale_y) of the level
     scale_x: float
     scale_y: float
 
@@ -77,12 +186,11 @@ def build_pyramid(
     appearance: Appearance = "normalised",
     features: FeatureMaps | None = None,
 ) -> list[Level]:
-    """The levels of an image, finest first.
+    """The levels of an image, finest first; raises DataError for what does not fit it.
 
     Parameters
     ----------
-    image : uint8 (H, W, 3), RGB.
-    mask : bool (H, W), True = use.
+    image, mask : RGB, uint8 (H, W, 3), and bool (H, W), True = use.
     levels : at most; none is smaller than 16 px.
     max_side_px : longer side of the finest level; larger images are reduced.
     appearance : ``intensity`` is brightness in [0, 1]; ``normalised`` is brightness of zero mean
@@ -90,10 +198,6 @@ def build_pyramid(
         blue; ``gradients`` is the magnitude of the gradient of brightness.
     features : compare these maps of the image instead; masked pixels are shown to it in the mean
         colour of the others.
-
-    Raises
-    ------
-    DataError : mask or feature maps of a shape that does not fit.
     """
     height, width = image.shape[:2]
     if mask is not None and mask.shape != (height, width):
@@ -176,27 +280,19 @@ def _gradient_magnitude(
     down, across = np.gradient(plane)
     magnitude = np.sqrt(down * down + across * across).astype(np.float32)
     eroded = cv2.erode(
-        valid.astype(np.uint8),
-        np.ones((3, 3), np.uint8),
-        borderType=cv2.BORDER_REPLICATE,
+        valid.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE
     )
     return magnitude[..., None], eroded.astype(bool)
 
 
 @dataclass(frozen=True, eq=False)
 class ChosenPoints:
-    """Points of several references at one level of their pyramids.
+    """Points of several references at one level of their pyramids."""
 
-    Attributes
-    ----------
-    points : float64 (N, 3), in the world.
-    values : float64 (N, C), in their reference.
-    groups : int64 (N,), of which reference each is.
-    """
-
+    # points, values: float64 (N, 3) in the world, and (N, C) in their reference
     points: Float64
     values: Float64
-    groups: NDArray[np.int64]
+    groups: NDArray[np.int64]  # int64 (N,), of which reference each is
 
     def thinned(self, most: int) -> ChosenPoints:
         """At most so many of them, still evenly spread."""
@@ -216,15 +312,9 @@ def choose_points(
 ) -> ChosenPoints:
     """At most ``max_points`` of each reference, evenly spread, with their values at a level.
 
-    Parameters
-    ----------
-    levels : of each reference, of one kind.
-    wanted : bool (N,) of each reference: those to choose from.
+    ``wanted`` are masks (N,), one for each reference, of those to choose from.
     """
-    from megloc_kapture.refinement.photometric_kernels import (
-        read_values,
-        strongest_per_cell,
-    )
+    from megloc_kapture.refinement.photometric_kernels import read_values, strongest_per_cell
 
     points, values, groups = [], [], []
     for group, (reference, level, ours) in enumerate(zip(references, levels, wanted, strict=True)):
@@ -234,10 +324,7 @@ def choose_points(
         x, y = reference.px[:, 0] * level.scale_x, reference.px[:, 1] * level.scale_y
         strongest_per_cell(x, y, level.gradient_energy, ours, cell_px, best)
         rows = best[best >= 0]
-        read, found = (
-            np.empty((len(rows), level.values.shape[2])),
-            np.empty(len(rows), np.bool_),
-        )
+        read, found = np.empty((len(rows), level.values.shape[2])), np.empty(len(rows), np.bool_)
         read_values(level.values, level.valid, x[rows] - 0.5, y[rows] - 0.5, read, found)
         points.append(reference.points[rows[found]])
         values.append(read[found])

@@ -25,12 +25,11 @@ from megloc_kapture.geometry.cameras import focal_px
 from megloc_kapture.plugins import PoseRefinement, RankingScene
 from megloc_kapture.refinement.acceptance import (
     Candidate,
+    RenderingOptions,
     accept_or_keep,
     correlation,
     perturbed_starts,
 )
-from megloc_kapture.refinement.consistency import Displacement, refine_held_out
-from megloc_kapture.refinement.depth_points import Visibility, usable_cells, visibility
 from megloc_kapture.refinement.photometric import (
     MIN_POINTS,
     Alignment,
@@ -38,16 +37,25 @@ from megloc_kapture.refinement.photometric import (
     minimise,
     unoccluded_points,
 )
-from megloc_kapture.refinement.pyramid import ChosenPoints, FeatureMaps, Level, choose_points
+from megloc_kapture.refinement.pyramid import (
+    ChosenPoints,
+    FeatureMaps,
+    Level,
+    Visibility,
+    choose_points,
+    usable_cells,
+    visibility,
+)
 from megloc_kapture.refinement.references import (
     REFERENCES,
+    Displacement,
     PyramidKind,
     ReferenceImages,
-    RenderingOptions,
     RenderingQuery,
     RenderingReference,
     pyramid_of,
     reference_of,
+    refine_held_out,
 )
 from megloc_kapture.values import Camera, RigidTransform
 
@@ -78,21 +86,17 @@ def refine_by_rendering(
 ) -> PoseRefinement:
     """Refine the pose of an image by what reference images show, lifted by their depth.
 
+    Returns the new pose with its covariance, or the old one and the reason. ``measures``: cost (of
+    the robust loss, 0 to 0.5), correlation and overlap before and after, by how many of its
+    standard errors the cost falls, how far the pose moved in m and deg, the points and references
+    used. Raises DataError for images, masks, depth maps or feature maps that do not fit their
+    cameras.
+
     Parameters
     ----------
     references : all of them are used; those that do not see the same cost time only.
     cam_from_world : of the query, in the frame of the references' poses, metres.
     features : compare a dense network's feature maps instead of brightness.
-
-    Returns
-    -------
-    The new pose with its covariance, or the old one and the reason. ``measures``: cost (of the
-    robust loss, 0 to 0.5), correlation and overlap before and after, by how many of its standard
-    errors the cost falls, how far the pose moved in m and deg, the points and references used.
-
-    Raises
-    ------
-    DataError : images, masks, depth maps or feature maps do not fit their cameras.
     """
     options = options or RenderingOptions()
     # what is independent goes to two threads; the order of results is that of the work
@@ -109,16 +113,10 @@ def judge_by_rendering(
     *,
     judged: NDArray[np.bool_] | None = None,
 ) -> PoseRefinement:
-    """Judge a pose that was found by other means, aligned at the finest level, as above.
+    """Judge a pose that was found by other means, aligned at the finest level; raises as above.
 
-    Parameters
-    ----------
-    start, found : the old ``cam_from_world`` and the one that may replace it.
-    judged : bool (H, W), pixels of the query by which it is accepted or not; all unless given.
-
-    Raises
-    ------
-    DataError : as above.
+    ``start`` and ``found``: the old ``cam_from_world`` and the one that may replace it; ``judged``:
+    bool (H, W), pixels of the query by which it is accepted or not; all unless given.
     """
     with ThreadPoolExecutor(2) as threads:
         return _Refining(query, references, options, None, threads).judge(start, found, judged)
@@ -132,21 +130,18 @@ def displacement_by_rendering(
     *,
     features: FeatureMaps | None = None,
 ) -> Displacement | None:
-    """Displacement by :func:`refine_by_rendering` of a pose that should be right.
+    """Displacement by :func:`refine_by_rendering` of a pose that should be right; raises as there.
 
     Where it keeps the pose, how far the least cost nearby is from it. None where the references do
     not determine the pose: they cover too little, correlate too little, or lead out of its bounds.
-
-    Raises
-    ------
-    DataError : as there.
     """
     options = options or RenderingOptions()
     with ThreadPoolExecutor(2) as threads:
         refining = _Refining(query, references, options, features, threads)
         refined = refining.refine(cam_from_world)
         if not refined.accepted:
-            refined = refining.refine_nearby(cam_from_world)
+            # the same at the finest level alone, without looking around
+            refined = refining.judge(cam_from_world, cam_from_world, None)
     found = refined.measures
     if "squared_distance" not in found or (
         found["moved_m"] > options.max_translation_m
@@ -168,7 +163,7 @@ class _Refining:
         features: FeatureMaps | None,
         threads: Executor,
     ) -> None:
-        self.options = options
+        self.options, self.least_overlap = options, max(options.min_overlap, 1e-9)
         self.camera = query.camera
         self.threads = threads
         kind = PyramidKind(options.levels, options.max_side_px, options.appearance, features)
@@ -181,7 +176,7 @@ class _Refining:
     def refine(self, start: RigidTransform) -> PoseRefinement:
         """See :func:`refine_by_rendering`."""
         sight, overlap = self._visibility(start)
-        if sight is None:
+        if overlap < self.least_overlap:
             return _uncovered(start, overlap)
         coarsest = min([len(self.query_levels), *map(len, self.levels)]) - 1
         searched = self._decide(start, overlap, self._align_from_search(coarsest, start, sight))
@@ -192,32 +187,25 @@ class _Refining:
         direct = self._decide(start, overlap, self._align(0, start, sight))
         if not searched.accepted:
             return direct if direct.accepted else searched
-        return max((direct, searched), key=_correlation_after)
-
-    def refine_nearby(self, start: RigidTransform) -> PoseRefinement:
-        """The same at the finest level alone, without looking around."""
-        sight, overlap = self._visibility(start)
-        if sight is None:
-            return _uncovered(start, overlap)
-        return self._decide(start, overlap, self._align(0, start, sight))
+        return max((direct, searched), key=lambda each: each.measures.get("correlation_after", -1))
 
     def judge(
         self, start: RigidTransform, pose: RigidTransform, judged: NDArray[np.bool_] | None
     ) -> PoseRefinement:
         """See :func:`judge_by_rendering`."""
         sight, overlap = self._visibility(pose)
-        if sight is None:
+        if overlap < self.least_overlap:
             return _uncovered(start, overlap)
         found = self._align(0, pose, sight)
         if found is not None and judged is not None:
             found = replace(found, problem=found.problem.within(judged))
         return self._decide(start, overlap, found)
 
-    def _visibility(self, start: RigidTransform) -> tuple[Visibility | None, float]:
-        """Visibility of the references, if it is enough, and the share of the query covered."""
-        sight = visibility(self.points, self.camera, start)
-        overlap = self._overlap(sight)
-        return None if overlap < max(self.options.min_overlap, 1e-9) else sight, overlap
+    def _visibility(self, pose: RigidTransform) -> tuple[Visibility, float]:
+        """Visibility of the references, and the share of the query's usable cells they cover."""
+        sight = visibility(self.points, self.camera, pose)
+        usable = usable_cells(self.query_levels[0].valid, sight.covered.shape)
+        return sight, float((sight.covered & usable).sum() / max(usable.sum(), 1))
 
     def _align_from_search(
         self, coarsest: int, start: RigidTransform, sight: Visibility
@@ -245,7 +233,8 @@ class _Refining:
         found = problem.nuisance_at(pose)
         for step_px in (_COARSE_STEP_PX, _COARSE_STEP_PX if number else _LAST_STEP_PX):
             # what is in front of the scene shows the better the better the pose
-            free = self._without_occluders(problem, found)
+            unhidden = unoccluded_points(problem, found)
+            free = problem.subset(unhidden) if unhidden.sum() >= MIN_POINTS else problem
             found = minimise(free, found, last_step_px=step_px, rounds=1 if number else 2)
         return Candidate(problem, free, found)
 
@@ -258,13 +247,9 @@ class _Refining:
 
     def _best_rotation(self, problem: LevelProblem, pose: RigidTransform) -> RigidTransform:
         """The rotation of the camera that leads to the best pose, of those that correlate best."""
+        chosen, max_deg = problem.chosen.thinned(_SEARCH_POINTS), self.options.search_deg
         starts = best_rotations(
-            problem.chosen.thinned(_SEARCH_POINTS),
-            problem.level,
-            self.camera,
-            pose,
-            max_deg=self.options.search_deg,
-            count=_MAX_STARTS,
+            chosen, problem.level, self.camera, pose, max_deg=max_deg, count=_MAX_STARTS
         )
         fewer = problem.thinned(_START_POINTS)
         return self._best(fewer, self.threads.map(fewer.nuisance_at, starts))
@@ -280,33 +265,19 @@ class _Refining:
         tried = list(self.threads.map(align, starts))
         return max(tried, key=partial(correlation, problem)).cam_from_world
 
-    def _without_occluders(self, problem: LevelProblem, at: Alignment) -> LevelProblem:
-        free = unoccluded_points(problem, at)
-        return problem.subset(free) if free.sum() >= MIN_POINTS else problem
-
     def _decide(
         self, start: RigidTransform, old_overlap: float, found: Candidate | None
     ) -> PoseRefinement:
         if found is None:
             reason = f"fewer than {MIN_POINTS} points to compare"
             return PoseRefinement(start, reason, {"overlap_before": old_overlap})
-        pose = found.alignment.cam_from_world
-        overlap = self._overlap(visibility(self.points, self.camera, pose))
+        _, overlap = self._visibility(found.alignment.cam_from_world)
         return accept_or_keep(start, found, (old_overlap, overlap), self.options)
-
-    def _overlap(self, sight: Visibility) -> float:
-        """Share of the query's usable cells in which references have points."""
-        usable = usable_cells(self.query_levels[0].valid, sight.covered.shape)
-        return float((sight.covered & usable).sum() / max(usable.sum(), 1))
 
 
 def _uncovered(start: RigidTransform, overlap: float) -> PoseRefinement:
     reason = f"references with depth cover {overlap:.0%} of the query"
     return PoseRefinement(start, reason, {"overlap_before": overlap})
-
-
-def _correlation_after(refined: PoseRefinement) -> float:
-    return refined.measures.get("correlation_after", -1.0)
 
 
 class Rendering:
@@ -319,10 +290,7 @@ class Rendering:
     Options = RenderingOptions
 
     def __init__(
-        self,
-        options: RenderingOptions | None = None,
-        *,
-        features: FeatureMaps | None = None,
+        self, options: RenderingOptions | None = None, *, features: FeatureMaps | None = None
     ) -> None:
         self.options = options or RenderingOptions()
         self.features = features
@@ -331,7 +299,7 @@ class Rendering:
     def hold_out(
         self, image: str, images: ReferenceImages, scene: RankingScene
     ) -> Displacement | None:
-        """Displacement of a map image; see :func:`~.consistency.refine_held_out`."""
+        """Displacement of a map image; see :func:`~.references.refine_held_out`."""
         displace = partial(displacement_by_rendering, options=self.options, features=self.features)
         return refine_held_out(
             image, images, scene, displace, max_references=self.options.max_references
@@ -369,14 +337,9 @@ def best_rotations(
 ) -> list[RigidTransform]:
     """The poses, turned by up to ``max_deg``, under which references and query correlate best.
 
-    Parameters
-    ----------
-    chosen, level : the points of the references, and that level of the query.
-    camera, cam_from_world : of the query.
-
-    Returns
-    -------
     The given pose, then at most ``count`` turned ones that differ from each other, best first.
+    ``chosen`` and ``level``: the points of the references, and that level of the query; ``camera``
+    and ``cam_from_world``: of the query.
     """
     from megloc_kapture.refinement.photometric_kernels import camera_of, correlations
 
@@ -385,20 +348,12 @@ def best_rotations(
     vectors = rotation_grid(level, camera, max_deg)
     quats = _quats(vectors)
     rotations = np.stack([_rotation(quat).rotation_matrix() for quat in quats])
+    in_camera = cam_from_world.apply(chosen.points), chosen.values, chosen.groups
+    scale_xy = np.array([level.scale_x, level.scale_y])
+    query = level.values, level.valid, scale_xy, camera_of(camera)
+    sums = np.empty((int(chosen.groups.max()) + 1, chosen.values.shape[1], 6))
     score = np.empty(len(rotations))
-    num_groups = int(chosen.groups.max()) + 1
-    correlations(
-        (cam_from_world.apply(chosen.points), chosen.values, chosen.groups),
-        (
-            level.values,
-            level.valid,
-            np.array([level.scale_x, level.scale_y]),
-            camera_of(camera),
-        ),
-        rotations,
-        np.empty((num_groups, chosen.values.shape[1], 6)),
-        score,
-    )
+    correlations(in_camera, query, rotations, sums, score)
     result = [cam_from_world]
     taken: list[Float64] = []
     apart = _NEAR_STEPS * _step_rad(level, camera)

@@ -28,13 +28,15 @@ from megloc_kapture.io.kapture import (
 )
 from megloc_kapture.io.tables import DepthRow, write_depth_rows
 from megloc_kapture.mapping.depth import LiftingOptions, lift_with_covariances
-from megloc_kapture.mvs.consistency import (
+from megloc_kapture.mvs.views import (
     AgreementOptions,
     agreeing_views,
+    choose_sources,
     confirmed,
+    depth_range,
+    stereo_view,
     with_pose_errors,
 )
-from megloc_kapture.mvs.views import choose_sources, depth_range, stereo_view
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import (
     DEPTH_ESTIMATORS,

@@ -35,11 +35,8 @@ from megloc_kapture.plugins import (
     PoseRefinement,
     RankingScene,
 )
-from megloc_kapture.refinement.references import (
-    RenderingOptions,
-    RenderingQuery,
-    RenderingReference,
-)
+from megloc_kapture.refinement.acceptance import RenderingOptions
+from megloc_kapture.refinement.references import RenderingQuery, RenderingReference
 from megloc_kapture.refinement.rendering import judge_by_rendering
 from megloc_kapture.values import Camera, Device, Failure, ImageFeatures, Options, RigidTransform
 

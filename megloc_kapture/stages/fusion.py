@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.kapture import KaptureFolder, write_ply
-from megloc_kapture.mvs.consistency import AgreementOptions, agreeing_views
-from megloc_kapture.mvs.views import pinhole_matrix, stereo_view
+from megloc_kapture.mvs.views import AgreementOptions, agreeing_views, pinhole_matrix, stereo_view
 from megloc_kapture.plugins import StereoView
 from megloc_kapture.stages.local_features import read_image_of
 from megloc_kapture.stages.rigs import depth_records

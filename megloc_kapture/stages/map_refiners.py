@@ -26,14 +26,14 @@ from megloc_kapture.plugins import (
     RankingScene,
     chosen_by_name,
 )
-from megloc_kapture.refinement.consistency import (
+from megloc_kapture.refinement.references import (
     Consistency,
     Displacement,
     HoldsOut,
+    ReferenceImages,
     judge_consistency,
     spread_names,
 )
-from megloc_kapture.refinement.references import ReferenceImages
 from megloc_kapture.stages.kept_items import Digest, map_inputs
 from megloc_kapture.stages.ranking_scene import KaptureScene, image_inputs
 from megloc_kapture.stages.restrictions import Restrictions

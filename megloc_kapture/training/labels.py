@@ -53,10 +53,8 @@ class LabelOptions(Options):
 class PosedView:
     """An image whose depth and pose are known.
 
-    Attributes
-    ----------
-    camera, cam_from_world : of the image, in the resolution that keypoints are given in.
-    depth : the depth map of its moment, in its own resolution.
+    ``camera`` is in the resolution that keypoints are given in, ``depth`` the depth map of its
+    moment, in its own.
     """
 
     camera: Camera
@@ -68,10 +66,8 @@ class PosedView:
 class Labels:
     """Labels of the N and M keypoints of two images.
 
-    Attributes
-    ----------
-    partner_a : int64 (N,): the row in b, UNMATCHED or IGNORED.
-    partner_b : int64 (M,): the row in a, UNMATCHED or IGNORED.
+    ``partner_a`` is int64 (N,), the row in b, UNMATCHED or IGNORED; ``partner_b`` (M,) the row in
+    a.
     """
 
     partner_a: NDArray[np.int64]
@@ -94,11 +90,7 @@ def labels_of_views(
 
     A keypoint without depth is unmatched where it is farther than ``negative_px`` (Sampson
     distance) from the epipolar curves of all keypoints that have no partner; otherwise it is
-    ignored.
-
-    Parameters
-    ----------
-    px_a, px_b : (N, 2) and (M, 2), COLMAP's pixel origin.
+    ignored. ``px_a`` and ``px_b`` are (N, 2) and (M, 2), of COLMAP's pixel origin.
     """
     options = options or LabelOptions()
     a_in_b, known_a, visible_a = reproject(px_a, a, b, options)
@@ -126,13 +118,9 @@ def labels_of_homography(
     size_b: tuple[int, int],
     options: LabelOptions | None = None,
 ) -> Labels:
-    """Labels by a homography between the pixels of two images.
+    """Labels by a homography (3, 3) between the pixels, of COLMAP's origin, of two images.
 
-    Parameters
-    ----------
-    px_a, px_b : (N, 2) and (M, 2), COLMAP's pixel origin.
-    b_from_a : float64 (3, 3), of such pixels.
-    size_a, size_b : width and height of the images.
+    ``size_a`` and ``size_b`` are width and height of the images.
     """
 
     def side(px: NDArray[np.floating[Any]], matrix: Floats, size: tuple[int, int]) -> _Side:
@@ -149,13 +137,11 @@ def labels_of_homography(
 def reproject(
     px: NDArray[np.floating[Any]], a: PosedView, b: PosedView, options: LabelOptions | None = None
 ) -> tuple[Floats, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Where b has the points that a sees at pixels.
+    """Find where b has the points that a sees at pixels.
 
-    Returns
-    -------
-    px : float64 (N, 2) in b; NaN behind it and without depth.
-    known : bool (N,), where a has depth.
-    visible : bool (N,), where b shows the point: inside the image, and of the depth that b has.
+    Returns ``px``: float64 (N, 2) in b; NaN behind it and without depth; ``known`` and ``visible``:
+    bool (N,), where a has depth; where b shows the point: inside the image, and of the depth that b
+    has.
     """
     options = options or LabelOptions()
     points, known = lift_keypoints(
@@ -231,11 +217,6 @@ def _epipolar_error_px(
         for view, px, ray in ((a, px_a, rays[0]), (b, px_b, rays[1]))
     ]
     first, second = (grid.ravel() for grid in np.indices((len(px_a), len(px_b))))
-    error = sampson_error_px(
-        rays[0][first],
-        slopes[0][first],
-        rays[1][second],
-        slopes[1][second],
-        b.cam_from_world @ a.cam_from_world.inverse(),
-    )
+    ours, theirs = (rays[0][first], slopes[0][first]), (rays[1][second], slopes[1][second])
+    error = sampson_error_px(*ours, *theirs, b.cam_from_world @ a.cam_from_world.inverse())
     return np.where(np.isfinite(error), error, 0.0).reshape(len(px_a), len(px_b))

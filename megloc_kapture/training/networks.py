@@ -1,14 +1,16 @@
-"""What is trained: SuperGlue on frozen features, or a descriptor network under a frozen detector.
+"""What is trained, its loss, and its figures on held-out pairs.
 
-The split is MegLoc's (section on local features): the detector is frozen, a second network of the
-same kind describes its keypoints, and the gradient comes through SuperGlue, which is trained with
-it, or through the optimal transport of the descriptors' own products.
+SuperGlue is trained on frozen features, or a descriptor network under a frozen detector. The split
+is MegLoc's (section on local features): a second network of the same kind describes the detector's
+keypoints, and the gradient comes through SuperGlue, which is trained with it, or through the
+optimal transport of the descriptors' own products.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,8 +20,11 @@ from torch import nn
 from megloc_kapture.errors import OptionError
 from megloc_kapture.features.superpoint import SuperPoint, gray_tensor
 from megloc_kapture.features.xfeat import XFeat, network_image
+from megloc_kapture.geometry.cameras import bearing_rays, focal_px
+from megloc_kapture.geometry.poses import rotation_angles_deg
 from megloc_kapture.io.weights import find_weights, read_weights
 from megloc_kapture.matching.superglue import network_input
+from megloc_kapture.matching.verification import TwoViewOptions, relative_pose
 from megloc_kapture.nets.runtime import load_strictly
 from megloc_kapture.nets.superglue import (
     ImageKeypoints,
@@ -30,10 +35,9 @@ from megloc_kapture.nets.superglue import (
 from megloc_kapture.nets.superpoint import SuperPointNet, sample_descriptors
 from megloc_kapture.nets.xfeat import descriptors_at, load_xfeat
 from megloc_kapture.plugins import LocalFeatureExtractor
-from megloc_kapture.training.labels import Labels
-from megloc_kapture.training.loss import transport_loss
+from megloc_kapture.training.labels import IGNORED, UNMATCHED, Labels
 from megloc_kapture.training.pairs import TrainingPair
-from megloc_kapture.values import ImageFeatures
+from megloc_kapture.values import ImageFeatures, RigidTransform
 
 _FEATURES_KEPT = 1024  # images
 _FIRST_SCALE = 10.0  # of products of descriptors; SuperGlue's final projection learns its own
@@ -41,6 +45,9 @@ _FIRST_DUSTBIN = 0.7  # cosine at which a product is as good as nothing
 _CONFIDENT = 0.2  # the matcher's own threshold
 
 Image = NDArray[np.uint8]
+AUC_DEG = (5, 10, 20)
+_TWO_VIEWS = TwoViewOptions(max_error_px=2.0, min_matches=6)
+_SAME_CENTRE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,10 +67,7 @@ class PreparedPair:
 class FrozenFeatures:
     """Features of an extractor, the best of each image; those of images that come again are kept.
 
-    Parameters
-    ----------
-    extractor : its keypoints carry a score as third column.
-    max_keypoints : best kept of each image.
+    Its keypoints carry a score as third column; ``max_keypoints`` are kept of each image.
     """
 
     def __init__(self, extractor: LocalFeatureExtractor, max_keypoints: int) -> None:
@@ -91,12 +95,8 @@ class FrozenFeatures:
 class SuperPointDescriber(nn.Module):
     """SuperPoint's backbone and descriptor head; its file is an option ``descriptor_weights``.
 
-    Raises
-    ------
-    DataError : the extractor's weights do not fit.
+    Raises DataError for weights of the extractor that do not fit.
     """
-
-    descriptor_size = SuperPoint.descriptor_size
 
     def __init__(self, extractor: SuperPoint) -> None:
         super().__init__()
@@ -104,9 +104,8 @@ class SuperPointDescriber(nn.Module):
         tensors = read_weights(find_weights(options.weights))
         if options.descriptor_weights is not None:
             tensors |= read_weights(find_weights(options.descriptor_weights))
-        self.net = SuperPointNet(detector=False)
         described = {key: value for key, value in tensors.items() if not key.startswith("convP")}
-        load_strictly(self.net, described, options.weights)
+        self.net = load_strictly(SuperPointNet(detector=False), described, options.weights)
 
     def forward(self, image: Image, xy_px: torch.Tensor) -> torch.Tensor:
         dense = self.net.describe(self.net.encode(gray_tensor(image, xy_px.device)))
@@ -114,13 +113,10 @@ class SuperPointDescriber(nn.Module):
 
 
 class XFeatDescriber(nn.Module):
-    """XFeat's backbone; its file, which has all of XFeat's keys, is an option
-    ``descriptor_weights``.
+    """XFeat's backbone; its file has all of XFeat's keys, as ``descriptor_weights`` has them.
 
     Its normalisation keeps the statistics it has: pairs of one step are few.
     """
-
-    descriptor_size = XFeat.descriptor_size
 
     def __init__(self, extractor: XFeat) -> None:
         super().__init__()
@@ -192,11 +188,9 @@ def begin_at_products(net: SuperGlueNet) -> None:
 
 
 def encoder_sizes(descriptor_size: int) -> tuple[int, ...]:
-    """Of SuperGlue's keypoint encoder, in the proportions of the official network.
+    """Sizes of SuperGlue's keypoint encoder, in the proportions of the official network.
 
-    Raises
-    ------
-    OptionError : the size is not one that four heads share.
+    Raises OptionError for a size that is not one that four heads share.
     """
     if descriptor_size % 8:
         raise OptionError(
@@ -210,7 +204,6 @@ class PairModel(nn.Module):
 
     Parameters
     ----------
-    head : the matcher.
     describer : None: the frozen features' own descriptors.
     iterations : of the optimal transport.
     deep_supervision : the loss is the mean over the head's cross-attention layers.
@@ -270,3 +263,102 @@ class PairModel(nn.Module):
             return found
         xy_px = torch.from_numpy(features.keypoints_px[:, :2].copy()).to(device)
         return replace(found, descriptors=self.describer(prepared.pair.images[side], xy_px))
+
+
+def transport_loss(log_assignment: torch.Tensor, labels: Labels) -> torch.Tensor:
+    """Negative log likelihood () of labels; ignored keypoints do not count, nothing labelled is 0.
+
+    SuperGlue's equation 10 (Sarlin et al., CVPR 2020), with the means of the matched and of the
+    unmatched keypoints weighted alike, as LightGlue does (Lindenberger et al., ICCV 2023, equation
+    9): how many there are of each depends on the images. ``log_assignment`` are logarithms (N + 1,
+    M + 1), the dustbins last.
+    """
+    device = log_assignment.device
+    rows, columns = torch.from_numpy(labels.matches()).to(device).T
+    lost_a = torch.from_numpy(labels.partner_a == UNMATCHED).to(device)
+    lost_b = torch.from_numpy(labels.partner_b == UNMATCHED).to(device)
+    matched = log_assignment[rows, columns]
+    unmatched = torch.cat([log_assignment[:-1, -1][lost_a], log_assignment[-1, :-1][lost_b]])
+    # a mean of nothing is not a number
+    return -sum(0.5 * part.sum() / max(len(part), 1) for part in (matched, unmatched))  # type: ignore[return-value]
+
+
+@dataclass(frozen=True)
+class HeldOutResult:
+    """Figures of a matcher on pairs."""
+
+    pairs: int
+    loss: float  # mean over the pairs
+    precision: float  # share of right ones among all matches whose keypoints are labelled
+    recall: float  # share of the labelled matches that are found
+    # area under the curve of the relative pose's error up to 5, 10 and 20 degrees, in [0, 1]
+    auc: tuple[float, ...]
+
+
+def held_out_result(model: PairModel, pairs: Sequence[PreparedPair]) -> HeldOutResult:
+    """Match pairs with a model that is set to evaluate."""
+    right = told = labelled = 0
+    losses, errors = [], []
+    for pair in pairs:
+        matches, loss = model.match(pair)
+        good, known = judged(matches, pair.labels)
+        right, told = right + int(good.sum()), told + int(known.sum())
+        labelled += len(pair.labels.matches())
+        losses.append(loss)
+        if pair.pair.views is not None:
+            errors.append(pose_error_deg(pair, matches))
+    loss = float(np.mean(losses)) if losses else 0.0
+    precision, recall = right / max(told, 1), right / max(labelled, 1)
+    return HeldOutResult(len(pairs), loss, precision, recall, pose_auc(errors))
+
+
+def judged(
+    matches: NDArray[np.int64], labels: Labels
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Matches (K, 2) that are right, and those of which a label tells it, bool (K,) both."""
+    a, b = labels.partner_a[matches[:, 0]], labels.partner_b[matches[:, 1]]
+    return a == matches[:, 1], (a != IGNORED) | (b != IGNORED)
+
+
+def pose_error_deg(pair: PreparedPair, matches: NDArray[np.int64]) -> float:
+    """The larger of the angles of rotation and translation, degrees; infinite without a pose.
+
+    The translation's sign is left open, as SuperGlue's evaluation does; between views of one centre
+    only the rotation counts.
+    """
+    views, truth = pair.pair.views, pair.pair.b_from_a
+    assert views is not None and truth is not None  # who calls has asked
+    rays = [
+        bearing_rays(view.camera, features.keypoints_px[matches[:, side], :2])
+        for side, (view, features) in enumerate(zip(views, pair.features, strict=True))
+    ]
+    usable = np.isfinite(rays[0]).all(axis=1) & np.isfinite(rays[1]).all(axis=1)
+    focal = 0.5 * (focal_px(views[0].camera) + focal_px(views[1].camera))
+    found = relative_pose(rays[0][usable], rays[1][usable], focal, _TWO_VIEWS)
+    return np.inf if found is None else relative_pose_error_deg(found, truth)
+
+
+def relative_pose_error_deg(found: RigidTransform, truth: RigidTransform) -> float:
+    """See :func:`pose_error_deg`."""
+    rotation = rotation_angles_deg(np.array(found.quat_wxyz), np.array(truth.quat_wxyz))
+    a, b = np.array(found.translation), np.array(truth.translation)
+    lengths = np.linalg.norm(a) * np.linalg.norm(b)
+    if np.linalg.norm(b) < _SAME_CENTRE or lengths == 0:
+        return float(rotation)
+    translation = np.degrees(np.arccos(min(1.0, abs(a @ b) / lengths)))
+    return float(max(rotation, translation))
+
+
+def pose_auc(errors_deg: Sequence[float] | NDArray[Any]) -> tuple[float, ...]:
+    """Area under the curve of recall over the error, up to each of AUC_DEG, over that bound."""
+    ascending = np.sort(np.asarray(errors_deg, np.float64))
+    if not len(ascending):
+        return (0.0,) * len(AUC_DEG)
+    recall = np.arange(1, len(ascending) + 1) / len(ascending)
+    areas = []
+    for bound in AUC_DEG:
+        inside = np.searchsorted(ascending, bound)
+        x = np.concatenate([[0.0], ascending[:inside], [bound]])
+        y = np.concatenate([[0.0], recall[:inside], recall[inside - 1 : inside] if inside else [0]])
+        areas.append(float(np.trapezoid(y, x) / bound))
+    return tuple(areas)

@@ -2,18 +2,22 @@
 
 A source draws pairs at random from a generator that it is given, and keeps no state of its own: the
 pair of a step depends on the seed and the step, so that training goes on where it was interrupted.
+Views of a photograph are under random homographies and random light, as SuperPoint and the open
+matchers are pretrained (DeTone et al., CVPR workshops 2018, section 5): any folder of photographs
+will do.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
@@ -27,7 +31,6 @@ from megloc_kapture.plugins import DepthView
 from megloc_kapture.preprocessing.resampling import resized, scaled_camera
 from megloc_kapture.stages.rigs import depth_records
 from megloc_kapture.stages.work import HERE, Work
-from megloc_kapture.training.homographies import HomographyOptions, random_view, relit
 from megloc_kapture.training.labels import (
     LabelOptions,
     Labels,
@@ -42,8 +45,23 @@ from megloc_kapture.values import Options, RigidTransform
 _CANDIDATES = PairsByPosesOptions(num_neighbours=40, max_angle_deg=90)
 _VIEWS_KEPT = 64
 
+Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Labelling = Callable[[NDArray[Any], NDArray[Any]], Labels]
+_HALF = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
+
+
+class HomographyOptions(Options):
+    """Options of random views of a photograph."""
+
+    min_scale: float = Field(default=0.5, gt=0, le=1, description="of a view, of the photograph")
+    max_angle_deg: float = Field(default=45.0, ge=0, le=180, description="of a view's rotation")
+    perspective: float = Field(
+        default=0.2, ge=0, lt=0.5, description="how far corners move, of the view's sides"
+    )
+    light: float = Field(
+        default=1.0, ge=0, le=1, description="strength of changes of light, noise, blur and JPEG"
+    )
 
 
 class PairOptions(Options):
@@ -69,19 +87,12 @@ class PairOptions(Options):
 
 @dataclass(frozen=True, eq=False)
 class TrainingPair:
-    """Two images, and how the keypoints that are found in them are labelled.
+    """Two images, and how the keypoints that are found in them are labelled."""
 
-    Attributes
-    ----------
-    images : uint8 (H, W, 3), RGB.
-    keys : of images that come again as they are; None of those that do not.
-    label : labels of keypoints (N, 2) and (M, 2) of the images.
-    views : cameras, poses and depth of a pair of posed images; None under a homography.
-    """
-
-    images: tuple[Image, Image]
-    keys: tuple[str, str] | None
-    label: Labelling
+    images: tuple[Image, Image]  # uint8 (H, W, 3), RGB
+    keys: tuple[str, str] | None  # of images that come again as they are; None of those that do not
+    label: Labelling  # labels of keypoints (N, 2) and (M, 2) of the images
+    # cameras, poses and depth of a pair of posed images; None under a homography
     views: tuple[PosedView, PosedView] | None = None
 
     @property
@@ -93,35 +104,12 @@ class TrainingPair:
         return b.cam_from_world @ a.cam_from_world.inverse()
 
 
-class PairSource(Protocol):
-    """Where pairs come from."""
-
-    folder: Path
-
-    def draw(self, rng: np.random.Generator) -> TrainingPair:
-        """A pair, by the generator's numbers; raises DataError for a broken file."""
-        ...
-
-    def files(self) -> Iterable[Path]:
-        """All files that pairs are made of, sorted."""
-        ...
-
-    def counts(self) -> dict[str, int]:
-        """What there is, for the manifest."""
-        ...
-
-
 class PosedPairs:
     """Pairs of a kapture's images that have poses and depth, by the overlap of what they show.
 
-    Parameters
-    ----------
-    measured : file of pairs with their overlap as score; it is read where it is there, else made.
-
-    Raises
-    ------
-    DataError : fewer than two images have a pose and depth, or no two overlap as asked for; or the
-        file of overlaps is of other images.
+    ``measured`` is a file of pairs with their overlap as score; it is read where it is there, else
+    made. Raises DataError where fewer than two images have a pose and depth, or no two overlap as
+    asked for, and for a file of overlaps that is of other images.
     """
 
     def __init__(
@@ -176,13 +164,8 @@ class PosedPairs:
             for name, view in zip(names, (a, b), strict=True)
         ]
         keys = (str(self._kapture.image_path(names[0])), str(self._kapture.image_path(names[1])))
-        labels = self._options.labels
-        return TrainingPair(
-            (images[0], images[1]),
-            keys,
-            lambda px_a, px_b: labels_of_views(px_a, px_b, a, b, labels),
-            (a, b),
-        )
+        label = partial(labels_of_views, a=a, b=b, options=self._options.labels)
+        return TrainingPair((images[0], images[1]), keys, label, (a, b))
 
     def files(self) -> list[Path]:
         sensors = sorted((self.folder / "sensors").glob("*.txt"))
@@ -209,24 +192,16 @@ class PosedPairs:
     def _read_view(self, name: str) -> PosedView:
         camera, record = self._kapture.read().camera_of(name), self._records[name]
         size = reduced_size(camera.width, camera.height, self._options.max_size_px)
-        depth_m = read_depth_map(
-            self._kapture.depth_path(record.path),
-            width=record.camera.width,
-            height=record.camera.height,
-        )
-        return PosedView(
-            scaled_camera(camera, *size),
-            self._poses[name],
-            DepthView(record.camera, depth_m, record.image_from_depth),
-        )
+        path, sensor = self._kapture.depth_path(record.path), record.camera
+        depth_m = read_depth_map(path, width=sensor.width, height=sensor.height)
+        depth = DepthView(sensor, depth_m, record.image_from_depth)
+        return PosedView(scaled_camera(camera, *size), self._poses[name], depth)
 
 
 class Photographs:
     """Pairs of views of single photographs, of all image files below a folder.
 
-    Raises
-    ------
-    DataError : there is no such folder, or no image in it.
+    Raises DataError where there is no such folder, or no image in it.
     """
 
     def __init__(self, folder: Path, options: PairOptions) -> None:
@@ -249,18 +224,18 @@ class Photographs:
             random_view(image, size, rng, options) for _ in range(2)
         )
         b_from_a = b_from_image @ np.linalg.inv(a_from_image)
-        labels = self._options.labels
-        return TrainingPair(
-            (relit(a, rng, options.light), relit(b, rng, options.light)),
-            None,
-            lambda px_a, px_b: labels_of_homography(px_a, px_b, b_from_a, size, size, labels),
-        )
+        lit = relit(a, rng, options.light), relit(b, rng, options.light)
+        label = partial(labels_of_homography, b_from_a=b_from_a, size_a=size, size_b=size)
+        return TrainingPair(lit, None, partial(label, options=self._options.labels))
 
     def files(self) -> list[Path]:
         return self._paths
 
     def counts(self) -> dict[str, int]:
         return {"images": len(self._paths)}
+
+
+PairSource = PosedPairs | Photographs
 
 
 def reduced_size(width: int, height: int, max_size_px: int) -> tuple[int, int]:
@@ -280,3 +255,56 @@ def sha256_of_files(root: Path, paths: Sequence[Path]) -> str:
 
 def _size(view: PosedView) -> tuple[int, int]:
     return view.camera.width, view.camera.height
+
+
+def random_view(
+    image: Image, size: tuple[int, int], rng: np.random.Generator, options: HomographyOptions
+) -> tuple[Image, Floats]:
+    """A view of a quadrilateral of the photograph, which lies in it as a whole.
+
+    Returns ``view``: uint8 (height, width, 3), of ``size``, width and height; ``view_from_image``:
+    float64 (3, 3), of pixels whose first centre is (0.5, 0.5).
+    """
+    width, height = size
+    sides = np.array([image.shape[1], image.shape[0]], np.float64)
+    rectangle = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float64) * size
+    moved = rectangle + rng.uniform(-1, 1, (4, 2)) * options.perspective * np.array(size)
+    angle = np.radians(rng.uniform(-1, 1) * options.max_angle_deg)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    corners = (moved - rectangle.mean(axis=0)) @ turn.T
+    extent = np.ptp(corners, axis=0)
+    # as large a part of the photograph as fits, times the scale
+    corners *= rng.uniform(options.min_scale, 1.0) * (sides / extent).min()
+    corners -= corners.min(axis=0)
+    corners += rng.uniform(0, 1, 2) * (sides - corners.max(axis=0))
+    view_from_image = cv2.getPerspectiveTransform(
+        corners.astype(np.float32), rectangle.astype(np.float32)
+    )
+    # OpenCV's warp has the first pixel's centre at (0, 0)
+    warp = np.linalg.inv(_HALF) @ view_from_image @ _HALF
+    view = cv2.warpPerspective(
+        image, warp, (width, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    return np.asarray(view, np.uint8), np.asarray(view_from_image, np.float64)
+
+
+def relit(image: Image, rng: np.random.Generator, strength: float = 1.0) -> Image:
+    """The photograph in other light, by another camera: gamma, exposure, cast, noise, blur, JPEG.
+
+    A ``strength`` of 0 changes nothing.
+    """
+    if strength <= 0:
+        return image
+    gamma, exposure = np.exp2(rng.uniform(-1, 1, 2) * strength)
+    cast = np.exp2(rng.normal(0, 0.12 * strength, 3))
+    noise, blur = rng.uniform(0, 0.04 * strength), rng.uniform(0, 1.2 * strength)
+    level = (image.astype(np.float32) / 255) ** np.float32(gamma)
+    # what is brighter than white is lost, so exposure mostly takes light away
+    level *= (min(exposure, 1.3) * cast).astype(np.float32)
+    if blur > 0.3:
+        level = np.asarray(cv2.GaussianBlur(level, (0, 0), float(blur)), np.float32)
+    level += rng.normal(0, noise, level.shape).astype(np.float32)
+    lit = np.clip(255 * level, 0, 255).astype(np.uint8)
+    quality = int(rng.integers(100 - int(60 * strength), 101))
+    done, encoded = cv2.imencode(".jpg", lit, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return np.asarray(cv2.imdecode(encoded, cv2.IMREAD_COLOR), np.uint8) if done else lit

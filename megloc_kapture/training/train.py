@@ -19,7 +19,7 @@ from megloc_kapture.io.files import read_content, remove, write_bytes, write_jso
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.weights import find_weights, sha256_of
 from megloc_kapture.io.weights.registry import by_sha256
-from megloc_kapture.nets.runtime import pick_device
+from megloc_kapture.nets.runtime import pick_device, state_bytes
 from megloc_kapture.nets.superglue import SuperGlueNet
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.training.pairs import (
@@ -47,19 +47,13 @@ TASKS: dict[str, type[TrainingOptions]] = {
 
 @dataclass(frozen=True)
 class TrainingData:
-    """What a training sees.
+    """The data of a training."""
 
-    Attributes
-    ----------
-    kaptures : with poses and depth.
-    photographs : folders of images, trained on under homographies.
-    held_out : kaptures that are only evaluated on; no folder of ``kaptures`` may be one.
-    licences : of the folders, by their paths as they are given; others are unknown.
-    """
-
-    kaptures: Sequence[KaptureFolder] = ()
-    photographs: Sequence[Path] = ()
+    kaptures: Sequence[KaptureFolder] = ()  # with poses and depth
+    photographs: Sequence[Path] = ()  # folders of images, trained on under homographies
+    # kaptures that are only evaluated on; no folder of ``kaptures`` may be one
     held_out: Sequence[KaptureFolder] = ()
+    # of the folders, by their paths as they are given; others are unknown
     licences: Mapping[Path, str] = field(default_factory=dict)
 
     def check(self, options: TrainingOptions) -> None:
@@ -104,22 +98,16 @@ def train(
 
     Written at each evaluation, beside each other: ``output``, of descriptors that are trained
     through SuperGlue also ``X-superglue.safetensors``, the manifest ``X.json``, the curves
-    ``X.csv`` and ``X.state.pt``, from which the same call goes on; before, ``X.overlaps``.
+    ``X.csv`` and ``X.state.pt``, from which the same call goes on; before, ``X.overlaps``. Returns
+    the last row of the curves by column. Raises OptionError, DataError, MissingWeightsError:
+    options, data or weights cannot be used; OutputError: files of another training stand there, or
+    they cannot be written.
 
     Parameters
     ----------
     output : the file to write, ``X.safetensors``.
     force : begin again where another training's files stand.
     threads : that prepare pairs.
-
-    Returns
-    -------
-    The last row of the curves by column.
-
-    Raises
-    ------
-    OptionError, DataError, MissingWeightsError : options, data or weights cannot be used.
-    OutputError : files of another training stand there, or they cannot be written.
     """
     if output.suffix != ".safetensors":
         raise OptionError(f"{output}: the file to write must end in .safetensors")
@@ -154,28 +142,13 @@ def train(
     return dict(zip(COLUMNS, state.rows[-1], strict=True)) if state.rows else {}
 
 
-@dataclass(frozen=True)
 class _Files:
-    """The files of one training."""
+    """The files of one training; ``overlaps`` is a folder, of measured overlaps of pairs."""
 
-    output: Path
-
-    @property
-    def state(self) -> Path:
-        return self.output.with_suffix(".state.pt")
-
-    @property
-    def manifest(self) -> Path:
-        return self.output.with_suffix(".json")
-
-    @property
-    def overlaps(self) -> Path:
-        """Folder of the measured overlaps of pairs."""
-        return self.output.with_suffix(".overlaps")
-
-    @property
-    def matcher(self) -> Path:
-        return self.output.with_name(f"{self.output.stem}-superglue.safetensors")
+    def __init__(self, output: Path) -> None:
+        self.output = output
+        self.state, self.manifest = output.with_suffix(".state.pt"), output.with_suffix(".json")
+        self.overlaps = output.with_suffix(".overlaps")
 
     def begin(self, *, force: bool) -> None:
         """Remove what training would go on from, where none was begun, or it begins again."""
@@ -206,7 +179,8 @@ class _Files:
         if model.describer is not None:
             networks[self.output] = model.describer.net
         if isinstance(model.head, SuperGlueNet):
-            networks[self.matcher if networks else self.output] = model.head
+            matcher = self.output.with_name(f"{self.output.stem}-superglue.safetensors")
+            networks[matcher if networks else self.output] = model.head
         for path, network in networks.items():
             tensors = {key: value.cpu().contiguous() for key, value in network.state_dict().items()}
             content = save(tensors)
@@ -223,7 +197,8 @@ class _Files:
         }
         write_json(self.manifest, manifest)
         # with it the rest is there
-        write_bytes(self.state, state.tensors(model, trainer.optimizer))
+        more = {"step": state.step, "rows": state.rows}
+        write_bytes(self.state, state_bytes(model, trainer.optimizer, more))
 
 
 def _record(
@@ -260,5 +235,4 @@ def _described(source: PairSource, licences: Mapping[Path, str]) -> dict[str, An
 
 
 def _licence_of(sha256: str) -> str:
-    known = by_sha256(sha256)
-    return UNKNOWN_LICENCE if known is None else known[0].licence
+    return UNKNOWN_LICENCE if (known := by_sha256(sha256)) is None else known[0].licence

@@ -24,21 +24,22 @@ from torch import distributed
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.files import read_content
 from megloc_kapture.io.weights import find_weights, read_weights
-from megloc_kapture.nets.runtime import NetworkOptions, pick_device
+from megloc_kapture.nets.runtime import NetworkOptions, load_state, pick_device
 from megloc_kapture.nets.superglue import SuperGlueNet, superglue
-from megloc_kapture.nets.training_state import load_state, state_bytes
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import LOCAL_FEATURES, LocalFeatureExtractor, PluginChoice
 from megloc_kapture.stages.work import HERE, Work, ordered_map
-from megloc_kapture.training.held_out import AUC_DEG, HeldOutResult, held_out_result
 from megloc_kapture.training.networks import (
+    AUC_DEG,
     FrozenFeatures,
+    HeldOutResult,
     PairModel,
     PreparedPair,
     ProductHead,
     begin_at_products,
     describer_of,
     encoder_sizes,
+    held_out_result,
 )
 from megloc_kapture.training.pairs import PairOptions, PairSource
 
@@ -104,30 +105,16 @@ class DescriptorOptions(TrainingOptions):
 
 @dataclass
 class TrainingState:
-    """How far a training is.
-
-    Attributes
-    ----------
-    rows : of the curves so far, COLUMNS; NaN where there is nothing held out.
-    """
+    """How far a training is."""
 
     step: int
-    rows: list[list[float]]
-
-    def tensors(self, model: PairModel, optimizer: torch.optim.Optimizer) -> bytes:
-        """The state with networks and optimizer, as a file."""
-        return state_bytes(model, optimizer, {"step": self.step, "rows": self.rows})
+    rows: list[list[float]]  # of the curves so far, COLUMNS; NaN where nothing is held out
 
     @classmethod
     def resume(
         cls, path: Path, model: PairModel, optimizer: torch.optim.Optimizer
     ) -> TrainingState:
-        """Where a training was left, from its file; the beginning where there is none.
-
-        Raises
-        ------
-        DataError : the file is damaged.
-        """
+        """Where a training was left; the beginning without a file; raises DataError."""
         if not path.is_file():
             return cls(0, [])
         content = load_state(read_content(path), path, model, optimizer)
@@ -176,13 +163,7 @@ class ProcessGroup:
 
 
 def model_of(options: TrainingOptions, extractor: LocalFeatureExtractor) -> PairModel:
-    """The networks as training begins.
-
-    Raises
-    ------
-    OptionError, DataError : the extractor or the weights cannot be trained.
-    """
-    describes = isinstance(options, DescriptorOptions)
+    """The networks as training begins; raises for what cannot be trained."""
     # plugins need not say it
     noise = np.random.default_rng(0).integers(0, 256, (128, 128, 3), np.uint8)
     size = extractor.extract(noise).descriptors.shape[1]
@@ -202,25 +183,13 @@ def model_of(options: TrainingOptions, extractor: LocalFeatureExtractor) -> Pair
                 f"matcher_weights={options.matcher_weights} are for descriptors of "
                 f"{head.descriptor_size} dimensions; {options.features.name} has {size}"
             )
-        return PairModel(
-            head,
-            describer_of(extractor) if describes else None,
-            iterations=options.sinkhorn_iterations,
-            deep_supervision=options.deep_supervision,
-        )
+        describer = describer_of(extractor) if isinstance(options, DescriptorOptions) else None
+        iterations, deep = options.sinkhorn_iterations, options.deep_supervision
+        return PairModel(head, describer, iterations=iterations, deep_supervision=deep)
 
 
 class Trainer:
-    """A model and its optimizer.
-
-    Attributes
-    ----------
-    results : of the last evaluation, by the name of the held-out source.
-
-    Raises
-    ------
-    MeglocError : the options or weights cannot be used.
-    """
+    """A model and its optimizer; raises MeglocError for options or weights that cannot be used."""
 
     def __init__(self, options: TrainingOptions) -> None:
         self.options = options
@@ -232,6 +201,7 @@ class Trainer:
         trained = [p for p in self.model.parameters() if p.requires_grad]
         self.optimizer = torch.optim.Adam(trained, lr=options.learning_rate)
         self._held_out: dict[str, list[PreparedPair]] = {}
+        # of the last evaluation, by the name of the held-out source
         self.results: dict[str, HeldOutResult] = {}
 
     def train(
@@ -245,15 +215,9 @@ class Trainer:
     ) -> Iterator[TrainingState]:
         """Train to the last step; the state at each evaluation, in the process of rank 0.
 
-        Parameters
-        ----------
-        sources : where pairs are drawn from, from each alike.
-        threads : that prepare pairs; one: those of a step are prepared when it comes.
-
-        Raises
-        ------
-        OptionError : the loss is not finite any more.
-        DataError : an image or depth map is broken.
+        ``sources``: where pairs are drawn from, from each alike; ``threads``: that prepare pairs;
+        one: those of a step are prepared when it comes. Raises OptionError for a loss that is not
+        finite any more, DataError for a broken image or depth map.
         """
         options, losses = self.options, []
         steps = range(state.step, options.steps)
@@ -268,12 +232,8 @@ class Trainer:
                 if (step + 1) % options.check_every and step + 1 < options.steps:
                     continue
                 if group.rank == 0:
-                    row = [
-                        float(step + 1),
-                        self._rate(step),
-                        float(np.mean(losses)),
-                        *self.evaluate(),
-                    ]
+                    row = [float(step + 1), self._rate(step), float(np.mean(losses))]
+                    row += self.evaluate()
                     state = TrainingState(step + 1, [*state.rows, row])
                     yield state
                 losses = []

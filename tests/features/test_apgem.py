@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.features.global_networks import ApGem, ApGemOptions
 from megloc_kapture.io.weights import MissingWeightsError
-from megloc_kapture.nets.apgem import ApGemNet
+from megloc_kapture.nets.global_descriptors import ApGemNet
 from megloc_kapture.plugins import GlobalFeatureExtractor
 
 Image = NDArray[np.uint8]

@@ -25,9 +25,8 @@ from megloc_kapture.features.global_networks import (
 )
 from megloc_kapture.io.weights import MissingWeightsError
 from megloc_kapture.nets import megaloc as nets_megaloc
-from megloc_kapture.nets.dinov2 import DinoV2
-from megloc_kapture.nets.eigenplaces import EigenPlacesNet
-from megloc_kapture.nets.megaloc import MegaLocNet
+from megloc_kapture.nets.global_descriptors import EigenPlacesNet
+from megloc_kapture.nets.megaloc import DinoV2, MegaLocNet
 from megloc_kapture.plugins import GlobalFeatureExtractor
 
 Image = NDArray[np.uint8]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError
 from megloc_kapture.features import global_networks
 from megloc_kapture.features.global_networks import OpenIbl, OpenIblOptions, official_size
-from megloc_kapture.nets.netvlad import VggNetVlad
+from megloc_kapture.nets.global_descriptors import VggNetVlad
 from megloc_kapture.plugin_loading import weights_of
 from megloc_kapture.plugins import GlobalFeatureExtractor
 

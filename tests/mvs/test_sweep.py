@@ -8,7 +8,6 @@ import pytest
 from corner import CAMERA, WALLS, depth_m, pose_at, render
 
 from megloc_kapture.geometry.warping import scaled_camera
-from megloc_kapture.mvs.consistency import AgreementOptions, agreeing_views, confirmed
 from megloc_kapture.mvs.sweep import (
     CALIBRATION,
     Sweep,
@@ -17,7 +16,7 @@ from megloc_kapture.mvs.sweep import (
     refine,
     stereo_image,
 )
-from megloc_kapture.mvs.views import stereo_view
+from megloc_kapture.mvs.views import AgreementOptions, agreeing_views, confirmed, stereo_view
 from megloc_kapture.plugins import DepthEstimate, DepthEstimator, StereoView
 
 POSES = [pose_at((x, 0.1 * (-1) ** i, 0.0), 0.5 * i, 0.0) for i, x in enumerate((0, -0.5, 0.5))]

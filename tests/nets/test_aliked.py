@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 import torch
+from published import published_shapes
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.weights import find_weights, read_weights
 from megloc_kapture.nets.aliked import AlikedNet, aliked_from
 
-KEYS = Path(__file__).parent / "keys"
 # numbers that the published files hold, and the size of the descriptors
 VARIANTS = {
     "aliked-t16": (192_588, 64),
@@ -22,16 +22,10 @@ VARIANTS = {
 }
 
 
-def frozen_keys(variant: str) -> dict[str, tuple[int, ...]]:
-    """Key -> shape, as the published checkpoints have them."""
-    pairs = (row.split() for row in (KEYS / f"{variant}.txt").read_text().splitlines())
-    return {key: () if s == "scalar" else tuple(map(int, s.split("x"))) for key, s in pairs}
-
-
 def random_tensors(variant: str, seed: int = 0) -> dict[str, torch.Tensor]:
     generator = torch.Generator().manual_seed(seed)
     tensors = {}
-    for key, shape in frozen_keys(variant).items():
+    for key, shape in published_shapes(variant).items():
         fan_in = max(1, int(torch.tensor(shape[1:]).prod())) if len(shape) == 4 else 4
         values = torch.randn(shape, generator=generator) / fan_in**0.5
         if key.endswith("running_var") or (".bn" in key and key.endswith("weight")):
@@ -78,7 +72,7 @@ def test_keys_are_those_of_the_published_files(variant: str) -> None:
     numbers, size = VARIANTS[variant]
     net = aliked_from(random_tensors(variant), variant)
     found = {key: tuple(values.shape) for key, values in net.state_dict().items()}
-    assert found == frozen_keys(variant)
+    assert found == published_shapes(variant)
     assert len(found) == 76
     assert sum(values.numel() for values in net.state_dict().values()) == numbers
     assert net.descriptor_size == size and not net.training
@@ -87,7 +81,9 @@ def test_keys_are_those_of_the_published_files(variant: str) -> None:
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_the_published_files_load(shared_data: Path, variant: str) -> None:
     tensors = published(shared_data, variant)
-    assert {key: tuple(values.shape) for key, values in tensors.items()} == frozen_keys(variant)
+    assert {key: tuple(values.shape) for key, values in tensors.items()} == published_shapes(
+        variant
+    )
     net = aliked_from(tensors, variant)
     for key, values in net.state_dict().items():
         assert torch.equal(values, tensors[key])

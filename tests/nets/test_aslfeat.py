@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from published import published_shapes
 from torch.nn import functional
 
 from megloc_kapture.errors import DataError
@@ -25,15 +26,8 @@ from megloc_kapture.nets.aslfeat import (
     resize_as_tensorflow_1,
 )
 
-KEYS = Path(__file__).parent / "keys"
 TENSORFLOW = Path(__file__).parent / "data" / "aslfeat"  # what make_reference.py of it has written
 ONE = torch.tensor(1.0)
-
-
-def frozen_variables() -> dict[str, tuple[int, ...]]:
-    """Variable -> shape, TensorFlow's names and layouts."""
-    pairs = (row.split() for row in (KEYS / "aslfeat.txt").read_text().splitlines())
-    return {key: () if s == "scalar" else tuple(map(int, s.split("x"))) for key, s in pairs}
 
 
 def tensorflows_variables() -> dict[str, torch.Tensor]:
@@ -43,7 +37,7 @@ def tensorflows_variables() -> dict[str, torch.Tensor]:
 def random_variables(seed: int = 0) -> dict[str, torch.Tensor]:
     generator = torch.Generator().manual_seed(seed)
     tensors = {}
-    for name, shape in frozen_variables().items():
+    for name, shape in published_shapes("aslfeat").items():
         values = torch.randn(shape, generator=generator)
         if name.startswith("deform_param"):
             values = values * (0.03 if name.endswith("kernel") else 0.3)
@@ -165,7 +159,9 @@ def test_maps_are_tensorflows(image: str, dtype: torch.dtype, tolerance: float) 
 def test_the_checkpoint_that_tensorflow_wrote_has_the_published_variables() -> None:
     variables = tensorflows_variables()
     assert variables.pop("global_step") == 380_000
-    assert {name: tuple(values.shape) for name, values in variables.items()} == frozen_variables()
+    assert {name: tuple(values.shape) for name, values in variables.items()} == published_shapes(
+        "aslfeat"
+    )
 
 
 def test_brightness_and_contrast_change_nothing() -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from published import published_shapes
 from torch.nn import functional as F
 from transformers import MobileViTConfig
 from transformers.models.mobilevit.modeling_mobilevit import MobileViTASPP
@@ -22,16 +23,8 @@ from megloc_kapture.nets.deeplabv3plus import (
 )
 from megloc_kapture.nets.runtime import load_strictly
 
-KEYS = Path(__file__).parent / "keys"
 PUBLISHED = Path(__file__).parent / "data" / "deeplabv3plus"
 random_state = runpy.run_path(str(PUBLISHED / "make_reference.py"))["random_state"]
-
-
-def frozen_keys(backbone: Backbone) -> dict[str, tuple[int, ...]]:
-    """Key -> shape, as the published checkpoint has them."""
-    rows = (KEYS / f"deeplabv3plus-{backbone}.txt").read_text().splitlines()
-    pairs = (row.split() for row in rows)
-    return {key: () if s == "scalar" else tuple(map(int, s.split("x"))) for key, s in pairs}
 
 
 @pytest.mark.parametrize(
@@ -41,7 +34,7 @@ def test_keys_and_shapes_are_the_published_ones(backbone: Backbone, parameters: 
     with torch.device("meta"):
         network = DeepLabV3Plus(backbone, num_classes=19)
     found = {key: tuple(value.shape) for key, value in network.state_dict().items()}
-    assert found == frozen_keys(backbone)
+    assert found == published_shapes(f"deeplabv3plus-{backbone}")
     assert sum(p.numel() for p in network.parameters()) == parameters
     assert backbone_of(found, "w.pth") == backbone
 
@@ -49,7 +42,7 @@ def test_keys_and_shapes_are_the_published_ones(backbone: Backbone, parameters: 
 def test_a_checkpoint_goes_in_whole_or_not_at_all() -> None:
     tensors = {
         key: torch.rand(shape) if shape else torch.tensor(7)
-        for key, shape in frozen_keys("mobilenet").items()
+        for key, shape in published_shapes("deeplabv3plus-mobilenet").items()
     }
     network = DeepLabV3Plus("mobilenet", num_classes=19)
     load_strictly(network, tensors, "w.pth")
@@ -75,7 +68,8 @@ def test_logits_and_classes_are_the_authors(backbone: Backbone) -> None:
     outputs = np.load(PUBLISHED / "reference.npz")
     with torch.device("meta"):
         network = DeepLabV3Plus(backbone, num_classes=19)
-    network.load_state_dict(random_state(frozen_keys(backbone)), strict=True, assign=True)
+    state = random_state(published_shapes(f"deeplabv3plus-{backbone}"))
+    network.load_state_dict(state, strict=True, assign=True)
     image = torch.from_numpy(outputs["image"]).permute(2, 0, 1)
     with torch.inference_mode():
         logits = network.eval()(image[None] / 255)[0]

@@ -1,32 +1,29 @@
-"""MegaLoc: its keys and the size of its file, what its parts are given, and pixels against PIL."""
+"""MegaLoc: keys, what its parts are given, pixels against PIL; DINOv2 against transformers'."""
 
 from __future__ import annotations
 
 import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 from PIL import Image
+from published import published_shapes
 from torch import nn
 from torch.nn import functional
+from transformers import Dinov2Config, Dinov2Model
 
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.weights.registry import lookup
 from megloc_kapture.nets import megaloc
-from megloc_kapture.nets.dinov2 import DinoV2
-from megloc_kapture.nets.megaloc import MegaLocNet, Salad, assignment, megaloc_from, squared
+from megloc_kapture.nets.megaloc import DinoV2, MegaLocNet, Salad, assignment, megaloc_from, squared
 
-KEYS = Path(__file__).parent / "keys" / "megaloc.txt"
 CHANNELS, CLUSTERS, SIZE, TOKEN = 6, 4, 5, 3
-
-
-def frozen_keys() -> dict[str, tuple[int, ...]]:
-    pairs = (row.split() for row in KEYS.read_text().splitlines())
-    return {key: () if s == "scalar" else tuple(map(int, s.split("x"))) for key, s in pairs}
+DINO_CHANNELS, DINO_DEPTH, DINO_HEADS, DINO_GRID = 24, 3, 4, 5
 
 
 def small() -> MegaLocNet:
@@ -43,14 +40,14 @@ def test_keys_and_shapes_are_the_published_ones() -> None:
     with torch.device("meta"):
         network = MegaLocNet()
     found = {key: tuple(value.shape) for key, value in network.state_dict().items()}
-    assert found == frozen_keys()
+    assert found == published_shapes("megaloc")
     assert sum(p.numel() for p in network.parameters()) == 228_639_553
 
 
 def test_float32_under_these_keys_fills_the_published_file_to_the_byte() -> None:
     """safetensors: 8 bytes, a JSON that names every tensor and its place, padded, the numbers."""
     end, header = 0, {}
-    for key, shape in sorted(frozen_keys().items()):
+    for key, shape in sorted(published_shapes("megaloc").items()):
         start, end = end, end + 4 * int(np.prod(shape, dtype=int))
         header[key] = {"dtype": "F32", "shape": list(shape), "data_offsets": [start, end]}
     length = len(json.dumps(header, separators=(",", ":")))
@@ -257,3 +254,149 @@ def test_it_needs_more_patches_than_clusters() -> None:
     with pytest.raises(OptionError, match="an image of 4 patches is too small for 4 clusters"):
         net(*random_input(rows=2, columns=2))
     assert net(*random_input(rows=1, columns=5)).isfinite().all()
+
+
+def small_trunk(seed: int = 0) -> DinoV2:
+    """A small trunk in which nothing is trivial: norms, layer scale, positions."""
+    generator = torch.Generator().manual_seed(seed)
+    net = DinoV2(channels=DINO_CHANNELS, depth=DINO_DEPTH, heads=DINO_HEADS, grid=DINO_GRID)
+    with torch.no_grad():
+        for name, value in net.named_parameters():
+            value.normal_(0.0, 0.3, generator=generator)
+            if name.endswith("gamma") or "norm" in name and name.endswith("weight"):
+                value.add_(0.8)
+    return net.eval()
+
+
+def as_transformers(net: DinoV2) -> Dinov2Model:
+    """transformers' model with the same weights; every one of its weights is set."""
+    config = Dinov2Config(
+        hidden_size=DINO_CHANNELS,
+        num_hidden_layers=DINO_DEPTH,
+        num_attention_heads=DINO_HEADS,
+        image_size=14 * DINO_GRID,
+        patch_size=14,
+    )
+    theirs = Dinov2Model(config).eval()
+    ours = net.state_dict()
+    renamed = {
+        "embeddings.cls_token": ours["cls_token"],
+        "embeddings.mask_token": torch.zeros(1, DINO_CHANNELS),
+        "embeddings.position_embeddings": ours["pos_embed"],
+        "embeddings.patch_embeddings.projection.weight": ours["patch_embed.proj.weight"],
+        "embeddings.patch_embeddings.projection.bias": ours["patch_embed.proj.bias"],
+        "layernorm.weight": ours["norm.weight"],
+        "layernorm.bias": ours["norm.bias"],
+    }
+    for i in range(DINO_DEPTH):
+        here, there = f"blocks.{i}.", f"encoder.layer.{i}."
+        for end in ("weight", "bias"):
+            for part in ("norm1", "norm2", "mlp.fc1", "mlp.fc2"):
+                renamed[f"{there}{part}.{end}"] = ours[f"{here}{part}.{end}"]
+            for part, value in zip("qkv", ours[f"{here}attn.qkv.{end}"].chunk(3), strict=True):
+                renamed[f"{there}attention.{part}_proj.{end}"] = value
+            renamed[f"{there}attention.o_proj.{end}"] = ours[f"{here}attn.proj.{end}"]
+        for k in (1, 2):
+            renamed[f"{there}layer_scale{k}.lambda1"] = ours[f"{here}ls{k}.gamma"]
+    theirs.load_state_dict(renamed, strict=True)
+    return theirs
+
+
+def tokens_of(net: DinoV2, image: torch.Tensor) -> torch.Tensor:
+    """As transformers orders them: the whole's first, then the patches', row by row."""
+    with torch.inference_mode():
+        patches, whole = net(image)
+    return torch.cat([whole[:, None], patches.flatten(2).transpose(1, 2)], dim=1)
+
+
+def test_tokens_are_transformers() -> None:
+    net = small_trunk()
+    theirs = as_transformers(net)
+    image = torch.randn(
+        2, 3, 14 * DINO_GRID, 14 * DINO_GRID, generator=torch.Generator().manual_seed(1)
+    )
+    with torch.inference_mode():
+        expected = theirs(image).last_hidden_state
+    assert expected.std() > 0.3  # the comparison says something
+    torch.testing.assert_close(tokens_of(net, image), expected, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("size", [(42, 98), (98, 42), (112, 70)])
+def test_at_other_sizes_only_the_positions_differ_from_transformers(
+    size: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    net = small_trunk(2)
+    theirs = as_transformers(net)
+    image = torch.randn(1, 3, *size, generator=torch.Generator().manual_seed(3))
+    found = tokens_of(net, image)
+    with torch.inference_mode():
+        by_its_own_rule = theirs(image).last_hidden_state
+        monkeypatch.setattr(
+            theirs.embeddings,
+            "interpolate_pos_encoding",
+            lambda _, height, width: net.positions(height // 14, width // 14),
+        )
+        expected = theirs(image).last_hidden_state
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+    # its rule is near the official one, and not it
+    distance = (found - by_its_own_rule).abs().max()
+    assert 1e-3 < distance < 1.0
+
+
+def cubic(distance: float) -> float:
+    """Keys' kernel with a = -0.75, which torch takes."""
+    x = abs(distance)
+    if x <= 1:
+        return 1.25 * x**3 - 2.25 * x**2 + 1
+    return -0.75 * x**3 + 3.75 * x**2 - 6 * x + 3 if x < 2 else 0.0
+
+
+def weights(length: int, learnt: int) -> NDArray[np.float64]:
+    """Matrix (length, learnt) of the bicubic reading whose scale is (length + 0.1) / learnt."""
+    matrix = np.zeros((length, learnt))
+    for k in range(length):
+        place = (k + 0.5) * learnt / (length + 0.1) - 0.5
+        for tap in range(math.floor(place) - 1, math.floor(place) + 3):
+            matrix[k, min(max(tap, 0), learnt - 1)] += cubic(place - tap)
+    return matrix
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(3, 7), (9, 2), (5, 6), (1, 1), (4, 4)])
+def test_positions_are_read_bicubically_with_dinov2s_offset(rows: int, columns: int) -> None:
+    net = small_trunk(4)
+    learnt = net.pos_embed.detach().double().numpy()[0]
+    maps = learnt[1:].reshape(DINO_GRID, DINO_GRID, DINO_CHANNELS)
+    expected = np.einsum(
+        "ri,cj,ijk->rck", weights(rows, DINO_GRID), weights(columns, DINO_GRID), maps
+    )
+    found = net.positions(rows, columns).detach().numpy()[0]
+    np.testing.assert_allclose(found[0], learnt[0], atol=1e-7)
+    np.testing.assert_allclose(found[1:].reshape(rows, columns, DINO_CHANNELS), expected, atol=1e-5)
+
+
+def test_at_the_learnt_size_positions_are_as_learnt() -> None:
+    net = small_trunk()
+    torch.testing.assert_close(net.positions(DINO_GRID, DINO_GRID), net.pos_embed, rtol=0, atol=0)
+
+
+@given(st.integers(1, 90), st.integers(1, 90))
+@settings(max_examples=60)
+def test_every_size_has_as_many_positions_as_patches(rows: int, columns: int) -> None:
+    net = DinoV2(channels=1, depth=0, heads=1)
+    assert net.positions(rows, columns).shape == (1, 1 + rows * columns, 1)
+
+
+def test_what_fills_no_patch_is_left_out() -> None:
+    net = small_trunk()
+    image = torch.randn(1, 3, 75, 95, generator=torch.Generator().manual_seed(5))
+    torch.testing.assert_close(tokens_of(net, image), tokens_of(net, image[:, :, :70, :84]))
+    assert tokens_of(net, image).shape == (1, 1 + 5 * 6, DINO_CHANNELS)
+
+
+def test_vit_b_has_as_many_parameters_as_transformers() -> None:
+    with torch.device("meta"):
+        ours = DinoV2()
+        theirs = Dinov2Model(Dinov2Config(image_size=518, patch_size=14))
+    mask_token = 768
+    count = sum(p.numel() for p in ours.parameters())
+    assert count == sum(p.numel() for p in theirs.parameters()) - mask_token == 86_579_712

@@ -6,26 +6,20 @@ from pathlib import Path
 
 import pytest
 import torch
+from published import published_shapes
 from torch.nn import functional
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.weights import find_weights, read_weights
 from megloc_kapture.nets.r2d2 import R2D2Network, load_r2d2, pyramid_levels
 
-KEYS = Path(__file__).parent / "keys"
 FILES = {"r2d2_WAF_N16": 32, "r2d2_WASF_N16": 32, "r2d2_WASF_N8_big": 48}
-
-
-def frozen_keys(name: str) -> dict[str, tuple[int, ...]]:
-    """Key -> shape, as the published checkpoints have them without ``module.``."""
-    pairs = (row.split() for row in (KEYS / f"{name}.txt").read_text().splitlines())
-    return {key: () if s == "scalar" else tuple(map(int, s.split("x"))) for key, s in pairs}
 
 
 def random_tensors(name: str = "r2d2_WASF_N16", seed: int = 0) -> dict[str, torch.Tensor]:
     generator = torch.Generator().manual_seed(seed)
     tensors = {}
-    for key, shape in frozen_keys(name).items():
+    for key, shape in published_shapes(name).items():
         fan_in = max(1, int(torch.tensor(shape[1:]).prod())) if len(shape) == 4 else 4
         tensors[key] = torch.randn(shape, generator=generator) / fan_in**0.5
         if key.endswith("running_var"):
@@ -44,7 +38,7 @@ def published(shared_data: Path, name: str) -> dict[str, torch.Tensor]:
 )
 def test_keys_and_shapes_are_the_published_ones(name: str, stored: int) -> None:
     state = R2D2Network(FILES[name]).state_dict()
-    assert {key: tuple(value.shape) for key, value in state.items()} == frozen_keys(name)
+    assert {key: tuple(value.shape) for key, value in state.items()} == published_shapes(name)
     assert sum(value.numel() for value in state.values()) == stored
 
 

@@ -9,10 +9,11 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from megloc_kapture.nets.nerfw import NerfW  # noqa: E402
 from megloc_kapture.nets.radiance import (  # noqa: E402
+    NerfW,  # noqa: E402
     Rays,
     Samples,
+    TriPlane,  # noqa: E402
     about_depth,
     composite,
     frequencies,
@@ -21,7 +22,6 @@ from megloc_kapture.nets.radiance import (  # noqa: E402
     spacings,
     stratified,
 )
-from megloc_kapture.nets.triplane import TriPlane  # noqa: E402
 
 
 def rays_of(count: int, *, near: float = 0.5, far: float = 4.0, seed: int = 0) -> Rays:
@@ -183,7 +183,7 @@ def test_a_field_renders_rays(kind: type[NerfW] | type[TriPlane]) -> None:
 
 
 def test_space_beyond_the_planes_is_contracted_without_a_seam() -> None:
-    from megloc_kapture.nets.triplane import _contracted
+    from megloc_kapture.nets.radiance import _contracted
 
     points = torch.tensor([0.0, 0.5, 1.0, 1.0 + 1e-6, 3.0, 1e6, -3.0], dtype=torch.float64)
     found = _contracted(points)

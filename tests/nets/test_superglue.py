@@ -7,10 +7,10 @@ so that a wrong head, a wrong mask or a lost message changes the matches.
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import pytest
 import torch
+from published import published_shapes
 from torch.nn import functional
 from transformers import SuperGlueConfig, SuperGlueForKeypointMatching
 from transformers.models.superglue.modeling_superglue import log_optimal_transport as in_logarithm
@@ -25,7 +25,6 @@ from megloc_kapture.nets.superglue import (
     superglue,
 )
 
-KEYS = Path(__file__).parent / "keys" / "superglue.txt"
 WIDTH, HEIGHT = 640, 480
 THRESHOLD = 0.2
 BIN = torch.tensor(1.0)
@@ -35,9 +34,7 @@ def peaky_weights(seed: int = 0) -> dict[str, torch.Tensor]:
     """Under the official keys and shapes."""
     generator = torch.Generator().manual_seed(seed)
     found = {}
-    for row in KEYS.read_text().splitlines():
-        key, shape = row.split()
-        sizes = [] if shape == "scalar" else [int(size) for size in shape.split("x")]
+    for key, sizes in published_shapes("superglue").items():
         value = torch.randn(sizes, generator=generator)
         if len(sizes) == 3:
             value *= sizes[1] ** -0.5
@@ -146,13 +143,8 @@ def network(seed: int = 0) -> SuperGlueNet:
 
 
 def test_keys_and_shapes_are_the_official_ones() -> None:
-    rows = [row.split() for row in KEYS.read_text().splitlines()]
-    net = SuperGlueNet()
-    shapes = {
-        key: "x".join(map(str, value.shape)) if value.ndim else "scalar"
-        for key, value in net.state_dict().items()
-    }
-    assert shapes == dict(rows)
+    net, rows = SuperGlueNet(), published_shapes("superglue")
+    assert {key: tuple(value.shape) for key, value in net.state_dict().items()} == rows
     assert len(rows) == 339
     assert sum(parameter.numel() for parameter in net.parameters()) == 12_023_297
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import pytest
 import torch
+from published import published_shapes
 from torch.nn import functional
 from transformers import SuperPointConfig, SuperPointForKeypointDetection
 
@@ -25,9 +25,7 @@ from megloc_kapture.nets.superpoint import (
     superpoint_with_descriptor,
 )
 
-KEYS = Path(__file__).parent / "keys" / "superpoint.txt"
 BACKBONE = ("conv1", "conv2", "conv3", "conv4")
-BATCHNORM_KEYS = Path(__file__).parent / "keys" / "superpoint-batchnorm.txt"
 LAYERS = {
     **{
         f"conv{block + 1}{letter}": f"backbone.{block}.{index}"
@@ -45,9 +43,7 @@ def random_weights(seed: int) -> dict[str, torch.Tensor]:
     """Under the official keys and shapes; activations neither vanish nor grow with the depth."""
     generator = torch.Generator().manual_seed(seed)
     found = {}
-    for row in KEYS.read_text().splitlines():
-        key, shape = row.split()
-        sizes = [int(size) for size in shape.split("x")]
+    for key, sizes in published_shapes("superpoint").items():
         fan_in = sizes[1] * sizes[2] * sizes[3] if len(sizes) == 4 else 100
         found[key] = torch.randn(sizes, generator=generator) * (2 / fan_in) ** 0.5
     return found
@@ -80,11 +76,9 @@ def transformers_model(
 
 
 def test_keys_and_shapes_are_the_official_ones() -> None:
-    rows = [row.split() for row in KEYS.read_text().splitlines()]
     state = SuperPointNet().state_dict()
-    shapes = {key: "x".join(map(str, value.shape)) for key, value in state.items()}
-    assert shapes == dict(rows)
-    assert len(rows) == 24
+    shapes = {key: tuple(value.shape) for key, value in state.items()}
+    assert shapes == published_shapes("superpoint") and len(shapes) == 24
     assert sum(value.numel() for value in state.values()) == 1_300_865
 
 
@@ -247,9 +241,7 @@ def test_a_checkpoint_that_does_not_fit_is_named() -> None:
 def random_batchnorm_weights(seed: int) -> dict[str, torch.Tensor]:
     generator = torch.Generator().manual_seed(seed)
     found = {}
-    for row in BATCHNORM_KEYS.read_text().splitlines():
-        key, shape = row.split()
-        sizes = [] if shape == "scalar" else [int(size) for size in shape.split("x")]
+    for key, sizes in published_shapes("superpoint-batchnorm").items():
         fan_in = sizes[1] * sizes[2] * sizes[3] if len(sizes) == 4 else 10
         found[key] = torch.randn(sizes, generator=generator) * (2 / fan_in) ** 0.5
         if key.endswith(("bn.weight", "running_var")):
@@ -263,12 +255,8 @@ def gray() -> torch.Tensor:
 
 def test_keys_and_shapes_are_the_published_ones() -> None:
     state = SuperPointBatchNormNet().state_dict()
-    rows = [row.split() for row in BATCHNORM_KEYS.read_text().splitlines()]
-    shapes = {
-        key: "x".join(map(str, value.shape)) if value.ndim else "scalar"
-        for key, value in state.items()
-    }
-    assert shapes == dict(rows)
+    shapes = {key: tuple(value.shape) for key, value in state.items()}
+    assert shapes == published_shapes("superpoint-batchnorm")
 
 
 @torch.inference_mode()

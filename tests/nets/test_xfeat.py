@@ -12,30 +12,18 @@ from kornia.feature.xfeat import InterpolateSparse2d
 from kornia.feature.xfeat import XFeat as KorniaXFeat
 from numpy.typing import NDArray
 from PIL import Image
+from published import published_shapes
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.weights import find_weights, read_weights
-from megloc_kapture.nets.xfeat import (
-    XFeatNetwork,
-    keypoint_scores,
-    load_xfeat,
-    sample_at_pixels,
-)
-
-KEYS = Path(__file__).parent / "keys" / "xfeat.txt"
-
-
-def frozen_keys() -> dict[str, tuple[int, ...]]:
-    """Key -> shape, as the published files have them."""
-    pairs = (row.split() for row in KEYS.read_text().splitlines())
-    return {key: tuple(map(int, shape.split("x"))) for key, shape in pairs}
+from megloc_kapture.nets.xfeat import XFeatNetwork, keypoint_scores, load_xfeat, sample_at_pixels
 
 
 def random_tensors(seed: int = 0) -> dict[str, torch.Tensor]:
     generator = torch.Generator().manual_seed(seed)
     return {
         key: torch.rand(shape, generator=generator) + 0.1 * key.endswith("running_var")
-        for key, shape in frozen_keys().items()
+        for key, shape in published_shapes("xfeat").items()
     }
 
 
@@ -65,7 +53,7 @@ def test_keys_and_shapes_are_the_published_ones() -> None:
         for key, value in XFeatNetwork().state_dict().items()
         if not key.endswith("num_batches_tracked")
     }
-    assert found == frozen_keys()
+    assert found == published_shapes("xfeat")
     assert sum(int(np.prod(shape)) for shape in found.values()) == 660_654
 
 

@@ -14,7 +14,7 @@ from megloc_kapture.errors import OptionError
 from megloc_kapture.io.kapture import KaptureFolder, read_pairs
 from megloc_kapture.io.tables import read_match_counts
 from megloc_kapture.io.weights import MissingWeightsError
-from megloc_kapture.nets.eigenplaces import EigenPlacesNet
+from megloc_kapture.nets.global_descriptors import EigenPlacesNet
 from megloc_kapture.pipeline.datasets import choose_dataset
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
 from megloc_kapture.pipeline.kapture_queries import KaptureQueries

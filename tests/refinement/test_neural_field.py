@@ -14,20 +14,12 @@ torch = pytest.importorskip("torch")
 import room  # noqa: E402
 
 from megloc_kapture.errors import DataError  # noqa: E402
-from megloc_kapture.nets.triplane import TriPlane  # noqa: E402
+from megloc_kapture.nets.radiance import TriPlane  # noqa: E402
 from megloc_kapture.pipeline.executors import single_threaded  # noqa: E402
 from megloc_kapture.plugins import DepthView  # noqa: E402
 from megloc_kapture.refinement import field_training  # noqa: E402
-from megloc_kapture.refinement.field_training import (  # noqa: E402
-    FieldTrainer,
-    FieldTrainingOptions,
-)
-from megloc_kapture.refinement.neural_field import (  # noqa: E402
-    FieldView,
-    NeuralField,
-    light_rows,
-    pixels_of,
-)
+from megloc_kapture.refinement.field_training import FieldTrainer, FieldTrainingOptions  # noqa: E402
+from megloc_kapture.refinement.neural_field import FieldView, NeuralField, light_rows, pixels_of  # noqa: E402
 from megloc_kapture.values import Camera, RigidTransform  # noqa: E402
 
 SMALL = Camera("PINHOLE", 32, 24, (22.0, 22.0, 16.0, 12.0))

@@ -1,18 +1,34 @@
-"""Pyramids of what is compared: scales, masks, and what changes of light do to the values."""
+"""Points of depth maps and their visibility; pyramids: scales, masks, and changes of light."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError
+from megloc_kapture.geometry.cameras import project
+from megloc_kapture.plugins import DepthView
 from megloc_kapture.refinement.pyramid import (
     Appearance,
+    DepthPoints,
+    Level,
     build_pyramid,
+    choose_points,
+    lift_points,
+    usable_cells,
+    visibility,
 )
+from megloc_kapture.values import Camera, RigidTransform
 
 APPEARANCES: tuple[Appearance, ...] = ("normalised", "colours", "intensity", "gradients")
+CAMERA = Camera("SIMPLE_RADIAL", 320, 240, (250.0, 161.0, 118.5, -0.05))
+DEPTH_CAMERA = Camera("PINHOLE", 160, 120, (130.0, 131.0, 80.0, 60.5))
+HERE = RigidTransform.identity()
+POSE = RigidTransform.from_matrix(
+    Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix(), np.array([1.0, 2.0, -0.5])
+)
 
 
 def picture(seed: int = 0, width: int = 200, height: int = 150) -> NDArray[np.uint8]:
@@ -120,3 +136,106 @@ def test_what_does_not_fit_is_refused() -> None:
         build_pyramid(picture(), features=lambda image: np.zeros((3, 4)))
     with pytest.raises(DataError, match="finite"):
         build_pyramid(picture(), features=lambda image: np.full((1, 40, 40), np.nan))
+
+
+def plane(camera: Camera, slope: float = 0.1, at: float = 3.0) -> NDArray[np.float32]:
+    """Depth of the plane z = at + slope x."""
+    x = (np.arange(camera.width) + 0.5 - 80.0) / 130.0
+    return np.broadcast_to(at / (1 - slope * x), (camera.height, camera.width)).astype(np.float32)
+
+
+def test_points_project_to_their_pixels() -> None:
+    depth = np.full((240, 320), 4.0, np.float32)
+    lifted = lift_points(CAMERA, POSE, DepthView(CAMERA, depth, HERE))
+    assert len(lifted.points) > 70_000
+    np.testing.assert_allclose(project(CAMERA, POSE, lifted.points), lifted.px, atol=1e-6)
+    np.testing.assert_allclose(POSE.apply(lifted.points)[:, 2], 4.0)
+    np.testing.assert_array_equal(lifted.px % 1.0, 0.5)
+
+
+def test_another_depth_camera_is_honoured() -> None:
+    image_from_depth = RigidTransform.from_matrix(
+        Rotation.from_rotvec([0.0, 0.05, 0.0]).as_matrix(), np.array([0.1, -0.02, 0.03])
+    )
+    view = DepthView(DEPTH_CAMERA, plane(DEPTH_CAMERA), image_from_depth)
+    lifted = lift_points(CAMERA, POSE, view)
+    points = (image_from_depth.inverse() @ POSE).apply(lifted.points)
+    assert len(points) > 10_000
+    np.testing.assert_allclose(points[:, 2], 3.0 + 0.1 * points[:, 0], atol=1e-5)
+    np.testing.assert_allclose(project(CAMERA, POSE, lifted.points), lifted.px, atol=1e-6)
+
+
+def test_edges_and_unknown_depths_give_no_points() -> None:
+    depth = np.full((120, 160), 4.0, np.float32)
+    depth[:, 80:] = 2.0
+    depth[50, 30], depth[60, 30], depth[70, 30], depth[80, 30] = 0.0, np.nan, -1.0, np.inf
+    lifted = lift_points(DEPTH_CAMERA, HERE, DepthView(DEPTH_CAMERA, depth, HERE))
+    there = np.zeros((120, 160), bool)
+    there[tuple((lifted.px[:, ::-1] - 0.5).astype(int).T)] = True
+    assert not there[:, 79:81].any() and there[10, 77] and there[10, 82]
+    for row in (50, 60, 70, 80):
+        assert not there[row, 30] and there[row + 3, 30]
+
+
+def test_a_depth_map_of_another_size_is_refused() -> None:
+    with pytest.raises(DataError, match="depth map"):
+        lift_points(CAMERA, HERE, DepthView(CAMERA, np.ones((10, 10), np.float32), HERE))
+
+
+def test_near_surfaces_hide_far_ones() -> None:
+    far = lift_points(CAMERA, HERE, DepthView(CAMERA, np.full((240, 320), 6.0, np.float32), HERE))
+    small = np.zeros((240, 320), np.float32)
+    small[80:160, 100:200] = 2.0
+    near = lift_points(CAMERA, HERE, DepthView(CAMERA, small, HERE))
+    seen = visibility([far, near], CAMERA, HERE)
+    assert seen.seen[1].all() and seen.covered.all()
+    x, y = far.px.T
+    inside = (x > 104) & (x < 196) & (y > 84) & (y < 156)
+    outside = (x < 95) | (x > 205) | (y < 75) | (y > 165)
+    assert not seen.seen[0][inside].any() and seen.seen[0][outside].all()
+    alone = visibility([near], CAMERA, HERE).covered
+    assert 0.08 < alone.mean() < 0.16
+    # from behind, nothing is in front of the camera
+    turned = RigidTransform((0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0))
+    assert not visibility([far, near], CAMERA, turned).covered.any()
+
+
+def test_usable_cells_are_those_whose_middle_is_valid() -> None:
+    valid = np.ones((240, 320), bool)
+    valid[:, :100] = False
+    usable = usable_cells(valid, (60, 80))
+    assert not usable[:, :25].any() and usable[:, 25:].all()
+
+
+def level_of(seed: int) -> Level:
+    image = np.random.default_rng(seed).integers(0, 256, (240, 320, 3)).astype(np.uint8)
+    return build_pyramid(image, levels=1)[0]
+
+
+def test_the_strongest_of_each_cell_are_chosen() -> None:
+    levels = [level_of(0), level_of(1)]
+    depth = DepthView(CAMERA, np.full((240, 320), 4.0, np.float32), HERE)
+    lifted = [lift_points(CAMERA, HERE, depth), lift_points(CAMERA, POSE, depth)]
+    wanted = [np.ones(len(lifted[0].points), bool), lifted[1].px[:, 0] < 160]
+    chosen = choose_points(lifted, levels, wanted, 768)  # cells of 10 px
+    for group, level in enumerate(levels):
+        energy = level.gradient_energy
+        energy[[0, -1]] = energy[:, [0, -1]] = 0
+        ours = chosen.groups == group
+        pose = (HERE, POSE)[group]
+        px = project(CAMERA, pose, chosen.points[ours])
+        columns = 32 if group == 0 else 16
+        assert len(px) == 24 * columns
+        rows_columns = np.round(px[:, ::-1] - 0.5).astype(int)
+        blocks = energy[:, : 10 * columns].reshape(24, 10, columns, 10).max((1, 3))
+        np.testing.assert_array_equal(energy[tuple(rows_columns.T)], blocks.ravel())
+        np.testing.assert_allclose(
+            chosen.values[ours], level.values[tuple(rows_columns.T)], atol=1e-5
+        )
+    assert len(chosen.thinned(100).points) <= 100
+
+
+def test_a_flat_image_gives_no_points() -> None:
+    flat = build_pyramid(np.full((240, 320, 3), 90, np.uint8), levels=1)[0]
+    lifted = DepthPoints(np.ones((4, 3)), np.full((4, 2), 20.5))
+    assert len(choose_points([lifted], [flat], [np.ones(4, bool)], 100).points) == 0

@@ -1,33 +1,65 @@
-"""Prepared references are kept by their content, up to a number of bytes."""
+"""References are kept by their content; a map's own images, held out, in a corner of a room."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError
+from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.plugins import DepthView
+from megloc_kapture.refinement.acceptance import CHI2_OF_CHANCE, RenderingOptions
 from megloc_kapture.refinement.references import (
+    MAX_TESTED,
+    MAX_TRIED,
+    MIN_TESTED,
+    Consistency,
+    Displacement,
+    HoldsOut,
     PyramidKind,
     ReferenceCache,
+    ReferenceImages,
     RenderingReference,
+    judge_consistency,
     prepare,
+    refine_held_out,
+    spread_names,
 )
+from megloc_kapture.refinement.rendering import Rendering
 from megloc_kapture.values import Camera, RigidTransform
 
-CAMERA = Camera("PINHOLE", 80, 60, (70.0, 70.0, 40.0, 30.0))
+SMALL_CAMERA = Camera("PINHOLE", 80, 60, (70.0, 70.0, 40.0, 30.0))
 HERE = RigidTransform.identity()
 KIND = PyramidKind(levels=2, max_side_px=640, appearance="intensity")
+Array = NDArray[np.float64]
+Map = Mapping[str, RenderingReference]
+
+CAMERA = Camera("PINHOLE", 240, 180, (195.0, 197.0, 120.0, 90.0))
+PX_PER_M = 60
+SLOW = pytest.mark.slow
+# two threads on small images wait for each other most of the time
+QUICK = RenderingOptions(max_references=3, search_deg=2.0)
+# origin, unit vectors of the texture's columns and rows, metres along them
+WALLS = (
+    ((-4.0, -3.0, 4.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), 6, 6),
+    ((2.0, -3.0, 4.0), (0.6, 0.0, -0.8), (0.0, 1.0, 0.0), 5, 6),
+    ((-4.0, 1.5, 4.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0), 9, 5),
+)
 
 
 def reference(seed: int) -> RenderingReference:
     rng = np.random.default_rng(seed)
     image = rng.integers(0, 256, (60, 80, 3), np.uint8)
     depth_m = rng.uniform(2.0, 2.001, (60, 80)).astype(np.float32)
-    return RenderingReference(image, CAMERA, HERE, DepthView(CAMERA, depth_m, HERE))
+    return RenderingReference(image, SMALL_CAMERA, HERE, DepthView(SMALL_CAMERA, depth_m, HERE))
 
 
 def test_the_same_content_is_prepared_once() -> None:
@@ -49,7 +81,7 @@ def test_any_other_content_is_prepared_anew() -> None:
     pixel[30, 40, 1] ^= 1
     further = replace(one.depth, depth_m=one.depth.depth_m + np.float32(1e-3))
     there = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1e-9))
-    wider = replace(CAMERA, params=(69.0, 70.0, 40.0, 30.0))
+    wider = replace(SMALL_CAMERA, params=(69.0, 70.0, 40.0, 30.0))
     others = [
         replace(one, image=pixel),
         replace(one, mask=np.ones((60, 80), bool)),
@@ -92,3 +124,306 @@ def test_images_of_another_size_are_refused() -> None:
     one = reference(0)
     with pytest.raises(DataError, match="does not fit a camera"):
         ReferenceCache(2**24).prepared(replace(one, image=one.image[:50]), KIND)
+
+
+def texture(width: int, height: int, seed: int) -> NDArray[np.uint8]:
+    rng = np.random.default_rng(seed)
+    image = np.zeros((height, width, 3))
+    for sigma in (1.5, 4.0, 12.0):
+        layer = cv2.GaussianBlur(rng.normal(size=(height, width, 3)), (0, 0), sigma)
+        image += layer / layer.std()
+    return np.clip(128 + 30 * image, 0, 255).astype(np.uint8)
+
+
+def view(cam_from_world: RigidTransform, camera: Camera) -> RenderingReference:
+    """What a camera sees of the corner: every ray meets the nearest wall."""
+    h, w = camera.height, camera.width
+    px = np.stack(np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5), axis=-1).reshape(-1, 2)
+    rays = bearing_rays(camera, px)
+    rays /= rays[:, 2:]
+    directions = rays @ cam_from_world.rotation_matrix()
+    depth, image = np.full(h * w, np.inf), np.full((h * w, 3), 128, np.uint8)
+    for seed, (corner, u, v, width, height) in enumerate(WALLS):
+        origin, across, down = (np.array(each) for each in (corner, u, v))
+        normal = np.cross(across, down)
+        far = ((origin - cam_from_world.center()) @ normal) / (directions @ normal)
+        on = cam_from_world.center() + far[:, None] * directions - origin
+        # OpenCV's pixel centres are at integers
+        x, y = ((on @ axis * PX_PER_M - 0.5).astype(np.float32) for axis in (across, down))
+        painted = texture(width * PX_PER_M, height * PX_PER_M, seed)
+        inside = (x >= 0) & (x < painted.shape[1]) & (y >= 0) & (y < painted.shape[0])
+        nearest = inside & (far > 0) & (far < depth)
+        seen = cv2.remap(painted, x.reshape(h, w), y.reshape(h, w), cv2.INTER_LINEAR)
+        depth = np.where(nearest, far, depth)
+        image[nearest] = seen.reshape(-1, 3)[nearest]
+    depth_m = np.where(np.isfinite(depth), depth, 0.0).reshape(h, w).astype(np.float32)
+    shape = (h, w, 3)
+    return RenderingReference(
+        image.reshape(shape), camera, cam_from_world, DepthView(camera, depth_m, HERE)
+    )
+
+
+def pose(center: tuple[float, float, float], yaw_deg: float, pitch_deg: float) -> RigidTransform:
+    rotation = Rotation.from_euler("xy", [pitch_deg, yaw_deg], degrees=True).as_matrix()
+    return RigidTransform.from_matrix(rotation, -rotation @ np.array(center))
+
+
+POSES = [
+    pose((-1.5, 0.0, 0.0), -4, 3),
+    pose((-0.9, 0.3, 0.6), -2, 4),
+    pose((-0.2, -0.3, 0.1), 0, 6),
+    pose((0.4, 0.2, 0.9), 3, 2),
+    pose((1.0, -0.1, 0.2), 8, 5),
+    pose((-0.6, -0.5, -0.8), -6, 8),
+]
+
+
+def drawn(camera: Camera) -> Map:
+    return {f"{k}.png": view(each, camera) for k, each in enumerate(POSES)}
+
+
+@pytest.fixture(scope="module")
+def corner() -> Map:
+    return drawn(CAMERA)
+
+
+@pytest.fixture(scope="module")
+def exact(corner: Map) -> Consistency:
+    return verdict(corner)
+
+
+class Scene:
+    """A map of images in memory; nothing of queries."""
+
+    def __init__(self, images: Map) -> None:
+        self.images = images
+
+    def map_image(self, name: str) -> NDArray[np.uint8]:
+        return self.images[name].image
+
+    def map_mask(self, name: str) -> None:
+        return None
+
+    def map_depth(self, name: str) -> DepthView | None:
+        depth = self.images[name].depth
+        return depth if depth.depth_m.any() else None
+
+    def map_camera(self, name: str) -> Camera:
+        return self.images[name].camera
+
+    def map_pose(self, name: str) -> RigidTransform:
+        return self.images[name].cam_from_world
+
+
+def verdict(images: Map) -> Consistency:
+    rendering = Rendering(QUICK)
+    assert isinstance(rendering, HoldsOut)
+    poses = ReferenceImages({name: each.cam_from_world for name, each in images.items()})
+    scene = Scene(images)
+    return judge_consistency(
+        rendering.hold_out(name, poses, scene) for name in spread_names(list(images))
+    )
+
+
+def posed(images: Map, change: Callable[[int, RigidTransform], RigidTransform]) -> Map:
+    return {
+        name: replace(each, cam_from_world=change(k, each.cam_from_world))
+        for k, (name, each) in enumerate(images.items())
+    }
+
+
+def displaced(pose: RigidTransform, seed: int, m: float, deg: float) -> RigidTransform:
+    rng = np.random.default_rng(seed)
+    axis, shift = rng.normal(size=3), rng.normal(size=3)
+    turn = Rotation.from_rotvec(np.radians(deg) * axis / np.linalg.norm(axis)).as_matrix()
+    rotation = turn @ pose.rotation_matrix()
+    center = pose.center() + m * shift / np.linalg.norm(shift)
+    return RigidTransform.from_matrix(rotation, -rotation @ center)
+
+
+def test_an_exact_map_is_consistent(exact: Consistency) -> None:
+    assert exact.consistent and exact.images == len(POSES)
+    assert exact.median is not None
+    assert exact.median.moved_m < 0.005 and exact.median.turned_deg < 0.08
+
+
+@pytest.mark.parametrize(
+    ("m", "deg"),
+    [(0.02, 0.5), pytest.param(0.02, 0.0, marks=SLOW), pytest.param(0.0, 0.5, marks=SLOW)],
+)
+def test_poses_that_are_off_contradict_each_other(corner: Map, m: float, deg: float) -> None:
+    found = verdict(posed(corner, lambda k, each: displaced(each, k, m, deg)))
+    assert "contradicts itself" in found.reason
+    assert found.median is not None
+    assert found.median.moved_m > 0.5 * m and found.median.turned_deg > 0.5 * deg
+
+
+@pytest.mark.parametrize("shift_px", [7, pytest.param(-7, marks=SLOW)])
+def test_depth_that_is_shifted_against_colour_shows_between_views(
+    corner: Map, shift_px: int
+) -> None:
+    shifted = {
+        name: replace(
+            each, depth=replace(each.depth, depth_m=np.roll(each.depth.depth_m, shift_px, axis=1))
+        )
+        for name, each in corner.items()
+    }
+    assert "contradicts itself" in verdict(shifted).reason
+
+
+@SLOW
+def test_a_depth_camera_that_stands_elsewhere_than_said_shows_between_views(
+    corner: Map, exact: Consistency
+) -> None:
+    beside = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.025, 0.0, 0.0))
+    off = {
+        name: replace(each, depth=replace(each.depth, image_from_depth=beside))
+        for name, each in corner.items()
+    }
+    # that all images are off by as much and look nearly the same way hides most of it
+    found = verdict(off)
+    assert found.median is not None and exact.median is not None
+    assert found.median.squared_distance > 2.0 * exact.median.squared_distance
+
+
+@SLOW
+@pytest.mark.parametrize(("scale", "off_deg"), [(0.1, 0.0), (0.1, 0.5), (12.0, 0.0), (12.0, 0.5)])
+def test_neither_unit_nor_frame_matters(corner: Map, scale: float, off_deg: float) -> None:
+    elsewhere = pose((30.0, -20.0, 5.0), 40, 20)
+
+    def change(k: int, each: RigidTransform) -> RigidTransform:
+        moved = displaced(each, k, 0.0, off_deg) @ elsewhere
+        return RigidTransform.from_matrix(
+            moved.rotation_matrix(), scale * np.array(moved.translation)
+        )
+
+    other = {
+        name: replace(
+            each, depth=replace(each.depth, depth_m=np.float32(scale) * each.depth.depth_m)
+        )
+        for name, each in posed(corner, change).items()
+    }
+    assert verdict(other).consistent == (off_deg == 0.0)
+
+
+@SLOW
+def test_the_size_of_images_does_not_matter() -> None:
+    large = drawn(Camera("PINHOLE", 720, 540, tuple(3.0 * x for x in CAMERA.params)))
+    assert verdict(large).consistent
+    noisy = posed(large, lambda k, each: displaced(each, k, 0.02, 0.5))
+    assert "contradicts itself" in verdict(noisy).reason
+
+
+@SLOW
+def test_images_that_share_a_displacement_do_not_vouch_for_each_other() -> None:
+    # two scans of three views each, a centimetre apart
+    centers = [(-0.6, 0.0, 0.0), (0.4, 0.1, 0.2)]
+    scans = {
+        f"{scan}-{k}.png": view(
+            pose((x + 0.01 * k, y, z), (0.0, -5.0, 5.0)[k], (4.0, 3.0, 6.0)[k]), CAMERA
+        )
+        for scan, (x, y, z) in enumerate(centers)
+        for k in range(3)
+    }
+    assert verdict(scans).consistent
+    whole = displaced(HERE, 1, 0.02, 0.5)
+    off = posed(scans, lambda k, each: each @ whole if k >= 3 else each)
+    assert "6 of 6" in verdict(off).reason
+
+
+def test_images_of_one_position_say_nothing_of_each_other(corner: Map) -> None:
+    rotations = [each.rotation_matrix() for each in POSES]
+    center = POSES[2].center()
+    there = {
+        f"{k}.png": view(RigidTransform.from_matrix(r, -r @ center), CAMERA)
+        for k, r in enumerate(rotations)
+    }
+    found = verdict(there)
+    assert found.images == 0 and "seen by others from elsewhere" in found.reason
+
+
+def test_a_map_without_depth_is_not_known(corner: Map) -> None:
+    flat = {
+        name: replace(each, depth=replace(each.depth, depth_m=np.zeros_like(each.depth.depth_m)))
+        for name, each in corner.items()
+    }
+    found = verdict(flat)
+    assert found == Consistency(0, 0, None, found.reason) and "depth" in found.reason
+
+
+def test_what_a_wall_hides_is_no_reference(corner: Map) -> None:
+    # two rooms back to back: what looks the same way from behind the wall sees nothing of it
+    behind = {
+        f"behind-{k}.png": view(
+            RigidTransform.from_matrix(np.eye(3), -np.array([0.3 * k, 0.0, -0.5])), CAMERA
+        )
+        for k in range(3)
+    }
+    shifted = {  # the same pictures and depths, said to be 6 m further on
+        name: replace(
+            each,
+            cam_from_world=RigidTransform(
+                each.cam_from_world.quat_wxyz,
+                tuple(np.array(each.cam_from_world.translation) - (0.0, 0.0, 6.0)),
+            ),
+        )
+        for name, each in behind.items()
+    }
+    images = {"0.png": corner["0.png"], **shifted}
+    poses = ReferenceImages({name: each.cam_from_world for name, each in images.items()})
+    asked: list[int] = []
+
+    def displace(query: object, references: object, given: object) -> None:
+        asked.append(len(references))  # type: ignore[arg-type]
+
+    assert refine_held_out("0.png", poses, Scene(images), displace, max_references=4) is None
+    assert not asked
+
+
+def known(squared_distance: float, moved_px: float = 0.5) -> Displacement:
+    return Displacement(0.01, 0.1, moved_px, 0.002, 0.02, squared_distance)
+
+
+@given(st.lists(st.booleans(), min_size=MIN_TESTED, max_size=MAX_TESTED))
+def test_most_of_the_images_decide(wrong: list[bool]) -> None:
+    values = [CHI2_OF_CHANCE * (1.01 if each else 0.99) for each in wrong]
+    found = judge_consistency(map(known, values))
+    assert (found.images, found.contradicting) == (len(wrong), sum(wrong))
+    assert found.consistent == (sum(wrong) <= len(wrong) / 2)
+    assert found.median is not None
+    assert found.median.squared_distance == pytest.approx(np.median(values))
+
+
+def test_what_alignment_does_not_resolve_contradicts_nothing() -> None:
+    assert known(1e4, 0.06).contradicts and not known(1e4, 0.04).contradicts
+    assert not known(CHI2_OF_CHANCE, 100.0).contradicts
+
+
+def test_few_images_decide_nothing() -> None:
+    few = judge_consistency([None, *[known(1.0)] * (MIN_TESTED - 1), None])
+    assert "not known" in few.reason and few.images == MIN_TESTED - 1
+    assert judge_consistency([None, *[known(1.0)] * MIN_TESTED]).consistent
+
+
+def test_no_more_is_asked_for_than_is_needed() -> None:
+    asked = iter([known(1.0)] * 100)
+    assert judge_consistency(asked).images == MAX_TESTED
+    assert len(list(asked)) == 100 - MAX_TESTED
+
+
+@given(st.integers(0, 3000))
+def test_a_sample_is_bounded_and_spread(count: int) -> None:
+    names = [f"{k:05d}" for k in range(count)]
+    found = spread_names(names[::-1])
+    assert len(found) == min(count, MAX_TRIED) == len(set(found))
+    assert set(found) <= set(names)
+    for first in (8, 32):
+        if count >= first:
+            ranks = sorted(int(name) for name in found[:first])
+            gaps = np.diff([-1, *ranks, count])
+            assert gaps.max() <= 4 * count / first + 1
+
+
+def test_it_can_be_switched_off() -> None:
+    assert Rendering().require_consistent_map
+    assert not Rendering(RenderingOptions(require_consistent_map=False)).require_consistent_map

@@ -22,13 +22,10 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.geometry.poses import rotation_angles_deg
 from megloc_kapture.plugins import DepthView, PoseRefinement, PoseRefiner
+from megloc_kapture.refinement.acceptance import RenderingOptions
 from megloc_kapture.refinement.photometric import perturbed
 from megloc_kapture.refinement.pyramid import ChosenPoints, Level
-from megloc_kapture.refinement.references import (
-    RenderingOptions,
-    RenderingQuery,
-    RenderingReference,
-)
+from megloc_kapture.refinement.references import RenderingQuery, RenderingReference
 from megloc_kapture.refinement.rendering import (
     Rendering,
     _Refining,

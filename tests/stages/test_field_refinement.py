@@ -27,13 +27,10 @@ from megloc_kapture.io.kapture import (  # noqa: E402
     write_sensors,  # noqa: E402
 )
 from megloc_kapture.pipeline.executors import single_threaded  # noqa: E402
+from megloc_kapture.refinement.acceptance import RenderingOptions  # noqa: E402
 from megloc_kapture.refinement.field_training import FieldTrainingOptions  # noqa: E402
 from megloc_kapture.refinement.neural_field import FieldRendering  # noqa: E402
-from megloc_kapture.refinement.references import (  # noqa: E402
-    RenderingOptions,
-    RenderingQuery,
-    RenderingReference,
-)
+from megloc_kapture.refinement.references import RenderingQuery, RenderingReference  # noqa: E402
 from megloc_kapture.refinement.rendering import judge_by_rendering  # noqa: E402
 from megloc_kapture.stages import neural_field  # noqa: E402
 

@@ -21,7 +21,7 @@ from megloc_kapture.io.tables import (
     read_status,
 )
 from megloc_kapture.plugins import PoseRefinement
-from megloc_kapture.refinement.consistency import Displacement
+from megloc_kapture.refinement.references import Displacement
 from megloc_kapture.stages.localized_folder import write_localized
 from megloc_kapture.stages.map_refiners import PoseRefinementOptions
 from megloc_kapture.stages.pose_refinement import refine_poses

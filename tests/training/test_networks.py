@@ -1,4 +1,4 @@
-"""The networks in training: what they describe is what the extractors extract."""
+"""Networks in training: descriptions as extracted, the loss, and figures of held-out pairs."""
 
 from __future__ import annotations
 
@@ -8,28 +8,42 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from corner import pose_at
 from numpy.typing import NDArray
 from safetensors.torch import save_file
+from scipy.spatial.transform import Rotation
 from torch import nn
 
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.features.rootsift import RootSift
 from megloc_kapture.features.superpoint import SuperPoint, SuperPointOptions
 from megloc_kapture.features.xfeat import XFeat, XFeatOptions
-from megloc_kapture.nets.superglue import ImageKeypoints, SuperGlueNet
-from megloc_kapture.training.labels import Labels
+from megloc_kapture.geometry.cameras import project
+from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.nets.superglue import ImageKeypoints, SuperGlueNet, log_optimal_transport
+from megloc_kapture.training.labels import IGNORED, UNMATCHED, Labels
 from megloc_kapture.training.networks import (
     FrozenFeatures,
     PairModel,
+    PreparedPair,
     ProductHead,
     XFeatDescriber,
     begin_at_products,
     describer_of,
     encoder_sizes,
+    judged,
+    pose_auc,
+    pose_error_deg,
+    relative_pose_error_deg,
+    transport_loss,
 )
-from megloc_kapture.training.pairs import TrainingPair
+from megloc_kapture.training.pairs import PairOptions, PosedPairs, TrainingPair
+from megloc_kapture.values import ImageFeatures, RigidTransform
 
 NOTHING = Labels(np.zeros(0, np.int64), np.zeros(0, np.int64))
+LABELS = Labels(
+    np.array([2, UNMATCHED, IGNORED, 0, UNMATCHED]), np.array([3, IGNORED, 0, UNMATCHED])
+)
 
 
 def texture(height: int, width: int, seed: int = 0) -> NDArray[np.uint8]:
@@ -202,3 +216,111 @@ def test_what_cannot_be_trained_is_refused(files: dict[str, str], tmp_path: Path
     options = SuperPointOptions(weights=files["xfeat"], device="cpu")
     with pytest.raises(DataError, match="does not fit SuperPointNet"):
         describer_of(SuperPoint(options))
+
+
+def test_it_is_the_likelihood_of_the_labels() -> None:
+    log = torch.log_softmax(torch.randn(6, 5, generator=torch.Generator().manual_seed(0)), dim=1)
+    matched = (log[0, 2] + log[3, 0]) / 2
+    unmatched = (log[1, 4] + log[4, 4] + log[5, 3]) / 3
+    torch.testing.assert_close(transport_loss(log, LABELS), -(matched + unmatched) / 2)
+    # what is ignored changes nothing
+    log[2, :], log[:, 1] = 7.0, -3.0
+    torch.testing.assert_close(transport_loss(log, LABELS), -(matched + unmatched) / 2)
+
+
+def test_nothing_labelled_is_no_loss() -> None:
+    log = torch.zeros(4, 3, requires_grad=True)
+    nothing = Labels(np.full(3, IGNORED), np.full(2, IGNORED))
+    assert transport_loss(log, nothing).item() == 0
+    lost = Labels(np.array([UNMATCHED, IGNORED, IGNORED]), np.full(2, IGNORED))
+    transport_loss(log - 2, lost).backward()
+    assert log.grad is not None and log.grad.nonzero().tolist() == [[0, 2]]
+
+
+@pytest.mark.parametrize("scale", [1.0, 40.0])  # the larger one rescales potentials on its way
+def test_gradients_through_the_transport(scale: float) -> None:
+    generator = torch.Generator().manual_seed(1)
+    scores = scale * torch.randn(5, 4, generator=generator, dtype=torch.float64)
+    dustbin = torch.tensor(0.3, dtype=torch.float64)
+
+    def loss(scores: torch.Tensor, dustbin: torch.Tensor) -> torch.Tensor:
+        return transport_loss(log_optimal_transport([scores], dustbin, 12)[0], LABELS)
+
+    inputs = (scores.requires_grad_(), dustbin.requires_grad_())
+    assert torch.autograd.gradcheck(loss, inputs, eps=1e-6, atol=1e-6)
+
+
+def test_gradients_through_superglue_reach_its_inputs() -> None:
+    torch.manual_seed(2)
+    net = SuperGlueNet(encoder_sizes=(8, 8), num_layers=2).double()
+    generator = torch.Generator().manual_seed(3)
+
+    def side(num: int) -> ImageKeypoints:
+        xy = torch.rand(num, 2, generator=generator, dtype=torch.float64)
+        scores = torch.rand(num, generator=generator, dtype=torch.float64)
+        descriptors = torch.randn(num, 8, generator=generator, dtype=torch.float64)
+        return ImageKeypoints(xy, scores, descriptors)
+
+    a, b = side(5), side(4)
+
+    def loss(first: torch.Tensor, second: torch.Tensor, bin_score: torch.Tensor) -> torch.Tensor:
+        net.bin_score.data = bin_score.data
+        pair = (ImageKeypoints(a.xy, a.scores, first), ImageKeypoints(b.xy, b.scores, second))
+        depths = net.assignments([pair], 10, [1, 2])
+        return sum(transport_loss(depth[0], LABELS) for depth in depths)  # type: ignore[return-value]
+
+    inputs = (a.descriptors.requires_grad_(), b.descriptors.requires_grad_(), net.bin_score.data)
+    assert torch.autograd.gradcheck(loss, inputs, eps=1e-6, atol=1e-5)
+
+
+def test_matches_are_judged_by_labels_of_both_images() -> None:
+    labels = Labels(np.array([1, UNMATCHED, IGNORED, IGNORED]), np.array([IGNORED, 0, UNMATCHED]))
+    matches = np.array([[0, 1], [1, 0], [2, 0], [3, 2]])
+    right, told = judged(matches, labels)
+    assert right.tolist() == [True, False, False, False]
+    assert told.tolist() == [True, True, False, True]
+
+
+def test_auc_is_the_area() -> None:
+    # half of the poses are perfect
+    assert pose_auc([0.0, np.inf]) == pytest.approx((0.5, 0.5, 0.5))
+    assert pose_auc([]) == (0.0, 0.0, 0.0)
+    assert pose_auc([90.0]) == (0.0, 0.0, 0.0)
+    # errors spread evenly over 0 to 20 degrees: recall is the line error / 20
+    even = np.linspace(0, 20, 20001)
+    assert pose_auc(even) == pytest.approx((0.125, 0.25, 0.5), abs=1e-3)
+
+
+def test_the_error_of_a_relative_pose_is_the_larger_angle() -> None:
+    truth = pose_at((1.0, 0, 0), 0, 0)
+    turned = RigidTransform.from_matrix(
+        Rotation.from_euler("z", 7, degrees=True).as_matrix(), np.array(truth.translation)
+    )
+    assert relative_pose_error_deg(turned, truth) == pytest.approx(7)
+    sideways = RigidTransform((1.0, 0.0, 0.0, 0.0), (-1.0, 0.2, 0.0))
+    expected = np.degrees(np.arctan(0.2))
+    assert relative_pose_error_deg(sideways, truth) == pytest.approx(expected)
+    # its sign is left open; of one centre there is no translation
+    away = RigidTransform((1.0, 0.0, 0.0, 0.0), (1.0, 0.2, 0.0))
+    assert relative_pose_error_deg(away, truth) == pytest.approx(expected)
+    still = RigidTransform.identity()
+    assert relative_pose_error_deg(turned, still) == pytest.approx(7)
+
+
+def test_true_matches_give_the_true_pose(walk: Path) -> None:
+    pair = PosedPairs(KaptureFolder(walk), PairOptions()).draw(np.random.default_rng(0))
+    assert pair.views is not None
+    points = np.random.default_rng(1).uniform((-3, -2, 4), (1, 2, 6), (200, 3))
+    sides = []
+    for view in pair.views:
+        px = project(view.camera, view.cam_from_world, points).astype(np.float32)
+        sides.append(ImageFeatures(px, np.zeros((200, 8), np.float32), 400, 300))
+    inside = np.all([(s.keypoints_px > 0) & (s.keypoints_px < (400, 300)) for s in sides], (0, 2))
+    rows = np.flatnonzero(inside)
+    nothing = Labels(np.zeros(200, np.int64), np.zeros(200, np.int64))
+    prepared = PreparedPair(pair, (sides[0], sides[1]), nothing)
+    assert len(rows) > 20
+    assert pose_error_deg(prepared, np.stack([rows, rows], 1)) < 0.2
+    shuffled = np.stack([rows, np.roll(rows, 7)], 1)
+    assert pose_error_deg(prepared, shuffled) > 2
+    assert pose_error_deg(prepared, np.zeros((0, 2), np.int64)) == np.inf

@@ -313,7 +313,7 @@ def _dense_points(
     mapping: KaptureFolder | None, notes: list[str]
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8], list[str]]:
     """Points (N, 3) of depth by stereo with their colours (N, 3) and images; none without any."""
-    from megloc_kapture.mvs.consistency import AgreementOptions  # loads more than others wait for
+    from megloc_kapture.mvs.views import AgreementOptions  # loads more than others wait for
     from megloc_kapture.stages.fusion import fused_cloud
     from megloc_kapture.stages.stereo_depth import stereo_images
 

@@ -237,10 +237,7 @@ def main():
         session.run(tf1.global_variables_initializer())
         with tempfile.TemporaryDirectory() as folder:
             tf1.train.Saver().save(
-                session,
-                f"{folder}/{CHECKPOINT}",
-                write_meta_graph=False,
-                write_state=False,
+                session, f"{folder}/{CHECKPOINT}", write_meta_graph=False, write_state=False
             )
             (HERE / "aslfeat.tar.gz").write_bytes(archive(folder))
         arrays = {}

@@ -216,8 +216,4 @@ def slim_vectors():
 
 
 if __name__ == "__main__":
-    np.savez(
-        HERE / "reference.npz",
-        keras=np.stack(keras_vectors()),
-        slim=np.stack(slim_vectors()),
-    )
+    np.savez(HERE / "reference.npz", keras=np.stack(keras_vectors()), slim=np.stack(slim_vectors()))
