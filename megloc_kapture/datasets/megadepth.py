@@ -30,7 +30,7 @@ from megloc_kapture.io.files import link_records
 from megloc_kapture.io.images import image_size, write_depth_map
 from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
 from megloc_kapture.io.paths import check_component, safe_join
-from megloc_kapture.preprocessing.resampling import scaled_camera
+from megloc_kapture.preprocessing.frames import scaled_camera
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, Options, RigidTransform
 

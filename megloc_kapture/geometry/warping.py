@@ -160,7 +160,7 @@ def _seen_depth(
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """Depth (H, W) of a reference's surface in a view, and where its front is seen."""
     # here, as numba takes half a second to import
-    from megloc_kapture.geometry.rasterising import draw_depth_surface
+    from megloc_kapture.geometry.projection import draw_depth_surface
 
     return draw_depth_surface(
         source.depth_m,

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.values import Camera, RigidTransform
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,14 +54,14 @@ class MapIndex:
         covariances: NDArray[np.float64] | None = None,
     ) -> MapIndex:
         """Group observations, given as parallel arrays (O,), by image and keypoint."""
-        from megloc_kapture.localization import index_kernels
+        from megloc_kapture.localization import kernels
 
         counts = np.bincount(image_ids, minlength=len(image_names))
         offsets = np.zeros(len(image_names) + 1, dtype=np.int64)
         np.cumsum(counts, out=offsets[1:])
         keypoints = np.empty(len(image_ids), dtype=np.int32)
         points = np.empty(len(image_ids), dtype=np.int32)
-        index_kernels.group_by_image(image_ids, keypoint_ids, point_ids, offsets, keypoints, points)
+        kernels.group_by_image(image_ids, keypoint_ids, point_ids, offsets, keypoints, points)
         return cls(
             xyz=_read_only(np.ascontiguousarray(xyz, dtype=np.float64)),
             row_of_image={name: row for row, name in enumerate(image_names)},
@@ -111,13 +114,13 @@ class MapIndex:
         The diagonal has the points that an image observes. The cost grows with these images'
         observations, not with the map; an image that is not in the map shares nothing.
         """
-        from megloc_kapture.localization import index_kernels
+        from megloc_kapture.localization import kernels
 
         rows = self.rows_of(images)
-        keys = index_kernels.sightings(self.offsets, self.point_ids, rows)
+        keys = kernels.sightings(self.offsets, self.point_ids, rows)
         keys.sort()
         shared = np.zeros((len(rows), len(rows)), dtype=np.int64)
-        index_kernels.count_shared(keys, shared)
+        kernels.count_shared(keys, shared)
         return shared
 
 
@@ -180,7 +183,7 @@ class ObservedMatches:
         ----------
         rows : bool (num_images,), the images whose matches count; all where it is None.
         """
-        from megloc_kapture.localization import index_kernels
+        from megloc_kapture.localization import kernels
 
         if rows is None:
             rows = np.ones(self.num_images, dtype=np.bool_)
@@ -202,7 +205,7 @@ class ObservedMatches:
         order = [-best, -support]
         if self.seen_once is not None:
             order.append(self.seen_once[taken][first])
-        chosen = index_kernels.choose(
+        chosen = kernels.choose(
             np.lexsort(order),
             np.cumsum(np.diff(keypoints, prepend=keypoints[0]) != 0),
             np.unique(points, return_inverse=True)[1],
@@ -226,14 +229,14 @@ def observed_matches(
     matches : of each map image: its name, rows of query and map keypoints (K, 2), scores (K,). An
         image that is not in the map has nothing to say.
     """
-    from megloc_kapture.localization import index_kernels
+    from megloc_kapture.localization import kernels
 
     if not matches:
         empty = np.zeros(0, dtype=np.int64)
         return ObservedMatches(empty, empty, np.zeros(0), empty, 0)
     starts = np.zeros(len(matches) + 1, dtype=np.int64)
     np.cumsum([len(pairs) for _, pairs, _ in matches], out=starts[1:])
-    keypoint_ids, point_ids, similarities, image_rows = index_kernels.observed(
+    keypoint_ids, point_ids, similarities, image_rows = kernels.observed(
         index.offsets,
         index.keypoint_ids,
         index.point_ids,
@@ -249,4 +252,210 @@ def observed_matches(
         image_rows,
         len(matches),
         index.seen_once[point_ids],
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One camera and its matches; a camera on its own is a rig of one, at its origin.
+
+    Attributes
+    ----------
+    camera : the intrinsics.
+    cam_from_rig : the camera in its rig; the identity for a camera on its own.
+    points_px : float (N, 2) pixels, first pixel's centre at (0.5, 0.5).
+    points_world : float64 (N, 3) the points that they are matched with.
+    point_covariances : float64 (N, 6) of the points as xx, xy, xz, yy, yz, zz in the map's unit
+        squared, for a measurement noise of 1 px, not finite where unknown; or None. An unknown
+        covariance counts as none at all.
+
+    Raises
+    ------
+    DataError : the arrays do not have these shapes.
+    """
+
+    camera: Camera
+    cam_from_rig: RigidTransform
+    points_px: NDArray[np.floating[Any]]
+    points_world: NDArray[np.float64]
+    point_covariances: NDArray[np.float64] | None = None
+
+    def __post_init__(self) -> None:
+        count = len(self.points_px)
+        if self.points_px.shape != (count, 2) or self.points_world.shape != (count, 3):
+            raise DataError(
+                f"pixels {self.points_px.shape} and points {self.points_world.shape} of a view "
+                "are not (N, 2) and (N, 3)"
+            )
+        if self.point_covariances is not None and self.point_covariances.shape != (count, 6):
+            raise DataError(
+                f"covariances {self.point_covariances.shape} of {count} points are not ({count}, 6)"
+            )
+
+
+def split_by_view(views: Sequence[View], per_match: NDArray[Any]) -> list[NDArray[Any]]:
+    """One part for each view of what runs over the matches of all views, such as inliers (N,)."""
+    return np.split(per_match, np.cumsum([len(view.points_px) for view in views])[:-1])
+
+
+@dataclass(frozen=True, eq=False)
+class PoseProblem:
+    """The matches of a camera, or of all cameras of a rig, that its pose is estimated from.
+
+    Attributes
+    ----------
+    views : of each camera, as they were given.
+    points_px, points : float64 (N, 2) and (N, 3), the latter minus ``offset``.
+    covariances : float64 (N, 6), or (0, 6) where no view has any.
+    starts : int64 (V + 1,) first match of each view.
+    cameras : of the views in their rig, as
+        :func:`~megloc_kapture.geometry.projection.packed_views` has them.
+    offset : float64 (3,), a point amid the others: far from the origin (ECEF) float64 loses what
+        a recentred world keeps.
+    """
+
+    views: tuple[View, ...]
+    points_px: NDArray[np.float64]
+    points: NDArray[np.float64]
+    covariances: NDArray[np.float64]
+    starts: NDArray[np.int64]
+    cameras: tuple[NDArray[Any], ...]
+    offset: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, views: Sequence[View]) -> PoseProblem:
+        """The problem of any number of views, their matches in the same order."""
+        from megloc_kapture.geometry.projection import packed_views
+
+        starts = np.zeros(len(views) + 1, dtype=np.int64)
+        np.cumsum([len(view.points_px) for view in views], out=starts[1:])
+        world = _joined([view.points_world for view in views], 3)
+        offset = _amid(world)
+        covariances = np.zeros((0, 6))
+        if any(view.point_covariances is not None for view in views):
+            covariances = _joined(
+                [
+                    np.zeros((len(view.points_px), 6))
+                    if view.point_covariances is None
+                    else view.point_covariances
+                    for view in views
+                ],
+                6,
+            )
+        return cls(
+            views=tuple(views),
+            points_px=_joined([view.points_px for view in views], 2),
+            points=world - offset,
+            covariances=covariances,
+            starts=starts,
+            cameras=packed_views(
+                [view.camera for view in views], [view.cam_from_rig for view in views]
+            ),
+            offset=offset,
+        )
+
+    @property
+    def matches(self) -> tuple[NDArray[Any], ...]:
+        """The arrays that :mod:`~megloc_kapture.localization.kernels` calls ``matches``."""
+        return (self.points_px, self.points, self.covariances, self.starts, *self.cameras)
+
+
+def _joined(parts: Sequence[NDArray[np.floating[Any]]], width: int) -> NDArray[np.float64]:
+    return np.concatenate([np.zeros((0, width)), *parts], dtype=np.float64)
+
+
+def _amid(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    # the median of some of them: any point nearby serves, and wrong points must not move it far
+    some = points[:: max(1, len(points) // 64)]
+    some = np.sort(some[np.isfinite(some).all(axis=1)], axis=0)
+    return some[len(some) // 2] if len(some) else np.zeros(3)
+
+
+def undo_recentring(pose: RigidTransform, offset: NDArray[np.float64]) -> RigidTransform:
+    """``rig_from_world`` of a pose in a world that was moved by minus ``offset`` (3,)."""
+    t = np.array(pose.translation) - pose.rotation_matrix() @ offset
+    return RigidTransform(pose.quat_wxyz, (float(t[0]), float(t[1]), float(t[2])))
+
+
+ImageMatches = tuple[str, NDArray[np.int64], NDArray[np.floating]]
+
+
+@dataclass(frozen=True, eq=False)
+class TypedMatches:
+    """Matches of one query image in one keypoints type.
+
+    Attributes
+    ----------
+    index : the map's points of the type.
+    keypoints_px : float32 (N, 2 or more), of the query.
+    matches : of each candidate: its name, rows of query and map keypoints (K, 2), scores (K,).
+    """
+
+    index: MapIndex
+    keypoints_px: NDArray[np.float32]
+    matches: Sequence[ImageMatches]
+
+
+@dataclass(frozen=True, eq=False)
+class QueryView:
+    """One camera of a query: its pose on the rig, and its matches by keypoints type."""
+
+    name: str
+    camera: Camera
+    matches: tuple[TypedMatches, ...]
+    cam_from_rig: RigidTransform = RigidTransform.identity()
+
+    def matched_images(self) -> list[str]:
+        """Map images with a match, in the order given."""
+        named = (image for own in self.matches for image, pairs, _ in own.matches if len(pairs))
+        return list(dict.fromkeys(named))
+
+    def among(self, images: Sequence[str]) -> QueryView:
+        """With its matches with these map images only."""
+        members = set(images)
+        kept = (
+            replace(typed, matches=[one for one in typed.matches if one[0] in members])
+            for typed in self.matches
+        )
+        return replace(self, matches=tuple(kept))
+
+
+def rows_of_images(typed: TypedMatches, cluster: Sequence[str]) -> NDArray[np.bool_]:
+    """Which of the candidates are in a cluster."""
+    members = set(cluster)
+    return np.array([image in members for image, _, _ in typed.matches], bool)
+
+
+def num_observed(
+    views: Sequence[QueryView],
+    gathered: Sequence[Sequence[ObservedMatches]],
+    cluster: Sequence[str],
+) -> int:
+    """Matches of a cluster's images with keypoints of points."""
+    total = 0
+    for view, own in zip(views, gathered, strict=True):
+        for typed, observed in zip(view.matches, own, strict=True):
+            if len(typed.matches):
+                total += int(rows_of_images(typed, cluster)[observed.image_rows].sum())
+    return total
+
+
+def view_of(view: QueryView, found: Sequence[Correspondences]) -> View:
+    """The 2D-3D matches of one camera, types one after another."""
+    pixels, points, covariances = [np.zeros((0, 2))], [np.zeros((0, 3))], [np.zeros((0, 6))]
+    known = False
+    for typed, own in zip(view.matches, found, strict=True):
+        pixels.append(typed.keypoints_px[own.keypoint_ids, :2].astype(np.float64))
+        points.append(typed.index.xyz[own.point_ids])
+        if typed.index.covariances is None:
+            covariances.append(np.full((len(own.point_ids), 6), np.nan))
+        else:
+            known = True
+            covariances.append(np.asarray(typed.index.covariances[own.point_ids]))
+    return View(
+        camera=view.camera,
+        cam_from_rig=view.cam_from_rig,
+        points_px=np.concatenate(pixels),
+        points_world=np.concatenate(points),
+        point_covariances=np.concatenate(covariances) if known else None,
     )

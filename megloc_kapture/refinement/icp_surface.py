@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.geometry.cameras import focal_px, px_from_cam
-from megloc_kapture.geometry.poses import rotation_angles_deg
-from megloc_kapture.geometry.robust import deviation_by_median
+from megloc_kapture.geometry.poses import deviation_by_median, rotation_angles_deg
 from megloc_kapture.plugins import DepthView, RankingScene
 from megloc_kapture.refinement.depth_points import DepthCloudOptions, depth_cloud
 from megloc_kapture.values import Camera, RigidTransform

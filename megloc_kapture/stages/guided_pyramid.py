@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.geometry.image_variants import ImageVariant
-from megloc_kapture.localization.query_views import ImageMatches
+from megloc_kapture.localization.map_index import ImageMatches
 from megloc_kapture.matching.guided_pyramid import (
     GuidedPyramidOptions,
+    ImageVariant,
     PairVerifier,
     SkippedVariant,
     VariantFeatures,

@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.geometry.image_variants import ImageVariant
 from megloc_kapture.io.csv_table import write_csv_table
 from megloc_kapture.io.files import remove, write_bytes
 from megloc_kapture.io.kapture import (
@@ -32,6 +31,7 @@ from megloc_kapture.io.paths import safe_join
 from megloc_kapture.mapping.pairs import views_can_overlap
 from megloc_kapture.matching.guided_pyramid import (
     GuidedPyramidOptions,
+    ImageVariant,
     PairVerifier,
     VariantMatches,
     pyramid_type,

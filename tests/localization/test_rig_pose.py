@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from megloc_kapture.geometry.cameras import project
-from megloc_kapture.localization.absolute_pose import absolute_pose, rig_pose
-from megloc_kapture.localization.estimation import AbsolutePoseOptions, View, split_by_view
+from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions, absolute_pose, rig_pose
+from megloc_kapture.localization.map_index import View, split_by_view
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
 PINHOLE = Camera("PINHOLE", 640, 480, (500.0, 510.0, 320.5, 239.0))

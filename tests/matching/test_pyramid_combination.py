@@ -8,8 +8,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from megloc_kapture.geometry.image_variants import ImageVariant
 from megloc_kapture.matching.guided_pyramid import (
+    ImageVariant,
     VariantMatches,
 )
 from megloc_kapture.matching.pyramid_combination import (

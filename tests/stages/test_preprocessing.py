@@ -24,8 +24,8 @@ from megloc_kapture.io.files import read_json_model
 from megloc_kapture.io.images import image_size, read_depth_map, read_image_rgb, write_image
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.mapping.depth import lift_keypoints
+from megloc_kapture.preprocessing.frames import PixelMap
 from megloc_kapture.preprocessing.masks import FixedMask
-from megloc_kapture.preprocessing.resampling import PixelMap
 from megloc_kapture.stages.image_masks import MaskOptions
 from megloc_kapture.stages.local_features import extract_local_features, read_mask
 from megloc_kapture.stages.preprocessing import (

@@ -18,15 +18,13 @@ from megloc_kapture.io.colmap_cameras import px_from_cam
 from megloc_kapture.preprocessing.frames import (
     FrameOptions,
     FramePlan,
+    PixelMap,
+    cropped_size,
+    fitted_size,
     plan_frame,
     processed_image,
     processed_mask,
     reached_region,
-)
-from megloc_kapture.preprocessing.resampling import (
-    PixelMap,
-    cropped_size,
-    fitted_size,
     resized,
     scaled_camera,
     undistorted_camera,
