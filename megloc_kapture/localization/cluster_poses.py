@@ -1,7 +1,10 @@
 """Cluster-wise localization: a pose for each cluster of candidates, the best of them refined.
 
-MegLoc, section "Cluster-wise localization". One view or the views of a rig are treated alike, and
-matches of several keypoints types.
+MegLoc, section "Cluster-wise localization": retrieval returns images of several places that look
+alike, and the matches of one place are outliers to the pose of another. So the retrieved images are
+clustered by the proximity of their centres, whatever they look at, or by co-visibility, and each
+cluster is localized in by itself. One view or the views of a rig are treated alike, and matches of
+several keypoints types.
 """
 
 from __future__ import annotations
@@ -20,7 +23,6 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from megloc_kapture.geometry.cameras import focal_px
 from megloc_kapture.localization.absolute_pose import (
     AbsolutePoseOptions,
     PoseEstimate,
@@ -28,7 +30,7 @@ from megloc_kapture.localization.absolute_pose import (
     refine_pose,
     transform_covariance,
 )
-from megloc_kapture.localization.confidence import displacements_px, match_sources, with_confidence
+from megloc_kapture.localization.confidence import match_sources, with_confidence
 from megloc_kapture.localization.focal_length import (
     estimate_with_intrinsics,
     focal_remark,
@@ -40,347 +42,16 @@ from megloc_kapture.localization.map_index import (
     MapIndex,
     PoseProblem,
     QueryView,
-    num_observed,
     observed_matches,
-    rows_of_images,
-    split_by_view,
-    view_of,
 )
 from megloc_kapture.localization.ranking import poses_agree
+from megloc_kapture.localization.structure import displacements_rad
 from megloc_kapture.plugins import HypothesisView, PoseHypothesis, RankingScene
-from megloc_kapture.values import ClusterPose, Failure, Options, Pose, RigidTransform
+from megloc_kapture.values import ClusterPose, Failure, Options, Pose
 
 Rank = Callable[[Sequence[PoseHypothesis]], NDArray[np.float64]]
-
-
-def interleave(rankings: Sequence[Sequence[str]]) -> list[str]:
-    """One ranking of several: the first of each, then the second of each; each name once."""
-    ranks = zip_longest(*rankings)
-    return list(dict.fromkeys(name for rank in ranks for name in rank if name is not None))
-
-
-@dataclass(frozen=True, eq=False)
-class ClusterLocalization:
-    """A pose, or why there is none, and the number of 2D-3D matches of each view behind it."""
-
-    result: Pose | Failure
-    matches_of_views: tuple[int, ...]
-
-
-def localize_in_clusters(
-    views: Sequence[QueryView],
-    clusters: Sequence[Sequence[str]],
-    options: AbsolutePoseOptions,
-    *,
-    rank: Rank,
-    max_clusters: int,
-    frames: Sequence[str] | None = None,
-    centers: Mapping[str, NDArray[np.float64]] | None = None,
-    min_confidence: float | None = None,
-    scene: RankingScene | None = None,
-) -> ClusterLocalization:
-    """Localize a query in each cluster by itself, rank the poses, and refine the best.
-
-    Clusters whose poses explain each other are joined (images that look to different sides share no
-    points), and are localized in together.
-
-    Parameters
-    ----------
-    views : one camera, or those of a rig.
-    clusters : map images of each, see :func:`cluster_candidates`.
-    rank : scores of poses, higher is better.
-    max_clusters : only those with the most matches are tried.
-    frames : the coordinate frame of each cluster; clusters of different ones are never joined.
-    centers : of the map images, (3,) each; needed for ``min_confidence``.
-    min_confidence : a pose of less is a failure; None: poses have no confidence.
-    scene : looked at where the confidence is in doubt; None: nothing is.
-
-    Returns
-    -------
-    The pose, of a rig ``rig_from_world``; the mask of its inliers runs over the views, and in each
-    over the keypoints types, in their order. Or a failure with its reason.
-    """
-    clock = Clock()
-    matched = interleave([view.matched_images() for view in views])
-    rank_of = {image: rank for rank, image in enumerate(matched)}
-    clusters = [[image for image in cluster if image in rank_of] for cluster in clusters]
-    gathered = [[observed_matches(m.index, m.matches) for m in view.matches] for view in views]
-    counts = [num_observed(views, gathered, cluster) for cluster in clusters]
-    by_matches = sorted(range(len(clusters)), key=lambda at: (-counts[at], at))
-    tried = sorted(at for at in by_matches[:max_clusters] if counts[at])
-    clock.lap("correspondences")
-
-    def attempt(cluster: Sequence[str], frame: str) -> _Attempt:
-        found = [
-            [
-                observed.resolve(rows_of_images(m, cluster))
-                for m, observed in zip(view.matches, own, strict=True)
-            ]
-            for view, own in zip(views, gathered, strict=True)
-        ]
-        problem = PoseProblem.of(list(map(view_of, views, found)))
-        clock.lap("correspondences")
-        if is_uncertain(problem):
-            problem, estimate = estimate_with_intrinsics(problem, options)
-        else:
-            estimate = estimate_pose(problem, options)
-        hypothesis = None
-        if isinstance(estimate, PoseEstimate):
-            hypothesis = _hypothesis(tuple(cluster), views, problem, estimate, options)
-        clock.lap("estimation")
-        return _Attempt(tuple(cluster), frame, found, problem, estimate, hypothesis)
-
-    attempts = [attempt(clusters[at], frames[at] if frames else "") for at in tried]
-    attempts = _join_agreeing(attempts, attempt, rank_of.__getitem__)
-    if not attempts:
-        failure = Failure("no match is with a point of the map", seconds=clock.seconds)
-        return ClusterLocalization(failure, (0,) * len(views))
-    hypotheses = [each.hypothesis for each in attempts if each.hypothesis is not None]
-    scores = iter(rank(hypotheses).tolist() if hypotheses else ())
-    ranked = tuple(_cluster_pose(each, None if each.failed else next(scores)) for each in attempts)
-    clock.lap("ranking")
-    best = _best(ranked)
-    problem, estimate = attempts[best].problem, attempts[best].estimate
-    if isinstance(estimate, Failure):
-        result: Pose | Failure = _failure(ranked, best)
-    else:
-        if is_uncertain(problem):
-            problem, result = refine_with_intrinsics(problem, estimate, options, views[0].camera)
-        else:
-            result = refine_pose(problem, estimate, options)
-        clock.lap("refinement")
-        if min_confidence is not None and isinstance(result, Pose):
-            found = attempts[best].found
-            sources = match_sources(views, found, ranked[best].images, centers or {})
-            if scene is not None:
-                seen = partial(_displacements_rad, problem, views, found, scene)
-                sources = replace(sources, displacements_rad=seen)
-            result = with_confidence(problem, result, sources, options.max_error_px, min_confidence)
-            if isinstance(result, Pose) and result.camera is None:
-                remark = focal_remark(problem, result)
-                result = replace(result, remarks=(remark,) if remark else ())
-            clock.lap("confidence")
-    result = replace(result, candidates=ranked[best].images, clusters=ranked, seconds=clock.seconds)
-    if isinstance(result, Pose):
-        result = replace(
-            result,
-            cluster=best,
-            inlier_points_px=problem.points_px[result.inliers],
-            inlier_points_world=problem.points[result.inliers] + problem.offset,
-        )
-    return ClusterLocalization(result, tuple(len(view.points_px) for view in problem.views))
-
-
-@dataclass(frozen=True, eq=False)
-class _Attempt:
-    """One cluster, its 2D-3D matches, and what they came to."""
-
-    cluster: tuple[str, ...]
-    frame: str
-    found: Sequence[Sequence[Correspondences]]  # of each view, by keypoints type
-    problem: PoseProblem
-    estimate: PoseEstimate | Failure
-    hypothesis: PoseHypothesis | None
-
-    @property
-    def failed(self) -> bool:
-        return self.hypothesis is None
-
-
-def _join_agreeing(
-    attempts: list[_Attempt],
-    attempt: Callable[[Sequence[str], str], _Attempt],
-    rank_of: Callable[[str], int],
-) -> list[_Attempt]:
-    """Join attempts whose poses agree, where that does not lose inliers; in their order."""
-    groups: list[list[_Attempt]] = []
-    for each in attempts:
-        for group in groups:
-            first = group[0]
-            if (
-                each.frame == first.frame
-                and each.hypothesis is not None
-                and first.hypothesis is not None
-                and poses_agree(each.hypothesis, first.hypothesis)
-            ):
-                group.append(each)
-                break
-        else:
-            groups.append([each])
-    found: list[_Attempt] = []
-    for group in groups:
-        together = group[0]
-        if len(group) > 1:
-            images = [image for each in group for image in each.cluster]
-            together = attempt(sorted(images, key=rank_of), together.frame)
-        kept = together.estimate.num_inliers >= max(each.estimate.num_inliers for each in group)
-        found += [together] if kept else group
-    return found
-
-
-def _cluster_pose(attempt: _Attempt, score: float | None) -> ClusterPose:
-    images = attempt.cluster
-    estimate = attempt.estimate
-    if isinstance(estimate, Failure):
-        counted = (estimate.num_matches, estimate.num_inliers)
-        return ClusterPose(images, *counted, reason=estimate.reason)
-    counted = (len(estimate.inliers), estimate.num_inliers)
-    return ClusterPose(images, *counted, estimate.rig_from_world, score)
-
-
-def _best(clusters: Sequence[ClusterPose]) -> int:
-    """The first of the highest score; without any score the one that came nearest to a pose."""
-
-    def key(at: int) -> tuple[bool, float, int, int, int]:
-        cluster = clusters[at]
-        score = -np.inf if cluster.score is None else cluster.score
-        return cluster.score is not None, score, cluster.num_inliers, cluster.num_matches, -at
-
-    return max(range(len(clusters)), key=key)
-
-
-def _failure(clusters: Sequence[ClusterPose], best: int) -> Failure:
-    nearest = clusters[best]
-    others = f", the best of {len(clusters)} clusters" if len(clusters) > 1 else ""
-    return Failure(nearest.reason + others, nearest.num_matches, nearest.num_inliers)
-
-
-def _displacements_rad(
-    problem: PoseProblem,
-    views: Sequence[QueryView],
-    found: Sequence[Sequence[Correspondences]],
-    scene: RankingScene,
-    pose: Pose,
-) -> NDArray[np.float64]:
-    """See :attr:`MatchSources.displacements_rad`; of each match the first image that says so."""
-    assert pose.inliers is not None  # it was estimated here
-    angles = [np.zeros(0)]
-    inliers = split_by_view(problem.views, pose.inliers)
-    for query, view, of_types, kept in zip(views, problem.views, found, inliers, strict=True):
-        shown_by = [
-            typed.matches[row][0]
-            for typed, own in zip(query.matches, of_types, strict=True)
-            for row in own.image_rows[np.cumsum(own.support) - own.support].tolist()
-        ]
-        found_px = displacements_px(
-            query.name,
-            view.camera,
-            view.cam_from_rig @ pose.cam_from_world,
-            view.points_world[kept],
-            [shown_by[row] for row in np.flatnonzero(kept)],
-            scene,
-        )
-        angles.append(found_px / focal_px(view.camera))
-    return np.concatenate(angles)
-
-
-def _hypothesis(
-    images: tuple[str, ...],
-    views: Sequence[QueryView],
-    problem: PoseProblem,
-    estimate: PoseEstimate,
-    options: AbsolutePoseOptions,
-) -> PoseHypothesis:
-    posed = []
-    parts = (
-        split_by_view(problem.views, of_matches)
-        for of_matches in (problem.points_px, estimate.errors_px, estimate.inliers)
-    )
-    for query, view, points_px, errors_px, inliers in zip(
-        views, problem.views, *parts, strict=True
-    ):
-        posed.append(
-            HypothesisView(
-                name=query.name,
-                camera=view.camera,
-                cam_from_world=view.cam_from_rig @ estimate.rig_from_world,
-                points_px=points_px,
-                points_world=view.points_world,
-                errors_px=errors_px,
-                inliers=inliers,
-            )
-        )
-    return PoseHypothesis(images, tuple(posed), options.max_error_px)
-
-
-class Clock:
-    """Seconds by step."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._last = time.perf_counter()
-
-    def start(self) -> None:
-        """Begin a lap; what has passed since the last one was something else."""
-        self._last = time.perf_counter()
-
-    def lap(self, step: str) -> None:
-        """Add the time since the last lap to a step."""
-        now = time.perf_counter()
-        self.seconds[step] = self.seconds.get(step, 0.0) + now - self._last
-        self._last = now
-
-
-def poses_of_cameras(
-    views: Sequence[QueryView], found: ClusterLocalization
-) -> list[Pose | Failure]:
-    """One result per camera of a localized rig, with its own matches and inliers.
-
-    A camera without any inlier has not been localized, whatever the others say: it fails, and it
-    is for who asked to give it its pose through the rig.
-    """
-    result = found.result
-    if not isinstance(result, Pose) or result.inliers is None:
-        raise ValueError("the rig has no pose, or its inliers are not known")
-    masks = np.split(result.inliers, np.cumsum(found.matches_of_views)[:-1])
-    last = np.cumsum([mask.sum() for mask in masks])
-    cameras: list[Pose | Failure] = []
-    for view, inliers, end in zip(views, masks, last.tolist(), strict=True):
-        num_inliers = int(inliers.sum())
-        own = slice(end - num_inliers, end)
-        if num_inliers == 0:
-            cameras.append(
-                Failure(
-                    "no inlier in this camera; others of its rig were localized",
-                    num_matches=len(inliers),
-                    candidates=result.candidates,
-                    clusters=_of_camera(result.clusters, view.cam_from_rig),
-                    seconds=result.seconds,
-                )
-            )
-            continue
-        cameras.append(
-            replace(
-                result,
-                cam_from_world=view.cam_from_rig @ result.cam_from_world,
-                clusters=_of_camera(result.clusters, view.cam_from_rig),
-                num_matches=len(inliers),
-                num_inliers=num_inliers,
-                inliers=inliers,
-                inlier_points_px=_rows_of(result.inlier_points_px, own),
-                inlier_points_world=_rows_of(result.inlier_points_world, own),
-                covariance=None
-                if result.covariance is None
-                else transform_covariance(result.covariance, view.cam_from_rig),
-            )
-        )
-    return cameras
-
-
-def _rows_of(points: NDArray[np.float64] | None, rows: slice) -> NDArray[np.float64] | None:
-    return None if points is None else points[rows]
-
-
-def _of_camera(
-    clusters: Sequence[ClusterPose], cam_from_rig: RigidTransform
-) -> tuple[ClusterPose, ...]:
-    """The clusters of a rig, with the poses of one of its cameras."""
-    return tuple(
-        cluster
-        if cluster.cam_from_world is None
-        else replace(cluster, cam_from_world=cam_from_rig @ cluster.cam_from_world)
-        for cluster in clusters
-    )
+Found = Sequence[Sequence[Correspondences]]
+"""2D-3D matches of each view, by keypoints type."""
 
 
 class ClusterOptions(Options):
@@ -489,3 +160,285 @@ def _components(count: int, pairs: NDArray[np.integer]) -> NDArray[np.int64]:
     _, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
     order = np.argsort(np.argsort(first))
     return np.asarray(order[inverse], np.int64)
+
+
+def interleave(rankings: Sequence[Sequence[str]]) -> list[str]:
+    """One ranking of several: the first of each, then the second of each; each name once."""
+    ranks = zip_longest(*rankings)
+    return list(dict.fromkeys(name for rank in ranks for name in rank if name is not None))
+
+
+@dataclass(frozen=True, eq=False)
+class ClusterLocalization:
+    """A pose, or why there is none, and the number of 2D-3D matches of each view behind it."""
+
+    result: Pose | Failure
+    matches_of_views: tuple[int, ...]
+
+
+def localize_in_clusters(
+    views: Sequence[QueryView],
+    clusters: Sequence[Sequence[str]],
+    options: AbsolutePoseOptions,
+    *,
+    rank: Rank,
+    max_clusters: int,
+    frames: Sequence[str] | None = None,
+    centers: Mapping[str, NDArray[np.float64]] | None = None,
+    min_confidence: float | None = None,
+    scene: RankingScene | None = None,
+) -> ClusterLocalization:
+    """Localize a query in each cluster by itself, rank the poses, and refine the best.
+
+    Clusters whose poses explain each other are joined (images that look to different sides share no
+    points), and are localized in together.
+
+    Parameters
+    ----------
+    views : one camera, or those of a rig.
+    clusters : map images of each, see :func:`cluster_candidates`.
+    rank : scores of poses, higher is better.
+    max_clusters : only those with the most matches are tried.
+    frames : the coordinate frame of each cluster; clusters of different ones are never joined.
+    centers : of the map images, (3,) each; needed for ``min_confidence``.
+    min_confidence : a pose of less is a failure; None: poses have no confidence.
+    scene : looked at where the confidence is in doubt; None: nothing is.
+
+    Returns
+    -------
+    The pose, of a rig ``rig_from_world``; the mask of its inliers runs over the views, and in each
+    over the keypoints types, in their order. Or a failure with its reason.
+    """
+    clock = Clock()
+    matched = interleave([view.matched_images() for view in views])
+    rank_of = {image: rank for rank, image in enumerate(matched)}
+    clusters = [[image for image in cluster if image in rank_of] for cluster in clusters]
+    gathered = [[(m, observed_matches(m.index, m.matches)) for m in v.matches] for v in views]
+    every = [both for own in gathered for both in own]
+    counts = [
+        sum(int(typed.rows_of(cluster)[found.image_rows].sum()) for typed, found in every)
+        for cluster in clusters
+    ]
+    by_matches = sorted(range(len(clusters)), key=lambda at: (-counts[at], at))
+    tried = sorted(at for at in by_matches[:max_clusters] if counts[at])
+    clock.lap("correspondences")
+
+    def attempt(cluster: Sequence[str], frame: str) -> _Attempt:
+        found = [[one.resolve(typed.rows_of(cluster)) for typed, one in own] for own in gathered]
+        problem = PoseProblem.of([view.view(own) for view, own in zip(views, found, strict=True)])
+        clock.lap("correspondences")
+        if is_uncertain(problem):
+            problem, estimate = estimate_with_intrinsics(problem, options)
+        else:
+            estimate = estimate_pose(problem, options)
+        hypothesis = None
+        if isinstance(estimate, PoseEstimate):
+            hypothesis = _hypothesis(tuple(cluster), views, problem, estimate, options)
+        clock.lap("estimation")
+        return _Attempt(tuple(cluster), frame, found, problem, estimate, hypothesis)
+
+    attempts = [attempt(clusters[at], frames[at] if frames else "") for at in tried]
+    attempts = _join_agreeing(attempts, attempt, rank_of.__getitem__)
+    if not attempts:
+        failure = Failure("no match is with a point of the map", seconds=clock.seconds)
+        return ClusterLocalization(failure, (0,) * len(views))
+    hypotheses = [each.hypothesis for each in attempts if each.hypothesis is not None]
+    scores = iter(rank(hypotheses).tolist() if hypotheses else ())
+    ranked = tuple(
+        each.as_cluster_pose(None if each.hypothesis is None else next(scores)) for each in attempts
+    )
+    clock.lap("ranking")
+    best = _best(ranked)
+    problem, estimate = attempts[best].problem, attempts[best].estimate
+    if isinstance(estimate, Failure):
+        others = f", the best of {len(ranked)} clusters" if len(ranked) > 1 else ""
+        counted = estimate.num_matches, estimate.num_inliers
+        result: Pose | Failure = Failure(estimate.reason + others, *counted)
+    else:
+        if is_uncertain(problem):
+            problem, result = refine_with_intrinsics(problem, estimate, options, views[0].camera)
+        else:
+            result = refine_pose(problem, estimate, options)
+        clock.lap("refinement")
+        if min_confidence is not None and isinstance(result, Pose):
+            found = attempts[best].found
+            sources = match_sources(views, found, ranked[best].images, centers or {})
+            if scene is not None:
+                seen = partial(displacements_rad, problem, views, found, scene)
+                sources = replace(sources, displacements_rad=seen)
+            result = with_confidence(problem, result, sources, options.max_error_px, min_confidence)
+            if isinstance(result, Pose) and result.camera is None:
+                remark = focal_remark(problem, result)
+                result = replace(result, remarks=(remark,) if remark else ())
+            clock.lap("confidence")
+    result = replace(result, candidates=ranked[best].images, clusters=ranked, seconds=clock.seconds)
+    if isinstance(result, Pose):
+        result = replace(
+            result,
+            cluster=best,
+            inlier_points_px=problem.points_px[result.inliers],
+            inlier_points_world=problem.points[result.inliers] + problem.offset,
+        )
+    return ClusterLocalization(result, tuple(len(view.points_px) for view in problem.views))
+
+
+@dataclass(frozen=True, eq=False)
+class _Attempt:
+    """One cluster, its 2D-3D matches, and what they came to."""
+
+    cluster: tuple[str, ...]
+    frame: str
+    found: Found
+    problem: PoseProblem
+    estimate: PoseEstimate | Failure
+    hypothesis: PoseHypothesis | None
+
+    def as_cluster_pose(self, score: float | None) -> ClusterPose:
+        """The attempt as it is reported."""
+        images, estimate = self.cluster, self.estimate
+        if isinstance(estimate, Failure):
+            counted = (estimate.num_matches, estimate.num_inliers)
+            return ClusterPose(images, *counted, reason=estimate.reason)
+        counted = (len(estimate.inliers), estimate.num_inliers)
+        return ClusterPose(images, *counted, estimate.rig_from_world, score)
+
+
+def _join_agreeing(
+    attempts: list[_Attempt],
+    attempt: Callable[[Sequence[str], str], _Attempt],
+    rank_of: Callable[[str], int],
+) -> list[_Attempt]:
+    """Join attempts whose poses agree, where that does not lose inliers; in their order."""
+    groups: list[list[_Attempt]] = []
+    for each in attempts:
+        for group in groups:
+            first = group[0]
+            if (
+                each.frame == first.frame
+                and each.hypothesis is not None
+                and first.hypothesis is not None
+                and poses_agree(each.hypothesis, first.hypothesis)
+            ):
+                group.append(each)
+                break
+        else:
+            groups.append([each])
+    found: list[_Attempt] = []
+    for group in groups:
+        together = group[0]
+        if len(group) > 1:
+            images = [image for each in group for image in each.cluster]
+            together = attempt(sorted(images, key=rank_of), together.frame)
+        kept = together.estimate.num_inliers >= max(each.estimate.num_inliers for each in group)
+        found += [together] if kept else group
+    return found
+
+
+def _best(clusters: Sequence[ClusterPose]) -> int:
+    """The first of the highest score; without any score the one that came nearest to a pose."""
+
+    def key(at: int) -> tuple[bool, float, int, int, int]:
+        cluster = clusters[at]
+        score = -np.inf if cluster.score is None else cluster.score
+        return cluster.score is not None, score, cluster.num_inliers, cluster.num_matches, -at
+
+    return max(range(len(clusters)), key=key)
+
+
+def _hypothesis(
+    images: tuple[str, ...],
+    views: Sequence[QueryView],
+    problem: PoseProblem,
+    estimate: PoseEstimate,
+    options: AbsolutePoseOptions,
+) -> PoseHypothesis:
+    parts = map(problem.split, (problem.points_px, estimate.errors_px, estimate.inliers))
+    posed = tuple(
+        HypothesisView(
+            name=query.name,
+            camera=view.camera,
+            cam_from_world=view.cam_from_rig @ estimate.rig_from_world,
+            points_px=points_px,
+            points_world=view.points_world,
+            errors_px=errors_px,
+            inliers=inliers,
+        )
+        for query, view, points_px, errors_px, inliers in zip(
+            views, problem.views, *parts, strict=True
+        )
+    )
+    return PoseHypothesis(images, posed, options.max_error_px)
+
+
+class Clock:
+    """Seconds by step."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def start(self) -> None:
+        """Begin a lap; what has passed since the last one was something else."""
+        self._last = time.perf_counter()
+
+    def lap(self, step: str) -> None:
+        """Add the time since the last lap to a step."""
+        now = time.perf_counter()
+        self.seconds[step] = self.seconds.get(step, 0.0) + now - self._last
+        self._last = now
+
+
+def poses_of_cameras(
+    views: Sequence[QueryView], found: ClusterLocalization
+) -> list[Pose | Failure]:
+    """One result per camera of a localized rig, with its own matches and inliers.
+
+    A camera without any inlier has not been localized, whatever the others say: it fails, and it
+    is for who asked to give it its pose through the rig.
+    """
+    result = found.result
+    if not isinstance(result, Pose) or result.inliers is None:
+        raise ValueError("the rig has no pose, or its inliers are not known")
+    masks = np.split(result.inliers, np.cumsum(found.matches_of_views)[:-1])
+    cameras: list[Pose | Failure] = []
+    end = 0
+    for view, inliers in zip(views, masks, strict=True):
+        start, end = end, end + int(inliers.sum())
+        clusters = tuple(
+            one
+            if one.cam_from_world is None
+            else replace(one, cam_from_world=view.cam_from_rig @ one.cam_from_world)
+            for one in result.clusters
+        )
+        if start == end:
+            cameras.append(
+                Failure(
+                    "no inlier in this camera; others of its rig were localized",
+                    num_matches=len(inliers),
+                    candidates=result.candidates,
+                    clusters=clusters,
+                    seconds=result.seconds,
+                )
+            )
+            continue
+        px, points, covariance = (
+            result.inlier_points_px,
+            result.inlier_points_world,
+            result.covariance,
+        )
+        cameras.append(
+            replace(
+                result,
+                cam_from_world=view.cam_from_rig @ result.cam_from_world,
+                clusters=clusters,
+                num_matches=len(inliers),
+                num_inliers=end - start,
+                inliers=inliers,
+                inlier_points_px=None if px is None else px[start:end],
+                inlier_points_world=None if points is None else points[start:end],
+                covariance=None
+                if covariance is None
+                else transform_covariance(covariance, view.cam_from_rig),
+            )
+        )
+    return cameras

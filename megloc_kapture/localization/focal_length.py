@@ -1,4 +1,4 @@
-"""Intrinsics of one camera, from the matches of its pose.
+"""Intrinsics of a camera, from the matches of its pose, or of the poses of several photographs.
 
 A wrong focal length hides in the pose: the camera is moved nearer or farther, and most matches
 still agree. What gives it away is perspective. With a pose at hand the focal length is set free
@@ -60,6 +60,11 @@ _MAX_DEVIATIONS = 3.0
 # standard deviations of what nobody tells of a camera: the principal point's as a share of the
 # larger side, and the radial distortion's
 _PRINCIPAL_POINT_DEVIATION, _DISTORTION_DEVIATION = 0.01, 0.1
+# an estimate this many standard deviations off is of another zoom
+_MAX_SIGMAS = 3.0
+# errors of a map, and a lens that is none of the model, are alike in photographs: their number
+# averages less out than if they were independent (measured: docs/photos.md)
+_ALIKE = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,18 +89,13 @@ class _Fit:
 
 
 def is_uncertain(problem: PoseProblem) -> bool:
-    """Whether the problem is of one camera whose focal length is not known for certain."""
+    """True if the problem is of one camera whose focal length is not known for certain."""
     return len(problem.views) == 1 and problem.views[0].camera.focal_deviation > 0
 
 
 def focal_remark(problem: PoseProblem, pose: Pose) -> str | None:
-    """In words, that another focal length fits better; None where the given one may be right.
-
-    Parameters
-    ----------
-    problem : of one camera on its own; of a rig nothing is said.
-    pose : of it, with its inliers.
-    """
+    """Say that another focal length fits better; None where the given one may be right, or of a
+    rig."""
     if len(problem.views) != 1 or pose.inliers is None or pose.num_inliers < _MIN_INLIERS:
         return None
     found = _fit(problem, pose.cam_from_world, pose.inliers)
@@ -110,7 +110,7 @@ def focal_remark(problem: PoseProblem, pose: Pose) -> str | None:
 
 
 def estimate_remark(camera: Camera, given: Camera) -> str:
-    """In words, the focal length that was estimated of an uncertain camera."""
+    """Name the focal length that was estimated of an uncertain camera."""
     found_px, given_px = focal_px(camera), focal_px(given)
     return (
         f"focal length estimated: {found_px:.0f} +- {camera.focal_deviation * found_px:.0f} px "
@@ -121,12 +121,7 @@ def estimate_remark(camera: Camera, given: Camera) -> str:
 def estimate_with_intrinsics(
     problem: PoseProblem, options: AbsolutePoseOptions
 ) -> tuple[PoseProblem, PoseEstimate | Failure]:
-    """Estimate the pose and the intrinsics of an uncertain camera.
-
-    Returns
-    -------
-    The problem of the camera with these intrinsics, and the estimate of its pose.
-    """
+    """Estimate pose and intrinsics of an uncertain camera; the problem is then that camera's."""
     given = problem.views[0].camera
     found = estimate_pose(problem, options)
     free = focal_from_matches(
@@ -176,24 +171,13 @@ def refine_with_intrinsics(
                 num_inliers=pose.num_inliers,
             )
         if abs(fit.change[0]) < _SETTLED or updates == _MAX_UPDATES:
-            camera = problem.views[0].camera
-            return problem, _with_uncertainty(pose, camera, fit, options)
+            covariance = pose.covariance + fit.pose_covariance
+            camera = replace(problem.views[0].camera, focal_deviation=fit.deviation)
+            pose = replace(pose, covariance=covariance, camera=camera)
+            return problem, check_stable(pose, covariance, fit.depth, options)
         updates += 1
         problem = _with_camera(problem, _changed(problem.views[0].camera, fit.change))
         estimate = replace(estimate, rig_from_world=fit.rig_from_world)
-
-
-def _with_uncertainty(
-    pose: Pose, camera: Camera, fit: _Fit, options: AbsolutePoseOptions
-) -> Pose | Failure:
-    if pose.covariance is None:
-        return pose
-    found = replace(
-        pose,
-        covariance=pose.covariance + fit.pose_covariance,
-        camera=replace(camera, focal_deviation=fit.deviation),
-    )
-    return check_stable(found, fit.depth, options)
 
 
 def _with_camera(problem: PoseProblem, camera: Camera) -> PoseProblem:
@@ -314,19 +298,10 @@ def _fit(
     )
 
 
-# an estimate this many standard deviations off is of another zoom
-_MAX_SIGMAS = 3.0
-# errors of a map, and a lens that is none of the model, are alike in photographs: their number
-# averages less out than if they were independent (measured: docs/photos.md)
-_ALIKE = 2.0
-
-
 def shared_camera(cameras: Sequence[Camera]) -> Camera:
     """The camera that estimates of one camera agree on: medians, weighted by their certainty.
 
-    Parameters
-    ----------
-    cameras : estimates, of one model and size, with their ``focal_deviation``; at least one.
+    They are of one model and size, with their ``focal_deviation``; at least one.
     """
     weights = np.array([camera.focal_deviation**-2.0 for camera in cameras])
     params = np.array([camera.params for camera in cameras])
@@ -344,15 +319,18 @@ def solve_with_shared_camera(poses: Sequence[Pose], options: AbsolutePoseOptions
     A photograph whose own estimate contradicts the others', as one at another zoom, keeps it; and
     so does one whose pose was refined by other means.
 
-    Parameters
-    ----------
-    poses : with the camera that was estimated of each, and their inliers.
+    The poses come with the camera that was estimated of each, and their inliers.
     """
     usable = [p.camera for p in poses if p.camera is not None and p.camera.focal_deviation > 0]
     if len(usable) < 2:
         return list(poses)
     shared = shared_camera(usable)
-    near = [camera for camera in usable if _agrees(camera, shared)]
+    near = [
+        camera
+        for camera in usable
+        if abs(math.log(focal_px(camera) / focal_px(shared)))
+        <= _MAX_SIGMAS * math.hypot(camera.focal_deviation, shared.focal_deviation)
+    ]
     if len(near) < 2:
         return list(poses)
     shared = shared_camera(near)
@@ -362,11 +340,6 @@ def solve_with_shared_camera(poses: Sequence[Pose], options: AbsolutePoseOptions
         else pose
         for pose in poses
     ]
-
-
-def _agrees(camera: Camera, shared: Camera) -> bool:
-    apart = math.log(focal_px(camera) / focal_px(shared))
-    return abs(apart) <= _MAX_SIGMAS * math.hypot(camera.focal_deviation, shared.focal_deviation)
 
 
 def _solved(pose: Pose, shared: Camera, number: int, options: AbsolutePoseOptions) -> Pose:

@@ -1,7 +1,9 @@
-"""Compiled loops of the pose refinement: errors, robust costs and normal equations of matches.
+"""Compiled loops of the pose refinement, and over a map's index and a query's matches.
 
-Imported only when a pose is estimated: numba costs half a second to import. The matches are those
-of :attr:`megloc_kapture.localization.map_index.PoseProblem.matches`.
+Imported where they are called, not where their module is: numba costs half a second to import. The
+matches of a pose problem are those of
+:attr:`megloc_kapture.localization.map_index.PoseProblem.matches`. No loop costs more for a larger
+map, except the one that builds the index.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls, allow-untyped-decorators
@@ -13,7 +15,7 @@ import math
 import numpy as np
 
 from megloc_kapture.compiling import compiled_loop
-from megloc_kapture.geometry.projection import project_point
+from megloc_kapture.geometry.projection import moved, project_point
 
 _MAX_STEPS = 20
 # squared length in standard deviations (for one pixel) of a step that is the last one
@@ -22,17 +24,6 @@ _LAST_STEP = 1e-5
 _LEAST_DAMPING, _DAMPING = 1e-9, 1e-4
 # of a point that a step has put behind the camera: as if it were a hundred pixels off
 _BEHIND = 1e4
-
-
-@compiled_loop
-def _moved(r, t, points, k):
-    """Point ``k`` by a rotation and a translation; slices and small arrays would cost more."""
-    px, py, pz = points[k, 0], points[k, 1], points[k, 2]
-    return (
-        r[0, 0] * px + r[0, 1] * py + r[0, 2] * pz + t[0],
-        r[1, 0] * px + r[1, 1] * py + r[1, 2] * pz + t[1],
-        r[2, 0] * px + r[2, 1] * py + r[2, 2] * pz + t[2],
-    )
 
 
 @compiled_loop
@@ -69,7 +60,7 @@ def measure(matches, usable, rotation, translation, errors, whitening, squared, 
             errors[k] = np.inf
             if not usable[k]:
                 continue
-            x, y, z = _moved(r, t, points, k)
+            x, y, z = moved(r, t, points, k)
             project_point(model, packed, x, y, z, out)
             du = out[0] - points_px[k, 0]
             dv = out[1] - points_px[k, 1]
@@ -141,7 +132,7 @@ def normal_equations(
         packed = params[view]
         while row < len(inliers) and inliers[row] < starts[view + 1]:
             k = inliers[row]
-            x, y, z = _moved(r, t, points, k)
+            x, y, z = moved(r, t, points, k)
             project_point(model, packed, x, y, z, out)
             w00, w10, w11 = whitening[k, 0], whitening[k, 1], whitening[k, 2]
             du = out[0] - points_px[k, 0]
@@ -162,7 +153,7 @@ def normal_equations(
                 continue
             weight = 1.0 / growth
             # the point in the rig, about whose origin the perturbation turns
-            x, y, z = _moved(rotation, translation, points, k)
+            x, y, z = moved(rotation, translation, points, k)
             # whitened derivatives by the point in the camera, then in the rig
             a0 = w00 * out[2]
             a1 = w00 * out[3]

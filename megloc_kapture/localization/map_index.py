@@ -1,4 +1,7 @@
-"""A map's points and observations as arrays, and the 2D-3D matches of a query with them."""
+"""A map's points as arrays, a query's matches with them, and the pose problem that they make.
+
+One view or the views of a rig are treated alike; each keypoints type has an index of its own.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,9 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.values import Camera, RigidTransform
+
+Integers = NDArray[np.integer[Any]]
+ImageMatches = tuple[str, NDArray[np.int64], NDArray[np.floating]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,9 +54,9 @@ class MapIndex:
         cls,
         xyz: NDArray[np.float64],
         image_names: tuple[str, ...],
-        image_ids: NDArray[np.integer[Any]],
-        keypoint_ids: NDArray[np.integer[Any]],
-        point_ids: NDArray[np.integer[Any]],
+        image_ids: Integers,
+        keypoint_ids: Integers,
+        point_ids: Integers,
         covariances: NDArray[np.float64] | None = None,
     ) -> MapIndex:
         """Group observations, given as parallel arrays (O,), by image and keypoint."""
@@ -84,9 +90,7 @@ class MapIndex:
         part = slice(self.offsets[row], self.offsets[row + 1])
         return self.keypoint_ids[part], self.point_ids[part]
 
-    def points_of_keypoints(
-        self, image: str, keypoint_ids: NDArray[np.integer]
-    ) -> NDArray[np.int64]:
+    def points_of_keypoints(self, image: str, keypoint_ids: Integers) -> NDArray[np.int64]:
         """Point row of each keypoint of a map image, -1 where it observes none; int64 (K,)."""
         keypoints, points = self.observed(image)
         found = np.full(len(keypoint_ids), -1, dtype=np.int64)
@@ -155,8 +159,7 @@ class ObservedMatches:
 
     Attributes
     ----------
-    keypoint_ids : int64 (M,), rows of the query's keypoints, not negative.
-    point_ids : int64 (M,), rows of the map's points, not negative.
+    keypoint_ids, point_ids : int64 (M,), rows of the query's keypoints and of the map's points.
     similarities : float64 (M,), higher is better.
     image_rows : int64 (M,), which of the map images the match is with, from 0.
     num_images : int, of the map images, whether they have matches or not.
@@ -197,8 +200,7 @@ class ObservedMatches:
         taken = taken[np.argsort((self.keypoint_ids[taken] << 32) | self.point_ids[taken])]
         keypoints, points = self.keypoint_ids[taken], self.point_ids[taken]
         # every distinct pair once, sorted by keypoint, then point
-        new = (np.diff(keypoints, prepend=-1) != 0) | (np.diff(points, prepend=-1) != 0)
-        first = np.flatnonzero(new)
+        first = np.flatnonzero(np.diff(keypoints, prepend=-1) | np.diff(points, prepend=-1))
         best = np.maximum.reduceat(self.similarities[taken], first)
         support = np.diff(first, append=len(taken))
         keypoints, points = keypoints[first], points[first]
@@ -220,7 +222,7 @@ class ObservedMatches:
 
 def observed_matches(
     index: MapIndex,
-    matches: Sequence[tuple[str, NDArray[np.integer[Any]], NDArray[np.floating[Any]]]],
+    matches: Sequence[tuple[str, Integers, NDArray[np.floating[Any]]]],
 ) -> ObservedMatches:
     """The matches whose map keypoint observes a point.
 
@@ -245,13 +247,9 @@ def observed_matches(
         np.concatenate([pairs for _, pairs, _ in matches], dtype=np.int64),
         np.concatenate([scores for _, _, scores in matches], dtype=np.float64),
     )
+    seen_once = index.seen_once[point_ids]
     return ObservedMatches(
-        keypoint_ids,
-        point_ids,
-        similarities,
-        image_rows,
-        len(matches),
-        index.seen_once[point_ids],
+        keypoint_ids, point_ids, similarities, image_rows, len(matches), seen_once
     )
 
 
@@ -261,7 +259,6 @@ class View:
 
     Attributes
     ----------
-    camera : the intrinsics.
     cam_from_rig : the camera in its rig; the identity for a camera on its own.
     points_px : float (N, 2) pixels, first pixel's centre at (0.5, 0.5).
     points_world : float64 (N, 3) the points that they are matched with.
@@ -291,11 +288,6 @@ class View:
             raise DataError(
                 f"covariances {self.point_covariances.shape} of {count} points are not ({count}, 6)"
             )
-
-
-def split_by_view(views: Sequence[View], per_match: NDArray[Any]) -> list[NDArray[Any]]:
-    """One part for each view of what runs over the matches of all views, such as inliers (N,)."""
-    return np.split(per_match, np.cumsum([len(view.points_px) for view in views])[:-1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -331,26 +323,20 @@ class PoseProblem:
         np.cumsum([len(view.points_px) for view in views], out=starts[1:])
         world = _joined([view.points_world for view in views], 3)
         offset = _amid(world)
-        covariances = np.zeros((0, 6))
-        if any(view.point_covariances is not None for view in views):
-            covariances = _joined(
-                [
-                    np.zeros((len(view.points_px), 6))
-                    if view.point_covariances is None
-                    else view.point_covariances
-                    for view in views
-                ],
-                6,
-            )
+        given = [view.point_covariances for view in views]
+        known = any(own is not None for own in given)
+        covariances = [
+            np.zeros((len(view.points_px), 6)) if own is None else own
+            for view, own in zip(views, given, strict=True)
+            if known
+        ]
         return cls(
             views=tuple(views),
             points_px=_joined([view.points_px for view in views], 2),
             points=world - offset,
-            covariances=covariances,
+            covariances=_joined(covariances, 6),
             starts=starts,
-            cameras=packed_views(
-                [view.camera for view in views], [view.cam_from_rig for view in views]
-            ),
+            cameras=packed_views([v.camera for v in views], [v.cam_from_rig for v in views]),
             offset=offset,
         )
 
@@ -358,6 +344,10 @@ class PoseProblem:
     def matches(self) -> tuple[NDArray[Any], ...]:
         """The arrays that :mod:`~megloc_kapture.localization.kernels` calls ``matches``."""
         return (self.points_px, self.points, self.covariances, self.starts, *self.cameras)
+
+    def split(self, per_match: NDArray[Any]) -> list[NDArray[Any]]:
+        """One part for each view of what runs over the matches of all views, as inliers (N,)."""
+        return np.split(per_match, self.starts[1:-1])
 
 
 def _joined(parts: Sequence[NDArray[np.floating[Any]]], width: int) -> NDArray[np.float64]:
@@ -377,9 +367,6 @@ def undo_recentring(pose: RigidTransform, offset: NDArray[np.float64]) -> RigidT
     return RigidTransform(pose.quat_wxyz, (float(t[0]), float(t[1]), float(t[2])))
 
 
-ImageMatches = tuple[str, NDArray[np.int64], NDArray[np.floating]]
-
-
 @dataclass(frozen=True, eq=False)
 class TypedMatches:
     """Matches of one query image in one keypoints type.
@@ -394,6 +381,11 @@ class TypedMatches:
     index: MapIndex
     keypoints_px: NDArray[np.float32]
     matches: Sequence[ImageMatches]
+
+    def rows_of(self, images: Sequence[str]) -> NDArray[np.bool_]:
+        """Mask of the candidates that are some of these images."""
+        members = set(images)
+        return np.array([image in members for image, _, _ in self.matches], bool)
 
 
 @dataclass(frozen=True, eq=False)
@@ -419,43 +411,21 @@ class QueryView:
         )
         return replace(self, matches=tuple(kept))
 
-
-def rows_of_images(typed: TypedMatches, cluster: Sequence[str]) -> NDArray[np.bool_]:
-    """Which of the candidates are in a cluster."""
-    members = set(cluster)
-    return np.array([image in members for image, _, _ in typed.matches], bool)
-
-
-def num_observed(
-    views: Sequence[QueryView],
-    gathered: Sequence[Sequence[ObservedMatches]],
-    cluster: Sequence[str],
-) -> int:
-    """Matches of a cluster's images with keypoints of points."""
-    total = 0
-    for view, own in zip(views, gathered, strict=True):
-        for typed, observed in zip(view.matches, own, strict=True):
-            if len(typed.matches):
-                total += int(rows_of_images(typed, cluster)[observed.image_rows].sum())
-    return total
-
-
-def view_of(view: QueryView, found: Sequence[Correspondences]) -> View:
-    """The 2D-3D matches of one camera, types one after another."""
-    pixels, points, covariances = [np.zeros((0, 2))], [np.zeros((0, 3))], [np.zeros((0, 6))]
-    known = False
-    for typed, own in zip(view.matches, found, strict=True):
-        pixels.append(typed.keypoints_px[own.keypoint_ids, :2].astype(np.float64))
-        points.append(typed.index.xyz[own.point_ids])
-        if typed.index.covariances is None:
-            covariances.append(np.full((len(own.point_ids), 6), np.nan))
-        else:
-            known = True
-            covariances.append(np.asarray(typed.index.covariances[own.point_ids]))
-    return View(
-        camera=view.camera,
-        cam_from_rig=view.cam_from_rig,
-        points_px=np.concatenate(pixels),
-        points_world=np.concatenate(points),
-        point_covariances=np.concatenate(covariances) if known else None,
-    )
+    def view(self, found: Sequence[Correspondences]) -> View:
+        """The camera with its 2D-3D matches of all types, one after another."""
+        pixels, points, covariances = [np.zeros((0, 2))], [np.zeros((0, 3))], [np.zeros((0, 6))]
+        for typed, own in zip(self.matches, found, strict=True):
+            pixels.append(typed.keypoints_px[own.keypoint_ids, :2].astype(np.float64))
+            points.append(typed.index.xyz[own.point_ids])
+            if typed.index.covariances is None:
+                covariances.append(np.full((len(own.point_ids), 6), np.nan))
+            else:
+                covariances.append(np.asarray(typed.index.covariances[own.point_ids]))
+        known = any(typed.index.covariances is not None for typed in self.matches)
+        return View(
+            camera=self.camera,
+            cam_from_rig=self.cam_from_rig,
+            points_px=np.concatenate(pixels),
+            points_world=np.concatenate(points),
+            point_covariances=np.concatenate(covariances) if known else None,
+        )

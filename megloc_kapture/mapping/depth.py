@@ -131,7 +131,9 @@ def lift_with_covariances(
 def sample_depth(
     depth_m: NDArray[np.float32], pixels: Floats, max_jump: float, *, whole: bool = False
 ) -> Floats:
-    """Depth at pixels of a depth map, interpolated as :func:`lift_keypoints` does.
+    """Depth (N,) at pixels of a depth map, interpolated as :func:`lift_keypoints` does.
+
+    NaN outside, where the depth is unknown, and where it jumps.
 
     Parameters
     ----------
@@ -139,10 +141,6 @@ def sample_depth(
     pixels : float64 (N, 2) of the depth map, COLMAP's pixel origin; may be NaN.
     max_jump : see :class:`LiftingOptions`.
     whole : all four depths around a pixel must be known, else some of them.
-
-    Returns
-    -------
-    float64 (N,); NaN outside, where the depth is unknown, and where it jumps.
     """
     height, width = depth_m.shape
     result = np.full(len(pixels), np.nan)
@@ -155,14 +153,8 @@ def sample_depth(
     rows = np.clip(np.stack([top, top, top + 1, top + 1]), 0, height - 1)
     corners = depth_m[rows, columns].astype(np.float64)
     right, bottom = x - left, y - top
-    weights = np.stack(
-        [
-            (1 - right) * (1 - bottom),
-            right * (1 - bottom),
-            (1 - right) * bottom,
-            right * bottom,
-        ]
-    )
+    upper, lower = ((1 - right) * side for side in (1 - bottom, bottom))
+    weights = np.stack([upper, right * (1 - bottom), lower, right * bottom])
     there = np.isfinite(corners) & (corners > 0)
     smooth = (weights * corners).sum(axis=0)
     nearest = np.take_along_axis(corners, np.where(there, weights, -1.0).argmax(0)[None], 0)[0]
@@ -272,10 +264,9 @@ def contradicted_by_depth(
     own = np.zeros(len(rows)) if deviations is None else np.nan_to_num(deviations[rows])
     own = own * options.keypoint_noise_px
     checked[rows] = True
-    contradicted[rows] = z < low - options.max_sigmas * np.hypot(
-        depth_noise(low, options.noise), own
+    below, above = (
+        options.max_sigmas * np.hypot(depth_noise(depth, options.noise), own)
+        for depth in (low, high)
     )
-    contradicted[rows] |= z > high + options.max_sigmas * np.hypot(
-        depth_noise(high, options.noise), own
-    )
+    contradicted[rows] = (z < low - below) | (z > high + above)
     return contradicted, checked

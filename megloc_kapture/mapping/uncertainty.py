@@ -1,4 +1,4 @@
-"""Covariances of the points of a map, from the images that observe them.
+"""Covariances of the points of a map, and rejection of points and of their observations.
 
 MegLoc, section "Mapping": a point's uncertainty from its observations, poses and cameras fixed.
 With ``p_c = R_cw p_w + t_cw`` and the camera's projection ``pi``, an observation has the Jacobian
@@ -11,6 +11,9 @@ For independent noise of one pixel the information about the point is ``sum J^T 
 observations, its inverse the point's covariance, and the roots of the covariance's eigenvalues are
 the deviations along three orthogonal axes. ``d pi / d p_c`` is that of the camera's own model,
 distortion included.
+
+Points are rejected by them, and by reprojection error, triangulation angle and track length as
+COLMAP's ``ObservationManager`` has them. Arrays in, masks out; nothing is moved.
 """
 
 from __future__ import annotations
@@ -28,6 +31,7 @@ from megloc_kapture.geometry.poses import deviation_by_median
 from megloc_kapture.values import Camera, Options, RigidTransform
 
 Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 _CHUNK = 1 << 14  # points; each is worked out by itself, so that chunks change nothing
 
@@ -80,14 +84,8 @@ def point_covariances(
 
 
 def point_deviations(covariances: Floats) -> Floats:
-    """Standard deviations of points along their three principal axes.
+    """Standard deviations of points along their three principal axes, of covariances (N, 6).
 
-    Parameters
-    ----------
-    covariances : float64 (N, 6), see :func:`point_covariances`.
-
-    Returns
-    -------
     float64 (N, 3) in the map's unit for a noise of 1 px, ascending; NaN where unknown.
     """
     from megloc_kapture.mapping import kernels
@@ -121,12 +119,14 @@ def _by_point(
     if (point_ids[1:] < point_ids[:-1]).any():
         order = np.argsort(point_ids, kind="stable")
         point_ids, image_ids = point_ids[order], image_ids[order]
-    starts = np.zeros(num_points + 1, dtype=np.int64)
-    np.cumsum(np.bincount(point_ids, minlength=num_points), out=starts[1:])
-    return starts, np.ascontiguousarray(image_ids, dtype=np.int32)
+    return _starts(point_ids, num_points), np.ascontiguousarray(image_ids, dtype=np.int32)
 
 
-Mask = NDArray[np.bool_]
+def _starts(ids: NDArray[np.integer], count: int) -> NDArray[np.int64]:
+    """First row of each of ``count`` ascending ids, and the end of the last one's (count + 1,)."""
+    starts = np.zeros(count + 1, dtype=np.int64)
+    np.cumsum(np.bincount(ids, minlength=count), out=starts[1:])
+    return starts
 
 
 class ConsistencyOptions(Options):
@@ -192,15 +192,7 @@ class ObservedPoints:
 
     def starts(self) -> NDArray[np.int64]:
         """First observation of each point, and the end of the last one's; int64 (N + 1,)."""
-        starts = np.zeros(len(self.xyz) + 1, dtype=np.int64)
-        np.cumsum(track_lengths(self), out=starts[1:])
-        return starts
-
-    def rotations_and_translations(self) -> tuple[Floats, Floats]:
-        """Of ``cams_from_world``, (I, 3, 3) and (I, 3)."""
-        poses = self.cams_from_world
-        rotations = np.array([pose.rotation_matrix() for pose in poses]).reshape(-1, 3, 3)
-        return rotations, np.array([pose.translation for pose in poses]).reshape(-1, 3)
+        return _starts(self.point_ids, len(self.xyz))
 
     def by_image(self) -> Iterator[tuple[int, NDArray[np.int64]]]:
         """Every image that observes something, and the rows of its observations, ascending."""
@@ -238,16 +230,12 @@ def reprojection_errors_px(
 
 def mean_depths(observed: ObservedPoints) -> Floats:
     """Mean depth (N,) of each point in the images that observe it; NaN where none does."""
+    from megloc_kapture.geometry.projection import packed_views
     from megloc_kapture.mapping import kernels
 
     depths = np.empty(len(observed.xyz))
-    kernels.mean_depths(
-        observed.starts(),
-        observed.image_ids,
-        observed.xyz,
-        *observed.rotations_and_translations(),
-        depths,
-    )
+    poses = packed_views(observed.cameras, observed.cams_from_world)[:2]
+    kernels.mean_depths(observed.starts(), observed.image_ids, observed.xyz, *poses, depths)
     return depths
 
 
@@ -296,15 +284,11 @@ def too_uncertain(deviations: Floats, depths: Floats, options: UncertaintyOption
             relative = deviations / depths
             usual = relative[np.isfinite(relative) & (relative > 0)]
             if len(usual):
-                limit = robust_limit(np.log(usual), options.max_robust_sigmas)
-                rejected |= relative > np.exp(limit)
+                logarithms = np.log(usual)
+                median = float(np.median(logarithms))
+                deviation = float(deviation_by_median(logarithms - median))
+                rejected |= relative > np.exp(median + options.max_robust_sigmas * deviation)
     return rejected
-
-
-def robust_limit(values: Floats, num_sigmas: float) -> float:
-    """The median of ``values`` (N,), N > 0, and so many of their standard deviations more."""
-    median = float(np.median(values))
-    return median + num_sigmas * float(deviation_by_median(values - median))
 
 
 def left_with_too_few(
@@ -312,11 +296,8 @@ def left_with_too_few(
 ) -> Mask:
     """Points (N,) that lost an observation and have fewer than ``min_observations`` left.
 
-    Who has lost nothing stays, however few there were: a lifted point has a single one.
-
-    Parameters
-    ----------
-    point_ids, dropped : (O,).
+    Of observations (O,). Who has lost nothing stays, however few there were: a lifted point has a
+    single one.
     """
     lost = np.bincount(point_ids[dropped], minlength=num_points)
     left = np.bincount(point_ids[~dropped], minlength=num_points)

@@ -21,12 +21,8 @@ from megloc_kapture.matching.guided_pyramid import PairMatches, VariantMatches
 SAME_KEYPOINT_PX = 1.0
 
 
-@dataclass(frozen=True, eq=False)
-class TriedVariant:
-    """A variant of the first (0) or the second (1) image of a pair, with its matches."""
-
-    side: Literal[0, 1]
-    matches: VariantMatches
+TriedVariant = tuple[int, VariantMatches]
+"""Matches of a variant of the first (0) or the second (1) image of a pair."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +63,8 @@ def combine(
     keypoints : of both images, appended to; the second is not needed where no variant is of it.
     """
     base_matches, base_scores = base
-    order = sorted(range(len(tried)), key=lambda at: -len(tried[at].matches))
-    best = order[0] if order and len(tried[order[0]].matches) > len(base_matches) else None
+    order = sorted(range(len(tried)), key=lambda at: -len(tried[at][1]))
+    best = order[0] if order and len(tried[order[0]][1]) > len(base_matches) else None
     lengths = [0 if union is None else len(union) for union in keypoints]
     if mode == "max":
         if best is not None:
@@ -104,7 +100,7 @@ class _Combination:
 
     def take(self, number: int, tried: TriedVariant) -> None:
         """Add the matches of a variant whose keypoints have none yet."""
-        side, found = tried.side, tried.matches
+        side, found = tried
         union = self._keypoints[side]
         if union is None:
             raise ValueError("a variant of an image whose keypoints are not given")

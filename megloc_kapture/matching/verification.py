@@ -22,8 +22,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.special import gammaln
-from scipy.stats import binom
 
 from megloc_kapture.geometry.cameras import bearing_rays, focal_px
 from megloc_kapture.geometry.poses import cross_matrix
@@ -40,6 +38,12 @@ Floats = NDArray[np.float64]
 _MAX_RAY_ERROR_PX = 0.1
 # of a variant's matches, whose own model is another one where fewer agree
 _MIN_AGREEING = 0.5
+_SAMPLE = 5  # matches that a relative pose of calibrated cameras is made of
+# shares of the threshold: the most telling one counts, as in the paper of false alarms
+_THRESHOLDS = (1.0, 0.5, 0.25)
+# matches of one thing in two images are not independent of each other, so few must be expected
+_MAX_FALSE_ALARMS = 1e-10
+_MAX_WRONG_PAIRS = 20_000
 
 
 class KnownPoseOptions(Options):
@@ -102,15 +106,10 @@ def sampson_error_px(
     slopes_b: Floats,
     b_from_a: RigidTransform,
 ) -> Floats:
-    """Sampson distance in pixels of matched rays (N, 3), last component 1, see above; (N,).
+    """Sampson distance in pixels (N,) of matched rays (N, 3), last component 1, see above.
 
-    Parameters
-    ----------
-    slopes_a, slopes_b : float64 (N, 2, 2), see :func:`ray_slopes`.
-
-    Returns
-    -------
-    float64 (N,); infinite where there is no epipolar line, NaN where a slope is.
+    Of slopes (N, 2, 2), see :func:`ray_slopes`. Infinite where there is no epipolar line, NaN where
+    a slope is.
     """
     essential = essential_matrix(b_from_a)
     line_b = rays_a @ essential.T
@@ -157,7 +156,6 @@ def verify_with_poses(
     ----------
     rays_a, rays_b : float64 (N, 3), matched homogeneous rays, last component 1.
     slopes_a, slopes_b : float64 (N, 2, 2), see :func:`ray_slopes`; a match with NaN is refused.
-    b_from_a : the known pose.
 
     Returns
     -------
@@ -192,8 +190,6 @@ def verify_two_view(
     bool (N,); all False when no model has ``min_matches`` inliers. False where a camera's
     distortion cannot be undone.
     """
-    import poselib
-
     options = options or TwoViewOptions()
     none = np.zeros(len(keypoints_a_px), dtype=bool)
     rays_a = bearing_rays(camera_a, keypoints_a_px)
@@ -201,30 +197,11 @@ def verify_two_view(
     usable = np.isfinite(rays_a).all(axis=1) & np.isfinite(rays_b).all(axis=1)
     if usable.sum() < options.min_matches:
         return none
-    # in normalised coordinates poselib needs to know no camera model, and ours knows them all
     focal = 0.5 * (focal_px(camera_a) + focal_px(camera_b))
-    pinhole = {
-        "model": "PINHOLE",
-        "width": 1,
-        "height": 1,
-        "params": [focal, focal, 0.0, 0.0],
-    }
-    _, info = poselib.estimate_relative_pose(
-        rays_a[usable, :2] * focal,
-        rays_b[usable, :2] * focal,
-        pinhole,
-        pinhole,
-        {
-            "max_epipolar_error": options.max_error_px,
-            "min_iterations": options.min_iterations,
-            "max_iterations": options.max_iterations,
-            "success_prob": options.confidence,
-            "progressive_sampling": True,
-            "max_prosac_iterations": options.max_iterations,
-            "seed": options.seed,
-        },
-        {"max_iterations": 0},  # of the pose, which is not asked for; inliers are known before
-    )
+    best_first = {"progressive_sampling": True, "max_prosac_iterations": options.max_iterations}
+    # the pose is not asked for, and the inliers are known before it is refined
+    unrefined = {"max_iterations": 0}
+    _, info = _ransac(rays_a[usable], rays_b[usable], focal, options, best_first, unrefined)
     inliers = np.asarray(info["inliers"], dtype=bool)
     if len(inliers) != usable.sum() or inliers.sum() < options.min_matches:
         return none
@@ -298,8 +275,8 @@ def two_view_of_variants(
 
 def known_pose_of_variants(
     camera: Camera,
-    other_rays: NDArray[np.float64],
-    other_slopes: NDArray[np.float64],
+    other_rays: Floats,
+    other_slopes: Floats,
     other_from_image: RigidTransform,
     options: KnownPoseOptions,
 ) -> PairVerifier:
@@ -308,8 +285,7 @@ def known_pose_of_variants(
     Parameters
     ----------
     camera : of the image the variants are of.
-    other_rays, other_slopes : float64 (M, 3) and (M, 2, 2) of the other image's keypoints, see
-        ``verification.ray_slopes``.
+    other_rays, other_slopes : float64 (M, 3) and (M, 2, 2) of the other image's keypoints.
     """
 
     def verify(found: VariantFeatures, matches: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -324,57 +300,51 @@ def known_pose_of_variants(
 
 
 def relative_pose(
-    rays: NDArray[np.float64],
-    other_rays: NDArray[np.float64],
+    rays: Floats,
+    other_rays: Floats,
     focal: float,
     options: TwoViewOptions,
 ) -> RigidTransform | None:
-    """``other_from_image`` of matched rays, with a translation of length 1, by RANSAC.
+    """Estimate ``other_from_image`` of matched rays, with a translation of length 1, by RANSAC.
 
-    Parameters
-    ----------
-    rays, other_rays : float64 (N, 3), homogeneous, last component 1.
-    focal : pixels, at which an error counts.
-
-    Returns
-    -------
-    None where no model has ``min_matches`` inliers.
+    Of homogeneous rays (N, 3), last component 1, at a focal length in pixels, at which an error
+    counts. None where no model has ``min_matches`` inliers.
     """
-    import poselib
-
     if len(rays) < options.min_matches:
         return None
-    # normalised coordinates at a focal length, as verify_two_view has them
-    pinhole = {"model": "PINHOLE", "width": 1, "height": 1, "params": [focal, focal, 0.0, 0.0]}
-    pose, info = poselib.estimate_relative_pose(
-        rays[:, :2] * focal,
-        other_rays[:, :2] * focal,
-        pinhole,
-        pinhole,
-        {
-            "max_epipolar_error": options.max_error_px,
-            "min_iterations": options.min_iterations,
-            "max_iterations": options.max_iterations,
-            "success_prob": options.confidence,
-            "seed": options.seed,
-        },
-    )
+    pose, info = _ransac(rays, other_rays, focal, options, {}, {})
     if info["num_inliers"] < options.min_matches:
         return None
     return RigidTransform.from_matrix(np.asarray(pose.R), np.asarray(pose.t))
 
 
+def _ransac(
+    rays_a: Floats,
+    rays_b: Floats,
+    focal: float,
+    options: TwoViewOptions,
+    sampling: dict[str, object],
+    refinement: dict[str, object],
+) -> tuple[Any, dict[str, Any]]:
+    """poselib's relative pose, of normalised coordinates at a focal length: so it needs to know no
+    camera model, and ours knows them all."""
+    import poselib
+
+    pinhole = {"model": "PINHOLE", "width": 1, "height": 1, "params": [focal, focal, 0.0, 0.0]}
+    ransac = {
+        "max_epipolar_error": options.max_error_px,
+        "min_iterations": options.min_iterations,
+        "max_iterations": options.max_iterations,
+        "success_prob": options.confidence,
+        "seed": options.seed,
+    }
+    pixels = rays_a[:, :2] * focal, rays_b[:, :2] * focal
+    return poselib.estimate_relative_pose(*pixels, pinhole, pinhole, ransac | sampling, refinement)
+
+
 def _precision(variant: ImageVariant) -> float:
     """Pixels of the image that a keypoint was found in, for one of the original; 1 at most."""
     return min(1.0, variant.scale)
-
-
-_SAMPLE = 5  # matches that a relative pose of calibrated cameras is made of
-# shares of the verification's threshold: the most telling one counts, as in that paper
-_THRESHOLDS = (1.0, 0.5, 0.25)
-# matches of one thing in two images are not independent of each other, so few must be expected
-_MAX_FALSE_ALARMS = 1e-10
-_MAX_WRONG_PAIRS = 20_000
 
 
 def agree_by_chance(
@@ -385,7 +355,16 @@ def agree_by_chance(
     num_matches: int,
     options: TwoViewOptions,
 ) -> bool:
-    """Whether wrong matches of two images may agree with a relative pose as well as these do.
+    """True if wrong matches of two images may agree with a relative pose as well as these do.
+
+    Of matches that are all wrong some lie near the epipolar lines of any model, and RANSAC finds
+    the model with most of them. The number of false alarms (Moisan and Stival, A probabilistic
+    criterion to detect rigid point matches between two images, IJCV 2004) is how many models as
+    good as this one are expected among wrong matches. There a wrong match falls anywhere in the
+    image; but keypoints stand where the texture is, and wrong matches are of things that look
+    alike. How often one is near its line is therefore counted, on the keypoints themselves: each
+    with the others' partners. Few keypoints tell little of that, so it is never taken to be less
+    than anywhere.
 
     Parameters
     ----------
@@ -393,6 +372,9 @@ def agree_by_chance(
     num_matches : of which it kept them.
     options : of that verification.
     """
+    from scipy.special import gammaln
+    from scipy.stats import binom
+
     number = len(keypoints_a_px)
     if number <= max(_SAMPLE, options.min_matches - 1):
         return True
@@ -405,7 +387,7 @@ def agree_by_chance(
     slopes_a = ray_slopes(camera_a, keypoints_a_px, rays_a)
     slopes_b = ray_slopes(camera_b, keypoints_b_px, rays_b)
 
-    def errors_px(a: NDArray[np.integer[Any]], b: NDArray[np.integer[Any]]) -> NDArray[np.float64]:
+    def errors_px(a: NDArray[np.integer[Any]], b: NDArray[np.integer[Any]]) -> Floats:
         return sampson_error_px(rays_a[a], slopes_a[a], rays_b[b], slopes_b[b], b_from_a)
 
     rows = np.arange(number)

@@ -1,4 +1,4 @@
-"""Fusion of several global features: of their vectors, their similarities or their rankings.
+"""Fusion of several global features, by vectors, similarities or rankings; reranking.
 
 The operators are those of Csurka and Clinchant, "An empirical study of fusion operators for
 multimodal image retrieval", CBMI 2012, as kapture-localization has them, which MegLoc uses. With
@@ -16,7 +16,7 @@ villena_roman   ``(1 - alpha) max + alpha min ** 2 / (max + min)``
 harmonic_mean   ``1 / sum((1 / n) / (w_i s_i))``
 ghm             ``1 / sum((1 / n) / (gamma + w_i s_i)) - gamma``, the generalized harmonic mean
 early           as ``mean``, in one search: the vectors are concatenated, see :func:`concatenate`
-round_robin     first of each feature, second of each feature, ...; see :func:`round_robin`
+round_robin     first of each feature, second of each feature, ...; see :func:`fuse_rankings`
 ==============  ===================================================================================
 
 They are written for similarities that are not negative, as those of text are. A cosine may be
@@ -211,8 +211,7 @@ def _by_ranks(
 ) -> NDArray[np.float64]:
     features = len(similarities)
     length = similarities[0].shape[1]
-    fused = np.zeros(similarities[0].shape)
-    fused[:] = -np.inf if options.method == "round_robin" else 0.0
+    fused = np.full(similarities[0].shape, -np.inf if options.method == "round_robin" else 0.0)
     for feature, (matrix, share) in enumerate(zip(similarities, shares, strict=True)):
         order = np.argsort(-matrix, axis=1, kind="stable")
         ranks = np.empty_like(order)
@@ -224,12 +223,6 @@ def _by_ranks(
         else:
             fused += share * (length - ranks)
     return fused
-
-
-def check_features(count: int, databases: int) -> None:
-    """Raise OptionError unless queries and database have the same number of features, any."""
-    if count == 0 or count != databases:
-        raise OptionError(f"{count} global features of the queries, {databases} of the map")
 
 
 def normalized_weights(weights: Sequence[float] | None, count: int) -> NDArray[np.float64]:
@@ -290,68 +283,52 @@ def concatenate(
     return fused
 
 
-def round_robin(lists: Sequence[NDArray[np.int64]], top_k: int) -> Ranking:
-    """The first of each list in turn, then the second of each, without what was there already.
+def fuse_rankings(
+    lists: Sequence[NDArray[np.int64]],
+    top_k: int,
+    options: FusionOptions,
+    weights: Sequence[float] | None = None,
+) -> Ranking:
+    """Fuse the ranked lists of several features by one of RANK_METHODS.
+
+    ``round_robin`` takes the first of each list in turn, then the second of each, without what was
+    there already. ``reciprocal_rank`` sums ``w_i / (rank_constant + rank_i)``, ranks from 1
+    (Cormack, Clarke and Buettcher, "Reciprocal rank fusion outperforms Condorcet and individual
+    rank learning methods", SIGIR 2009, whose constant is 60). ``borda`` gives the last of the
+    longest list one point, each before it one more. A list without the image adds nothing; equal
+    sums are in the order of the images.
 
     Parameters
     ----------
-    lists : per feature int64 (Q, K_i).
+    lists : per feature int64 (Q, K_i), best first, -1 where there are no more.
     top_k : at most this many per row.
+    weights : one per feature, positive; all equal by default. ``round_robin`` has no use for them.
 
     Returns
     -------
     indices : int64 (Q, top_k), best first, -1 where the lists have no more.
-    scores : float32 (Q, top_k), ``top_k`` for the first, then one less each; -inf where -1.
+    scores : float32 (Q, top_k), the sums; of ``round_robin`` ``top_k`` for the first, then one less
+        each. -inf where -1.
 
     Raises
     ------
     DataError : lists of different numbers of queries.
-    OptionError : no list.
+    OptionError : no list, or weights that cannot be used.
     """
-    features = max(len(lists), 1)
-    turns = [
-        -(np.arange(ranked.shape[-1]) * features + feature) for feature, ranked in enumerate(lists)
-    ]
-    indices, _ = _best(lists, turns, top_k, np.maximum)
-    scores = np.arange(top_k, 0, -1, dtype=np.float32)
-    return indices, np.where(indices >= 0, scores, np.float32(-np.inf))
-
-
-def reciprocal_rank(
-    lists: Sequence[NDArray[np.int64]],
-    top_k: int,
-    weights: Sequence[float] | None = None,
-    *,
-    constant: float = 60.0,
-) -> Ranking:
-    """Reciprocal rank fusion: ``sum(w_i / (constant + rank_i))``, ranks from 1.
-
-    Cormack, Clarke and Buettcher, "Reciprocal rank fusion outperforms Condorcet and individual
-    rank learning methods", SIGIR 2009, whose constant is 60. A list without the image adds nothing.
-    Equal sums are in the order of the images. Parameters as of :func:`round_robin`; the weights
-    are positive and brought to a sum of one, scores are the sums.
-    """
+    if not lists:
+        raise OptionError("no ranked list to fuse")
+    ranks = [np.arange(ranked.shape[-1]) for ranked in lists]
+    if options.method == "round_robin":
+        turns = [-(own * len(lists) + feature) for feature, own in enumerate(ranks)]
+        indices, _ = _best(lists, turns, top_k, np.maximum)
+        scores = np.arange(top_k, 0, -1, dtype=np.float32)
+        return indices, np.where(indices >= 0, scores, np.float32(-np.inf))
     shares = normalized_weights(weights, len(lists))
-    points = [
-        share / (constant + 1 + np.arange(ranked.shape[-1]))
-        for ranked, share in zip(lists, shares, strict=True)
-    ]
-    return _best(lists, points, top_k, np.add)
-
-
-def borda(
-    lists: Sequence[NDArray[np.int64]], top_k: int, weights: Sequence[float] | None = None
-) -> Ranking:
-    """Borda count: the last of the longest list gets one point, each before it one more.
-
-    Parameters and result as of :func:`reciprocal_rank`.
-    """
-    shares = normalized_weights(weights, len(lists))
-    longest = max(ranked.shape[-1] for ranked in lists)
-    points = [
-        share * (longest - np.arange(ranked.shape[-1]))
-        for ranked, share in zip(lists, shares, strict=True)
-    ]
+    both = list(zip(shares, ranks, strict=True))
+    if options.method == "reciprocal_rank":
+        points = [share / (options.rank_constant + 1 + own) for share, own in both]
+    else:
+        points = [share * (max(map(len, ranks)) - own) for share, own in both]
     return _best(lists, points, top_k, np.add)
 
 
@@ -362,8 +339,6 @@ def _best(
     together: np.ufunc,
 ) -> Ranking:
     """The images with most points; ``together`` is what makes one of an image's points."""
-    if not lists:
-        raise OptionError("no ranked list to fuse")
     if any(ranked.ndim != 2 or len(ranked) != len(lists[0]) for ranked in lists):
         raise DataError(f"ranked lists of shapes {[ranked.shape for ranked in lists]}")
     every = np.concatenate(lists, axis=1)
@@ -378,7 +353,7 @@ def _best(
         return indices, scores
     order = np.lexsort((images, rows))
     rows, values, images = rows[order], values[order], images[order]
-    starts = np.flatnonzero((np.diff(rows, prepend=-1) != 0) | (np.diff(images, prepend=-1) != 0))
+    starts = np.flatnonzero(np.diff(rows, prepend=-1) | np.diff(images, prepend=-1))
     rows, images, values = rows[starts], images[starts], together.reduceat(values, starts)
     order = np.lexsort((images, -values, rows))
     rows, images, values = rows[order], images[order], values[order]

@@ -17,13 +17,10 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError, OptionError, missing_extra
 from megloc_kapture.retrieval.fusion import (
     FusionOptions,
-    borda,
-    check_features,
     concatenate,
     fuse,
+    fuse_rankings,
     normalized_weights,
-    reciprocal_rank,
-    round_robin,
 )
 from megloc_kapture.retrieval.vectors import (
     ConcatenatedBlocks,
@@ -37,12 +34,16 @@ from megloc_kapture.retrieval.vectors import (
 _BLOCK_ELEMENTS = 1 << 24  # similarities held at once, per feature: 64 MiB of float32
 _VECTOR_ELEMENTS = 1 << 25  # of a block of database rows, per feature: 128 MiB of float32
 _MOST_ROWS = 1 << 14  # of a block, however short they are
-_CACHED_ELEMENTS = 1 << 18  # of similarities ranked at once: 1 MiB
+_CACHED_ELEMENTS = 1 << 18  # of similarities ranked at once: 1 MiB, which a cache holds
 Permitted = NDArray[np.bool_] | Callable[[int, int], NDArray[np.bool_]] | None
+Matrices = Sequence[NDArray[np.floating[Any]]]
 Found = tuple[NDArray[np.int64], NDArray[np.float32]]
 _GROUP = 8  # columns of which only the best is looked at first
 _NOTHING = np.iinfo(np.int64).max  # sorts last
 _SIGN = np.int32(0x7FFFFFFF)
+_SUBVECTOR = 16  # values that share a code of 4 bits, one of 16 centroids
+_SAMPLE = 16 * 39  # fewer rows than 39 for each centroid FAISS calls too few
+_LENGTH = 1000  # rows of a query whose exact similarity is found
 
 
 def rank_by_similarity(
@@ -134,7 +135,10 @@ class FusedSearch:
         ------
         DataError, OptionError : as of :func:`rank_fused`.
         """
-        check_features(len(queries), len(database))
+        if len(queries) == 0 or len(queries) != len(database):
+            raise OptionError(
+                f"{len(queries)} global features of the queries, {len(database)} of the map"
+            )
         normalized_weights(self.weights, len(queries))  # refused before anything is read
         if len(queries) == 1:
             return [rank_by_similarity(queries[0], database[0], self.top_k, permitted=permitted)]
@@ -160,11 +164,7 @@ class FusedSearch:
             return indices[:, : self.top_k], scores[:, : self.top_k]
         rankings = [indices for indices, _ in lists]
         top_k = min(self.top_k, rankings[0].shape[1])
-        if self.fusion.method == "round_robin":
-            return round_robin(rankings, top_k)
-        if self.fusion.method == "borda":
-            return borda(rankings, top_k, self.weights)
-        return reciprocal_rank(rankings, top_k, self.weights, constant=self.fusion.rank_constant)
+        return fuse_rankings(rankings, top_k, self.fusion, self.weights)
 
     def _list_length(self) -> int:
         # a turn of the round gives one image at most, so longer lists would change nothing
@@ -180,9 +180,6 @@ def _merged(parts: Sequence[Found], length: int) -> Found:
     indices, scores = (np.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True))
     best = np.argsort(-scores, axis=1, kind="stable")[:, :length]
     return np.take_along_axis(indices, best, axis=1), np.take_along_axis(scores, best, axis=1)
-
-
-Matrices = Sequence[NDArray[np.floating[Any]]]
 
 
 def _search(
@@ -222,19 +219,16 @@ def _search(
                 for rows, block, out, finite in zip(vectors, blocks, products, finites, strict=True)
             ]
             mask = None if allowed is None else allowed[some]
-            for part in _parts(*matrices[0].shape):
+            count, width = matrices[0].shape
+            few = max(1, _CACHED_ELEMENTS // width)
+            for start in range(0, count, few):
+                part = slice(start, start + few)
                 fused = combine([matrix[part] for matrix in matrices])
                 for scores, ranking in zip(fused, best, strict=True):
                     if mask is not None:
                         scores = np.where(mask[part], scores, -np.inf)
-                    ranking.add(first + part.start, left, scores)
+                    ranking.add(first + start, left, scores)
     return [ranking.result() for ranking in best]
-
-
-def _parts(num_queries: int, width: int) -> list[slice]:
-    """Queries whose scores a processor's cache holds."""
-    step = max(1, _CACHED_ELEMENTS // width)
-    return [slice(start, start + step) for start in range(0, num_queries, step)]
 
 
 def _checked(queries: NDArray[np.floating[Any]], source: VectorBlocks) -> NDArray[np.float32]:
@@ -351,13 +345,14 @@ def _padded(query: NDArray[np.int64], keys: NDArray[np.int64], count: int) -> ND
     return padded
 
 
-_SUBVECTOR = 16  # values that share a code of 4 bits, one of 16 centroids
-_SAMPLE = 16 * 39  # fewer rows than 39 for each centroid FAISS calls too few
-_LENGTH = 1000  # rows of a query whose exact similarity is found
-
-
 class QuantizedRows:
-    """Codes of the rows of a source.
+    """Codes of the rows of a source, for short lists of their nearest neighbours.
+
+    Jégou, Douze, Schmid, "Product quantization for nearest neighbor search", TPAMI 2011; FAISS's
+    implementation with asymmetric distances by shuffles (André, Kermarrec, Le Scouarnec, "Quicker
+    ADC", TPAMI 2021), every code compared. A row takes a byte per 32 values in memory; the rows of
+    a short list are read again for their exact similarities, so that a ranking is exact search's as
+    long as the short list holds it.
 
     Raises
     ------

@@ -39,7 +39,6 @@ from megloc_kapture.matching.guided_pyramid import (
 from megloc_kapture.matching.pyramid_combination import (
     Combined,
     KeypointUnion,
-    TriedVariant,
     combine,
 )
 from megloc_kapture.matching.verification import KnownPoseOptions, known_pose_of_variants
@@ -286,9 +285,7 @@ class _AllMatched:
         if options.mode == "off":
             raise ValueError("only pairs that are tried again are combined")
         places = self.of_pair(pair)
-        tried = [
-            TriedVariant(0 if image == pair[0] else 1, spool.get(image, at)) for image, at in places
-        ]
+        tried = [(pair.index(image), spool.get(image, at)) for image, at in places]
         first, second = (KeypointUnion(keypoints.read(one), added[one].px) for one in pair)
         combined = combine(base, tried, options.mode, (first, second))
         for image, union, new in zip(pair, (first, second), combined.added, strict=True):

@@ -25,7 +25,7 @@ from megloc_kapture.localization.absolute_pose import (
     estimate_pose,
     pose_covariance,
 )
-from megloc_kapture.localization.map_index import PoseProblem, View, split_by_view
+from megloc_kapture.localization.map_index import PoseProblem, View
 from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, Failure, Pose, RigidTransform
 
 Array = NDArray[np.float64]
@@ -459,7 +459,7 @@ def test_any_of_a_rigs_cameras_may_have_the_matches(used: list[int]) -> None:
     estimate = estimated(estimate_pose(PoseProblem.of(views)))
     assert distance(estimate.rig_from_world, truth) < 0.05
     assert estimate.num_inliers == estimate.inliers.sum() <= estimate.usable.sum()
-    for k, inliers in enumerate(split_by_view(views, estimate.inliers)):
+    for k, inliers in enumerate(PoseProblem.of(views).split(estimate.inliers)):
         if k in used:
             assert inliers[1::2].all() and inliers[::2].mean() < 0.1
         else:
@@ -528,7 +528,7 @@ def test_arrays_that_do_not_belong_together_are_refused(
 
 def test_what_runs_over_all_views_is_taken_apart() -> None:
     views = [View(PINHOLE, AT_ORIGIN, np.zeros((n, 2)), np.zeros((n, 3))) for n in (2, 0, 3)]
-    parts = split_by_view(views, np.array([True, False, False, True, True]))
+    parts = PoseProblem.of(views).split(np.array([True, False, False, True, True]))
     assert [part.tolist() for part in parts] == [[True, False], [], [False, True, True]]
 
 

@@ -15,7 +15,7 @@ from megloc_kapture.localization.absolute_pose import (
     AbsolutePoseOptions,
     PoseEstimate,
     center_deviation,
-    reprojection_errors_px,
+    match_errors,
     rig_pose,
 )
 from megloc_kapture.localization.focal_length import (
@@ -115,7 +115,7 @@ def uncertain(
         # what is looked at afterwards is of the camera that the pose was found with
         assert problem.views[0].camera.params == found.camera.params
         assert found.inliers is not None
-        errors = reprojection_errors_px(problem, found.cam_from_world)
+        errors, _ = match_errors(problem, found.cam_from_world)
         assert ((errors <= options.max_error_px) == found.inliers).all()
     return true, found, pose
 

@@ -158,7 +158,7 @@ def test_a_variant_that_cannot_be_extracted_is_skipped_and_says_why() -> None:
     variants = [ImageVariant(0.5), ImageVariant(1 / 3), ImageVariant(0.5, 90)]
     found, skipped = extract_variants(IMAGE, None, variants, picky, like=LIKE)
     assert [each.variant for each in found] == variants[:1]
-    assert [(each.variant, each.reason) for each in skipped] == [
+    assert list(skipped.items()) == [
         (variants[1], "error: too small"),
         (variants[2], "no keypoints"),
     ]

@@ -15,7 +15,6 @@ from megloc_kapture.matching.guided_pyramid import (
 from megloc_kapture.matching.pyramid_combination import (
     SAME_KEYPOINT_PX,
     KeypointUnion,
-    TriedVariant,
     combine,
 )
 
@@ -117,7 +116,7 @@ def test_all_is_what_was_there_and_what_is_new() -> None:
         variant_matches([(20.5, 0.5), (5, 5), (6, 50), (10, 0)], [7, 8, 0, 9], [0.1, 0.2, 1, 1]),
         variant_matches([(5, 5.9)], [10]),  # the poorer one's keypoint is the other's: has a match
     ]
-    combined = combine(BASE, [TriedVariant(0, each) for each in tried], "all", (keypoints, None))
+    combined = combine(BASE, [(0, each) for each in tried], "all", (keypoints, None))
     assert combined.matches.tolist() == [[0, 0], [1, 1], [5, 8], [2, 7]]
     np.testing.assert_allclose(combined.scores, [0.9, 0.8, 0.2, 0.1])
     assert combined.best == 0
@@ -128,8 +127,8 @@ def test_all_is_what_was_there_and_what_is_new() -> None:
 def test_variants_of_both_images_add_to_both() -> None:
     first, second = KeypointUnion(grid(3)), KeypointUnion(grid(4))
     tried = [
-        TriedVariant(0, variant_matches([(5, 5)], [3])),
-        TriedVariant(1, variant_matches([(6, 6), (7, 60)], [2, 1])),
+        (0, variant_matches([(5, 5)], [3])),
+        (1, variant_matches([(6, 6), (7, 60)], [2, 1])),
     ]
     combined = combine(BASE, tried, "all", (first, second))
     # the richer one first; row 1 of the first image has a match
@@ -141,12 +140,10 @@ def test_max_is_the_richest() -> None:
     rich = variant_matches([(5, 5), (0, 0.5), (15, 5)], [0, 5, 6])
     richer = variant_matches([(5, 45), (10, 40), (15, 45), (20, 40)], [0, 5, 6, 7])
     keypoints = KeypointUnion(grid(5))
-    combined = combine(
-        BASE, [TriedVariant(0, rich), TriedVariant(0, richer)], "max", (keypoints, None)
-    )
+    combined = combine(BASE, [(0, rich), (0, richer)], "max", (keypoints, None))
     assert combined.matches.tolist() == [[5, 0], [6, 5], [7, 6], [8, 7]]
     assert combined.best == 1
-    combined = combine(BASE, [TriedVariant(0, rich)], "max", (KeypointUnion(grid(5)), None))
+    combined = combine(BASE, [(0, rich)], "max", (KeypointUnion(grid(5)), None))
     assert combined.matches.tolist() == [[5, 0], [0, 5], [6, 6]]
 
 
@@ -156,9 +153,7 @@ def test_max_keeps_the_images_as_they_are_where_no_variant_has_more() -> None:
     # three matches, but two of their keypoints are one
     seemingly = variant_matches([(5, 5), (5, 5.5), (15, 5)], [4, 5, 6])
     for tried in ([], [as_many], [seemingly]):
-        combined = combine(
-            BASE, [TriedVariant(0, each) for each in tried], "max", (keypoints, None)
-        )
+        combined = combine(BASE, [(0, each) for each in tried], "max", (keypoints, None))
         assert combined.matches.tolist() == BASE[0].tolist()
         assert combined.best is None
         assert len(combined.added[0]) == 0 and len(keypoints) == 5
@@ -176,7 +171,7 @@ def test_whatever_is_tried(
     unions = KeypointUnion(grid(8)), KeypointUnion(grid(9))
     base = (np.stack([rng.permutation(8)[:4], rng.permutation(9)[:4]], axis=1), rng.random(4))
     tried = [
-        TriedVariant(
+        (
             side,
             variant_matches(
                 rng.uniform(0, 30, (size, 2)).tolist(),

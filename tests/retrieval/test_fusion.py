@@ -19,13 +19,11 @@ from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.retrieval.fusion import (
     DiversityOptions,
     FusionOptions,
-    borda,
     concatenate,
     diversify,
     fuse,
+    fuse_rankings,
     greedy_coverage,
-    reciprocal_rank,
-    round_robin,
 )
 from megloc_kapture.retrieval.search import rank_by_similarity, rank_fused
 from megloc_kapture.retrieval.vectors import ConcatenatedBlocks
@@ -336,7 +334,7 @@ def naive_round_robin(lists: list[list[int]], top_k: int) -> list[int]:
 
 @given(ranked_lists(), st.integers(0, 12))
 def test_round_robin(lists: list[NDArray[np.int64]], top_k: int) -> None:
-    indices, scores = round_robin(lists, top_k)
+    indices, scores = fuse_rankings(lists, top_k, FusionOptions(method="round_robin"))
     assert indices.shape == scores.shape == (len(lists[0]), top_k)
     for row in range(len(lists[0])):
         expected = naive_round_robin([ranked[row].tolist() for ranked in lists], top_k)
@@ -349,11 +347,8 @@ def test_round_robin(lists: list[NDArray[np.int64]], top_k: int) -> None:
 def test_points_add_up(lists: list[NDArray[np.int64]], top_k: int, reciprocal: bool) -> None:
     weights = [float(k + 1) for k in range(len(lists))]
     longest = max(ranked.shape[1] for ranked in lists)
-    fused = (
-        reciprocal_rank(lists, top_k, weights, constant=7)
-        if reciprocal
-        else borda(lists, top_k, weights)
-    )
+    method = FusionOptions(method="reciprocal_rank" if reciprocal else "borda", rank_constant=7)
+    fused = fuse_rankings(lists, top_k, method, weights)
     for row in range(len(lists[0])):
         points: defaultdict[int, float] = defaultdict(float)
         for ranked, weight in zip(lists, weights, strict=True):
@@ -371,22 +366,24 @@ def test_points_add_up(lists: list[NDArray[np.int64]], top_k: int, reciprocal: b
 
 def test_equal_sums_keep_the_order_of_the_images() -> None:
     lists = [np.array([[5, 3, 9]]), np.array([[3, 5, 7]])]
-    assert reciprocal_rank(lists, 4)[0].tolist() == [[3, 5, 7, 9]]
-    assert borda(lists, 4)[0].tolist() == [[3, 5, 7, 9]]
+    for options in (FusionOptions(method="reciprocal_rank"), FusionOptions(method="borda")):
+        assert fuse_rankings(lists, 4, options)[0].tolist() == [[3, 5, 7, 9]]
 
 
 def test_the_papers_constant_is_the_default() -> None:
-    _, scores = reciprocal_rank([np.array([[4]]), np.array([[4]])], 1)
+    options = FusionOptions(method="reciprocal_rank")
+    _, scores = fuse_rankings([np.array([[4]]), np.array([[4]])], 1, options)
     np.testing.assert_allclose(scores, 1 / 61, rtol=1e-6)
 
 
-def test_lists_that_cannot_be_fused_are_refused() -> None:
+@pytest.mark.parametrize("method", ["round_robin", "borda", "reciprocal_rank"])
+def test_lists_that_cannot_be_fused_are_refused(method: Any) -> None:
     one, other = np.zeros((1, 2), dtype=np.int64), np.zeros((2, 2), dtype=np.int64)
-    for fused in (round_robin, borda, reciprocal_rank):
-        with pytest.raises(OptionError):
-            fused([], 3)
-        with pytest.raises(DataError, match="shapes"):
-            fused([one, other], 3)
+    options = FusionOptions(method=method)
+    with pytest.raises(OptionError):
+        fuse_rankings([], 3, options)
+    with pytest.raises(DataError, match="shapes"):
+        fuse_rankings([one, other], 3, options)
 
 
 AHEAD = np.array([0.0, 0.0, 1.0])
