@@ -1,4 +1,6 @@
-"""Pose algebra on arrays: quaternions (..., 4) ordered w x y z, translations (..., 3), float64.
+"""Pose algebra on arrays, and alignment with positions on earth.
+
+Quaternions (..., 4) are ordered w x y z, translations (..., 3), both float64.
 
 The conventions are those of :class:`megloc_kapture.values.RigidTransform`: ``a_from_b`` maps
 ``x_a = R x_b + t``, transforms compose right to left, and ``q`` and ``-q`` are one rotation.
@@ -12,15 +14,29 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.values import RigidTransform
 
-Float64Array = NDArray[np.float64]
+Floats = NDArray[np.float64]
+GeoPosition = tuple[float, float, float]
+"""Latitude and longitude in degrees, height in metres above the ellipsoid."""
+
+# the standard deviation of normal values over the median of their magnitudes: 1 / (quantile of 3/4)
+_DEVIATION_OF_MEDIAN = 1.482602218505602
+# of the ellipsoid WGS84
+_SEMI_MAJOR_M = 6378137.0
+_FLATTENING = 1 / 298.257223563
+_ECCENTRICITY_SQUARED = _FLATTENING * (2 - _FLATTENING)
+_LATITUDE_ROUNDS = 8  # each gains more than two digits
+_ALIGNING_ROUNDS = 50
+# how far the positions have to spread in two directions, in residuals, to tell scale and axes
+_MIN_SPREAD = 3.0
+# receivers of phones claim no better; residuals of three positions may be smaller by chance
+_MIN_RESIDUAL_M = 1.0
 
 
-def stack_poses(poses: Iterable[RigidTransform]) -> tuple[Float64Array, Float64Array]:
+def stack_poses(poses: Iterable[RigidTransform]) -> tuple[Floats, Floats]:
     """Quaternions (N, 4) and translations (N, 3) of N transforms, in their order."""
     listed = list(poses)
     quats = np.array([p.quat_wxyz for p in listed], dtype=np.float64).reshape(-1, 4)
@@ -28,7 +44,7 @@ def stack_poses(poses: Iterable[RigidTransform]) -> tuple[Float64Array, Float64A
     return quats, translations
 
 
-def unstack_poses(quats_wxyz: Float64Array, translations: Float64Array) -> list[RigidTransform]:
+def unstack_poses(quats_wxyz: Floats, translations: Floats) -> list[RigidTransform]:
     """The transforms of quaternions (N, 4) and translations (N, 3); undoes :func:`stack_poses`."""
     return [
         RigidTransform((w, x, y, z), (tx, ty, tz))
@@ -38,18 +54,18 @@ def unstack_poses(quats_wxyz: Float64Array, translations: Float64Array) -> list[
     ]
 
 
-def normalize_quats(quats_wxyz: Float64Array) -> Float64Array:
+def normalize_quats(quats_wxyz: Floats) -> Floats:
     """Quaternions (..., 4) at unit length; a zero quaternion gives NaN."""
     with np.errstate(invalid="ignore", divide="ignore"):
         return quats_wxyz / np.linalg.norm(quats_wxyz, axis=-1, keepdims=True)
 
 
-def invert_quats(quats_wxyz: Float64Array) -> Float64Array:
+def invert_quats(quats_wxyz: Floats) -> Floats:
     """The inverses ``conj(q) / |q|^2`` of quaternions (..., 4)."""
     return _conjugate(quats_wxyz) / _squared_length(quats_wxyz)[..., None]
 
 
-def multiply_quats(first: Float64Array, second: Float64Array) -> Float64Array:
+def multiply_quats(first: Floats, second: Floats) -> Floats:
     """Hamilton products ``first * second`` of quaternions (..., 4); shapes broadcast."""
     w1, x1, y1, z1 = np.moveaxis(np.asarray(first), -1, 0)
     w2, x2, y2, z2 = np.moveaxis(np.asarray(second), -1, 0)
@@ -64,7 +80,7 @@ def multiply_quats(first: Float64Array, second: Float64Array) -> Float64Array:
     )
 
 
-def rotation_matrices(quats_wxyz: Float64Array) -> Float64Array:
+def rotation_matrices(quats_wxyz: Floats) -> Floats:
     """Rotation matrices (..., 3, 3) of quaternions (..., 4), whose length does not matter."""
     quats = np.asarray(quats_wxyz, dtype=np.float64)
     w, x, y, z = np.moveaxis(quats, -1, 0)
@@ -79,17 +95,17 @@ def rotation_matrices(quats_wxyz: Float64Array) -> Float64Array:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def rotate(quats_wxyz: Float64Array, vectors: Float64Array) -> Float64Array:
+def rotate(quats_wxyz: Floats, vectors: Floats) -> Floats:
     """Vectors (..., 3) turned by quaternions (..., 4); shapes broadcast."""
     return np.matmul(rotation_matrices(quats_wxyz), vectors[..., None])[..., 0]
 
 
 def compose(
-    quats_ab: Float64Array,
-    translations_ab: Float64Array,
-    quats_bc: Float64Array,
-    translations_bc: Float64Array,
-) -> tuple[Float64Array, Float64Array]:
+    quats_ab: Floats,
+    translations_ab: Floats,
+    quats_bc: Floats,
+    translations_bc: Floats,
+) -> tuple[Floats, Floats]:
     """``a_from_c`` of ``a_from_b`` and ``b_from_c``: quaternions (..., 4), translations (..., 3).
 
     The result's quaternions are normalised, so that long chains do not drift off unit length.
@@ -98,20 +114,18 @@ def compose(
     return quats, rotate(quats_ab, translations_bc) + translations_ab
 
 
-def invert(
-    quats_wxyz: Float64Array, translations: Float64Array
-) -> tuple[Float64Array, Float64Array]:
+def invert(quats_wxyz: Floats, translations: Floats) -> tuple[Floats, Floats]:
     """``b_from_a`` of ``a_from_b``: quaternions (..., 4), translations (..., 3)."""
     inverse = invert_quats(quats_wxyz)
     return inverse, -rotate(inverse, translations)
 
 
-def camera_centers(quats_wxyz: Float64Array, translations: Float64Array) -> Float64Array:
+def camera_centers(quats_wxyz: Floats, translations: Floats) -> Floats:
     """Centres ``-R^T t`` in the world (..., 3) of ``cam_from_world`` transforms."""
     return -rotate(invert_quats(quats_wxyz), translations)
 
 
-def rotation_angles_deg(quats_a: Float64Array, quats_b: Float64Array) -> Float64Array:
+def rotation_angles_deg(quats_a: Floats, quats_b: Floats) -> Floats:
     """Angles (...) in degrees, 0 to 180, of the rotations ``a b^-1`` of quaternions (..., 4).
 
     It is the length of the rotation vector, and the half angle is ``atan2(|v|, |w|)``. The usual
@@ -135,24 +149,20 @@ def movement(old: RigidTransform, new: RigidTransform) -> tuple[float, float]:
     return moved_m, float(turned_deg)
 
 
-def cross_matrix(vector: Float64Array) -> Float64Array:
+def cross_matrix(vector: Floats) -> Floats:
     """``[v]_x`` (3, 3) with ``[v]_x w = v x w``."""
     x, y, z = vector
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
-def _conjugate(quats: Float64Array) -> Float64Array:
+def _conjugate(quats: Floats) -> Floats:
     return quats * np.array([1.0, -1.0, -1.0, -1.0])
 
 
-def _squared_length(quats: Float64Array) -> Float64Array:
+def _squared_length(quats: Floats) -> Floats:
     """``|q|^2`` (...) of quaternions (..., 4)."""
     w, x, y, z = np.moveaxis(quats, -1, 0)
     return w * w + x * x + y * y + z * z
-
-
-# the standard deviation of normal values over the median of their magnitudes: 1 / (quantile of 3/4)
-_DEVIATION_OF_MEDIAN = 1.482602218505602
 
 
 def deviation_by_median(residuals: NDArray[np.floating[Any]]) -> np.float64:
@@ -161,12 +171,6 @@ def deviation_by_median(residuals: NDArray[np.floating[Any]]) -> np.float64:
     Up to half of the values cannot spoil it (Rousseeuw and Croux, JASA 1993). NaN of none.
     """
     return _DEVIATION_OF_MEDIAN * np.median(np.abs(residuals))
-
-
-_SEMI_MAJOR_M = 6378137.0
-_FLATTENING = 1 / 298.257223563
-_ECCENTRICITY_SQUARED = _FLATTENING * (2 - _FLATTENING)
-_ROUNDS = 8  # each gains more than two digits
 
 
 def earth_from_enu(latitude_deg: float, longitude_deg: float, height_m: float) -> RigidTransform:
@@ -181,27 +185,17 @@ def earth_from_enu(latitude_deg: float, longitude_deg: float, height_m: float) -
     return RigidTransform.from_matrix(rotation, position)
 
 
-def geodetic(ecef_m: NDArray[np.float64]) -> tuple[float, float, float]:
+def geodetic(ecef_m: Floats) -> tuple[float, float, float]:
     """Latitude and longitude in degrees and height in metres of an ECEF position (3,)."""
     x, y, z = (float(value) for value in ecef_m)
     across = np.hypot(x, y)
     lat = np.arctan2(z, across * (1 - _ECCENTRICITY_SQUARED))
-    for _ in range(_ROUNDS):
+    for _ in range(_LATITUDE_ROUNDS):
         normal = _SEMI_MAJOR_M / np.sqrt(1 - _ECCENTRICITY_SQUARED * np.sin(lat) ** 2)
         lat = np.arctan2(z + normal * _ECCENTRICITY_SQUARED * np.sin(lat), across)
     height = across * np.cos(lat) + z * np.sin(lat)
     height -= _SEMI_MAJOR_M * np.sqrt(1 - _ECCENTRICITY_SQUARED * np.sin(lat) ** 2)
     return float(np.degrees(lat)), float(np.degrees(np.arctan2(y, x))), float(height)
-
-
-GeoPosition = tuple[float, float, float]
-"""Latitude and longitude in degrees, height in metres above the ellipsoid."""
-
-_ALIGNING_ROUNDS = 50
-# how far the positions have to spread in two directions, in residuals, to tell scale and axes
-_MIN_SPREAD = 3.0
-# receivers of phones claim no better; residuals of three positions may be smaller by chance
-_MIN_RESIDUAL_M = 1.0
 
 
 @dataclass(frozen=True)
@@ -222,7 +216,7 @@ class EarthAlignment:
 
 
 def align_to_earth(
-    centers: Mapping[str, NDArray[np.float64]], positions: Mapping[str, GeoPosition]
+    centers: Mapping[str, Floats], positions: Mapping[str, GeoPosition]
 ) -> EarthAlignment:
     """Scale and axes of a map by the positions of its cameras on earth.
 
@@ -265,10 +259,10 @@ def align_to_earth(
     )
 
 
-def _similarity(
-    source: NDArray[np.float64], target: NDArray[np.float64], weights: NDArray[np.float64]
-) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
+def _similarity(source: Floats, target: Floats, weights: Floats) -> tuple[float, Floats, Floats]:
     """``target = scale * rotation @ source + translation`` in weighted least squares."""
+    from scipy.spatial.transform import Rotation
+
     means = [np.average(points, axis=0, weights=weights) for points in (source, target)]
     a, b = source - means[0], target - means[1]
     rotation = Rotation.align_vectors(b, a, weights=weights)[0].as_matrix()

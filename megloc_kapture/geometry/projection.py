@@ -1,4 +1,4 @@
-"""Projection under COLMAP's camera models with its derivatives, compiled.
+"""Projection under COLMAP's camera models with its derivatives, and of depth maps; compiled.
 
 The models are those of COLMAP's ``sensor/models.h``, with the same expansions near the axis.
 Imported only when needed: numba costs half a second to import. Loops elsewhere call
@@ -25,15 +25,14 @@ _NUMBERS = {name: number for number, name in enumerate(CAMERA_MODEL_NUM_PARAMS)}
 # models up to this number have no distortion
 PINHOLES = _NUMBERS["PINHOLE"]
 _SIMPLE_RADIAL, _RADIAL = _NUMBERS["SIMPLE_RADIAL"], _NUMBERS["RADIAL"]
-_OPENCV, _OPENCV_FISHEYE = _NUMBERS["OPENCV"], _NUMBERS["OPENCV_FISHEYE"]
-_FULL_OPENCV, _FOV = _NUMBERS["FULL_OPENCV"], _NUMBERS["FOV"]
-_SIMPLE_RADIAL_FISHEYE = _NUMBERS["SIMPLE_RADIAL_FISHEYE"]
-_RADIAL_FISHEYE = _NUMBERS["RADIAL_FISHEYE"]
+_OPENCV, _FULL_OPENCV, _FOV = _NUMBERS["OPENCV"], _NUMBERS["FULL_OPENCV"], _NUMBERS["FOV"]
 _THIN_PRISM_FISHEYE = _NUMBERS["THIN_PRISM_FISHEYE"]
 
 _FOV_EPSILON = 1e-4  # COLMAP's
 # below this radius the angle is its series to double precision
 _NEAR_AXIS = 1e-3
+# a pixel's centre that lies on an edge belongs to both triangles, whatever rounding says
+_ON_EDGE = 1e-6
 
 
 def model_id(camera: Camera) -> int:
@@ -231,10 +230,6 @@ def _project_all(model, p, points, out):
         project_point(model, p, points[i, 0], points[i, 1], points[i, 2], out[i])
 
 
-# a pixel's centre that lies on an edge belongs to both triangles, whatever rounding says
-_ON_EDGE = 1e-6
-
-
 def draw_depth_surface(
     depth_m: NDArray[np.float32],
     rays: NDArray[np.float64],
@@ -268,18 +263,9 @@ def draw_depth_surface(
     rows, columns = depth_m.shape
     depth = np.ascontiguousarray(depth_m, np.float64)
     px, z = np.empty((rows, columns, 2)), np.empty((rows, columns))
-    _project(
-        depth,
-        rays.reshape(rows, columns, 3),
-        view_from_depth.rotation_matrix(),
-        np.array(view_from_depth.translation),
-        model_id(view),
-        packed_params(view),
-        near_m,
-        field,
-        px,
-        z,
-    )
+    pose = view_from_depth.rotation_matrix(), np.array(view_from_depth.translation)
+    camera = model_id(view), packed_params(view)
+    _project(depth, rays.reshape(rows, columns, 3), *pose, *camera, near_m, field, px, z)
     inverse = np.zeros((view.height, view.width))
     front = np.zeros((view.height, view.width), np.bool_)
     _draw(depth, px, z, max_jump, inverse, front)

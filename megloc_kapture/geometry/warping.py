@@ -159,7 +159,6 @@ def _seen_depth(
     source: WarpSource, camera: Camera, cam_from_world: RigidTransform
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """Depth (H, W) of a reference's surface in a view, and where its front is seen."""
-    # here, as numba takes half a second to import
     from megloc_kapture.geometry.projection import draw_depth_surface
 
     return draw_depth_surface(
@@ -176,13 +175,9 @@ def _seen_depth(
 @lru_cache(maxsize=8)
 def _field(camera: Camera) -> float:
     """Tangent of the angle off the axis beyond which nothing is projected."""
-    x, y = camera.width, camera.height
-    middle = 0.5 * x, 0.5 * y
-    border = np.array(
-        [(0, 0), (x, 0), (0, y), (x, y), (middle[0], 0), (middle[0], y), (0, middle[1])]
-        + [(x, middle[1])],
-        np.float64,
-    )
+    # corners and middles of the border
+    grid = np.stack(np.meshgrid([0.0, 0.5, 1.0], [0.0, 0.5, 1.0]), axis=-1).reshape(-1, 2)
+    border = np.delete(grid, 4, axis=0) * (camera.width, camera.height)
     rays = bearing_rays(camera, border)
     reach = np.hypot(rays[:, 0], rays[:, 1]).max()
     return float(_FIELD_MARGIN * reach) if np.isfinite(reach) else np.inf

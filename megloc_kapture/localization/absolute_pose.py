@@ -72,6 +72,16 @@ class AbsolutePoseOptions(Options):
     )
     seed: int = Field(default=0, ge=0, description="of RANSAC's samples")
 
+    def for_poselib(self) -> dict[str, Any]:
+        """The RANSAC options in poselib's names."""
+        return {
+            "max_reproj_error": self.max_error_px,
+            "min_iterations": self.min_iterations,
+            "max_iterations": self.max_iterations,
+            "success_prob": self.confidence,
+            "seed": self.seed,
+        }
+
 
 @dataclass(frozen=True, eq=False)
 class PoseEstimate:
@@ -210,13 +220,6 @@ def _ransac(
     # its last bundle adjustment takes longer than the whole refinement that follows instead; the
     # local optimisations of the RANSAC are not concerned
     bundle = {"max_iterations": 0}
-    ransac = {
-        "max_reproj_error": options.max_error_px,
-        "min_iterations": options.min_iterations,
-        "max_iterations": options.max_iterations,
-        "success_prob": options.confidence,
-        "seed": options.seed,
-    }
     points_2d, points_3d, extrinsics, pinholes, cams_from_rig = [], [], [], [], []
     starts = problem.starts.tolist()
     for view, first, last in zip(problem.views, starts[:-1], starts[1:], strict=True):
@@ -238,7 +241,7 @@ def _ransac(
         extrinsics.append(extrinsic)
     if len(points_2d) == 1:
         found, _ = poselib.estimate_absolute_pose(
-            points_2d[0], points_3d[0], pinholes[0], ransac, bundle
+            points_2d[0], points_3d[0], pinholes[0], options.for_poselib(), bundle
         )
         return cams_from_rig[0].inverse() @ _rigid_from_poselib(found)
     # GP3P draws from C's rand() whatever poselib's own seed is, and the last digits follow; other
@@ -246,7 +249,7 @@ def _ransac(
     with _RAND:
         ctypes.CDLL(None).srand(ctypes.c_uint(options.seed))
         found, _ = poselib.estimate_generalized_absolute_pose(
-            points_2d, points_3d, extrinsics, pinholes, ransac, bundle
+            points_2d, points_3d, extrinsics, pinholes, options.for_poselib(), bundle
         )
     return _rigid_from_poselib(found)
 

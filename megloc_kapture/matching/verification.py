@@ -323,8 +323,8 @@ def _ransac(
     rays_b: Floats,
     focal: float,
     options: TwoViewOptions,
-    sampling: dict[str, object],
-    refinement: dict[str, object],
+    sampling: dict[str, Any],
+    refinement: dict[str, Any],
 ) -> tuple[Any, dict[str, Any]]:
     """poselib's relative pose, of normalised coordinates at a focal length: so it needs to know no
     camera model, and ours knows them all."""

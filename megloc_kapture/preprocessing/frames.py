@@ -1,4 +1,4 @@
-"""Images and masks as a :class:`FramePlan` has them.
+"""Resizing and undistortion of images and masks, their cameras and their keypoints.
 
 An image is resampled once. Where it is undistorted, each pixel of the result is the mean of a
 square of samples taken from the original, as many as it spans pixels there: undistorting first and
@@ -37,6 +37,23 @@ _CHECKED_EVERY = 16
 # original pixels between which a map is interpolated, which costs it less than 0.005 px; the
 # library's own interpolation rounds positions to 1/32 px
 _INTERPOLATED_PX = 4
+# a point may leave the image by rounding
+_ROUNDING_PX = 1e-6
+# two that are one up to what COLMAP's iterations leave
+_SAME_PX = 1e-3
+Floats = NDArray[np.float64]
+# the model with two focal lengths that has each one's distortion among its own, in the same order
+_TWO_FOCAL_MODEL = {
+    "SIMPLE_PINHOLE": "PINHOLE",
+    "SIMPLE_RADIAL": "OPENCV",
+    "RADIAL": "OPENCV",
+    "SIMPLE_RADIAL_FISHEYE": "OPENCV_FISHEYE",
+    "RADIAL_FISHEYE": "OPENCV_FISHEYE",
+}
+PINHOLE_MODELS = frozenset({"PINHOLE", "SIMPLE_PINHOLE"})
+# models whose distortion is a polynomial of the tangent: without coefficients there is none (the
+# fisheye models' is one of the angle)
+_POLYNOMIAL_MODELS = frozenset({"OPENCV", "FULL_OPENCV"})
 Float32 = NDArray[np.float32]
 
 
@@ -71,8 +88,10 @@ def processed_mask(mask: NDArray[np.bool_], plan: FramePlan) -> NDArray[np.bool_
         return mask
     if not plan.warps:
         # not the library's nearest neighbour, which looks up the pixel's corner
-        rows = _nearest(size[0], mask.shape[0], plan.resized[1])
-        columns = _nearest(size[1], mask.shape[1], plan.resized[0])
+        rows, columns = (
+            (2 * np.arange(number) + 1) * old_side // (2 * side)
+            for number, old_side, side in zip(size, mask.shape, plan.resized[::-1], strict=True)
+        )
         return np.ascontiguousarray(mask[np.ix_(rows, columns)])
     x, y = _sampled_at(plan, 1)
     column = np.clip(np.floor(x + 0.5), 0, mask.shape[1] - 1).astype(np.int32)
@@ -86,22 +105,16 @@ def reached_region(plan: FramePlan) -> NDArray[np.bool_] | None:
     if not plan.warps:
         return None
     width, height = plan.processed.width, plan.processed.height
-    coarse = _reaches(plan, *(_every(side) for side in (width, height)))
-    if coarse.all():
+    # not all pixels along a side, but the first and the last
+    some = [
+        np.append(np.arange(0, side - 1, _CHECKED_EVERY), side - 1) + 0.5
+        for side in (width, height)
+    ]
+    if _reaches(plan, *some).all():
         return None
     full = _reaches(plan, np.arange(width) + 0.5, np.arange(height) + 0.5)
     full.setflags(write=False)
     return full
-
-
-def _nearest(number: int, old_side: int, side: int) -> NDArray[np.int64]:
-    """Index of the old pixel under the centre of each of the first pixels of a resized side."""
-    return (2 * np.arange(number, dtype=np.int64) + 1) * old_side // (2 * side)
-
-
-def _every(side: int) -> NDArray[np.float64]:
-    """Pixel centres along a side, not all, but the first and the last."""
-    return np.append(np.arange(0, side - 1, _CHECKED_EVERY), side - 1) + 0.5
 
 
 def _reaches(
@@ -222,17 +235,11 @@ class FramePlan:
             found = with_distortion(found, radial_distortion(estimated))
         return replace(found, focal_deviation=estimated.focal_deviation)
 
-    def pixel_map(self) -> PixelMap:
-        """Carries keypoints between the two."""
-        return PixelMap(self.original, self.processed)
-
 
 def plan_frame(camera: Camera, options: FrameOptions) -> FramePlan:
     """Plan the frame of a camera.
 
-    Raises
-    ------
-    OptionError : its images are too small to be cropped.
+    Raises OptionError where its images are too small to be cropped.
     """
     lens = camera
     if options.undistort:
@@ -251,62 +258,20 @@ def plan_frame(camera: Camera, options: FrameOptions) -> FramePlan:
     return FramePlan(camera, processed, (width, height), shrink)
 
 
-# a point may leave the image by rounding
-_ROUNDING_PX = 1e-6
-# two that are one up to what COLMAP's iterations leave
-_SAME_PX = 1e-3
-Floats = NDArray[np.float64]
-# the model with two focal lengths that has each one's distortion among its own, in the same order
-_TWO_FOCAL_MODEL = {
-    "SIMPLE_PINHOLE": "PINHOLE",
-    "SIMPLE_RADIAL": "OPENCV",
-    "RADIAL": "OPENCV",
-    "SIMPLE_RADIAL_FISHEYE": "OPENCV_FISHEYE",
-    "RADIAL_FISHEYE": "OPENCV_FISHEYE",
-}
-PINHOLE_MODELS = frozenset({"PINHOLE", "SIMPLE_PINHOLE"})
-# models whose distortion is a polynomial of the tangent: without coefficients there is none (the
-# fisheye models' is one of the angle)
-_POLYNOMIAL_MODELS = frozenset({"OPENCV", "FULL_OPENCV"})
-
-
-@dataclass(frozen=True, slots=True)
-class PixelMap:
-    """Carries points between an image and what pre-processing made of it, in double precision.
-
-    Both cameras look along the same axes from the same centre, so a pixel is carried through its
-    ray. Where they share their distortion that is a scale per axis, else COLMAP's camera models.
-
-    Parameters
-    ----------
-    original, processed : the cameras of the two images.
-    """
-
-    original: Camera
-    processed: Camera
-
-    def original_from_processed(self, points_px: NDArray[np.floating[Any]]) -> Floats:
-        """Points (N, 2) of the processed image in the original one; float64 (N, 2).
-
-        NaN where the original image does not reach.
-        """
-        return _carried(self.processed, self.original, points_px)
-
-    def processed_from_original(self, points_px: NDArray[np.floating[Any]]) -> Floats:
-        """Points (N, 2) of the original image in the processed one; float64 (N, 2).
-
-        NaN where the processed image does not reach: cropped away, or beyond what a pinhole sees.
-        """
-        return _carried(self.original, self.processed, points_px)
-
-
 def same_lens(first: Camera, second: Camera) -> bool:
     """True if two cameras differ by their focal lengths and principal points at most."""
     a, b = with_two_focals(first), with_two_focals(second)
     return a.model == b.model and a.params[4:] == b.params[4:]
 
 
-def _carried(source: Camera, target: Camera, points_px: NDArray[np.floating[Any]]) -> Floats:
+def carry_points(source: Camera, target: Camera, points_px: NDArray[np.floating[Any]]) -> Floats:
+    """Carry points (N, 2) of one camera's image into another's, in double precision; (N, 2).
+
+    Both look along the same axes from the same centre, as before and after pre-processing, so a
+    pixel is carried through its ray. Where they share their distortion that is a scale per axis,
+    else COLMAP's camera models. NaN where the target's image does not reach: cropped away, or
+    beyond what a pinhole sees.
+    """
     points = np.asarray(points_px, np.float64).reshape(-1, 2)
     if same_lens(source, target):
         a, b = (np.array(with_two_focals(camera).params[:4]) for camera in (source, target))
@@ -339,9 +304,7 @@ def fitted_size(
 ) -> tuple[int, int]:
     """Size whose larger side is ``max_size_px``, the ratio kept as whole pixels allow.
 
-    Parameters
-    ----------
-    upscale : enlarge smaller images too, which adds pixels but nothing that can be seen.
+    Smaller images stay unless ``upscale``, which adds pixels but nothing that can be seen.
     """
     larger = max(width, height)
     if larger <= max_size_px and not upscale:
@@ -354,9 +317,7 @@ def fitted_size(
 def cropped_size(width: int, height: int, multiple_of: int) -> tuple[int, int]:
     """The largest size within an image both of whose sides are multiples of a number.
 
-    Raises
-    ------
-    OptionError : a side is smaller than that number.
+    Raises OptionError where a side is smaller than that number.
     """
     if min(width, height) < multiple_of:
         raise OptionError(
@@ -413,16 +374,14 @@ def resized(image: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uin
 
 
 def undistorted_camera(camera: Camera, *, blank_pixels: float = 0.0) -> Camera:
-    """The camera of the undistorted image, as COLMAP chooses it: its focal lengths are kept.
+    """The pinhole camera of an undistorted image, as COLMAP chooses it, with the focal lengths.
+
+    The argument itself where it is a pinhole already.
 
     Parameters
     ----------
     blank_pixels : 0: as large as it can be without a pixel that the image does not show; 1: as
         large as it must be to show all of the image; in between, in between.
-
-    Returns
-    -------
-    A pinhole camera; the argument itself where it is one already.
     """
     if camera.model in PINHOLE_MODELS:
         return camera
