@@ -72,10 +72,8 @@ class GlobalNetwork(Checkpointed[GlobalOptions]):
     def describe(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
         """The vector of an RGB image, uint8 (H, W, 3): float32 (D,), unit length.
 
-        Raises
-        ------
-        DataError : the checkpoint does not fit, or the image is too small.
-        OptionError : the device is not there.
+        Raises DataError where the checkpoint does not fit, or the image is too small, OptionError
+        where the device is not there.
         """
         return self.describe_many([image])[0]
 

@@ -43,13 +43,9 @@ class RootSift:
     def extract(
         self, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
     ) -> LocalFeatures:
-        """Extract from an RGB image.
+        """Extract from an RGB image, uint8 (H, W, 3).
 
-        Parameters
-        ----------
-        image : uint8 (H, W, 3), RGB.
-        mask : bool (H, W) or None; keypoints on False pixels are dropped before the strongest
-            are selected.
+        Keypoints on False pixels of the mask (H, W) are dropped before the strongest are selected.
         """
         options = self.options
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)

@@ -75,12 +75,8 @@ class PcaWhitening:
     Jegou and Chum, "Negative evidences and co-occurrences in image retrieval", ECCV 2012: vectors
     of several vocabularies are centred, turned into the frame of their principal components,
     divided by the deviation along each, cut and scaled to unit length. That makes up for what
-    occurs together and removes what the vocabularies tell twice.
-
-    Attributes
-    ----------
-    mean : float32 (D,).
-    projection : float32 (d, D), rows are scaled principal components, the strongest first.
+    occurs together and removes what the vocabularies tell twice. Of the mean float32 (D,) and the
+    projection float32 (d, D), whose rows are scaled principal components, the strongest first.
     """
 
     mean: NDArray[np.float32]
@@ -98,23 +94,14 @@ class PcaWhitening:
 def learn_whitening(
     vectors: NDArray[np.float32], dimensions: int, power: float = 1.0
 ) -> PcaWhitening:
-    """Learn whitening from vectors (N, D).
+    """Learn whitening from vectors (N, D), float32, which are overwritten: they may be large.
 
     A map has fewer images than its vectors have dimensions. The deviations along the last
     components are then noise, and N vectors in N - 1 dimensions divided by them are all equally
-    unlike. So the deviation may be taken to a power below one, as AP-GeM's published whitening does
-    (Revaud et al., ICCV 2019: the variance to the power 0.25, which is 0.5 here).
-
-    Parameters
-    ----------
-    vectors : float32; overwritten by the centred ones, they may be large.
-    dimensions : at most this many are kept, and never more than the vectors vary in, which is
-        less than N.
-    power : of the deviation that each component is divided by: 1 whitens, 0 only turns and cuts.
-
-    Raises
-    ------
-    DataError : fewer than two different vectors.
+    unlike. So the deviation that each is divided by may be taken to a power below one, as AP-GeM's
+    published whitening does (Revaud et al., ICCV 2019: the variance to the power 0.25, which is 0.5
+    here). At most so many dimensions are kept, and never more than the vectors vary in, which is
+    less than N. Raises DataError for fewer than two different vectors.
     """
     mean = vectors.mean(axis=0, dtype=np.float64).astype(np.float32)
     vectors -= mean
@@ -147,13 +134,7 @@ def learn_whitening(
 
 @dataclass(frozen=True, eq=False)
 class Vocabulary:
-    """Visual words, and the whitening of the vectors that they give.
-
-    Attributes
-    ----------
-    centres : float32 (V, K, D), the clusters of each vocabulary.
-    whitening : of the vectors of all vocabularies, or None.
-    """
+    """Visual words float32 (V, K, D), clusters of each vocabulary, and their vectors' whitening."""
 
     centres: NDArray[np.float32]
     whitening: PcaWhitening | None = None
@@ -184,8 +165,7 @@ def train_vlad(
 
     Parameters
     ----------
-    length : how many descriptors an image has.
-    read : an image's descriptors (N, D).
+    length, read : how many descriptors an image has, and these (N, D).
     each : what shares the description of the images, which whitening is learnt from.
 
     Raises
@@ -230,9 +210,7 @@ def train_vocabulary(
 ) -> Vocabulary:
     """k-means (k-means++ start, Lloyd) over descriptors (N, D), once per vocabulary; no whitening.
 
-    Raises
-    ------
-    DataError : fewer distinct descriptors than clusters, or values that are not finite.
+    Raises DataError for fewer distinct descriptors than clusters, or values that are not finite.
     """
     options = options or VladOptions()
     data = np.ascontiguousarray(descriptors, dtype=np.float32)

@@ -200,12 +200,9 @@ def geodetic(ecef_m: Floats) -> tuple[float, float, float]:
 
 @dataclass(frozen=True)
 class EarthAlignment:
-    """Where a map lies on earth: ``enu = enu_from_map(scale * x)``.
+    """Where a map lies on earth: ``enu = enu_from_map(scale * x)``, East, North, Up at the origin.
 
-    Attributes
-    ----------
-    origin : of the frame East, North, Up.
-    residual_m : median distance of the aligned camera centres from their positions.
+    ``residual_m`` is the median distance of the aligned camera centres from their positions.
     """
 
     scale: float
@@ -220,17 +217,10 @@ def align_to_earth(
 ) -> EarthAlignment:
     """Scale and axes of a map by the positions of its cameras on earth.
 
-    Least squares (Umeyama 1991), reweighted by Cauchy's weights, so that single bad positions of a
-    receiver do not count.
-
-    Parameters
-    ----------
-    centers : camera centres (3,) in the map, by image.
-    positions : of some images.
-
-    Raises
-    ------
-    DataError : of fewer than three images, or these lie too near to each other or on a line.
+    Of camera centres (3,) in the map, by image, and positions of some images. Least squares
+    (Umeyama 1991), reweighted by Cauchy's weights, so that single bad positions of a receiver do
+    not count. Raises DataError for fewer than three images, or where these lie too near to each
+    other or on a line.
     """
     names = sorted(centers.keys() & positions.keys())
     if len(names) < 3:

@@ -240,17 +240,16 @@ def draw_depth_surface(
     near_m: float,
     field: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """The nearest surface in each pixel of a view.
+    """Draw a depth map as a surface of small triangles into another view's depth buffer.
 
     Neighbouring pixels of the depth map are joined by triangles, which makes a surface without
-    holes at any zoom. It is cut where depth jumps. Inverse depth is linear in the pixels of a
-    plane without distortion, so it is what is interpolated.
+    holes at any zoom. It is cut where depth jumps. Inverse depth is linear in the pixels of a plane
+    without distortion, so it is what is interpolated.
 
     Parameters
     ----------
     depth_m : float32 (R, C), the depth map; 0, less or not finite where unknown.
     rays : float64 (R * C, 3), through its pixels' centres, z = 1, in the depth camera's frame.
-    view : the camera of the view, any model.
     max_jump : depths of neighbours may differ by this share of the nearer.
     near_m, field : what is nearer to the view along its axis, or farther off the axis (tangent of
         the angle), is left out.

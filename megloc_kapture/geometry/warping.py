@@ -38,16 +38,14 @@ Floats = NDArray[np.float64]
 class WarpSource:
     """A reference image with depth and pose.
 
+    Raises DataError where an array's size is not its camera's.
+
     Parameters
     ----------
     image : uint8 (H, W, 3), and ``camera``, ``cam_from_world``, its camera and pose.
     depth_m : float32, along the axis of ``depth_camera``; 0, less or NaN where unknown.
     image_from_depth : from the depth camera's frame to the image camera's, metres.
     mask : bool (H, W), True = use; None without one.
-
-    Raises
-    ------
-    DataError : an array's size is not its camera's.
     """
 
     image: NDArray[np.uint8]
@@ -111,20 +109,11 @@ def warp_to_view(
     *,
     scale: float = 1.0,
 ) -> WarpedView:
-    """Bring reference images to a view.
+    """Bring reference images to a view, of any model, in an image ``scale`` times its size.
 
     Of several references that see a surface, each pixel takes the one that looks at it most as the
-    view does: least angle between the two rays, and not from much farther away.
-
-    Parameters
-    ----------
-    sources : references; of equals the first counts.
-    camera, cam_from_world : of the view; any of COLMAP's models.
-    scale : size of the result over the camera's.
-
-    Raises
-    ------
-    DataError : the scale is not positive.
+    view does: least angle between the two rays, and not from much farther away; of equals the
+    first. Raises DataError where the scale is not positive.
     """
     if not scale > 0:
         raise DataError(f"scale {scale:g} of a view is not positive")

@@ -90,8 +90,8 @@ class PoseEstimate:
     Attributes
     ----------
     rig_from_world : the pose; ``cam_from_world`` where the only view is at the rig's origin.
-    usable : bool (N,) over the matches of all views in order: point and ray are finite.
-    inliers : bool (N,), usable and within the error that is allowed, under the camera's model.
+    usable, inliers : bool (N,) over the matches of all views in order: point and ray are finite;
+        the error under the camera's model is allowed as well.
     errors_px : float64 (N,) reprojection errors; infinite behind a camera and where not usable.
     """
 
@@ -112,21 +112,11 @@ def absolute_pose(
     options: AbsolutePoseOptions | None = None,
     point_covariances: Floats | None = None,
 ) -> Pose | Failure:
-    """Estimate ``cam_from_world`` of one camera.
+    """Estimate ``cam_from_world`` of one camera, with inlier mask and covariance.
 
-    Parameters
-    ----------
-    points_px : (N, 2), first pixel's centre at (0.5, 0.5).
-    points_world : float64 (N, 3).
-    point_covariances : float64 (N, 6) of the points, as :class:`View` has them, or None.
-
-    Returns
-    -------
-    Pose with inlier mask and covariance, or Failure with the reason.
-
-    Raises
-    ------
-    DataError : the arrays do not have these shapes.
+    Of pixels (N, 2), the first one's centre at (0.5, 0.5), matched with world points float64 (N,
+    3), whose covariances (N, 6) are as :class:`View` has them, or None. Raises DataError for arrays
+    of other shapes.
     """
     view = View(camera, RigidTransform.identity(), points_px, points_world, point_covariances)
     return rig_pose([view], options)
@@ -320,9 +310,7 @@ def check_stable(
 ) -> Pose | Failure:
     """The pose, or a Failure where its covariance says that the centre may be anywhere.
 
-    Parameters
-    ----------
-    depth : the median of the inliers', unit of the map.
+    ``depth`` is the median of the inliers', in the unit of the map.
     """
     deviation = center_deviation(covariance) / depth
     if deviation <= options.max_center_deviation:

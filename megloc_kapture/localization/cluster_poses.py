@@ -120,18 +120,14 @@ def cluster_candidates(
     centers: Mapping[str, NDArray[np.float64]],
     indices: Sequence[MapIndex],
 ) -> list[tuple[str, ...]]:
-    """Divide candidates into clusters.
+    """Divide candidates into clusters, in the order of their first members.
 
     Parameters
     ----------
-    images : the candidates, best first.
-    frames : the coordinate frame of each; different frames are never joined.
+    images, frames : the candidates, best first, and the coordinate frame of each; different frames
+        are never joined.
     centers : of the images in the world, (3,) each.
     indices : the map's points by keypoints type; shared points of all types add up.
-
-    Returns
-    -------
-    Clusters in the order of their first members, images in the order given.
     """
     clusters: list[list[int]] = []
     for frame in dict.fromkeys(frames):
@@ -191,7 +187,8 @@ def localize_in_clusters(
     """Localize a query in each cluster by itself, rank the poses, and refine the best.
 
     Clusters whose poses explain each other are joined (images that look to different sides share no
-    points), and are localized in together.
+    points), and are localized in together. The pose of a rig is ``rig_from_world``; the mask of its
+    inliers runs over the views, and in each over the keypoints types, in their order.
 
     Parameters
     ----------
@@ -203,11 +200,6 @@ def localize_in_clusters(
     centers : of the map images, (3,) each; needed for ``min_confidence``.
     min_confidence : a pose of less is a failure; None: poses have no confidence.
     scene : looked at where the confidence is in doubt; None: nothing is.
-
-    Returns
-    -------
-    The pose, of a rig ``rig_from_world``; the mask of its inliers runs over the views, and in each
-    over the keypoints types, in their order. Or a failure with its reason.
     """
     clock = Clock()
     matched = interleave([view.matched_images() for view in views])

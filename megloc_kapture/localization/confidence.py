@@ -85,13 +85,8 @@ def evidence_of(
 ) -> dict[str, float]:
     """The terms that speak for a pose or against it, by the names of :data:`TERMS`.
 
-    Parameters
-    ----------
-    pose : of the problem, refined, with its covariance and inliers; of a rig ``rig_from_world``.
-
-    Raises
-    ------
-    ValueError : the pose brings no inliers or no covariance.
+    The pose is of the problem, refined; of a rig ``rig_from_world``. Raises ValueError where it
+    brings no inliers or no covariance.
     """
     if pose.inliers is None or pose.covariance is None:
         raise ValueError("evidence needs the inliers and the covariance of a pose")
@@ -264,12 +259,9 @@ def _viewpoints(
 
 @dataclass(frozen=True)
 class Calibration:
-    """A logistic model of the confidence.
+    """A logistic model of the confidence, and the data that it was fitted to.
 
-    Attributes
-    ----------
-    origin : the data that it was fitted to.
-    bias, weights : of the terms, by name; a term without a weight counts nothing.
+    Its weights are of the terms, by name; a term without a weight counts nothing.
     """
 
     origin: str

@@ -69,14 +69,12 @@ _ALIKE = 2.0
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """The best change of a camera.
+    """The best change of a camera, and the pose that goes with it.
 
     Attributes
     ----------
-    change : float64 (1, 3 or 4,): logarithm of the focal length's factor; the principal point's
-        shift, as a share of the focal length; the radial distortion's.
-    deviation : of the logarithm.
-    rig_from_world : the pose that goes with it.
+    change : float64 (1, 3 or 4,): logarithm of the focal length's factor, of which ``deviation``
+        is; the principal point's shift, as a share of the focal length; the radial distortion's.
     pose_covariance : float64 (6, 6), what the uncertainty of the camera adds to that of the pose.
     depth : median of the inliers', unit of the map.
     """
@@ -149,14 +147,9 @@ def refine_with_intrinsics(
 ) -> tuple[PoseProblem, Pose | Failure]:
     """Refine pose and intrinsics of an uncertain camera, in turns.
 
-    Parameters
-    ----------
-    given : the camera as it was given, with the deviation of its focal length.
-
-    Returns
-    -------
-    The problem of the refined camera, and the Pose, its ``camera`` that one with the deviation that
-    remains; or a Failure.
+    ``given`` is the camera as it was given, with the deviation of its focal length. The problem is
+    then that of the refined camera, which is the Pose's ``camera``, with the deviation that
+    remains.
     """
     updates = 0
     while True:
@@ -218,10 +211,8 @@ def _fit(
 ) -> _Fit | None:
     """The camera that fits the inliers best; None where nothing determines it.
 
-    Parameters
-    ----------
-    given : the camera as it is known before, with its deviation; None: nothing is known of the
-        focal length, and the rest is as it is.
+    Without ``given``, the camera as it is known before, with its deviation, nothing is known of the
+    focal length, and the rest is as it is.
     """
     (view,) = problem.views
     rays = normalized_from_px(view.camera, problem.points_px[inliers])

@@ -141,8 +141,8 @@ class Correspondences:
 
     Attributes
     ----------
-    keypoint_ids : int64 (N,), rows of the query's keypoints, ascending.
-    point_ids : int64 (N,), rows of the map's points.
+    keypoint_ids, point_ids : int64 (N,), rows of the query's keypoints, ascending, and of the
+        points.
     support : int64 (N,), number of map images that say so.
     image_rows : int64 (sum of support,), these images, match by match.
     """
@@ -161,8 +161,7 @@ class ObservedMatches:
     ----------
     keypoint_ids, point_ids : int64 (M,), rows of the query's keypoints and of the map's points.
     similarities : float64 (M,), higher is better.
-    image_rows : int64 (M,), which of the map images the match is with, from 0.
-    num_images : int, of the map images, whether they have matches or not.
+    image_rows : int64 (M,), which of ``num_images`` map images the match is with, from 0.
     seen_once : bool (M,), of the points; None: none is.
     """
 
@@ -176,15 +175,11 @@ class ObservedMatches:
     def resolve(self, rows: NDArray[np.bool_] | None = None) -> Correspondences:
         """One point per keypoint and one keypoint per point, of the matches with some images.
 
-        The same keypoint can meet several points through different map images, and the reverse.
-        A point that several images observe comes before one that was lifted through one's depth;
-        then what most images say wins; then the best score; then the smaller ids.
-        Conflicts are settled greedily from the best on, so that a loser may still get its second
-        choice. Images that are left out have no say.
-
-        Parameters
-        ----------
-        rows : bool (num_images,), the images whose matches count; all where it is None.
+        The same keypoint can meet several points through different map images, and the reverse. A
+        point that several images observe comes before one that was lifted through one's depth; then
+        what most images say wins; then the best score; then the smaller ids. Conflicts are settled
+        greedily from the best on, so that a loser may still get its second choice. Only the images
+        of the mask ``rows`` (num_images,) have a say; all where it is None.
         """
         from megloc_kapture.localization import kernels
 
@@ -226,10 +221,8 @@ def observed_matches(
 ) -> ObservedMatches:
     """The matches whose map keypoint observes a point.
 
-    Parameters
-    ----------
-    matches : of each map image: its name, rows of query and map keypoints (K, 2), scores (K,). An
-        image that is not in the map has nothing to say.
+    Of each map image: its name, rows of query and map keypoints (K, 2), scores (K,). One that is
+    not in the map has nothing to say.
     """
     from megloc_kapture.localization import kernels
 
@@ -257,18 +250,15 @@ def observed_matches(
 class View:
     """One camera and its matches; a camera on its own is a rig of one, at its origin.
 
+    Raises DataError where the arrays do not have these shapes.
+
     Attributes
     ----------
-    cam_from_rig : the camera in its rig; the identity for a camera on its own.
-    points_px : float (N, 2) pixels, first pixel's centre at (0.5, 0.5).
-    points_world : float64 (N, 3) the points that they are matched with.
+    points_px, points_world : float (N, 2) pixels, first pixel's centre at (0.5, 0.5), and float64
+        (N, 3) the points that they are matched with.
     point_covariances : float64 (N, 6) of the points as xx, xy, xz, yy, yz, zz in the map's unit
         squared, for a measurement noise of 1 px, not finite where unknown; or None. An unknown
         covariance counts as none at all.
-
-    Raises
-    ------
-    DataError : the arrays do not have these shapes.
     """
 
     camera: Camera
@@ -296,14 +286,12 @@ class PoseProblem:
 
     Attributes
     ----------
-    views : of each camera, as they were given.
-    points_px, points : float64 (N, 2) and (N, 3), the latter minus ``offset``.
+    points_px, points : float64 (N, 2) and (N, 3), the latter minus ``offset`` (3,), a point amid
+        the others: far from the origin (ECEF) float64 loses what a recentred world keeps.
     covariances : float64 (N, 6), or (0, 6) where no view has any.
     starts : int64 (V + 1,) first match of each view.
-    cameras : of the views in their rig, as
-        :func:`~megloc_kapture.geometry.projection.packed_views` has them.
-    offset : float64 (3,), a point amid the others: far from the origin (ECEF) float64 loses what
-        a recentred world keeps.
+    cameras : of the views in their rig, as :func:`~megloc_kapture.geometry.projection.packed_views`
+        has them.
     """
 
     views: tuple[View, ...]
@@ -369,13 +357,10 @@ def undo_recentring(pose: RigidTransform, offset: NDArray[np.float64]) -> RigidT
 
 @dataclass(frozen=True, eq=False)
 class TypedMatches:
-    """Matches of one query image in one keypoints type.
+    """Matches of one query image in one keypoints type, and the map's points of the type.
 
-    Attributes
-    ----------
-    index : the map's points of the type.
-    keypoints_px : float32 (N, 2 or more), of the query.
-    matches : of each candidate: its name, rows of query and map keypoints (K, 2), scores (K,).
+    Of the query's keypoints, float32 (N, 2 or more), with each candidate: its name, rows of query
+    and map keypoints (K, 2), scores (K,).
     """
 
     index: MapIndex

@@ -118,14 +118,8 @@ def displacements_rad(
     the first map image of a match shows them, are where the pose says. In the scene's like, or its
     mirror image, they are off as its keypoints are.
 
-    Parameters
-    ----------
-    found : 2D-3D matches of each view, by keypoints type.
-
-    Returns
-    -------
-    Of those that are found, at most a few hundred of a view; none without pixels of the query or
-    the map.
+    Of matches ``found`` in each view, by keypoints type. Only of those whose surroundings are
+    found, at most a few hundred of a view; none without pixels of the query or the map.
     """
     assert pose.inliers is not None  # it was estimated here
     angles = [np.zeros(0)]

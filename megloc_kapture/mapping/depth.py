@@ -62,8 +62,8 @@ def lift_keypoints(
 
     Returns
     -------
-    points : float64 (N, 3) in the image camera's frame, metres; NaN where there is no depth.
-    valid : bool (N,).
+    Points float64 (N, 3) in the image camera's frame, metres, NaN where there is no depth; and a
+        mask.
     """
     options = options or LiftingOptions()
     rays = bearing_rays(image_camera, np.asarray(keypoints_px, np.float64)[:, :2])
@@ -99,17 +99,10 @@ def lift_with_covariances(
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     """:func:`lift_keypoints` through a depth map of the image's own centre, with covariances.
 
-    Across the ray a keypoint is off by its own noise; along it by the deviation of depth, which
-    is taken for that of keypoints with a noise of a third of a pixel (``map_noise`` of the pose).
-
-    Parameters
-    ----------
-    sigma_m : float32 (H, W), standard deviation of depth, 0 where unknown.
-
-    Returns
-    -------
-    points, valid : as of :func:`lift_keypoints`.
-    covariances : float64 (N, 3, 3) in the camera's frame for a noise of 1 px.
+    Across the ray a keypoint is off by its own noise; along it by the deviation of depth,
+    ``sigma_m`` float32 (H, W), 0 where unknown, which is taken for that of keypoints with a noise
+    of a third of a pixel (``map_noise`` of the pose). The covariances are float64 (N, 3, 3) in the
+    camera's frame for a noise of 1 px, between the points and the mask.
     """
     same = RigidTransform.identity()
     points, valid = lift_keypoints(keypoints_px, depth_m, image_camera, depth_camera, same, options)
@@ -225,7 +218,7 @@ def contradicted_by_depth(
     *,
     deviations: Floats | None = None,
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Mask of the points that do not lie on the surface of a depth map.
+    """Find the points that do not lie on the surface of a depth map.
 
     Parameters
     ----------
@@ -237,8 +230,8 @@ def contradicted_by_depth(
 
     Returns
     -------
-    contradicted : bool (N,); never where there is no depth.
-    checked : bool (N,), where there is depth to compare with.
+    Masks (N,): contradicted, never where there is no depth; and where there is depth to compare
+        with.
     """
     options = options or DepthVerificationOptions()
     points = image_from_depth.inverse().apply(np.asarray(points_in_image, np.float64))

@@ -50,12 +50,9 @@ _UNITS = {1000.0: "millimetres", 100.0: "centimetres", 1 / 1000: "kilometres", 1
 
 @dataclass(frozen=True, eq=False)
 class ObservedKeypoints:
-    """A map image with its observations.
+    """A map image with its keypoints (K, 2) and its observations.
 
-    Attributes
-    ----------
-    keypoints_px : (K, 2), all of the image.
-    rows, points : int (M,), rows of the keypoints and of the map's points that they observe.
+    ``rows`` and ``points`` int (M,) are rows of its keypoints and of the map's points.
     """
 
     name: str
@@ -75,14 +72,10 @@ class ObservedKeypoints:
 
 @dataclass(frozen=True)
 class PixelOrigin:
-    """Pixel origin of a map, and the evidence for it.
+    """Pixel origins of a map's intrinsics and keypoints as stored, and the evidence in words.
 
-    Attributes
-    ----------
-    intrinsics, keypoints : the origin each is stored with.
-    error_px : median reprojection error with the intrinsics' origin taken as corner or centre,
-        the keypoints' origin as found; NaN without observations.
-    reason : in words.
+    ``error_px`` is the median reprojection error with the intrinsics' origin taken as corner or
+    centre, the keypoints' origin as found; NaN without observations.
     """
 
     intrinsics: Origin
@@ -110,12 +103,8 @@ def find_pixel_origin(
 ) -> PixelOrigin:
     """Find the pixel origin of intrinsics and keypoints.
 
-    Parameters
-    ----------
-    images : a sample of the map's images, keypoints as stored.
-    xyz : (N, 3), all points.
-    cameras : all cameras of the map.
-    keypoints_at : the keypoints' origin where it is known.
+    Of a sample of the map's images, keypoints as stored, all points (N, 3) and all cameras;
+    ``keypoints_at`` is the keypoints' origin where it is known.
     """
     errors = {shift: _median_error(images, xyz, shift) for shift in (0.0, _HALF, -_HALF)}
     centred = bool(cameras) and all(

@@ -123,18 +123,11 @@ def pairs_by_covisibility(
 ) -> NDArray[np.int64]:
     """Pairs of each image with those that share most points with it; of equals the first.
 
-    The sparse product of the observations with themselves, row by row, of which only the best of
-    each row are kept. Its time is the number of observations times the length of a track, which is
-    bounded: of a point that very many images see, an image counts as seeing it only the 512 before
-    and the 512 after it in the order of the images.
-
-    Parameters
-    ----------
-    point_ids, image_ids : (O,), the observations; in any order, repeated ones count once.
-
-    Returns
-    -------
-    int64 (P, 2), indices i < j, sorted, each pair once.
+    Of observations (O,), in any order, repeated ones count once; int64 (P, 2), indices i < j,
+    sorted, each pair once. It is the sparse product of the observations with themselves, row by
+    row, of which only the best of each row are kept. Its time is the number of observations times
+    the length of a track, which is bounded: of a point that very many images see, an image counts
+    as seeing it only the 512 before and the 512 after it in the order of the images.
     """
     from megloc_kapture.mapping import kernels
 
@@ -171,10 +164,8 @@ def pairs_by_sequence(
 ) -> NDArray[np.int64]:
     """Pairs (P, 2) of each image with the next ones of its camera, i < j, sorted, each once.
 
-    Parameters
-    ----------
-    cameras, timestamps : (N,), which camera took an image and when; images of one camera at the
-        same time follow each other as they are given.
+    Of N images it is given which camera took each and when; images of one camera at the same time
+    follow each other as they are given.
     """
     options = options or PairsBySequenceOptions()
     sequences: dict[str, list[int]] = {}

@@ -43,23 +43,16 @@ def point_covariances(
     cameras: Sequence[Camera],
     cams_from_world: Sequence[RigidTransform],
 ) -> Floats:
-    """Covariances of points for a noise of 1 px in their images, poses and cameras exact.
+    """Covariances of points (N, 3) for a noise of 1 px in their images, poses and cameras exact.
 
-    Parameters
-    ----------
-    xyz : float64 (N, 3) in the world.
-    point_ids, image_ids : (O,), rows of ``xyz`` and of ``cameras``; in any order, faster where the
-        points ascend.
+    Of observations (O,), rows of ``xyz`` and of ``cameras``, in any order, faster where the points
+    ascend. Raises DataError for ids that are no rows, or not as many poses as cameras.
 
     Returns
     -------
     float64 (N, 6): xx, xy, xz, yy, yz, zz in the map's unit squared; NaN where the observations do
-    not determine the point (a single view, no parallax). A point behind a camera is not observed
-    by it.
-
-    Raises
-    ------
-    DataError : ids that are no rows, or not as many poses as cameras.
+        not determine the point (a single view, no parallax). A point behind a camera is not
+        observed by it.
     """
     from megloc_kapture.geometry.projection import packed_views
     from megloc_kapture.mapping import kernels
@@ -175,13 +168,9 @@ class UncertaintyOptions(Options):
 
 @dataclass(frozen=True, eq=False)
 class ObservedPoints:
-    """Points and the images that observe them.
+    """Points float64 (N, 3) and the images that observe them.
 
-    Parameters
-    ----------
-    xyz : float64 (N, 3).
-    point_ids : int64 (O,), rows of ``xyz``, ascending.
-    image_ids : int32 (O,), indices into ``cameras`` and ``cams_from_world``.
+    Of O observations, the rows of ``xyz``, int64, ascending, and of ``cameras`` and poses, int32.
     """
 
     xyz: Floats
@@ -264,10 +253,8 @@ def seen_at_angle(observed: ObservedPoints, min_angle_deg: float) -> Mask:
 def too_uncertain(deviations: Floats, depths: Floats, options: UncertaintyOptions) -> Mask:
     """Mask (N,) of the points to reject by their uncertainty.
 
-    Parameters
-    ----------
-    deviations : float64 (N,), the largest of each point, in the map's unit; NaN where unknown.
-    depths : float64 (N,), see :func:`mean_depths`.
+    Of deviations (N,), the largest of each point, in the map's unit, NaN where unknown, and the
+    :func:`mean_depths`.
     """
     rejected = np.zeros(len(deviations), dtype=bool)
     with np.errstate(invalid="ignore"):  # comparisons with NaN are false, as they should be

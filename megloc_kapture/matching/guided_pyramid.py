@@ -43,15 +43,11 @@ Match = Callable[[ImageFeatures, Sequence[ImageFeatures]], Sequence[PairMatches]
 class ImageVariant:
     """An image scaled and turned by quarters, and the exact map of its pixels to the original's.
 
-    Pixel coordinates are continuous, the first pixel's centre at (0.5, 0.5): an image of size
-    (w, h) covers [0, w] x [0, h]. A variant covers the same scene from edge to edge, so that
+    Pixel coordinates are continuous, the first pixel's centre at (0.5, 0.5): an image of size (w,
+    h) covers [0, w] x [0, h]. A variant covers the same scene from edge to edge, so that
     coordinates scale by the ratio of the sizes, which is not exactly ``scale`` where a size had to
-    be rounded.
-
-    Parameters
-    ----------
-    scale : size of the variant over that of the original.
-    rotation_deg : 0, 90, 180 or 270, counter-clockwise as one sees it, after scaling.
+    be rounded. After scaling it is turned by 0, 90, 180 or 270 degrees, counter-clockwise as one
+    sees it.
     """
 
     scale: float = 1.0
@@ -223,9 +219,7 @@ def equivalent_types(local_type: str) -> tuple[str, ...]:
 class VariantFeatures:
     """Features of an image's variant, as the matcher gets them, in the variant's own pixels.
 
-    Attributes
-    ----------
-    keypoints_px : float32 (N, C), x and y in pixels of the original; the other columns as found.
+    ``keypoints_px`` float32 (N, C) are x and y in pixels of the original; other columns as found.
     """
 
     variant: ImageVariant
@@ -237,10 +231,8 @@ class VariantFeatures:
 class VariantMatches:
     """Verified matches of a variant with another image.
 
-    Attributes
-    ----------
-    keypoints_px : float32 (K, C), in pixels of the original; descriptors (K, D).
-    other_rows : int64 (K,), keypoints of the other image; scores float32 (K,).
+    Keypoints float32 (K, C), in pixels of the original, descriptors (K, D), scores float32 (K,),
+    and the other image's keypoints int64 (K,).
     """
 
     variant: ImageVariant
@@ -267,11 +259,9 @@ class VariantMatches:
 class PairVerifier:
     """Verifies an image's matches with another one.
 
-    Attributes
-    ----------
-    verify : which matches (K, 2) of a variant, rows of it and of the other image, best first,
-        are right.
-    agree : what remains of several variants' verified matches that need not agree.
+    ``verify`` says which matches (K, 2) of a variant, rows of it and of the other image, best
+    first, are right; ``agree`` what remains of several variants' verified matches that need not
+    agree.
     """
 
     verify: Callable[[VariantFeatures, NDArray[np.int64]], NDArray[np.bool_]]
@@ -298,19 +288,15 @@ def extract_variants(
     *,
     like: ImageFeatures,
 ) -> tuple[list[VariantFeatures], dict[ImageVariant, str]]:
-    """Features of an image's variants, and why others have none.
+    """Extract features of an image's variants; of those without any, say why.
 
     Parameters
     ----------
-    image : uint8 (H, W, 3), RGB.
-    mask : bool (H, W), True = use; changed along with the image.
+    image, mask : uint8 (H, W, 3), RGB; bool (H, W), True = use, changed along with the image.
     extract : image and mask to features; whatever it raises skips the variant, for networks refuse
         images that are too small for them in ways of their own.
-    like : features of the image as it is: what is added has as many columns.
-
-    Raises
-    ------
-    DataError : the extractor's features have another size than ``like``.
+    like : features of the image as it is: what is added has as many columns, else it is a
+        DataError.
     """
     height, width = image.shape[:2]
     found, skipped = [], {}
@@ -358,16 +344,10 @@ def match_variants(
     match: Match,
     judgements: Sequence[PairVerifier],
 ) -> list[list[VariantMatches]]:
-    """Verified matches of an image's variants with each of several other images.
+    """Match an image's variants with each of several other images, and verify the matches.
 
-    Parameters
-    ----------
-    match : matches of one image with each of several, see ``plugins.Matcher``.
-    judgements : for each of ``others``.
-
-    Returns
-    -------
-    For each of ``others`` the variants that match it, in their order.
+    ``match`` gives matches of one image with each of several, see ``plugins.Matcher``; there is a
+    verifier for each of ``others``.
     """
     found: list[list[VariantMatches]] = [[] for _ in others]
     for variant in variants:
@@ -406,8 +386,7 @@ def match_probed(
 
     Returns
     -------
-    matches : for each of the images the variants that match it.
-    num_left : variants that were tried on the images behind the probed ones.
+    For each image the variants that match it, and the number that was tried on the last ones.
     """
     first = min(options.probed_pairs, num_others)
     found = list(match(variants, range(first)))

@@ -31,10 +31,9 @@ class Combined:
 
     Attributes
     ----------
-    matches : int64 (K, 2), rows of the two images' keypoints; each row at most once.
-    scores : float64 (K,).
-    best : which of the tried variants has most matches, None where the images as they are have
-        as many.
+    matches, scores : int64 (K, 2), rows of both images' keypoints, each at most once; float64 (K,).
+    best : which of the tried variants has most matches, None where the images as they are have as
+        many.
     added : for both images, of each keypoint that was appended: the tried variant it comes from,
         and which of its matches; int64 (A, 2).
     """
@@ -53,14 +52,10 @@ def combine(
 ) -> Combined:
     """Put the matches of a pair and of its variants together, and append their keypoints.
 
-    The base's matches come first, then those of the richest variant, in each the best first; one
-    whose keypoint has a match already, in either image, has nothing to add. By ``max`` the richest
-    variant stands for the base where it has more.
-
-    Parameters
-    ----------
-    base : matches (K, 2) of the images as they are, and scores (K,).
-    keypoints : of both images, appended to; the second is not needed where no variant is of it.
+    The base's matches (K, 2) and scores (K,) of the images as they are come first, then those of
+    the richest variant, in each the best first; one whose keypoint has a match already, in either
+    image, has nothing to add. By ``max`` the richest variant stands for the base where it has more.
+    The second image's keypoints are not needed where no variant is of it.
     """
     base_matches, base_scores = base
     order = sorted(range(len(tried)), key=lambda at: -len(tried[at][1]))
@@ -136,13 +131,9 @@ class _Combination:
 class KeypointUnion:
     """Keypoints that were there, which keep their rows, and behind them those that are added.
 
-    A keypoint within a pixel of one that is there already is that one (the nearest, of equals the
-    first), and never adds a row.
-
-    Parameters
-    ----------
-    base : float32 (N, C), x and y first, in pixels of the original image.
-    added : float32 (M, C), what was added to it before.
+    Of keypoints float32 (N, C), x and y first, in pixels of the original image, and those (M, C)
+    that were added before. A keypoint within a pixel of one that is there already is that one (the
+    nearest, of equals the first), and never adds a row.
     """
 
     def __init__(self, base: NDArray[np.float32], added: NDArray[np.float32] | None = None) -> None:

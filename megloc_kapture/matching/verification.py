@@ -74,17 +74,11 @@ def essential_matrix(b_from_a: RigidTransform) -> Floats:
 
 
 def ray_slopes(camera: Camera, keypoints_px: NDArray[np.floating[Any]], rays: Floats) -> Floats:
-    """Derivatives of rays by their pixels, under the camera's own model.
+    """Derivatives d (x, y) / d px (N, 2, 2) of rays by their pixels, under the camera's own model.
 
-    Parameters
-    ----------
-    keypoints_px : (N, 2).
-    rays : float64 (N, 3), their homogeneous rays, last component 1.
-
-    Returns
-    -------
-    float64 (N, 2, 2), d (x, y) / d px. NaN where a ray is not that of its pixel: the distortion
-    cannot be undone there, or the pixel looks sideways or back, as pixels of a fisheye may.
+    Of pixels (N, 2) and their homogeneous rays float64 (N, 3), last component 1. NaN where a ray is
+    not that of its pixel: the distortion cannot be undone there, or the pixel looks sideways or
+    back, as pixels of a fisheye may.
     """
     from megloc_kapture.geometry.projection import project_with_jacobian
 
@@ -150,16 +144,10 @@ def verify_with_poses(
     b_from_a: RigidTransform,
     options: KnownPoseOptions | None = None,
 ) -> NDArray[np.bool_]:
-    """Mask of the matches that agree with a known relative pose.
+    """Mask (N,) of the matches that agree with a known relative pose.
 
-    Parameters
-    ----------
-    rays_a, rays_b : float64 (N, 3), matched homogeneous rays, last component 1.
-    slopes_a, slopes_b : float64 (N, 2, 2), see :func:`ray_slopes`; a match with NaN is refused.
-
-    Returns
-    -------
-    bool (N,); all False when fewer than ``min_matches`` agree.
+    Of matched homogeneous rays float64 (N, 3), last component 1, and their :func:`ray_slopes`; a
+    match with NaN is refused. All False when fewer than ``min_matches`` agree.
     """
     options = options or KnownPoseOptions()
     if len(rays_a) == 0:
@@ -178,17 +166,12 @@ def verify_two_view(
     camera_b: Camera,
     options: TwoViewOptions | None = None,
 ) -> NDArray[np.bool_]:
-    """Mask of the matches that agree with one relative pose of two calibrated cameras.
+    """Mask (N,) of the matches that agree with one relative pose of two calibrated cameras.
 
-    Parameters
-    ----------
-    keypoints_a_px, keypoints_b_px : (N, 2) matched keypoints, the best matches first, see
-        :func:`~.guided_pyramid.verify_best_first`; in any other order it takes more iterations.
-
-    Returns
-    -------
-    bool (N,); all False when no model has ``min_matches`` inliers. False where a camera's
-    distortion cannot be undone.
+    Of matched keypoints (N, 2), the best matches first, see
+    :func:`~.guided_pyramid.verify_best_first`; in any other order it takes more iterations. All
+    False when no model has ``min_matches`` inliers; False where a camera's distortion cannot be
+    undone.
     """
     options = options or TwoViewOptions()
     none = np.zeros(len(keypoints_a_px), dtype=bool)
@@ -220,11 +203,8 @@ def two_view_of_variants(
 ) -> PairVerifier:
     """Verification by a two-view model; the richest's decides which variants agree.
 
-    Parameters
-    ----------
-    camera, image_px : of the image the variants are of: its own keypoints (N, 2 or more).
-    other_camera, other_px : of the other image, (M, 2 or more).
-    base_matches : int64 (K, 2), the verified matches of the two as they are.
+    Of a camera, the image that the variants are of, with its own keypoints (N, 2 or more), the
+    other image's (M, 2 or more), and the verified matches int64 (K, 2) of the two as they are.
     """
     focal, other_focal = focal_px(camera), focal_px(other_camera)
     pairs = image_px[base_matches[:, 0], :2], other_px[base_matches[:, 1], :2]
@@ -282,10 +262,8 @@ def known_pose_of_variants(
 ) -> PairVerifier:
     """Verification with the known poses.
 
-    Parameters
-    ----------
-    camera : of the image the variants are of.
-    other_rays, other_slopes : float64 (M, 3) and (M, 2, 2) of the other image's keypoints.
+    Of the camera of the image that the variants are of, and of the other image's keypoints the rays
+    float64 (M, 3) and slopes (M, 2, 2).
     """
 
     def verify(found: VariantFeatures, matches: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -357,20 +335,14 @@ def agree_by_chance(
 ) -> bool:
     """True if wrong matches of two images may agree with a relative pose as well as these do.
 
-    Of matches that are all wrong some lie near the epipolar lines of any model, and RANSAC finds
-    the model with most of them. The number of false alarms (Moisan and Stival, A probabilistic
-    criterion to detect rigid point matches between two images, IJCV 2004) is how many models as
-    good as this one are expected among wrong matches. There a wrong match falls anywhere in the
-    image; but keypoints stand where the texture is, and wrong matches are of things that look
-    alike. How often one is near its line is therefore counted, on the keypoints themselves: each
-    with the others' partners. Few keypoints tell little of that, so it is never taken to be less
-    than anywhere.
-
-    Parameters
-    ----------
-    keypoints_a_px, keypoints_b_px : (N, 2), the matches that two-view verification kept.
-    num_matches : of which it kept them.
-    options : of that verification.
+    These are the matches (N, 2) that two-view verification kept of ``num_matches``. Of matches that
+    are all wrong some lie near the epipolar lines of any model, and RANSAC finds the model with
+    most of them. The number of false alarms (Moisan and Stival, A probabilistic criterion to detect
+    rigid point matches between two images, IJCV 2004) is how many models as good as this one are
+    expected among wrong matches. There a wrong match falls anywhere in the image; but keypoints
+    stand where the texture is, and wrong matches are of things that look alike. How often one is
+    near its line is therefore counted, on the keypoints themselves: each with the others' partners.
+    Few keypoints tell little of that, so it is never taken to be less than anywhere.
     """
     from scipy.special import gammaln
     from scipy.stats import binom

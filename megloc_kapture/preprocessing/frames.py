@@ -196,14 +196,11 @@ class FrameOptions(Options):
 
 @dataclass(frozen=True, slots=True)
 class FramePlan:
-    """One camera and what pre-processing makes of it; the pose stays.
+    """One camera before and after pre-processing; the pose stays.
 
-    Parameters
-    ----------
-    original, processed : the cameras before and after.
-    resized : width and height before the crop.
-    shrink : how many original pixels of the undistorted image a processed one spans, the larger
-        of the two axes; 1 or less where nothing is made smaller.
+    ``resized`` is width and height before the crop, ``shrink`` how many original pixels of the
+    undistorted image a processed one spans, the larger of the two axes; 1 or less where nothing is
+    made smaller.
     """
 
     original: Camera
@@ -376,12 +373,9 @@ def resized(image: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uin
 def undistorted_camera(camera: Camera, *, blank_pixels: float = 0.0) -> Camera:
     """The pinhole camera of an undistorted image, as COLMAP chooses it, with the focal lengths.
 
-    The argument itself where it is a pinhole already.
-
-    Parameters
-    ----------
-    blank_pixels : 0: as large as it can be without a pixel that the image does not show; 1: as
-        large as it must be to show all of the image; in between, in between.
+    The argument itself where it is a pinhole already. With 0 ``blank_pixels`` the image is as large
+    as it can be without a pixel that the distorted one does not show, with 1 as it must be to show
+    all of that; in between, in between.
     """
     if camera.model in PINHOLE_MODELS:
         return camera

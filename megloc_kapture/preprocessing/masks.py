@@ -74,12 +74,7 @@ class FixedMask(Options):
         return self.camera == sensor_id or fnmatchcase(image, self.camera)
 
     def drawn(self, width: int, height: int) -> NDArray[np.bool_]:
-        """The mask bool (H, W), True = use, of a polygon or a bottom share.
-
-        Raises
-        ------
-        ValueError : it is a file.
-        """
+        """The mask bool (H, W), True = use, of polygon or share; ValueError of a file."""
         if self.polygon is not None:
             return outside_polygon(np.array(self.polygon), width, height)
         if self.bottom_share is None:
@@ -91,9 +86,7 @@ class FixedMask(Options):
 def outside_polygon(corners: NDArray[np.floating], width: int, height: int) -> NDArray[np.bool_]:
     """Mask (H, W) of the pixels whose centres are not in a polygon.
 
-    Parameters
-    ----------
-    corners : (N, 2) x and y in shares of width and height; even-odd where edges cross.
+    Its corners (N, 2) are x and y in shares of width and height; even-odd where edges cross.
     """
     x0, y0 = (np.asarray(corners, np.float64) * [width, height]).T
     x1, y1 = np.roll(x0, -1), np.roll(y0, -1)
@@ -112,19 +105,11 @@ def outside_polygon(corners: NDArray[np.floating], width: int, height: int) -> N
 
 
 def with_margin(mask: NDArray[np.bool_], margin_px: float) -> NDArray[np.bool_]:
-    """The mask without the pixels that are near what it ignores.
+    """The mask bool (H, W), True = use, without the pixels that are near what it ignores.
 
-    The border of the image is no edge of the mask: nothing is taken away along it.
-
-    Parameters
-    ----------
-    mask : bool (H, W), True = use.
-    margin_px : a pixel is used where the nearest ignored one is farther away than this, between
-        the centres of the two (Euclidean); 0 and less leave the mask as it is.
-
-    Returns
-    -------
-    bool (H, W); the argument itself where there is nothing to do.
+    A pixel is used where the nearest ignored one is farther away than the margin, between the
+    centres of the two (Euclidean). The border of the image is no edge of the mask: nothing is taken
+    away along it. The argument itself where there is nothing to do.
     """
     if margin_px <= 0 or mask.all():
         return mask
@@ -138,13 +123,10 @@ def with_margin(mask: NDArray[np.bool_], margin_px: float) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class UnchangingRegion:
-    """Region below a frontier across the image; falsy where it is empty.
+    """Region below a frontier across the image; falsy where it is empty, for a reason.
 
-    Parameters
-    ----------
-    frontier : where the region starts, from the top in shares of the height, at the middles of
-        equally wide columns; 1: nowhere.
-    reason : why there is none, or "".
+    The frontier is where the region starts, from the top in shares of the height, at the middles of
+    equally wide columns; 1: nowhere.
     """
 
     frontier: tuple[float, ...]
@@ -165,9 +147,7 @@ class UnchangingRegion:
 def edge_directions(image: NDArray[np.uint8]) -> Float32:
     """Directions of an image's edges, small: float32 (h, w, 2), x and y, of length 0 to 1.
 
-    Parameters
-    ----------
-    image : uint8 (H, W, 3) RGB.
+    Of an RGB image uint8 (H, W, 3).
     """
     import cv2
 
@@ -188,14 +168,8 @@ def edge_directions(image: NDArray[np.uint8]) -> Float32:
 def find_unchanging_region(sequence: Iterable[Float32]) -> UnchangingRegion:
     """The region at the bottom that never changes.
 
-    Parameters
-    ----------
-    sequence : :func:`edge_directions` of at least MIN_IMAGES images of one camera that moved
-        between them.
-
-    Raises
-    ------
-    ValueError : fewer images.
+    Of :func:`edge_directions` of at least MIN_IMAGES images, else it is a ValueError, of one camera
+    that moved between them.
     """
     total, lengths, squares, count = _sums(sequence)
     if count < MIN_IMAGES:

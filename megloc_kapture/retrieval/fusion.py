@@ -126,13 +126,10 @@ def fuse(
 
     Parameters
     ----------
-    similarities : per feature float (Q, M), finite; all of one shape and dtype.
+    similarities : per feature float (Q, M), finite; all of one shape and dtype, which is the
+        result's; that of ranks is float64.
     weights : one per feature, positive; all equal by default. Maximum, minimum, ``min_and_max``,
         ``villena_roman`` and ``round_robin`` have no use for them.
-
-    Returns
-    -------
-    float (Q, M), of the similarities' dtype; of ranks float64.
 
     Raises
     ------
@@ -228,10 +225,8 @@ def _by_ranks(
 def normalized_weights(weights: Sequence[float] | None, count: int) -> NDArray[np.float64]:
     """Weights (count,) that sum to one; all equal where none are given.
 
-    Raises
-    ------
-    OptionError : another number of weights, or one that is not finite and positive. A feature that
-        is not to count is left out: harmonic means and ranks know no weight of zero.
+    Raises OptionError for another number of weights, or one that is not finite and positive. A
+    feature that is not to count is left out: harmonic means and ranks know no weight of zero.
     """
     given = np.ones(count) if weights is None else np.asarray(weights, dtype=np.float64)
     if count == 0 or given.shape != (count,):
@@ -248,22 +243,13 @@ def concatenate(
     *,
     out: NDArray[np.float32] | None = None,
 ) -> NDArray[np.float32]:
-    """Concatenate the descriptors of several features, row by row.
+    """Concatenate the descriptors of several features, float (N, D_i), row by row; float32.
 
     The inner product of two rows is the weighted mean of the features' cosines: block i is scaled
     by the square root of ``w_i / sum(w)``. It is what late fusion by the mean gives, in one search.
     A row is of unit length where every feature's is; a feature of zeros, of an image that it finds
-    nothing in, takes its share away.
-
-    Parameters
-    ----------
-    vectors : float (N, D_i), rows of unit length or zero.
-    weights : one per feature, positive; all equal by default.
-    out : where to write the result.
-
-    Returns
-    -------
-    float32 (N, sum of D_i).
+    nothing in, takes its share away. Weights are positive, one per feature; all equal by default.
+    The result is written to ``out`` where it is given.
 
     Raises
     ------
@@ -296,12 +282,12 @@ def fuse_rankings(
     (Cormack, Clarke and Buettcher, "Reciprocal rank fusion outperforms Condorcet and individual
     rank learning methods", SIGIR 2009, whose constant is 60). ``borda`` gives the last of the
     longest list one point, each before it one more. A list without the image adds nothing; equal
-    sums are in the order of the images.
+    sums are in the order of the images. Raises DataError for lists of different numbers of queries,
+    OptionError for no list, or weights that cannot be used.
 
     Parameters
     ----------
     lists : per feature int64 (Q, K_i), best first, -1 where there are no more.
-    top_k : at most this many per row.
     weights : one per feature, positive; all equal by default. ``round_robin`` has no use for them.
 
     Returns
@@ -309,11 +295,6 @@ def fuse_rankings(
     indices : int64 (Q, top_k), best first, -1 where the lists have no more.
     scores : float32 (Q, top_k), the sums; of ``round_robin`` ``top_k`` for the first, then one less
         each. -inf where -1.
-
-    Raises
-    ------
-    DataError : lists of different numbers of queries.
-    OptionError : no list, or weights that cannot be used.
     """
     if not lists:
         raise OptionError("no ranked list to fuse")
@@ -369,21 +350,14 @@ def greedy_coverage(
 ) -> tuple[list[int], list[int]]:
     """Choose images one by one, each for the keypoints that those before it do not match.
 
-    By the number of matches alone, neighbours of the best image come next, which see the same
-    from nearly the same position. This is the greedy solution of maximum coverage, at least a
-    share of 1 - 1/e of the best one (Nemhauser, Wolsey and Fisher, "An analysis of
-    approximations for maximizing submodular set functions", Mathematical Programming 1978).
+    By the number of matches alone, neighbours of the best image come next, which see the same from
+    nearly the same position. This is the greedy solution of maximum coverage, at least a share of 1
+    - 1/e of the best one (Nemhauser, Wolsey and Fisher, "An analysis of approximations for
+    maximizing submodular set functions", Mathematical Programming 1978).
 
-    Parameters
-    ----------
-    keypoint_ids : of each image, the query's keypoints that it matches, each once.
-    keep : at most so many images.
-
-    Returns
-    -------
-    order : indices into ``keypoint_ids``. Of images that add as many, the one with more matches
-        comes first, of those the first.
-    added : keypoints that each of them adds.
+    Of each image, the query's keypoints that it matches are given, each once. The result is at most
+    ``keep`` indices, and the keypoints that each of them adds. Of images that add as many, the one
+    with more matches comes first, of those the first.
     """
     size = max((int(ids.max()) + 1 for ids in keypoint_ids if len(ids)), default=0)
     missing = np.ones(size, dtype=bool)
@@ -415,19 +389,12 @@ def diversify(
     top_k: int,
     options: DiversityOptions,
 ) -> NDArray[np.int64]:
-    """Positions in a ranking of the images to keep, in its order.
+    """Positions in a ranking, int64 (min(K, top_k),), of the images to keep, in its order.
 
     Greedy: an image is passed over when ``max_per_place`` of those kept are near it. Passed-over
-    images fill what is left of ``top_k`` in the end, so that the ranking stays as long.
-
-    Parameters
-    ----------
-    ranking : int64 (K,), images as rows of the following, best first.
-    centers, directions : float64 (N, 3), of camera centres and of unit viewing directions.
-
-    Returns
-    -------
-    int64 (min(K, top_k),) positions in ``ranking``: the kept ones, then the fillers.
+    images fill what is left of ``top_k`` in the end, so that the ranking stays as long. The ranking
+    int64 (K,) has images as rows of camera centres and unit viewing directions, float64 (N, 3),
+    best first.
     """
     at, towards = centers[ranking], directions[ranking]
     cosine = np.cos(np.deg2rad(options.angle_deg))

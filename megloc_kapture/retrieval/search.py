@@ -60,14 +60,13 @@ def rank_by_similarity(
     queries : float (Q, D), rows of unit length for cosine similarity. A zero row, of an image
         without features, has similarity 0 with everything.
     database : float (M, D), or a source of blocks of them.
-    top_k : at most this many per query.
-    permitted : bool (Q, M), False for rows that a query must not get; or a function that gives
-        (Q, stop - start) of the database rows ``start`` to ``stop``; or None.
+    permitted : bool (Q, M), False for rows that a query must not get; or a function that gives (Q,
+        stop - start) of the database rows ``start`` to ``stop``; or None.
 
     Returns
     -------
-    indices : int64 (Q, min(top_k, M)), best first; equal scores keep the database's order;
-        -1 where fewer than ``top_k`` rows are permitted.
+    indices : int64 (Q, min(top_k, M)), best first; equal scores keep the database's order; -1 where
+        fewer than ``top_k`` rows are permitted.
     scores : float32 of the same shape; -inf where the index is -1.
 
     Raises
@@ -250,12 +249,7 @@ def _similarities(
     out: NDArray[np.float32],
     finite: bool,
 ) -> NDArray[np.float32]:
-    """Inner products (q, b), in the memory of ``out``, which is flat.
-
-    Parameters
-    ----------
-    finite : the rows are known to be.
-    """
+    """Inner products (q, b), in the flat memory of ``out``; ``finite`` rows are known to be."""
     shape = (len(queries), len(rows))
     products = out[: shape[0] * shape[1]].reshape(shape)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -352,11 +346,8 @@ class QuantizedRows:
     implementation with asymmetric distances by shuffles (André, Kermarrec, Le Scouarnec, "Quicker
     ADC", TPAMI 2021), every code compared. A row takes a byte per 32 values in memory; the rows of
     a short list are read again for their exact similarities, so that a ranking is exact search's as
-    long as the short list holds it.
-
-    Raises
-    ------
-    OptionError : FAISS is not installed, or there are too few rows.
+    long as the short list holds it. Raises OptionError where FAISS is not installed, or there are
+    too few rows.
     """
 
     def __init__(self, source: VectorSource) -> None:
@@ -395,10 +386,8 @@ def short_lists(
 ) -> list[Found]:
     """As :meth:`~.search.FusedSearch.lists`, among the short lists of each query.
 
-    Parameters
-    ----------
-    codes : of the database, by feature; each feature has a short list of its own.
-    length : of a short list; at least ``search.top_k`` are taken.
+    Each feature's codes of the database give a short list of its own; of ``length`` rows, at least
+    ``search.top_k``.
     """
     sources = [as_blocks(source) for source in database]
     length = min(max(length, search.top_k), len(sources[0]))
