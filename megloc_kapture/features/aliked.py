@@ -13,11 +13,7 @@ from megloc_kapture.features.network import Images, LocalNetwork, LocalNetworkOp
 from megloc_kapture.nets.aliked import AlikedMaps, AlikedNet, aliked_from
 from megloc_kapture.nets.runtime import image_tensor, inference
 from megloc_kapture.nets.sampling import read_bilinear
-from megloc_kapture.nets.score_maps import (
-    select_pixels,
-    soft_argmax,
-    suppress_non_maxima,
-)
+from megloc_kapture.nets.score_maps import select_pixels, soft_argmax, suppress_non_maxima
 from megloc_kapture.values import LocalFeatures
 
 _TEMPERATURE = 0.1  # of the sub-pixel position, the one the network was trained with

@@ -28,12 +28,7 @@ from megloc_kapture.nets.dinov2 import PATCH_PX
 from megloc_kapture.nets.eigenplaces import eigenplaces_from
 from megloc_kapture.nets.megaloc import megaloc_from, squared
 from megloc_kapture.nets.netvlad import STRIDE_PX, VggNetVlad, netvlad, openibl
-from megloc_kapture.nets.runtime import (
-    NetworkOptions,
-    image_tensor,
-    inference,
-    sized_tensor,
-)
+from megloc_kapture.nets.runtime import NetworkOptions, image_tensor, inference, sized_tensor
 
 Tensors = Mapping[str, torch.Tensor]
 

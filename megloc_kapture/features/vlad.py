@@ -25,6 +25,7 @@ from megloc_kapture.values import Options
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+Float32 = NDArray[np.float32]
 
 _CHUNK = 16384  # descriptors assigned at once: bounds memory at 16384 x clusters floats
 # whitening is learnt from at most this many images, and numbers in all: 1 GiB of float32
@@ -79,10 +80,10 @@ class PcaWhitening:
     projection float32 (d, D), whose rows are scaled principal components, the strongest first.
     """
 
-    mean: NDArray[np.float32]
-    projection: NDArray[np.float32]
+    mean: Float32
+    projection: Float32
 
-    def apply(self, vector: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
+    def apply(self, vector: NDArray[np.floating[Any]]) -> Float32:
         """Whiten one vector (D,): float32 (d,), unit length; the zero vector gives zero."""
         if not np.any(vector):
             return np.zeros(len(self.projection), dtype=np.float32)
@@ -91,9 +92,7 @@ class PcaWhitening:
         return whitened / norm if norm > 0 else whitened
 
 
-def learn_whitening(
-    vectors: NDArray[np.float32], dimensions: int, power: float = 1.0
-) -> PcaWhitening:
+def learn_whitening(vectors: Float32, dimensions: int, power: float = 1.0) -> PcaWhitening:
     """Learn whitening from vectors (N, D), float32, which are overwritten: they may be large.
 
     A map has fewer images than its vectors have dimensions. The deviations along the last
@@ -136,7 +135,7 @@ def learn_whitening(
 class Vocabulary:
     """Visual words float32 (V, K, D), clusters of each vocabulary, and their vectors' whitening."""
 
-    centres: NDArray[np.float32]
+    centres: Float32
     whitening: PcaWhitening | None = None
 
     @property
@@ -201,7 +200,7 @@ def train_vlad(
 
 def _read_and_aggregate(
     read: Callable[[str], NDArray[Any]], vocabulary: Vocabulary, options: VladOptions, image: str
-) -> NDArray[np.float32]:
+) -> Float32:
     return aggregate(read(image), vocabulary, options)
 
 
@@ -226,7 +225,7 @@ def train_vocabulary(
     )
 
 
-def _cluster(data: NDArray[np.float32], options: VladOptions, number: int) -> NDArray[np.float32]:
+def _cluster(data: Float32, options: VladOptions, number: int) -> Float32:
     """The centres of one vocabulary; each draws numbers of its own."""
     rng = np.random.default_rng([options.seed, number])
     centres = _plus_plus(data, options.num_clusters, rng)
@@ -245,9 +244,7 @@ def _cluster(data: NDArray[np.float32], options: VladOptions, number: int) -> ND
     return centres
 
 
-def _plus_plus(
-    data: NDArray[np.float32], num_clusters: int, rng: np.random.Generator
-) -> NDArray[np.float32]:
+def _plus_plus(data: Float32, num_clusters: int, rng: np.random.Generator) -> Float32:
     """k-means++ seeding on a subsample: the start needs no more than that."""
     sample = data
     if len(sample) > 20_000:
@@ -267,7 +264,7 @@ def _plus_plus(
     return np.stack(centres).astype(np.float32)
 
 
-def _nearest(data: NDArray[np.float32], centres: NDArray[np.float32]) -> NDArray[np.int64]:
+def _nearest(data: Float32, centres: Float32) -> NDArray[np.int64]:
     half = 0.5 * np.einsum("kd,kd->k", centres, centres)
     labels = np.empty(len(data), dtype=np.int64)
     for start in range(0, len(data), _CHUNK):
@@ -277,7 +274,7 @@ def _nearest(data: NDArray[np.float32], centres: NDArray[np.float32]) -> NDArray
 
 
 def _sum_by_label(
-    data: NDArray[np.float32], labels: NDArray[np.int64], num_clusters: int
+    data: Float32, labels: NDArray[np.int64], num_clusters: int
 ) -> NDArray[np.float64]:
     order = np.argsort(labels, kind="stable")
     present, starts = np.unique(labels[order], return_index=True)
@@ -300,10 +297,8 @@ def sample_rows(counts: Iterable[int], total: int, seed: int) -> list[NDArray[np
 
 
 def aggregate(
-    descriptors: NDArray[Any],
-    vocabulary: Vocabulary,
-    options: VladOptions | None = None,
-) -> NDArray[np.float32]:
+    descriptors: NDArray[Any], vocabulary: Vocabulary, options: VladOptions | None = None
+) -> Float32:
     """VLAD of descriptors (N, D): float32 (``vocabulary.size``,), unit length.
 
     Without whitening vocabulary after vocabulary, in each cluster after cluster. An image without
@@ -323,9 +318,7 @@ def aggregate(
     return vector if vocabulary.whitening is None else vocabulary.whitening.apply(vector)
 
 
-def _aggregate_one(
-    data: NDArray[np.float32], centres: NDArray[np.float32], options: VladOptions
-) -> NDArray[np.float64]:
+def _aggregate_one(data: Float32, centres: Float32, options: VladOptions) -> NDArray[np.float64]:
     """VLAD by one vocabulary: float64 (K * D,), unit length."""
     if options.assignment == "hard":
         labels = _nearest(data, centres)
@@ -347,9 +340,7 @@ def _aggregate_one(
 
 
 def soft_assignment(
-    descriptors: NDArray[np.floating[Any]],
-    centres: NDArray[np.floating[Any]],
-    alpha: float,
+    descriptors: NDArray[np.floating[Any]], centres: NDArray[np.floating[Any]], alpha: float
 ) -> NDArray[np.float64]:
     """``a_k(x_i)`` of NetVLAD's equation 1: (N, K) float64, rows sum to one."""
     data = np.asarray(descriptors, dtype=np.float64)

@@ -101,10 +101,7 @@ def rotate(quats_wxyz: Floats, vectors: Floats) -> Floats:
 
 
 def compose(
-    quats_ab: Floats,
-    translations_ab: Floats,
-    quats_bc: Floats,
-    translations_bc: Floats,
+    quats_ab: Floats, translations_ab: Floats, quats_bc: Floats, translations_bc: Floats
 ) -> tuple[Floats, Floats]:
     """``a_from_c`` of ``a_from_b`` and ``b_from_c``: quaternions (..., 4), translations (..., 3).
 
@@ -128,10 +125,10 @@ def camera_centers(quats_wxyz: Floats, translations: Floats) -> Floats:
 def rotation_angles_deg(quats_a: Floats, quats_b: Floats) -> Floats:
     """Angles (...) in degrees, 0 to 180, of the rotations ``a b^-1`` of quaternions (..., 4).
 
-    It is the length of the rotation vector, and the half angle is ``atan2(|v|, |w|)``. The usual
-    arccos, of the scalar part or of the matrix' trace, is flat at zero and cannot resolve below
-    about 1e-6 degrees; this keeps full precision there and at 180 degrees, needs no clipping, and
-    takes ``q`` and ``-q`` as the same. Lengths other than 1 do not matter.
+    The half angle is ``atan2(|v|, |w|)``. The usual arccos, of the scalar part or of the matrix'
+    trace, is flat at zero and cannot resolve below about 1e-6 degrees; this keeps full precision
+    there and at 180 degrees, needs no clipping, and takes ``q`` and ``-q`` as the same. Lengths
+    other than 1 do not matter.
     """
     relative = multiply_quats(quats_a, _conjugate(quats_b))
     relative = relative / _squared_length(quats_b)[..., None]

@@ -58,10 +58,8 @@ def packed_views(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
     """Posed cameras as compiled loops take them.
 
-    Returns
-    -------
-    rotations, translations : float64 (I, 3, 3) and (I, 3) of ``cams_from_world``.
-    models, params : int64 (I,) of :func:`model_id` and float64 (I, 12) of :func:`packed_params`.
+    Rotations float64 (I, 3, 3) and translations (I, 3) of ``cams_from_world``, :func:`model_id`
+    int64 (I,) and :func:`packed_params` float64 (I, 12).
     """
     return (
         np.array([pose.rotation_matrix() for pose in cams_from_world]).reshape(-1, 3, 3),
@@ -74,16 +72,9 @@ def packed_views(
 def project_with_jacobian(
     camera: Camera, points_in_cam: NDArray[np.floating[Any]]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Pixels and their derivatives with respect to the points.
+    """Pixels of points (N, 3) in the camera frame, and their derivatives by the points.
 
-    Parameters
-    ----------
-    points_in_cam : (N, 3) in the camera frame.
-
-    Returns
-    -------
-    px : float64 (N, 2), the first pixel's centre at (0.5, 0.5); NaN behind the camera.
-    jacobian : float64 (N, 2, 3), NaN where ``px`` is.
+    float64 (N, 2), the first pixel's centre at (0.5, 0.5), and (N, 2, 3); NaN behind the camera.
     """
     points = np.ascontiguousarray(points_in_cam, dtype=np.float64).reshape(-1, 3)
     out = np.empty((len(points), 8))
@@ -164,17 +155,11 @@ def _not_radial(model, p, u, v):
 
 @compiled_loop
 def distorted(model, p, u, v):
-    """Distorted normalised coordinates of undistorted ones, and the four derivatives.
+    """Distorted normalised coordinates a, b of undistorted ones, and the four derivatives.
 
-    Parameters
-    ----------
-    model, p : see :func:`model_id` and :func:`packed_params`.
-    u, v : ``x / z`` and ``y / z`` of a point in the camera frame.
-
-    Returns
-    -------
-    a, b, then the derivatives of a by u and v and of b by u and v; the pixel is
-    ``(p[0] a + p[2], p[1] b + p[3])``.
+    Of ``u = x / z`` and ``v = y / z`` of a point in the camera frame. The derivatives are those of
+    a by u and v and of b by u and v; the pixel is ``(p[0] a + p[2], p[1] b + p[3])``. For ``model``
+    and ``p`` see :func:`model_id` and :func:`packed_params`.
     """
     if model <= PINHOLES:
         return u, v, 1.0, 0.0, 0.0, 1.0
@@ -194,11 +179,9 @@ def distorted(model, p, u, v):
 def project_point(model, p, x, y, z, out):
     """Pixel of one point in the camera frame, and its derivatives.
 
-    Parameters
-    ----------
-    model, p : see :func:`model_id` and :func:`packed_params`.
-    out : float64 (8,), filled with px, py, then the derivatives of px by x, y, z and of py by x, y,
-        z; NaN behind the camera.
+    ``out`` float64 (8,) is filled with px, py, then the derivatives of px by x, y, z and of py by
+    x, y, z; NaN behind the camera. For ``model`` and ``p`` see :func:`model_id` and
+    :func:`packed_params`.
     """
     if not z > 0.0:
         for i in range(8):

@@ -199,10 +199,7 @@ def _measured(
 
 
 def _ransac(
-    problem: PoseProblem,
-    rays: Floats,
-    usable: NDArray[np.bool_],
-    options: AbsolutePoseOptions,
+    problem: PoseProblem, rays: Floats, usable: NDArray[np.bool_], options: AbsolutePoseOptions
 ) -> RigidTransform:
     """``rig_from_world`` in the recentred world."""
     import poselib

@@ -402,35 +402,26 @@ def poses_of_cameras(
             else replace(one, cam_from_world=view.cam_from_rig @ one.cam_from_world)
             for one in result.clusters
         )
-        if start == end:
-            cameras.append(
-                Failure(
-                    "no inlier in this camera; others of its rig were localized",
-                    num_matches=len(inliers),
-                    candidates=result.candidates,
-                    clusters=clusters,
-                    seconds=result.seconds,
-                )
-            )
-            continue
-        px, points, covariance = (
-            result.inlier_points_px,
-            result.inlier_points_world,
-            result.covariance,
+        px, points = result.inlier_points_px, result.inlier_points_world
+        own = replace(
+            result,
+            cam_from_world=view.cam_from_rig @ result.cam_from_world,
+            clusters=clusters,
+            num_matches=len(inliers),
+            num_inliers=end - start,
+            inliers=inliers,
+            inlier_points_px=None if px is None else px[start:end],
+            inlier_points_world=None if points is None else points[start:end],
         )
-        cameras.append(
-            replace(
-                result,
-                cam_from_world=view.cam_from_rig @ result.cam_from_world,
-                clusters=clusters,
-                num_matches=len(inliers),
-                num_inliers=end - start,
-                inliers=inliers,
-                inlier_points_px=None if px is None else px[start:end],
-                inlier_points_world=None if points is None else points[start:end],
-                covariance=None
-                if covariance is None
-                else transform_covariance(covariance, view.cam_from_rig),
-            )
+        if own.covariance is not None:
+            moved = transform_covariance(own.covariance, view.cam_from_rig)
+            own = replace(own, covariance=moved)
+        failure = Failure(
+            "no inlier in this camera; others of its rig were localized",
+            num_matches=len(inliers),
+            candidates=result.candidates,
+            clusters=clusters,
+            seconds=result.seconds,
         )
+        cameras.append(own if start < end else failure)
     return cameras

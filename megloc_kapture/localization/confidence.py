@@ -25,6 +25,7 @@ from megloc_kapture.localization.absolute_pose import center_deviation, match_er
 from megloc_kapture.localization.map_index import Correspondences, PoseProblem, QueryView
 from megloc_kapture.values import Failure, Pose, RigidTransform
 
+Floats = NDArray[np.float64]
 # of an a contrario test: matches that a pose is made of
 _SAMPLE = 3
 # inliers so near to each other count once, as a share of the image's diagonal
@@ -71,13 +72,13 @@ class MatchSources:
     """
 
     support: NDArray[np.int64]
-    centers: NDArray[np.float64]
+    centers: Floats
     images: NDArray[np.int64]
     num_keypoints: int
-    noise: NDArray[np.float64]
-    seen: Sequence[NDArray[np.float64]]
+    noise: Floats
+    seen: Sequence[Floats]
     local_types: Collection[str] = ()
-    displacements_rad: Callable[[Pose], NDArray[np.float64]] | None = None
+    displacements_rad: Callable[[Pose], Floats] | None = None
 
 
 def evidence_of(
@@ -127,19 +128,20 @@ def with_confidence(
     evidence = evidence_of(problem, pose, sources, max_error_px)
     model = calibration_for(sources.local_types)
     confidence = model.probability(evidence)
+    weakest = min(model.weights, key=lambda name: model.weights[name] * evidence[name])
     if confidence >= min_confidence:
         return replace(pose, confidence=confidence, evidence=evidence)
     return Failure(
         f"confidence {confidence:.2g} of the pose, at least {min_confidence:g} is needed: "
         f"{pose.num_inliers} of {pose.num_matches} 2D-3D matches agree, and "
-        f"{model.weakest(evidence)}",
+        f"{TERMS[weakest]}",
         num_matches=pose.num_matches,
         num_inliers=pose.num_inliers,
         confidence=confidence,
     )
 
 
-def _surprise(problem: PoseProblem, errors_px: NDArray[np.float64], max_error_px: float) -> float:
+def _surprise(problem: PoseProblem, errors_px: Floats, max_error_px: float) -> float:
     """How unlikely it is that so many matches agree by chance: -log10 of the number of false
     alarms, at least 0.
 
@@ -177,7 +179,7 @@ def _surprise(problem: PoseProblem, errors_px: NDArray[np.float64], max_error_px
     return max(0.0, -float(log_alarms.min()) / math.log(10))
 
 
-def _log_choose(n: int | NDArray[np.int64], k: int | NDArray[np.int64]) -> NDArray[np.float64]:
+def _log_choose(n: int | NDArray[np.int64], k: int | NDArray[np.int64]) -> Floats:
     from scipy.special import gammaln
 
     return np.asarray(
@@ -187,7 +189,7 @@ def _log_choose(n: int | NDArray[np.int64], k: int | NDArray[np.int64]) -> NDArr
 
 def _misfit(
     problem: PoseProblem,
-    errors_px: NDArray[np.float64],
+    errors_px: Floats,
     pose: Pose,
     inliers: NDArray[np.bool_],
     sources: MatchSources,
@@ -225,7 +227,7 @@ def _misfit(
 
 
 def _num_visible(
-    problem: PoseProblem, rig_from_world: RigidTransform, seen: Sequence[NDArray[np.float64]]
+    problem: PoseProblem, rig_from_world: RigidTransform, seen: Sequence[Floats]
 ) -> int:
     """Of the points that the map's images observe, those that fall into a view."""
     total = 0.0
@@ -239,8 +241,8 @@ def _num_visible(
 
 
 def _viewpoints(
-    points: NDArray[np.float64],
-    center: NDArray[np.float64],
+    points: Floats,
+    center: Floats,
     sources: MatchSources,
     inliers: NDArray[np.bool_],
     sighted: NDArray[np.bool_],
@@ -275,18 +277,13 @@ class Calibration:
         )
         return 1.0 / (1.0 + math.exp(-min(max(logit, -700.0), 700.0)))
 
-    def weakest(self, evidence: Mapping[str, float]) -> str:
-        """In words, the term that speaks most against a pose."""
-        return TERMS[min(self.weights, key=lambda name: self.weights[name] * evidence[name])]
-
 
 OF_ALL = "all"
 
 
 @lru_cache(maxsize=1)
 def calibrations() -> Mapping[str, Calibration]:
-    """The calibrations that the package brings: :data:`OF_ALL`, and those of keypoints types, by
-    what the types' names begin with."""
+    """The package's calibrations: :data:`OF_ALL`, and by what keypoints types' names begin with."""
     text = resources.files(__package__).joinpath("confidence.toml").read_text(encoding="utf-8")
     return {
         name: Calibration(table["origin"], table["bias"], table["weights"])
@@ -308,7 +305,7 @@ def match_sources(
     views: Sequence[QueryView],
     found: Sequence[Sequence[Correspondences]],
     cluster: Sequence[str],
-    centers: Mapping[str, NDArray[np.float64]],
+    centers: Mapping[str, Floats],
 ) -> MatchSources:
     """Where the matches of a cluster come from, and what its images see."""
     number = {image: at for at, image in enumerate(cluster)}

@@ -45,6 +45,7 @@ from megloc_kapture.localization.absolute_pose import (
 from megloc_kapture.localization.map_index import PoseProblem, View
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
+Floats = NDArray[np.float64]
 # errors of a map are alike in neighbouring points, and lenses are no pinholes: deviations that
 # take every match for independent are too small by a factor (measured: docs/photos.md)
 _CORRELATED, _MIN_ERROR_PX = 5.0, 0.5
@@ -79,10 +80,10 @@ class _Fit:
     depth : median of the inliers', unit of the map.
     """
 
-    change: NDArray[np.float64]
+    change: Floats
     deviation: float
     rig_from_world: RigidTransform
-    pose_covariance: NDArray[np.float64]
+    pose_covariance: Floats
     depth: float
 
 
@@ -177,7 +178,7 @@ def _with_camera(problem: PoseProblem, camera: Camera) -> PoseProblem:
     return PoseProblem.of([replace(problem.views[0], camera=camera)])
 
 
-def _changed(camera: Camera, change: NDArray[np.float64]) -> Camera:
+def _changed(camera: Camera, change: Floats) -> Camera:
     focal = focal_px(camera)
     camera = shift_principal_point(camera, *(focal * change[1:3]).tolist())
     camera = scale_focal(camera, math.exp(change[0]))
@@ -186,7 +187,7 @@ def _changed(camera: Camera, change: NDArray[np.float64]) -> Camera:
     return with_distortion(camera, radial_distortion(camera) + float(change[3]))
 
 
-def _prior_of(camera: Camera, given: Camera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _prior_of(camera: Camera, given: Camera) -> tuple[Floats, Floats]:
     """The change that makes a camera the given one, and its standard deviations."""
     focal = focal_px(camera)
     shift = np.subtract(principal_point_px(given), principal_point_px(camera)) / focal

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError
 from megloc_kapture.values import Camera, RigidTransform
 
+Floats = NDArray[np.float64]
 Integers = NDArray[np.integer[Any]]
 ImageMatches = tuple[str, NDArray[np.int64], NDArray[np.floating]]
 
@@ -39,12 +40,12 @@ class MapIndex:
         point, seen by the map's image; NaN where they are not known.
     """
 
-    xyz: NDArray[np.float64]
+    xyz: Floats
     row_of_image: dict[str, int]
     offsets: NDArray[np.int64]
     keypoint_ids: NDArray[np.int32]
     point_ids: NDArray[np.int32]
-    covariances: NDArray[np.float64] | None = None
+    covariances: Floats | None = None
     local_type: str = ""
     noise_rad: float = math.nan
     noise_px: float = math.nan
@@ -52,12 +53,12 @@ class MapIndex:
     @classmethod
     def build(
         cls,
-        xyz: NDArray[np.float64],
+        xyz: Floats,
         image_names: tuple[str, ...],
         image_ids: Integers,
         keypoint_ids: Integers,
         point_ids: Integers,
-        covariances: NDArray[np.float64] | None = None,
+        covariances: Floats | None = None,
     ) -> MapIndex:
         """Group observations, given as parallel arrays (O,), by image and keypoint."""
         from megloc_kapture.localization import kernels
@@ -101,7 +102,7 @@ class MapIndex:
         found[hit] = points[rows[hit]]
         return found
 
-    def seen_by(self, images: Sequence[str]) -> NDArray[np.float64]:
+    def seen_by(self, images: Sequence[str]) -> Floats:
         """The points that some of the images observe, each once, (K, 3)."""
         seen = np.zeros(len(self.xyz), dtype=np.bool_)
         for image in images:
@@ -167,7 +168,7 @@ class ObservedMatches:
 
     keypoint_ids: NDArray[np.int64]
     point_ids: NDArray[np.int64]
-    similarities: NDArray[np.float64]
+    similarities: Floats
     image_rows: NDArray[np.int64]
     num_images: int
     seen_once: NDArray[np.bool_] | None = None
@@ -216,8 +217,7 @@ class ObservedMatches:
 
 
 def observed_matches(
-    index: MapIndex,
-    matches: Sequence[tuple[str, Integers, NDArray[np.floating[Any]]]],
+    index: MapIndex, matches: Sequence[tuple[str, Integers, NDArray[np.floating[Any]]]]
 ) -> ObservedMatches:
     """The matches whose map keypoint observes a point.
 
@@ -264,8 +264,8 @@ class View:
     camera: Camera
     cam_from_rig: RigidTransform
     points_px: NDArray[np.floating[Any]]
-    points_world: NDArray[np.float64]
-    point_covariances: NDArray[np.float64] | None = None
+    points_world: Floats
+    point_covariances: Floats | None = None
 
     def __post_init__(self) -> None:
         count = len(self.points_px)
@@ -295,12 +295,12 @@ class PoseProblem:
     """
 
     views: tuple[View, ...]
-    points_px: NDArray[np.float64]
-    points: NDArray[np.float64]
-    covariances: NDArray[np.float64]
+    points_px: Floats
+    points: Floats
+    covariances: Floats
     starts: NDArray[np.int64]
     cameras: tuple[NDArray[Any], ...]
-    offset: NDArray[np.float64]
+    offset: Floats
 
     @classmethod
     def of(cls, views: Sequence[View]) -> PoseProblem:
@@ -338,18 +338,18 @@ class PoseProblem:
         return np.split(per_match, self.starts[1:-1])
 
 
-def _joined(parts: Sequence[NDArray[np.floating[Any]]], width: int) -> NDArray[np.float64]:
+def _joined(parts: Sequence[NDArray[np.floating[Any]]], width: int) -> Floats:
     return np.concatenate([np.zeros((0, width)), *parts], dtype=np.float64)
 
 
-def _amid(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _amid(points: Floats) -> Floats:
     # the median of some of them: any point nearby serves, and wrong points must not move it far
     some = points[:: max(1, len(points) // 64)]
     some = np.sort(some[np.isfinite(some).all(axis=1)], axis=0)
     return some[len(some) // 2] if len(some) else np.zeros(3)
 
 
-def undo_recentring(pose: RigidTransform, offset: NDArray[np.float64]) -> RigidTransform:
+def undo_recentring(pose: RigidTransform, offset: Floats) -> RigidTransform:
     """``rig_from_world`` of a pose in a world that was moved by minus ``offset`` (3,)."""
     t = np.array(pose.translation) - pose.rotation_matrix() @ offset
     return RigidTransform(pose.quat_wxyz, (float(t[0]), float(t[1]), float(t[2])))

@@ -41,12 +41,9 @@ def most_shared(
 ):
     """Images that share most points with each of ``first`` to ``last``, rows of ``best`` (I, K).
 
-    Parameters
-    ----------
-    starts, of_image : observations of image i, ``of_image[starts[i]:starts[i + 1]]``.
-    images, track : of each observation; sorted by track, then image.
-    track_starts : observations of track t, from ``track_starts[t]`` to ``track_starts[t + 1]``.
-    window : how far in a track an image looks before and after itself.
+    Observations of image i are ``of_image[starts[i]:starts[i + 1]]``; they are sorted by track,
+    then image, and those of track t run from ``track_starts[t]`` to ``track_starts[t + 1]``. An
+    image looks no farther in a track than ``window`` before and after itself.
     """
     shared = np.zeros(len(best), np.int64)
     touched = np.empty(len(best), np.int64)

@@ -106,7 +106,13 @@ def find_pixel_origin(
     Of a sample of the map's images, keypoints as stored, all points (N, 3) and all cameras;
     ``keypoints_at`` is the keypoints' origin where it is known.
     """
-    errors = {shift: _median_error(images, xyz, shift) for shift in (0.0, _HALF, -_HALF)}
+    observed = [image for image in images if len(image.rows)]
+    errors = {
+        shift: float(np.nanmedian(np.concatenate([i.errors_px(xyz, shift) for i in observed])))
+        if observed
+        else math.nan
+        for shift in (0.0, _HALF, -_HALF)
+    }
     centred = bool(cameras) and all(
         principal_point_px(c) == ((c.width - 1) / 2, (c.height - 1) / 2) for c in cameras
     )
@@ -131,23 +137,14 @@ def find_pixel_origin(
             where = "and every principal point is ((w-1)/2, (h-1)/2)"
         else:
             where = "and no principal point says otherwise"
-        fit = (
-            "keypoints and intrinsics fit each other as stored"
-            if images
-            else "no observation to compare with"
-        )
-        reason = f"{fit}, {where}"
+        fit = "keypoints and intrinsics fit each other as stored"
+        reason = f"{fit if images else 'no observation to compare with'}, {where}"
     shift_of_keypoints = _HALF if keypoints == "centre" else 0.0
     by_origin: dict[Origin, float] = {
         "corner": errors[shift_of_keypoints],
         "centre": errors[shift_of_keypoints - _HALF],
     }
     return PixelOrigin(intrinsics, keypoints, by_origin, reason)
-
-
-def _median_error(images: Sequence[ObservedKeypoints], xyz: Floats, shift_px: float) -> float:
-    errors = [image.errors_px(xyz, shift_px) for image in images if len(image.rows)]
-    return float(np.nanmedian(np.concatenate(errors))) if errors else float("nan")
 
 
 # of an image: camera, pose, observed pixels (M, 2) and points (M, 3)
@@ -176,7 +173,8 @@ def map_fault(images: Sequence[ObservedKeypoints], xyz: Floats) -> str | None:
     if len(images) > 2 and len(rounded) == 1:
         return f"all of {len(images)} images have one pose"
     errors = _errors_px(observed, lambda image: _as_it_is(image, xyz))
-    limits = [_limit_px(image.camera) for image in observed]
+    sides = (max(image.camera.width, image.camera.height) for image in observed)
+    limits = [max(_MIN_LIMIT_PX, _MAX_SHARE * side) for side in sides]
     failing = sum(not error <= limit for error, limit in zip(errors, limits, strict=True))
     if failing <= _MAX_FAILING * len(observed):
         return None
@@ -213,10 +211,6 @@ def camera_fault(camera: Camera) -> str | None:
         farthest = max(ratios.tolist(), key=lambda ratio: abs(math.log(max(ratio, 1e-6))))
         return f"its distortion moves pixels by a factor of {farthest:.2g}"
     return None
-
-
-def _limit_px(camera: Camera) -> float:
-    return max(_MIN_LIMIT_PX, _MAX_SHARE * max(camera.width, camera.height))
 
 
 def _as_it_is(image: ObservedKeypoints, xyz: Floats) -> _View:

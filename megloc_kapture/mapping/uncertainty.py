@@ -92,10 +92,7 @@ def point_deviations(covariances: Floats) -> Floats:
 
 
 def _by_point(
-    point_ids: NDArray[np.integer],
-    image_ids: NDArray[np.integer],
-    num_points: int,
-    num_images: int,
+    point_ids: NDArray[np.integer], image_ids: NDArray[np.integer], num_points: int, num_images: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
     """First observation of each point (N + 1,), and the images (O,) in that order.
 

@@ -312,30 +312,19 @@ def extract_variants(
         if len(features.keypoints_px) == 0:
             skipped[variant] = "no keypoints"
             continue
-        found.append(_checked(variant, features, width, height, like))
+        px, columns = features.keypoints_px, like.keypoints_px.shape[1]
+        values = like.descriptors.shape[1]
+        if px.shape[1] < columns or features.descriptors.shape[1] != values:
+            raise DataError(
+                f"the image's features have {columns} numbers per keypoint and {values} per "
+                f"descriptor, the extractor's {px.shape[1]} and {features.descriptors.shape[1]}"
+            )
+        size = variant.size(width, height)
+        own = ImageFeatures(px[:, :columns], features.descriptors, *size)
+        original_px = px[:, :columns].copy()
+        original_px[:, :2] = variant.px_in_original(px[:, :2], width, height)
+        found.append(VariantFeatures(variant, own, original_px))
     return found, skipped
-
-
-def _checked(
-    variant: ImageVariant,
-    features: LocalFeatures,
-    width: int,
-    height: int,
-    like: ImageFeatures,
-) -> VariantFeatures:
-    columns, values = like.keypoints_px.shape[1], like.descriptors.shape[1]
-    sizes = features.keypoints_px.shape[1], features.descriptors.shape[1]
-    if sizes[0] < columns or sizes[1] != values:
-        raise DataError(
-            f"the image's features have {columns} numbers per keypoint and {values} per "
-            f"descriptor, the extractor's {sizes[0]} and {sizes[1]}"
-        )
-    keypoints = features.keypoints_px[:, :columns].copy()
-    keypoints[:, :2] = variant.px_in_original(features.keypoints_px[:, :2], width, height)
-    own = ImageFeatures(
-        features.keypoints_px[:, :columns], features.descriptors, *variant.size(width, height)
-    )
-    return VariantFeatures(variant, own, keypoints)
 
 
 def match_variants(

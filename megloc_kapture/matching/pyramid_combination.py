@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 from megloc_kapture.matching.guided_pyramid import PairMatches, VariantMatches
 
 SAME_KEYPOINT_PX = 1.0
+Float32 = NDArray[np.float32]
 
 
 TriedVariant = tuple[int, VariantMatches]
@@ -136,10 +137,10 @@ class KeypointUnion:
     nearest, of equals the first), and never adds a row.
     """
 
-    def __init__(self, base: NDArray[np.float32], added: NDArray[np.float32] | None = None) -> None:
+    def __init__(self, base: Float32, added: Float32 | None = None) -> None:
         self._base = base
         self._tree = cKDTree(base[:, :2]) if len(base) else None
-        self._added: list[NDArray[np.float32]] = []
+        self._added: list[Float32] = []
         self._rows_in: dict[tuple[int, int], list[int]] = defaultdict(list)
         for keypoint in () if added is None else added:
             self.append(keypoint)
@@ -147,7 +148,7 @@ class KeypointUnion:
     def __len__(self) -> int:
         return len(self._base) + len(self._added)
 
-    def find(self, keypoints_px: NDArray[np.float32]) -> NDArray[np.int64]:
+    def find(self, keypoints_px: Float32) -> NDArray[np.int64]:
         """Row (K,) of the keypoint that stands where each of (K, C) does, -1 where none does."""
         found = np.full(len(keypoints_px), -1, dtype=np.int64)
         if self._tree is not None and len(keypoints_px):
@@ -161,7 +162,7 @@ class KeypointUnion:
             found[k] = self.find_added(keypoints_px[k])
         return found
 
-    def find_added(self, keypoint_px: NDArray[np.float32]) -> int:
+    def find_added(self, keypoint_px: Float32) -> int:
         """As :meth:`find` of one keypoint (C,), among those that were added."""
         x, y = _cell(keypoint_px)
         rows = [
@@ -172,7 +173,7 @@ class KeypointUnion:
         near = [row for row in sorted(rows) if self._distance(keypoint_px, row) <= SAME_KEYPOINT_PX]
         return self._nearest(keypoint_px, near) if near else -1
 
-    def append(self, keypoint_px: NDArray[np.float32]) -> int:
+    def append(self, keypoint_px: Float32) -> int:
         """Add a keypoint (C,) that stands nowhere yet; its row."""
         row = len(self)
         self._added.append(np.array(keypoint_px, dtype=np.float32))
@@ -184,26 +185,26 @@ class KeypointUnion:
         while len(self) > length:
             self._rows_in[_cell(self._added.pop())].pop()
 
-    def added(self) -> NDArray[np.float32]:
+    def added(self) -> Float32:
         """The keypoints that were added, float32 (M, C)."""
         if not self._added:
             return np.zeros((0, self._base.shape[1]), dtype=np.float32)
         return np.stack(self._added)
 
-    def keypoints_px(self) -> NDArray[np.float32]:
+    def keypoints_px(self) -> Float32:
         """All keypoints, float32 (N + M, C)."""
         return np.concatenate([self._base, self.added()])
 
-    def _nearest(self, keypoint_px: NDArray[np.float32], rows: list[int]) -> int:
+    def _nearest(self, keypoint_px: Float32, rows: list[int]) -> int:
         return min(rows, key=lambda row: (self._distance(keypoint_px, row), row))
 
-    def _distance(self, keypoint_px: NDArray[np.float32], row: int) -> float:
+    def _distance(self, keypoint_px: Float32, row: int) -> float:
         n = len(self._base)
         there = self._base[row] if row < n else self._added[row - n]
         dx, dy = (float(keypoint_px[k]) - float(there[k]) for k in (0, 1))
         return float(np.hypot(dx, dy))
 
 
-def _cell(keypoint_px: NDArray[np.float32]) -> tuple[int, int]:
+def _cell(keypoint_px: Float32) -> tuple[int, int]:
     """The square of a pixel's size that a keypoint stands in."""
     return int(np.floor(keypoint_px[0])), int(np.floor(keypoint_px[1]))

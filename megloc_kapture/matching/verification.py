@@ -94,11 +94,7 @@ def ray_slopes(camera: Camera, keypoints_px: NDArray[np.floating[Any]], rays: Fl
 
 
 def sampson_error_px(
-    rays_a: Floats,
-    slopes_a: Floats,
-    rays_b: Floats,
-    slopes_b: Floats,
-    b_from_a: RigidTransform,
+    rays_a: Floats, slopes_a: Floats, rays_b: Floats, slopes_b: Floats, b_from_a: RigidTransform
 ) -> Floats:
     """Sampson distance in pixels (N,) of matched rays (N, 3), last component 1, see above.
 
@@ -278,10 +274,7 @@ def known_pose_of_variants(
 
 
 def relative_pose(
-    rays: Floats,
-    other_rays: Floats,
-    focal: float,
-    options: TwoViewOptions,
+    rays: Floats, other_rays: Floats, focal: float, options: TwoViewOptions
 ) -> RigidTransform | None:
     """Estimate ``other_from_image`` of matched rays, with a translation of length 1, by RANSAC.
 

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -171,13 +172,22 @@ def find_unchanging_region(sequence: Iterable[Float32]) -> UnchangingRegion:
     Of :func:`edge_directions` of at least MIN_IMAGES images, else it is a ValueError, of one camera
     that moved between them.
     """
-    total, lengths, squares, count = _sums(sequence)
+    total: Any
+    total = lengths = squares = np.float32(0)
+    count = 0
+    for directions in sequence:
+        length = np.linalg.norm(directions, axis=-1)
+        total, lengths, squares = total + directions, lengths + length, squares + length**2
+        count += 1
     if count < MIN_IMAGES:
         raise ValueError(f"{count} images; at least {MIN_IMAGES} are needed")
     # of all pairs of different images: products of their directions, and of the lengths alone
     agreeing = np.square(total).sum(axis=-1) - squares
     present = np.square(lengths) - squares
-    wide, narrow = (_share(agreeing, present, window) for window in (_WIDE_PX, _NARROW_PX))
+    wide, narrow = (
+        _mean(agreeing, window) / np.maximum(_mean(present, window), 1e-6)
+        for window in (_WIDE_PX, _NARROW_PX)
+    )
     persistent = np.minimum(wide, narrow) >= _MIN_AGREEMENT
     strength = _mean(present, _WIDE_PX)
     changing = (wide < _CHANGING_AGREEMENT) & (strength > _CHANGING_STRENGTH * np.median(strength))
@@ -193,30 +203,10 @@ def find_unchanging_region(sequence: Iterable[Float32]) -> UnchangingRegion:
     return UnchangingRegion(tuple(float(top) for top in tops / height))
 
 
-def _sums(sequence: Iterable[Float32]) -> tuple[Float32, Float32, Float32, int]:
-    """Sums over the images: directions (h, w, 2), their lengths (h, w), lengths squared."""
-    total = lengths = squares = np.zeros(0, np.float32)
-    count = 0
-    for directions in sequence:
-        length = np.linalg.norm(directions, axis=-1)
-        if count == 0:
-            total, lengths = np.zeros_like(directions), np.zeros_like(length)
-            squares = np.zeros_like(length)
-        total = total + directions
-        lengths = lengths + length
-        squares = squares + length**2
-        count += 1
-    return total, lengths, squares, count
-
-
 def _mean(values: Float32, window: int) -> Float32:
     import cv2
 
     return np.asarray(cv2.blur(values, (window, window)))
-
-
-def _share(part: Float32, whole: Float32, window: int) -> Float32:
-    return np.asarray(_mean(part, window) / np.maximum(_mean(whole, window), 1e-6))
 
 
 def _column_tops(persistent: NDArray[np.bool_], changing: NDArray[np.bool_]) -> NDArray[np.int64]:

@@ -37,7 +37,8 @@ _MOST_ROWS = 1 << 14  # of a block, however short they are
 _CACHED_ELEMENTS = 1 << 18  # of similarities ranked at once: 1 MiB, which a cache holds
 Permitted = NDArray[np.bool_] | Callable[[int, int], NDArray[np.bool_]] | None
 Matrices = Sequence[NDArray[np.floating[Any]]]
-Found = tuple[NDArray[np.int64], NDArray[np.float32]]
+Float32 = NDArray[np.float32]
+Found = tuple[NDArray[np.int64], Float32]
 _GROUP = 8  # columns of which only the best is looked at first
 _NOTHING = np.iinfo(np.int64).max  # sorts last
 _SIGN = np.int32(0x7FFFFFFF)
@@ -77,45 +78,12 @@ def rank_by_similarity(
     return found
 
 
-def rank_fused(
-    queries: Sequence[NDArray[np.floating[Any]]],
-    database: Sequence[VectorSource],
-    top_k: int,
-    *,
-    fusion: FusionOptions,
-    weights: Sequence[float] | None = None,
-    permitted: Permitted = None,
-) -> Found:
-    """The ``top_k`` best database rows of each query row by several features together.
-
-    Parameters
-    ----------
-    queries : per feature float (Q, D_i), rows of unit length or zero.
-    database : per feature float (M, D_i), or a source of blocks of them.
-    top_k, permitted : as of :func:`rank_by_similarity`.
-    fusion : the method, of similarities or of ranks. One feature alone is not fused.
-    weights : one per feature, positive; all equal by default.
-
-    Returns
-    -------
-    indices, scores : as of :func:`rank_by_similarity`; scores as the fusion makes them.
-
-    Raises
-    ------
-    DataError : different dimensions or numbers of rows, or values that are not finite.
-    OptionError : weights that cannot be used, or other features than those of the queries.
-    """
-    search = FusedSearch(top_k, fusion, weights)
-    return search.ranking([search.lists(queries, database, permitted)])
-
-
 @dataclass(frozen=True)
 class FusedSearch:
-    """What :func:`rank_fused` does, part by part of a database.
+    """The ``top_k`` best database rows of queries by several features, part by part of a database.
 
-    Attributes
-    ----------
-    top_k, fusion, weights : as of that function.
+    ``fusion`` is of similarities or of ranks; one feature alone is not fused. The weights are
+    positive, one per feature; all equal by default.
     """
 
     top_k: int
@@ -128,11 +96,12 @@ class FusedSearch:
         database: Sequence[VectorSource],
         permitted: Permitted = None,
     ) -> list[Found]:
-        """What is kept of a part: a ranking, or of methods that fuse ranks one per feature.
+        """Rank the rows of a part: one ranking, or of methods that fuse ranks one per feature.
 
-        Raises
-        ------
-        DataError, OptionError : as of :func:`rank_fused`.
+        Per feature queries are float (Q, D_i), rows of unit length or zero, the database float
+        (M, D_i), or a source of blocks of them. Raises DataError for different dimensions or
+        numbers of rows, or values that are not finite; OptionError for weights that cannot be used,
+        or other features than those of the queries.
         """
         if len(queries) == 0 or len(queries) != len(database):
             raise OptionError(
@@ -156,7 +125,8 @@ class FusedSearch:
         return _search(queries, database, lengths, lambda matrices: matrices, permitted)
 
     def ranking(self, parts: Sequence[Sequence[Found]]) -> Found:
-        """The ranking of the whole, from the lists of its parts, whose rows are the whole's."""
+        """Rank the whole, as :func:`rank_by_similarity`, from the lists of its parts, whose rows
+        are the whole's; scores are as the fusion makes them."""
         lists = [_merged(found, self._list_length()) for found in zip(*parts, strict=True)]
         if len(lists) == 1:
             indices, scores = lists[0]
@@ -230,7 +200,7 @@ def _search(
     return [ranking.result() for ranking in best]
 
 
-def _checked(queries: NDArray[np.floating[Any]], source: VectorBlocks) -> NDArray[np.float32]:
+def _checked(queries: NDArray[np.floating[Any]], source: VectorBlocks) -> Float32:
     rows = np.ascontiguousarray(queries, dtype=np.float32)
     if rows.ndim != 2 or rows.shape[1] != source.dimension:
         of_map = (len(source), source.dimension)
@@ -243,12 +213,8 @@ def _checked(queries: NDArray[np.floating[Any]], source: VectorBlocks) -> NDArra
 
 
 def _similarities(
-    queries: NDArray[np.float32],
-    rows: NDArray[np.float32],
-    first_row: int,
-    out: NDArray[np.float32],
-    finite: bool,
-) -> NDArray[np.float32]:
+    queries: Float32, rows: Float32, first_row: int, out: Float32, finite: bool
+) -> Float32:
     """Inner products (q, b), in the flat memory of ``out``; ``finite`` rows are known to be."""
     shape = (len(queries), len(rows))
     products = out[: shape[0] * shape[1]].reshape(shape)
@@ -309,13 +275,13 @@ class BestRows:
         merged.sort(axis=1)
         keys[:] = merged[:, :top_k]
 
-    def result(self) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    def result(self) -> tuple[NDArray[np.int64], Float32]:
         """Indices int64 (Q, top_k), best first, and scores; -1 and -inf where fewer rows came."""
         indices = np.where(self._keys == _NOTHING, -1, self._keys & 0xFFFFFFFF)
         return indices, _scores(self._keys)
 
 
-def _keys(scores: NDArray[np.float32], rows: NDArray[np.int64]) -> NDArray[np.int64]:
+def _keys(scores: Float32, rows: NDArray[np.int64]) -> NDArray[np.int64]:
     """Integers (..., b) in whose order scores fall and, of equal ones, database rows (b,) rise."""
     # the two zeros are equal; a negative number's other bits grow as it falls
     bits = (scores + np.float32(0)).view(np.int32)
@@ -325,7 +291,7 @@ def _keys(scores: NDArray[np.float32], rows: NDArray[np.int64]) -> NDArray[np.in
     return keys
 
 
-def _scores(keys: NDArray[np.int64]) -> NDArray[np.float32]:
+def _scores(keys: NDArray[np.int64]) -> Float32:
     rising = np.invert((keys >> 32).astype(np.int32))
     scores = (rising ^ ((rising >> 31) & _SIGN)).view(np.float32)
     return np.where(keys == _NOTHING, np.float32(-np.inf), scores)
@@ -370,7 +336,7 @@ class QuantizedRows:
         for start in range(0, len(rows), step):
             self._index.add(rows.read(start, min(start + step, len(rows))))
 
-    def nearest(self, queries: NDArray[np.float32], count: int) -> NDArray[np.int64]:
+    def nearest(self, queries: Float32, count: int) -> NDArray[np.int64]:
         """The ``count`` rows (Q, count) whose codes are most similar to each query (Q, D)."""
         found: NDArray[np.int64] = self._index.search(np.ascontiguousarray(queries), count)[1]
         return found
@@ -416,7 +382,7 @@ def _stacked(rankings: Sequence[Found]) -> Found:
     return found, scores
 
 
-def _picked(source: VectorBlocks, rows: NDArray[np.int64]) -> NDArray[np.float32]:
+def _picked(source: VectorBlocks, rows: NDArray[np.int64]) -> Float32:
     """Some rows of a source, rising; neighbours are read at once."""
     found = np.empty((len(rows), source.dimension), np.float32)
     starts = np.flatnonzero(np.diff(rows, prepend=-2) != 1)

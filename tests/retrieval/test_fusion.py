@@ -25,7 +25,7 @@ from megloc_kapture.retrieval.fusion import (
     fuse_rankings,
     greedy_coverage,
 )
-from megloc_kapture.retrieval.search import rank_by_similarity, rank_fused
+from megloc_kapture.retrieval.search import Found, FusedSearch, rank_by_similarity
 from megloc_kapture.retrieval.vectors import ConcatenatedBlocks
 
 needs_kapture_localization = pytest.mark.skipif(
@@ -33,6 +33,14 @@ needs_kapture_localization = pytest.mark.skipif(
     reason="kapture-localization is not installed (make test installs it)",
 )
 Matrices = list[NDArray[np.float64]]
+
+
+def rank_fused(
+    queries: Any, database: Any, top_k: int, *, fusion: FusionOptions, weights: Any = None,
+    permitted: Any = None,
+) -> Found:  # fmt: skip
+    search = FusedSearch(top_k, fusion, weights)
+    return search.ranking([search.lists(queries, database, permitted)])
 
 
 def theirs(matrices: Matrices, method: str, **parameters: Any) -> NDArray[np.float64]:

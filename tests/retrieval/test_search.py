@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,14 +16,22 @@ from megloc_kapture.retrieval import search
 from megloc_kapture.retrieval.fusion import FusionOptions, fuse
 from megloc_kapture.retrieval.search import (
     BestRows,
+    Found,
     FusedSearch,
     QuantizedRows,
     rank_by_similarity,
-    rank_fused,
     short_lists,
 )
 from megloc_kapture.stages.candidates import Candidates, QueryPairsOptions, Retrieval
 from megloc_kapture.values import RigidTransform
+
+
+def rank_fused(
+    queries: Any, database: Any, top_k: int, *, fusion: FusionOptions, weights: Any = None,
+    permitted: Any = None,
+) -> Found:  # fmt: skip
+    search = FusedSearch(top_k, fusion, weights)
+    return search.ranking([search.lists(queries, database, permitted)])
 
 
 def full_sort(
