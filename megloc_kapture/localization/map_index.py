@@ -91,17 +91,6 @@ class MapIndex:
         part = slice(self.offsets[row], self.offsets[row + 1])
         return self.keypoint_ids[part], self.point_ids[part]
 
-    def points_of_keypoints(self, image: str, keypoint_ids: Integers) -> NDArray[np.int64]:
-        """Point row of each keypoint of a map image, -1 where it observes none; int64 (K,)."""
-        keypoints, points = self.observed(image)
-        found = np.full(len(keypoint_ids), -1, dtype=np.int64)
-        if len(keypoints) == 0 or len(keypoint_ids) == 0:
-            return found
-        rows = np.minimum(np.searchsorted(keypoints, keypoint_ids), len(keypoints) - 1)
-        hit = keypoints[rows] == keypoint_ids
-        found[hit] = points[rows[hit]]
-        return found
-
     def seen_by(self, images: Sequence[str]) -> Floats:
         """The points that some of the images observe, each once, (K, 3)."""
         seen = np.zeros(len(self.xyz), dtype=np.bool_)

@@ -191,10 +191,6 @@ class KeypointUnion:
             return np.zeros((0, self._base.shape[1]), dtype=np.float32)
         return np.stack(self._added)
 
-    def keypoints_px(self) -> Float32:
-        """All keypoints, float32 (N + M, C)."""
-        return np.concatenate([self._base, self.added()])
-
     def _nearest(self, keypoint_px: Float32, rows: list[int]) -> int:
         return min(rows, key=lambda row: (self._distance(keypoint_px, row), row))
 
