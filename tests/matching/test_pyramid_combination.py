@@ -199,5 +199,5 @@ def test_whatever_is_tried(
     if mode == "all" or combined.best is None:
         assert found[:4].tolist() == base[0].tolist()
     if mode == "max":
-        most = max([len(each.matches) for each in tried], default=0)
+        most = max([len(each) for _, each in tried], default=0)
         assert combined.best is None or len(tried[combined.best][1]) == most > 4
