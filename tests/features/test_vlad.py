@@ -79,9 +79,7 @@ def test_soft_weights_are_equation_one(seed: int, alpha: float) -> None:
     squared = ((data[:, None] - centres) ** 2).sum(axis=2)
     powers = np.exp(-alpha * (squared - squared.min(axis=1, keepdims=True)))
     np.testing.assert_allclose(
-        soft_assignment(data, centres, alpha),
-        powers / powers.sum(axis=1, keepdims=True),
-        atol=1e-9,
+        soft_assignment(data, centres, alpha), powers / powers.sum(axis=1, keepdims=True), atol=1e-9
     )
 
 

@@ -66,8 +66,7 @@ def test_a_quaternion_and_its_negative_are_one_rotation(seed: int, signs: tuple[
     first, _ = random_poses(seed)
     second, _ = random_poses(seed + 1)
     np.testing.assert_array_equal(
-        rotation_angles_deg(signs[0] * first, signs[1] * second),
-        rotation_angles_deg(first, second),
+        rotation_angles_deg(signs[0] * first, signs[1] * second), rotation_angles_deg(first, second)
     )
 
 

@@ -69,9 +69,7 @@ def matches(shares: dict[str, int]) -> list[ImageMatches]:
 
 
 def view(
-    shares: dict[str, int],
-    cam_from_rig: RigidTransform = ALONE,
-    name: str = "q",
+    shares: dict[str, int], cam_from_rig: RigidTransform = ALONE, name: str = "q"
 ) -> QueryView:
     xyz = points()
     seen = project(CAMERA, cam_from_rig @ TRUTH, xyz[:PER_PLACE]).astype(np.float32)

@@ -32,11 +32,7 @@ ALONE = RigidTransform.identity()
 
 
 def remark(
-    factor: float,
-    *,
-    outliers: int = 100,
-    noise_px: float = 1.0,
-    seed: int = 0,
+    factor: float, *, outliers: int = 100, noise_px: float = 1.0, seed: int = 0
 ) -> str | None:
     """Of a facade with 4 m of relief, 10 m away, by a camera that is said to be that longer."""
     rng = np.random.default_rng(seed)

@@ -154,16 +154,11 @@ def greedy(matches: list[tuple[int, int, float, int]]) -> list[tuple[int, int, i
 
 
 def resolve_by_numpy(
-    keypoint_ids: NDArray[np.int64],
-    point_ids: NDArray[np.int64],
-    similarities: NDArray[np.float64],
+    keypoint_ids: NDArray[np.int64], point_ids: NDArray[np.int64], similarities: NDArray[np.float64]
 ) -> list[tuple[int, int, int]]:
     """How it was done before it was compiled."""
     pairs, inverse, support = np.unique(
-        np.stack([keypoint_ids, point_ids], axis=1),
-        axis=0,
-        return_inverse=True,
-        return_counts=True,
+        np.stack([keypoint_ids, point_ids], axis=1), axis=0, return_inverse=True, return_counts=True
     )
     best = np.full(len(pairs), -np.inf)
     np.maximum.at(best, inverse.reshape(-1), similarities)

@@ -145,9 +145,7 @@ def test_derivatives_are_finite_differences(model: str) -> None:
         cam_from_world = view.cam_from_rig @ pose
         for point, matrix in zip(view.points_world, matrices, strict=True):
             by_point = approx_fprime(
-                point,
-                lambda p, v=view, c=cam_from_world: project(v.camera, c, p[None])[0],
-                1e-6,
+                point, lambda p, v=view, c=cam_from_world: project(v.camera, c, p[None])[0], 1e-6
             )
             spread = np.eye(2) + by_point @ matrix @ by_point.T
             cholesky[row] = np.linalg.cholesky(spread)

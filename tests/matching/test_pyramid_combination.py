@@ -8,15 +8,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from megloc_kapture.matching.guided_pyramid import (
-    ImageVariant,
-    VariantMatches,
-)
-from megloc_kapture.matching.pyramid_combination import (
-    SAME_KEYPOINT_PX,
-    KeypointUnion,
-    combine,
-)
+from megloc_kapture.matching.guided_pyramid import ImageVariant, VariantMatches
+from megloc_kapture.matching.pyramid_combination import SAME_KEYPOINT_PX, KeypointUnion, combine
 
 # a grid of quarter pixels: distances of exactly one pixel, and equal ones, are common
 POSITIONS = st.lists(
@@ -125,10 +118,7 @@ def test_all_is_what_was_there_and_what_is_new() -> None:
 
 def test_variants_of_both_images_add_to_both() -> None:
     first, second = KeypointUnion(grid(3)), KeypointUnion(grid(4))
-    tried = [
-        (0, variant_matches([(5, 5)], [3])),
-        (1, variant_matches([(6, 6), (7, 60)], [2, 1])),
-    ]
+    tried = [(0, variant_matches([(5, 5)], [3])), (1, variant_matches([(6, 6), (7, 60)], [2, 1]))]
     combined = combine(BASE, tried, "all", (first, second))
     # the richer one first; row 1 of the first image has a match
     assert combined.matches.tolist() == [[0, 0], [1, 1], [2, 4], [3, 3]]
