@@ -44,7 +44,7 @@ from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.localization import confidence
 from megloc_kapture.localization.confidence import TERMS
 from megloc_kapture.pipeline.localizer import Localizer
-from megloc_kapture.preprocessing.resampling import scaled_camera
+from megloc_kapture.preprocessing.frames import scaled_camera
 from megloc_kapture.values import Camera, Pose, RigidTransform
 
 MAX_ERROR, MAX_ANGLE_DEG = 0.1, 10.0

@@ -35,9 +35,8 @@ from corridor_scene import ROOM_DISTANCE_M, Seen, write_corridor
 from mapped_scene import Query, Scene, errors, hypotheses, read_scene
 from scenes import megloc
 
-from megloc_kapture.localization.absolute_pose import absolute_pose
-from megloc_kapture.localization.clusters import ClusterOptions
-from megloc_kapture.localization.estimation import AbsolutePoseOptions
+from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions, absolute_pose
+from megloc_kapture.localization.cluster_poses import ClusterOptions
 from megloc_kapture.localization.map_index import observed_matches
 from megloc_kapture.localization.ranking import (
     DistinctiveInliers,

@@ -28,7 +28,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.geometry.image_variants import ImageVariant
 from megloc_kapture.io.colmap import TriangulationOptions
 from megloc_kapture.io.csv_table import read_csv_table
 from megloc_kapture.io.images import read_image_rgb, write_image
@@ -39,7 +38,7 @@ from megloc_kapture.io.kapture import (
     Sensor,
     write_sensors,
 )
-from megloc_kapture.matching.guided_pyramid import GuidedPyramidOptions, pyramid_type
+from megloc_kapture.matching.guided_pyramid import GuidedPyramidOptions, ImageVariant, pyramid_type
 from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
 from megloc_kapture.plugin_loading import load_plugin

@@ -11,10 +11,13 @@ from numpy.typing import NDArray
 
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.kapture import KaptureFolder, read_pairs
-from megloc_kapture.localization.cluster_poses import localize_in_clusters
-from megloc_kapture.localization.clusters import ClusterOptions, cluster_candidates
-from megloc_kapture.localization.estimation import AbsolutePoseOptions
-from megloc_kapture.localization.query_views import QueryView, TypedMatches
+from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions
+from megloc_kapture.localization.cluster_poses import (
+    ClusterOptions,
+    cluster_candidates,
+    localize_in_clusters,
+)
+from megloc_kapture.localization.map_index import QueryView, TypedMatches
 from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.plugins import PoseHypothesis
 from megloc_kapture.stages.matches import iterate_candidates

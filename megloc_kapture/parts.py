@@ -13,8 +13,7 @@ from megloc_kapture.errors import OptionError, suggestion
 from megloc_kapture.features.image_bound import extract_bounded
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.localization.absolute_pose import absolute_pose
-from megloc_kapture.localization.estimation import AbsolutePoseOptions
+from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions, absolute_pose
 from megloc_kapture.pipeline.presets import options_with
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS

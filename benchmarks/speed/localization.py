@@ -74,17 +74,18 @@ from megloc_kapture.io.kapture import (  # noqa: E402
     write_points3d,
     write_sensors,
 )
-from megloc_kapture.localization.cluster_poses import localize_in_clusters  # noqa: E402
-from megloc_kapture.localization.clusters import (  # noqa: E402
+from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions
+from megloc_kapture.localization.cluster_poses import (  # noqa: E402
     ClusterOptions,
     cluster_candidates,
+    localize_in_clusters,  # noqa: E402
 )
-from megloc_kapture.localization.estimation import AbsolutePoseOptions  # noqa: E402
-from megloc_kapture.localization.map_index import (
+from megloc_kapture.localization.map_index import (  # noqa: E402
     MapIndex,  # noqa: E402
+    QueryView,
+    TypedMatches,
     observed_matches,  # noqa: E402
 )
-from megloc_kapture.localization.query_views import QueryView, TypedMatches  # noqa: E402
 from megloc_kapture.values import Pose  # noqa: E402
 
 NUM_CANDIDATES = 20

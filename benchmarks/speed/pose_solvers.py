@@ -27,8 +27,10 @@ from numpy.typing import NDArray  # noqa: E402
 from timing import table  # noqa: E402
 
 from megloc_kapture.geometry.cameras import bearing_rays, focal_px, project  # noqa: E402
-from megloc_kapture.localization.absolute_pose import absolute_pose  # noqa: E402
-from megloc_kapture.localization.estimation import AbsolutePoseOptions  # noqa: E402
+from megloc_kapture.localization.absolute_pose import (
+    AbsolutePoseOptions,
+    absolute_pose,  # noqa: E402
+)
 from megloc_kapture.values import Camera, Pose, RigidTransform  # noqa: E402
 
 Array = NDArray[np.float64]

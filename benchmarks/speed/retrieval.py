@@ -51,8 +51,12 @@ from megloc_kapture.io.kapture import (
 )
 from megloc_kapture.io.kapture.vectors import KaptureVectors
 from megloc_kapture.retrieval.fusion import FusionOptions
-from megloc_kapture.retrieval.search import FusedSearch, rank_by_similarity
-from megloc_kapture.retrieval.short_list import QuantizedRows, short_lists
+from megloc_kapture.retrieval.search import (
+    FusedSearch,
+    QuantizedRows,
+    rank_by_similarity,
+    short_lists,
+)
 from megloc_kapture.values import Camera, RigidTransform
 
 TYPE = "generated"

@@ -29,7 +29,7 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.io.files import check_component, link_records, safe_join
 from megloc_kapture.io.images import image_size, write_depth_map
 from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
-from megloc_kapture.preprocessing.resampling import scaled_camera
+from megloc_kapture.preprocessing.frames import scaled_camera
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, Options, RigidTransform
 

@@ -31,11 +31,7 @@ from megloc_kapture.nets.score_maps import (
 from megloc_kapture.values import LocalFeatures
 
 _BORDER_PX = 5
-_NOTHING = (
-    np.zeros((0, 3), np.float32),
-    np.zeros(0, np.float32),
-    torch.zeros(0, DESCRIPTOR_SIZE),
-)
+_NOTHING = (np.zeros((0, 3), np.float32), np.zeros(0, np.float32), torch.zeros(0, DESCRIPTOR_SIZE))
 # the image pyramid of the authors
 _SCALE_STEP = math.sqrt(0.5)
 _SMALLEST_SCALE = 0.3

@@ -49,13 +49,10 @@ class ColmapSift:
     def extract(
         self, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
     ) -> LocalFeatures:
-        """Extract from an RGB image; scores are the scales, by which COLMAP selects.
+        """Extract from an RGB image, uint8 (H, W, 3); scores are scales, by which COLMAP selects.
 
-        Parameters
-        ----------
-        image : uint8 (H, W, 3), RGB.
-        mask : bool (H, W) or None; keypoints on False pixels are dropped before the coarsest are
-            selected, exactly ``max_keypoints`` of them where there are so many.
+        Keypoints on False pixels of the mask (H, W) are dropped before the coarsest are selected,
+        exactly ``max_keypoints`` of them where there are so many.
         """
         options = self.options
         masked = mask is not None and not mask.all()

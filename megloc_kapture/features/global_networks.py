@@ -8,10 +8,9 @@ and Masone, CVPR Workshops 2025).
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch
@@ -56,15 +55,19 @@ class GlobalNetworkOptions(NetworkOptions):
 GlobalOptions = TypeVar("GlobalOptions", bound=GlobalNetworkOptions)
 
 
-class GlobalNetwork(Checkpointed[GlobalOptions], ABC):
+class GlobalNetwork(Checkpointed[GlobalOptions]):
     """Global features by a network with a checkpoint.
 
     The type's name carries the model as well as the method, since vectors of different ones cannot
-    be compared.
+    be compared. A method says how its network is made (``_load``), what it sees of an image and
+    what it makes of a batch of them.
     """
 
     name: str
     method: ClassVar[str]
+    _load: Any  # makes the network of a checkpoint's tensors, the file's name and _load_with
+    _load_with: tuple[Any, ...] = ()
+    _channels_last: ClassVar[bool] = False
 
     def __init__(self, options: GlobalOptions | None = None) -> None:
         super().__init__(options)
@@ -74,19 +77,30 @@ class GlobalNetwork(Checkpointed[GlobalOptions], ABC):
     def describe(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
         """The vector of an RGB image, uint8 (H, W, 3): float32 (D,), unit length.
 
-        Raises
-        ------
-        DataError : the checkpoint does not fit, or the image is too small.
-        OptionError : the device is not there.
+        Raises DataError where the checkpoint does not fit, or the image is too small, OptionError
+        where the device is not there.
         """
         return self.describe_many([image])[0]
 
-    @abstractmethod
     def describe_many(self, images: Images) -> NDArray[np.float32]:
         """The vectors of images of one size, float32 (B, D), in their order, of one batch.
 
         As one by one but for rounding. Raises as :meth:`describe`.
         """
+        made = self.network(self._load, *self._load_with, channels_last=self._channels_last)
+        network, device = made
+        batch = torch.cat([self._seen(image, device) for image in images])
+        return self._vectors(network, batch).cpu().numpy()
+
+    def _seen(self, image: NDArray[np.uint8], device: torch.device) -> torch.Tensor:
+        """An image as the network sees it, (1, 3, h, w)."""
+        options: Any = self.options
+        return sized_tensor(image, options.max_size_px, device)
+
+    def _vectors(self, network: Any, batch: torch.Tensor) -> torch.Tensor:
+        with inference(batch.device, self.options.half_precision):
+            vectors: torch.Tensor = network(batch)
+            return vectors
 
 
 class NetVladOptions(GlobalNetworkOptions):
@@ -100,46 +114,32 @@ class NetVladOptions(GlobalNetworkOptions):
     )
 
 
-class NetVlad(GlobalNetwork[NetVladOptions]):
+class _VggNetVladNetwork(GlobalNetwork[GlobalOptions]):
+    def _vectors(self, network: VggNetVlad, batch: torch.Tensor) -> torch.Tensor:
+        """Only the convolutions are made in half precision; sums and whitening stay in float32."""
+        height, width = batch.shape[-2:]
+        if min(height, width) < STRIDE_PX:
+            raise DataError(
+                f"an image of {width}x{height} pixels as the network sees it cannot be described: "
+                f"it needs {STRIDE_PX} a side"
+            )
+        half_precision = self.options.half_precision
+        with inference(batch.device, half_precision):
+            features = network.features(batch).float()
+            # colours of 0 to 255 can take this trunk beyond what float16 holds
+            overflow = half_precision and not bool(features.isfinite().all())
+        with inference(batch.device):
+            if overflow:
+                features = network.features(batch)
+            return network.vectors(features)
+
+
+class NetVlad(_VggNetVladNetwork[NetVladOptions]):
     """NetVLAD on VGG-16 with its whitening: one vector of unit length, float32 (4096,)."""
 
     name = method = "netvlad"
     Options = NetVladOptions
-
-    def describe_many(self, images: Images) -> NDArray[np.float32]:
-        network, device = self.network(netvlad)
-        planes = [sized_tensor(image, self.options.max_size_px, device) for image in images]
-        return netvlad_vectors(network, planes, self.options.half_precision)
-
-
-def netvlad_vectors(
-    network: VggNetVlad,
-    images: Sequence[torch.Tensor],
-    half_precision: bool,
-) -> NDArray[np.float32]:
-    """Vectors (B, D) of unit length, of RGB images (1, 3, H, W) of one size, in [0, 1].
-
-    Only the convolutions are made in half precision; sums and whitening stay in float32.
-
-    Raises
-    ------
-    DataError : the images are less than 16 pixels a side.
-    """
-    device, (height, width) = images[0].device, images[0].shape[-2:]
-    if min(height, width) < STRIDE_PX:
-        raise DataError(
-            f"an image of {width}x{height} pixels as the network sees it cannot be described: "
-            f"it needs {STRIDE_PX} a side"
-        )
-    batch = torch.cat(list(images))
-    with inference(device, half_precision):
-        features = network.features(batch).float()
-        # colours of 0 to 255 can take this trunk beyond what float16 holds
-        overflow = half_precision and not bool(features.isfinite().all())
-    with inference(device):
-        if overflow:
-            features = network.features(batch)
-        return network.vectors(features).cpu().numpy()
+    _load = staticmethod(netvlad)
 
 
 class OpenIblOptions(GlobalNetworkOptions):
@@ -154,30 +154,27 @@ class OpenIblOptions(GlobalNetworkOptions):
     )
 
 
-class OpenIbl(GlobalNetwork[OpenIblOptions]):
+class OpenIbl(_VggNetVladNetwork[OpenIblOptions]):
     """OpenIBL's VGG-16 with NetVLAD and PCA: one vector of unit length, float32 (4096,)."""
 
     name = method = "openibl"
     Options = OpenIblOptions
+    _load = staticmethod(openibl)
 
-    def describe_many(self, images: Images) -> NDArray[np.float32]:
-        network, device = self.network(openibl)
-        planes = [self._resized(image, device) for image in images]
-        return netvlad_vectors(network, planes, self.options.half_precision)
-
-    def _resized(self, image: NDArray[np.uint8], device: torch.device) -> torch.Tensor:
+    def _seen(self, image: NDArray[np.uint8], device: torch.device) -> torch.Tensor:
         if self.options.max_size_px is None:
             return image_tensor(official_size(image), device)
-        return sized_tensor(image, self.options.max_size_px, device)
+        return super()._seen(image, device)
 
 
 def official_size(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The image, uint8 (480, 640, 3), as the authors resize it.
+    """The image, uint8 (480, 640, 3), as the authors resize it."""
+    return _bilinear(image, (_OPENIBL_WIDTH_PX, _OPENIBL_HEIGHT_PX))
 
-    Bilinear over all pixels that a smaller one covers, rounded to 8 bits.
-    """
-    size = (_OPENIBL_WIDTH_PX, _OPENIBL_HEIGHT_PX)
-    return np.asarray(Image.fromarray(image).resize(size, Image.Resampling.BILINEAR))
+
+def _bilinear(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
+    """Resize by Pillow's filter, over all pixels that a smaller one covers, rounded to 8 bits."""
+    return np.asarray(Image.fromarray(image).resize(size, Image.Resampling.BILINEAR), np.uint8)
 
 
 class ApGemOptions(GlobalNetworkOptions):
@@ -204,6 +201,16 @@ class ApGemOptions(GlobalNetworkOptions):
     )
 
 
+def _apgem_with_whitening(
+    tensors: Tensors, where: str, whitening: str, power: float
+) -> nn.ModuleList:
+    """The network, then the whitening of that name, if there is a name."""
+    modules: list[nn.Module] = [apgem_from(tensors, where)]
+    if whitening:
+        modules.append(whitening_from(tensors, whitening, where, power=power))
+    return nn.ModuleList(modules)
+
+
 class ApGem(GlobalNetwork[ApGemOptions]):
     """AP-GeM vectors of unit length, float32 (2048,).
 
@@ -213,34 +220,22 @@ class ApGem(GlobalNetwork[ApGemOptions]):
 
     name = method = "apgem"
     Options = ApGemOptions
+    _load = staticmethod(_apgem_with_whitening)
 
     def __init__(self, options: ApGemOptions | None = None) -> None:
         super().__init__(options)
+        self._load_with = self.options.whitening, self.options.whitening_power
         if self.options.whitening:
             self.name += f"-{self.options.whitening}-{self.options.whitening_power:g}"
 
-    def describe_many(self, images: Images) -> NDArray[np.float32]:
-        options = self.options
-        (net, *whitening), device = self.network(
-            _apgem_with_whitening, options.whitening, options.whitening_power
-        )
-        batch = torch.cat([sized_tensor(image, options.max_size_px, device) for image in images])
-        with inference(device, options.half_precision):
-            vectors = net.describe(batch)
-        with inference(device):
+    def _vectors(self, network: Any, batch: torch.Tensor) -> torch.Tensor:
+        net, *whitening = network
+        with inference(batch.device, self.options.half_precision):
+            vectors: torch.Tensor = net.describe(batch)
+        with inference(batch.device):
             for whiten in whitening:
                 vectors = whiten(vectors)
-        return vectors.cpu().numpy()
-
-
-def _apgem_with_whitening(
-    tensors: Tensors, where: str, whitening: str, power: float
-) -> nn.ModuleList:
-    """The network, then the whitening of that name, if there is a name."""
-    modules: list[nn.Module] = [apgem_from(tensors, where)]
-    if whitening:
-        modules.append(whitening_from(tensors, whitening, where, power=power))
-    return nn.ModuleList(modules)
+        return vectors
 
 
 class DelgOptions(GlobalNetworkOptions):
@@ -266,24 +261,25 @@ class Delg(GlobalNetwork[DelgOptions]):
 
     name = method = "delg"
     Options = DelgOptions
+    _load = staticmethod(delg_from)
 
-    def describe_many(self, images: Images) -> NDArray[np.float32]:
-        options = self.options
-        net, device = self.network(delg_from)
-        sized = np.stack([_with_longer_side(image, options.max_size_px) for image in images])
-        batch = torch.from_numpy(sized).to(device).permute(0, 3, 1, 2).float()
-        with inference(device, options.half_precision):
-            return describe(net, batch, options.scales).cpu().numpy()
+    def _seen(self, image: NDArray[np.uint8], device: torch.device) -> torch.Tensor:
+        sized = np.array(_with_longer_side(image, self.options.max_size_px))
+        return torch.from_numpy(sized).to(device)[None].permute(0, 3, 1, 2).float()
+
+    def _vectors(self, network: Any, batch: torch.Tensor) -> torch.Tensor:
+        with inference(batch.device, self.options.half_precision):
+            return describe(network, batch, self.options.scales)
 
 
 def _with_longer_side(image: NDArray[np.uint8], max_size_px: int | None) -> NDArray[np.uint8]:
-    """Made smaller as the authors do: Pillow's bilinear filter, which covers what it leaves out."""
+    """Make an image smaller as the authors do."""
     height, width = image.shape[:2]
     if max_size_px is None or max(height, width) <= max_size_px:
         return image
     scale = max_size_px / max(height, width)
     size = max(round(width * scale), 1), max(round(height * scale), 1)
-    return np.asarray(Image.fromarray(image).resize(size, Image.Resampling.BILINEAR), np.uint8)
+    return _bilinear(image, size)
 
 
 class EigenPlacesOptions(GlobalNetworkOptions):
@@ -307,13 +303,8 @@ class EigenPlaces(GlobalNetwork[EigenPlacesOptions]):
 
     name = method = "eigenplaces"
     Options = EigenPlacesOptions
-
-    def describe_many(self, images: Images) -> NDArray[np.float32]:
-        options = self.options
-        network, device = self.network(eigenplaces_from, channels_last=True)
-        batch = torch.cat([sized_tensor(image, options.max_size_px, device) for image in images])
-        with inference(device, options.half_precision):
-            return network(batch).cpu().numpy()
+    _load = staticmethod(eigenplaces_from)
+    _channels_last = True
 
 
 class MegaLocOptions(GlobalNetworkOptions):
@@ -336,16 +327,13 @@ class MegaLoc(GlobalNetwork[MegaLocOptions]):
 
     name = method = "megaloc"
     Options = MegaLocOptions
+    _load = staticmethod(megaloc_from)
 
     def __init__(self, options: MegaLocOptions | None = None) -> None:
         super().__init__(options)
         if self.options.size_px != _MEGALOC_SIZE_PX:
             self.name += f"-{self.options.size_px}px"
 
-    def describe_many(self, images: Images) -> NDArray[np.float32]:
-        options = self.options
-        network, device = self.network(megaloc_from)
+    def _seen(self, image: NDArray[np.uint8], device: torch.device) -> torch.Tensor:
         with inference(device):
-            batch = [squared(image_tensor(image, device), options.size_px) for image in images]
-        with inference(device, options.half_precision):
-            return network(torch.cat(batch)).cpu().numpy()
+            return squared(image_tensor(image, device), self.options.size_px)

@@ -64,11 +64,8 @@ def extract_bounded(extractor: Any, frames: Sequence[Frame]) -> list[LocalFeatur
     """Extract from images of one size, reduced where they are larger than the extractor's bound.
 
     x and y of the keypoints are those in the images as given; other columns, as a scale, are those
-    of the reduced ones. A pixel of a reduced mask is used where all that it covers is.
-
-    Parameters
-    ----------
-    extractor : a plugin of local features, that has ``extract_many`` where images are several.
+    of the reduced ones. A pixel of a reduced mask is used where all that it covers is. The
+    extractor is a plugin of local features that has ``extract_many`` where images are several.
     """
     bound = max_megapixels_of(extractor)
     small = [_reduced(*frame, bound) for frame in frames]

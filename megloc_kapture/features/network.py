@@ -41,18 +41,11 @@ class LocalNetwork(Checkpointed[LocalOptions], ABC):
     def extract(
         self, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
     ) -> LocalFeatures:
-        """Extract from an RGB image.
+        """Extract from an RGB image, uint8 (H, W, 3).
 
-        Parameters
-        ----------
-        image : uint8 (H, W, 3), RGB.
-        mask : bool (H, W) or None; keypoints on False pixels are removed after non-maximum
-            suppression, before the best are selected.
-
-        Raises
-        ------
-        DataError : the checkpoint does not fit.
-        OptionError : the device is not there.
+        Keypoints on False pixels of the mask (H, W) are removed after non-maximum suppression,
+        before the best are selected. Raises DataError where the checkpoint does not fit,
+        OptionError where the device is not there.
         """
         return self.extract_many([image], [mask])[0]
 
@@ -71,13 +64,10 @@ class LocalNetwork(Checkpointed[LocalOptions], ABC):
         size: tuple[int, ...],
         mask: NDArray[np.bool_] | None,
     ) -> LocalFeatures:
-        """The best of an image's keypoints.
+        """The best of an image's keypoints (N, 3): x and y in its pixels, and a third column.
 
-        Parameters
-        ----------
-        table : (N, 3), x and y in the image's pixels, and a third column.
-        describe : descriptors (K, D) of rows of the table, int64 (K,).
-        size : (H, W) of the image, and perhaps more.
+        ``describe`` gives descriptors (K, D) of rows of the table; ``size`` is (H, W) and perhaps
+        more.
         """
         rows, num_masked = select_keypoints(
             table[:, :2],

@@ -11,12 +11,7 @@ from pydantic import Field, model_validator
 from torch.nn import functional
 
 from megloc_kapture.features.network import Images, Level, LocalNetwork, LocalNetworkOptions, Masks
-from megloc_kapture.nets.r2d2 import (
-    DESCRIPTOR_SIZE,
-    R2D2Maps,
-    load_r2d2,
-    pyramid_levels,
-)
+from megloc_kapture.nets.r2d2 import DESCRIPTOR_SIZE, R2D2Maps, load_r2d2, pyramid_levels
 from megloc_kapture.nets.runtime import image_tensor, inference
 from megloc_kapture.nets.score_maps import window_maximum
 from megloc_kapture.values import LocalFeatures

@@ -20,9 +20,7 @@ class RootSiftOptions(BoundedOptions):
 
     max_keypoints: int = Field(default=5000, gt=0, description="strongest responses kept")
     contrast_threshold: float = Field(
-        default=0.01,
-        ge=0,
-        description="lower keeps weaker blobs (OpenCV's own default is 0.04)",
+        default=0.01, ge=0, description="lower keeps weaker blobs (OpenCV's own default is 0.04)"
     )
     edge_threshold: float = Field(default=10.0, gt=0)
     sigma_px: float = Field(default=1.6, gt=0, description="blur of the first octave")
@@ -43,13 +41,9 @@ class RootSift:
     def extract(
         self, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
     ) -> LocalFeatures:
-        """Extract from an RGB image.
+        """Extract from an RGB image, uint8 (H, W, 3).
 
-        Parameters
-        ----------
-        image : uint8 (H, W, 3), RGB.
-        mask : bool (H, W) or None; keypoints on False pixels are dropped before the strongest
-            are selected.
+        Keypoints on False pixels of the mask (H, W) are dropped before the strongest are selected.
         """
         options = self.options
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
@@ -65,11 +59,13 @@ class RootSift:
             True,  # precise upscaling: without it the first octave is shifted by a quarter pixel
         )
         keypoints, descriptors = sift.detectAndCompute(gray, None)
-        usable = range(len(keypoints))
-        order = sorted(
-            (k for k in usable if mask is None or _is_on(mask, keypoints[k])),
-            key=lambda k: _strongest_first(keypoints[k]),
-        )
+
+        def strongest_first(k: int) -> tuple[float, ...]:
+            point = keypoints[k]
+            return -point.response, point.pt[1], point.pt[0], point.size, point.angle
+
+        usable = (k for k, one in enumerate(keypoints) if mask is None or _is_on(mask, one))
+        order = sorted(usable, key=strongest_first)
         if descriptors is None or not order:
             return LocalFeatures(
                 np.zeros((0, 2), np.float32),
@@ -92,18 +88,6 @@ def _is_on(mask: NDArray[np.bool_], keypoint: cv2.KeyPoint) -> bool:
     column = min(max(int(keypoint.pt[0] + 0.5), 0), width - 1)
     row = min(max(int(keypoint.pt[1] + 0.5), 0), height - 1)
     return bool(mask[row, column])
-
-
-def _strongest_first(
-    keypoint: cv2.KeyPoint,
-) -> tuple[float, float, float, float, float]:
-    return (
-        -keypoint.response,
-        keypoint.pt[1],
-        keypoint.pt[0],
-        keypoint.size,
-        keypoint.angle,
-    )
 
 
 def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:

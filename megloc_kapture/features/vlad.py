@@ -21,16 +21,19 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.features.pca_whitening import PcaWhitening, learn_whitening
 from megloc_kapture.values import Options
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+Float32 = NDArray[np.float32]
 
 _CHUNK = 16384  # descriptors assigned at once: bounds memory at 16384 x clusters floats
 # whitening is learnt from at most this many images, and numbers in all: 1 GiB of float32
 _WHITENING_IMAGES = 4096
 _WHITENING_NUMBERS = 1 << 28
+_COLUMNS = 4096  # dimensions that are held in float64 at once
+# variances below this share of the first are rounding of the float32 vectors
+_LEAST = 1e-9
 
 
 class VladOptions(Options):
@@ -55,9 +58,7 @@ class VladOptions(Options):
     )
     assignment: Literal["hard", "soft"] = "hard"
     alpha: float = Field(
-        default=30.0,
-        gt=0,
-        description="sharpness of soft assignment, for unit descriptors",
+        default=30.0, gt=0, description="sharpness of soft assignment, for unit descriptors"
     )
     intra_normalization: bool = Field(default=True, description="unit length per cluster")
     power: float = Field(default=1.0, gt=0, le=1, description="signed power law, 0.5 is usual")
@@ -69,16 +70,72 @@ class VladOptions(Options):
 
 
 @dataclass(frozen=True, eq=False)
-class Vocabulary:
-    """Visual words, and the whitening of the vectors that they give.
+class PcaWhitening:
+    """PCA whitening of global descriptors: ``y = projection (x - mean)``, then unit length.
 
-    Attributes
-    ----------
-    centres : float32 (V, K, D), the clusters of each vocabulary.
-    whitening : of the vectors of all vocabularies, or None.
+    Jegou and Chum, "Negative evidences and co-occurrences in image retrieval", ECCV 2012: vectors
+    of several vocabularies are centred, turned into the frame of their principal components,
+    divided by the deviation along each, cut and scaled to unit length. That makes up for what
+    occurs together and removes what the vocabularies tell twice. Of the mean float32 (D,) and the
+    projection float32 (d, D), whose rows are scaled principal components, the strongest first.
     """
 
-    centres: NDArray[np.float32]
+    mean: Float32
+    projection: Float32
+
+    def apply(self, vector: NDArray[np.floating[Any]]) -> Float32:
+        """Whiten one vector (D,): float32 (d,), unit length; the zero vector gives zero."""
+        if not np.any(vector):
+            return np.zeros(len(self.projection), dtype=np.float32)
+        whitened = self.projection @ (np.asarray(vector, dtype=np.float32) - self.mean)
+        norm = np.linalg.norm(whitened)
+        return whitened / norm if norm > 0 else whitened
+
+
+def learn_whitening(vectors: Float32, dimensions: int, power: float = 1.0) -> PcaWhitening:
+    """Learn whitening from vectors (N, D), float32, which are overwritten: they may be large.
+
+    A map has fewer images than its vectors have dimensions. The deviations along the last
+    components are then noise, and N vectors in N - 1 dimensions divided by them are all equally
+    unlike. So the deviation that each is divided by may be taken to a power below one, as AP-GeM's
+    published whitening does (Revaud et al., ICCV 2019: the variance to the power 0.25, which is 0.5
+    here). At most so many dimensions are kept, and never more than the vectors vary in, which is
+    less than N. Raises DataError for fewer than two different vectors.
+    """
+    mean = vectors.mean(axis=0, dtype=np.float64).astype(np.float32)
+    vectors -= mean
+    count, size = vectors.shape
+    # N x N: its eigenvectors give those of the D x D covariance
+    gram = np.zeros((count, count))
+    for start in range(0, size, _COLUMNS):
+        part = vectors[:, start : start + _COLUMNS].astype(np.float64)
+        gram += part @ part.T
+    variances, axes = np.linalg.eigh(gram / count)
+    variances, axes = variances[::-1], axes[:, ::-1]  # the strongest first
+    kept = min(dimensions, count - 1, int((variances > _LEAST * variances[0]).sum()))
+    if kept < 1 or variances[0] <= 0:
+        raise DataError(
+            f"whitening cannot be learnt from {count} images that do not differ: use more images, "
+            "or no whitening"
+        )
+    variances, axes = variances[:kept], axes[:, :kept]
+    # rows of unit length in the vectors' space, then divided by the deviations
+    rows = (axes / np.sqrt(count * variances) / variances ** (power / 2)).T
+    projection = np.empty((kept, size), dtype=np.float32)
+    for start in range(0, size, _COLUMNS):
+        part = vectors[:, start : start + _COLUMNS].astype(np.float64)
+        projection[:, start : start + _COLUMNS] = rows @ part
+    # an axis may point either way: its largest entry is positive
+    largest = np.take_along_axis(projection, np.abs(projection).argmax(axis=1)[:, None], axis=1)
+    projection *= np.where(largest < 0, np.float32(-1), np.float32(1))
+    return PcaWhitening(mean, projection)
+
+
+@dataclass(frozen=True, eq=False)
+class Vocabulary:
+    """Visual words float32 (V, K, D), clusters of each vocabulary, and their vectors' whitening."""
+
+    centres: Float32
     whitening: PcaWhitening | None = None
 
     @property
@@ -107,8 +164,7 @@ def train_vlad(
 
     Parameters
     ----------
-    length : how many descriptors an image has.
-    read : an image's descriptors (N, D).
+    length, read : how many descriptors an image has, and these (N, D).
     each : what shares the description of the images, which whitening is learnt from.
 
     Raises
@@ -144,7 +200,7 @@ def train_vlad(
 
 def _read_and_aggregate(
     read: Callable[[str], NDArray[Any]], vocabulary: Vocabulary, options: VladOptions, image: str
-) -> NDArray[np.float32]:
+) -> Float32:
     return aggregate(read(image), vocabulary, options)
 
 
@@ -153,9 +209,7 @@ def train_vocabulary(
 ) -> Vocabulary:
     """k-means (k-means++ start, Lloyd) over descriptors (N, D), once per vocabulary; no whitening.
 
-    Raises
-    ------
-    DataError : fewer distinct descriptors than clusters, or values that are not finite.
+    Raises DataError for fewer distinct descriptors than clusters, or values that are not finite.
     """
     options = options or VladOptions()
     data = np.ascontiguousarray(descriptors, dtype=np.float32)
@@ -171,7 +225,7 @@ def train_vocabulary(
     )
 
 
-def _cluster(data: NDArray[np.float32], options: VladOptions, number: int) -> NDArray[np.float32]:
+def _cluster(data: Float32, options: VladOptions, number: int) -> Float32:
     """The centres of one vocabulary; each draws numbers of its own."""
     rng = np.random.default_rng([options.seed, number])
     centres = _plus_plus(data, options.num_clusters, rng)
@@ -190,9 +244,7 @@ def _cluster(data: NDArray[np.float32], options: VladOptions, number: int) -> ND
     return centres
 
 
-def _plus_plus(
-    data: NDArray[np.float32], num_clusters: int, rng: np.random.Generator
-) -> NDArray[np.float32]:
+def _plus_plus(data: Float32, num_clusters: int, rng: np.random.Generator) -> Float32:
     """k-means++ seeding on a subsample: the start needs no more than that."""
     sample = data
     if len(sample) > 20_000:
@@ -212,7 +264,7 @@ def _plus_plus(
     return np.stack(centres).astype(np.float32)
 
 
-def _nearest(data: NDArray[np.float32], centres: NDArray[np.float32]) -> NDArray[np.int64]:
+def _nearest(data: Float32, centres: Float32) -> NDArray[np.int64]:
     half = 0.5 * np.einsum("kd,kd->k", centres, centres)
     labels = np.empty(len(data), dtype=np.int64)
     for start in range(0, len(data), _CHUNK):
@@ -222,7 +274,7 @@ def _nearest(data: NDArray[np.float32], centres: NDArray[np.float32]) -> NDArray
 
 
 def _sum_by_label(
-    data: NDArray[np.float32], labels: NDArray[np.int64], num_clusters: int
+    data: Float32, labels: NDArray[np.int64], num_clusters: int
 ) -> NDArray[np.float64]:
     order = np.argsort(labels, kind="stable")
     present, starts = np.unique(labels[order], return_index=True)
@@ -245,10 +297,8 @@ def sample_rows(counts: Iterable[int], total: int, seed: int) -> list[NDArray[np
 
 
 def aggregate(
-    descriptors: NDArray[Any],
-    vocabulary: Vocabulary,
-    options: VladOptions | None = None,
-) -> NDArray[np.float32]:
+    descriptors: NDArray[Any], vocabulary: Vocabulary, options: VladOptions | None = None
+) -> Float32:
     """VLAD of descriptors (N, D): float32 (``vocabulary.size``,), unit length.
 
     Without whitening vocabulary after vocabulary, in each cluster after cluster. An image without
@@ -268,9 +318,7 @@ def aggregate(
     return vector if vocabulary.whitening is None else vocabulary.whitening.apply(vector)
 
 
-def _aggregate_one(
-    data: NDArray[np.float32], centres: NDArray[np.float32], options: VladOptions
-) -> NDArray[np.float64]:
+def _aggregate_one(data: Float32, centres: Float32, options: VladOptions) -> NDArray[np.float64]:
     """VLAD by one vocabulary: float64 (K * D,), unit length."""
     if options.assignment == "hard":
         labels = _nearest(data, centres)
@@ -292,9 +340,7 @@ def _aggregate_one(
 
 
 def soft_assignment(
-    descriptors: NDArray[np.floating[Any]],
-    centres: NDArray[np.floating[Any]],
-    alpha: float,
+    descriptors: NDArray[np.floating[Any]], centres: NDArray[np.floating[Any]], alpha: float
 ) -> NDArray[np.float64]:
     """``a_k(x_i)`` of NetVLAD's equation 1: (N, K) float64, rows sum to one."""
     data = np.asarray(descriptors, dtype=np.float64)

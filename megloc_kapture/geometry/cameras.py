@@ -9,24 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.io.colmap_cameras import normalized_from_px, px_from_cam
+from megloc_kapture.io.colmap_cameras import normalized_from_px as normalized_from_px
+from megloc_kapture.io.colmap_cameras import px_from_cam as px_from_cam
 from megloc_kapture.values import ONE_FOCAL_MODELS, Camera, RigidTransform
-
-__all__ = [
-    "RADIAL_MODELS",
-    "bearing_rays",
-    "focal_px",
-    "normalized_from_px",
-    "pixel_rays",
-    "principal_point_px",
-    "project",
-    "px_from_cam",
-    "radial_distortion",
-    "scale_focal",
-    "shift_principal_point",
-    "swap_principal_point",
-    "with_distortion",
-]
 
 # models whose first distortion parameter multiplies the squared radius
 RADIAL_MODELS = frozenset({"SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"})
@@ -91,8 +76,10 @@ def bearing_rays(camera: Camera, points_px: NDArray[np.floating[Any]]) -> NDArra
 
 @lru_cache(maxsize=8)
 def pixel_rays(camera: Camera) -> NDArray[np.float64]:
-    """Rays (H * W, 3) with z = 1 through the centres of a camera's pixels, row by row; not to be
-    written to. Kept, for images share few cameras, and distortion is slow to undo."""
+    """Rays (H * W, 3) with z = 1 through the centres of a camera's pixels, row by row; read-only.
+
+    Kept, for images share few cameras, and distortion is slow to undo.
+    """
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     rays = bearing_rays(camera, np.stack([x.ravel(), y.ravel()], axis=1))
     rays.flags.writeable = False

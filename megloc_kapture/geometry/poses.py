@@ -1,4 +1,6 @@
-"""Pose algebra on arrays: quaternions (..., 4) ordered w x y z, translations (..., 3), float64.
+"""Pose algebra on arrays, and alignment with positions on earth.
+
+Quaternions (..., 4) are ordered w x y z, translations (..., 3), both float64.
 
 The conventions are those of :class:`megloc_kapture.values.RigidTransform`: ``a_from_b`` maps
 ``x_a = R x_b + t``, transforms compose right to left, and ``q`` and ``-q`` are one rotation.
@@ -6,17 +8,35 @@ The conventions are those of :class:`megloc_kapture.values.RigidTransform`: ``a_
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from megloc_kapture.errors import DataError
 from megloc_kapture.values import RigidTransform
 
-Float64Array = NDArray[np.float64]
+Floats = NDArray[np.float64]
+GeoPosition = tuple[float, float, float]
+"""Latitude and longitude in degrees, height in metres above the ellipsoid."""
+
+# the standard deviation of normal values over the median of their magnitudes: 1 / (quantile of 3/4)
+_DEVIATION_OF_MEDIAN = 1.482602218505602
+# of the ellipsoid WGS84
+_SEMI_MAJOR_M = 6378137.0
+_FLATTENING = 1 / 298.257223563
+_ECCENTRICITY_SQUARED = _FLATTENING * (2 - _FLATTENING)
+_LATITUDE_ROUNDS = 8  # each gains more than two digits
+_ALIGNING_ROUNDS = 50
+# how far the positions have to spread in two directions, in residuals, to tell scale and axes
+_MIN_SPREAD = 3.0
+# receivers of phones claim no better; residuals of three positions may be smaller by chance
+_MIN_RESIDUAL_M = 1.0
 
 
-def stack_poses(poses: Iterable[RigidTransform]) -> tuple[Float64Array, Float64Array]:
+def stack_poses(poses: Iterable[RigidTransform]) -> tuple[Floats, Floats]:
     """Quaternions (N, 4) and translations (N, 3) of N transforms, in their order."""
     listed = list(poses)
     quats = np.array([p.quat_wxyz for p in listed], dtype=np.float64).reshape(-1, 4)
@@ -24,7 +44,7 @@ def stack_poses(poses: Iterable[RigidTransform]) -> tuple[Float64Array, Float64A
     return quats, translations
 
 
-def unstack_poses(quats_wxyz: Float64Array, translations: Float64Array) -> list[RigidTransform]:
+def unstack_poses(quats_wxyz: Floats, translations: Floats) -> list[RigidTransform]:
     """The transforms of quaternions (N, 4) and translations (N, 3); undoes :func:`stack_poses`."""
     return [
         RigidTransform((w, x, y, z), (tx, ty, tz))
@@ -34,18 +54,18 @@ def unstack_poses(quats_wxyz: Float64Array, translations: Float64Array) -> list[
     ]
 
 
-def normalize_quats(quats_wxyz: Float64Array) -> Float64Array:
+def normalize_quats(quats_wxyz: Floats) -> Floats:
     """Quaternions (..., 4) at unit length; a zero quaternion gives NaN."""
     with np.errstate(invalid="ignore", divide="ignore"):
         return quats_wxyz / np.linalg.norm(quats_wxyz, axis=-1, keepdims=True)
 
 
-def invert_quats(quats_wxyz: Float64Array) -> Float64Array:
+def invert_quats(quats_wxyz: Floats) -> Floats:
     """The inverses ``conj(q) / |q|^2`` of quaternions (..., 4)."""
     return _conjugate(quats_wxyz) / _squared_length(quats_wxyz)[..., None]
 
 
-def multiply_quats(first: Float64Array, second: Float64Array) -> Float64Array:
+def multiply_quats(first: Floats, second: Floats) -> Floats:
     """Hamilton products ``first * second`` of quaternions (..., 4); shapes broadcast."""
     w1, x1, y1, z1 = np.moveaxis(np.asarray(first), -1, 0)
     w2, x2, y2, z2 = np.moveaxis(np.asarray(second), -1, 0)
@@ -60,7 +80,7 @@ def multiply_quats(first: Float64Array, second: Float64Array) -> Float64Array:
     )
 
 
-def rotation_matrices(quats_wxyz: Float64Array) -> Float64Array:
+def rotation_matrices(quats_wxyz: Floats) -> Floats:
     """Rotation matrices (..., 3, 3) of quaternions (..., 4), whose length does not matter."""
     quats = np.asarray(quats_wxyz, dtype=np.float64)
     w, x, y, z = np.moveaxis(quats, -1, 0)
@@ -75,17 +95,14 @@ def rotation_matrices(quats_wxyz: Float64Array) -> Float64Array:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def rotate(quats_wxyz: Float64Array, vectors: Float64Array) -> Float64Array:
+def rotate(quats_wxyz: Floats, vectors: Floats) -> Floats:
     """Vectors (..., 3) turned by quaternions (..., 4); shapes broadcast."""
     return np.matmul(rotation_matrices(quats_wxyz), vectors[..., None])[..., 0]
 
 
 def compose(
-    quats_ab: Float64Array,
-    translations_ab: Float64Array,
-    quats_bc: Float64Array,
-    translations_bc: Float64Array,
-) -> tuple[Float64Array, Float64Array]:
+    quats_ab: Floats, translations_ab: Floats, quats_bc: Floats, translations_bc: Floats
+) -> tuple[Floats, Floats]:
     """``a_from_c`` of ``a_from_b`` and ``b_from_c``: quaternions (..., 4), translations (..., 3).
 
     The result's quaternions are normalised, so that long chains do not drift off unit length.
@@ -94,26 +111,24 @@ def compose(
     return quats, rotate(quats_ab, translations_bc) + translations_ab
 
 
-def invert(
-    quats_wxyz: Float64Array, translations: Float64Array
-) -> tuple[Float64Array, Float64Array]:
+def invert(quats_wxyz: Floats, translations: Floats) -> tuple[Floats, Floats]:
     """``b_from_a`` of ``a_from_b``: quaternions (..., 4), translations (..., 3)."""
     inverse = invert_quats(quats_wxyz)
     return inverse, -rotate(inverse, translations)
 
 
-def camera_centers(quats_wxyz: Float64Array, translations: Float64Array) -> Float64Array:
+def camera_centers(quats_wxyz: Floats, translations: Floats) -> Floats:
     """Centres ``-R^T t`` in the world (..., 3) of ``cam_from_world`` transforms."""
     return -rotate(invert_quats(quats_wxyz), translations)
 
 
-def rotation_angles_deg(quats_a: Float64Array, quats_b: Float64Array) -> Float64Array:
+def rotation_angles_deg(quats_a: Floats, quats_b: Floats) -> Floats:
     """Angles (...) in degrees, 0 to 180, of the rotations ``a b^-1`` of quaternions (..., 4).
 
-    It is the length of the rotation vector, and the half angle is ``atan2(|v|, |w|)``. The usual
-    arccos, of the scalar part or of the matrix' trace, is flat at zero and cannot resolve below
-    about 1e-6 degrees; this keeps full precision there and at 180 degrees, needs no clipping, and
-    takes ``q`` and ``-q`` as the same. Lengths other than 1 do not matter.
+    The half angle is ``atan2(|v|, |w|)``. The usual arccos, of the scalar part or of the matrix'
+    trace, is flat at zero and cannot resolve below about 1e-6 degrees; this keeps full precision
+    there and at 180 degrees, needs no clipping, and takes ``q`` and ``-q`` as the same. Lengths
+    other than 1 do not matter.
     """
     relative = multiply_quats(quats_a, _conjugate(quats_b))
     relative = relative / _squared_length(quats_b)[..., None]
@@ -131,17 +146,115 @@ def movement(old: RigidTransform, new: RigidTransform) -> tuple[float, float]:
     return moved_m, float(turned_deg)
 
 
-def cross_matrix(vector: Float64Array) -> Float64Array:
+def cross_matrix(vector: Floats) -> Floats:
     """``[v]_x`` (3, 3) with ``[v]_x w = v x w``."""
     x, y, z = vector
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
-def _conjugate(quats: Float64Array) -> Float64Array:
+def _conjugate(quats: Floats) -> Floats:
     return quats * np.array([1.0, -1.0, -1.0, -1.0])
 
 
-def _squared_length(quats: Float64Array) -> Float64Array:
+def _squared_length(quats: Floats) -> Floats:
     """``|q|^2`` (...) of quaternions (..., 4)."""
     w, x, y, z = np.moveaxis(quats, -1, 0)
     return w * w + x * x + y * y + z * z
+
+
+def deviation_by_median(residuals: NDArray[np.floating[Any]]) -> np.float64:
+    """Standard deviation of normal values around 0, by the median of their magnitudes.
+
+    Up to half of the values cannot spoil it (Rousseeuw and Croux, JASA 1993). NaN of none.
+    """
+    return _DEVIATION_OF_MEDIAN * np.median(np.abs(residuals))
+
+
+def earth_from_enu(latitude_deg: float, longitude_deg: float, height_m: float) -> RigidTransform:
+    """From the frame east, north, up at a position to earth-centred, earth-fixed (ECEF) metres."""
+    lat, lon = np.radians(latitude_deg), np.radians(longitude_deg)
+    east = np.array([-np.sin(lon), np.cos(lon), 0.0])
+    up = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
+    rotation = np.stack([east, np.cross(up, east), up], axis=1)
+    normal = _SEMI_MAJOR_M / np.sqrt(1 - _ECCENTRICITY_SQUARED * np.sin(lat) ** 2)
+    position = up * (normal + height_m)
+    position[2] -= normal * _ECCENTRICITY_SQUARED * np.sin(lat)
+    return RigidTransform.from_matrix(rotation, position)
+
+
+def geodetic(ecef_m: Floats) -> tuple[float, float, float]:
+    """Latitude and longitude in degrees and height in metres of an ECEF position (3,)."""
+    x, y, z = (float(value) for value in ecef_m)
+    across = np.hypot(x, y)
+    lat = np.arctan2(z, across * (1 - _ECCENTRICITY_SQUARED))
+    for _ in range(_LATITUDE_ROUNDS):
+        normal = _SEMI_MAJOR_M / np.sqrt(1 - _ECCENTRICITY_SQUARED * np.sin(lat) ** 2)
+        lat = np.arctan2(z + normal * _ECCENTRICITY_SQUARED * np.sin(lat), across)
+    height = across * np.cos(lat) + z * np.sin(lat)
+    height -= _SEMI_MAJOR_M * np.sqrt(1 - _ECCENTRICITY_SQUARED * np.sin(lat) ** 2)
+    return float(np.degrees(lat)), float(np.degrees(np.arctan2(y, x))), float(height)
+
+
+@dataclass(frozen=True)
+class EarthAlignment:
+    """Where a map lies on earth: ``enu = enu_from_map(scale * x)``, East, North, Up at the origin.
+
+    ``residual_m`` is the median distance of the aligned camera centres from their positions.
+    """
+
+    scale: float
+    enu_from_map: RigidTransform
+    origin: GeoPosition
+    residual_m: float
+    num_positions: int
+
+
+def align_to_earth(
+    centers: Mapping[str, Floats], positions: Mapping[str, GeoPosition]
+) -> EarthAlignment:
+    """Scale and axes of a map by the positions of its cameras on earth.
+
+    Of camera centres (3,) in the map, by image, and positions of some images. Least squares
+    (Umeyama 1991), reweighted by Cauchy's weights, so that single bad positions of a receiver do
+    not count. Raises DataError for fewer than three images, or where these lie too near to each
+    other or on a line.
+    """
+    names = sorted(centers.keys() & positions.keys())
+    if len(names) < 3:
+        raise DataError(
+            f"{len(names)} photographs of the map have a GPS position; the scale takes 3 or more"
+        )
+    on_earth = np.array([earth_from_enu(*positions[name]).translation for name in names])
+    origin = geodetic(np.median(on_earth, axis=0))
+    enu = earth_from_enu(*origin).inverse().apply(on_earth)
+    own = np.array([centers[name] for name in names])
+    weights = np.ones(len(names))
+    for _ in range(_ALIGNING_ROUNDS):
+        scale, rotation, translation = _similarity(own, enu, weights)
+        apart = np.linalg.norm(scale * own @ rotation.T + translation - enu, axis=1)
+        weights = 1 / (1 + (apart / max(float(np.median(apart)), 1e-9)) ** 2)
+    residual_m = float(np.median(apart))
+    spread_m = np.linalg.svd(scale * (own - np.median(own, axis=0)), compute_uv=False)[1]
+    spread_m /= np.sqrt(len(names))
+    if spread_m < _MIN_SPREAD * max(residual_m, _MIN_RESIDUAL_M):
+        raise DataError(
+            f"the GPS positions tell no scale: the photographs spread over {spread_m:.1f} m across "
+            f"their path, and the positions are good to {max(residual_m, _MIN_RESIDUAL_M):.1f} m"
+        )
+    return EarthAlignment(
+        scale, RigidTransform.from_matrix(rotation, translation), origin, residual_m, len(names)
+    )
+
+
+def _similarity(source: Floats, target: Floats, weights: Floats) -> tuple[float, Floats, Floats]:
+    """``target = scale * rotation @ source + translation`` in weighted least squares."""
+    from scipy.spatial.transform import Rotation
+
+    means = [np.average(points, axis=0, weights=weights) for points in (source, target)]
+    a, b = source - means[0], target - means[1]
+    rotation = Rotation.align_vectors(b, a, weights=weights)[0].as_matrix()
+    spread = float((weights * (a**2).sum(axis=1)).sum())
+    if spread == 0:
+        raise DataError("the photographs were all taken at one place: there is no scale to tell")
+    scale = float((weights[:, None] * b * (a @ rotation.T)).sum()) / spread
+    return scale, rotation, means[1] - scale * rotation @ means[0]

@@ -38,16 +38,14 @@ Floats = NDArray[np.float64]
 class WarpSource:
     """A reference image with depth and pose.
 
+    Raises DataError where an array's size is not its camera's.
+
     Parameters
     ----------
     image : uint8 (H, W, 3), and ``camera``, ``cam_from_world``, its camera and pose.
     depth_m : float32, along the axis of ``depth_camera``; 0, less or NaN where unknown.
     image_from_depth : from the depth camera's frame to the image camera's, metres.
     mask : bool (H, W), True = use; None without one.
-
-    Raises
-    ------
-    DataError : an array's size is not its camera's.
     """
 
     image: NDArray[np.uint8]
@@ -111,20 +109,11 @@ def warp_to_view(
     *,
     scale: float = 1.0,
 ) -> WarpedView:
-    """Bring reference images to a view.
+    """Bring reference images to a view, of any model, in an image ``scale`` times its size.
 
     Of several references that see a surface, each pixel takes the one that looks at it most as the
-    view does: least angle between the two rays, and not from much farther away.
-
-    Parameters
-    ----------
-    sources : references; of equals the first counts.
-    camera, cam_from_world : of the view; any of COLMAP's models.
-    scale : size of the result over the camera's.
-
-    Raises
-    ------
-    DataError : the scale is not positive.
+    view does: least angle between the two rays, and not from much farther away; of equals the
+    first. Raises DataError where the scale is not positive.
     """
     if not scale > 0:
         raise DataError(f"scale {scale:g} of a view is not positive")
@@ -159,8 +148,7 @@ def _seen_depth(
     source: WarpSource, camera: Camera, cam_from_world: RigidTransform
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """Depth (H, W) of a reference's surface in a view, and where its front is seen."""
-    # here, as numba takes half a second to import
-    from megloc_kapture.geometry.rasterising import draw_depth_surface
+    from megloc_kapture.geometry.projection import draw_depth_surface
 
     return draw_depth_surface(
         source.depth_m,
@@ -176,13 +164,9 @@ def _seen_depth(
 @lru_cache(maxsize=8)
 def _field(camera: Camera) -> float:
     """Tangent of the angle off the axis beyond which nothing is projected."""
-    x, y = camera.width, camera.height
-    middle = 0.5 * x, 0.5 * y
-    border = np.array(
-        [(0, 0), (x, 0), (0, y), (x, y), (middle[0], 0), (middle[0], y), (0, middle[1])]
-        + [(x, middle[1])],
-        np.float64,
-    )
+    # corners and middles of the border
+    grid = np.stack(np.meshgrid([0.0, 0.5, 1.0], [0.0, 0.5, 1.0]), axis=-1).reshape(-1, 2)
+    border = np.delete(grid, 4, axis=0) * (camera.width, camera.height)
     rays = bearing_rays(camera, border)
     reach = np.hypot(rays[:, 0], rays[:, 1]).max()
     return float(_FIELD_MARGIN * reach) if np.isfinite(reach) else np.inf

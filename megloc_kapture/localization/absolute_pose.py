@@ -1,4 +1,7 @@
-"""Absolute pose of a camera or a rig: estimation, then refinement on the inliers with covariance.
+"""Absolute pose of a camera or a rig: LO-RANSAC by poselib, then refinement with covariance.
+
+P3P where the matches of one camera have to do, GP3P where several cameras of a rig have some. The
+same seed gives the same pose, from however many threads.
 
 The refinement is Levenberg-Marquardt on the reprojection errors in pixels of all cameras of the rig
 together, under each camera's real model. A residual counts by the uncertainty of its pixel and its
@@ -16,24 +19,23 @@ determine, or place too badly to be of use, is a failure.
 
 from __future__ import annotations
 
+import ctypes
+import threading
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
-from megloc_kapture.localization.estimation import (
-    AbsolutePoseOptions,
-    PoseEstimate,
-    PoseProblem,
-    View,
-    estimate_pose,
-    too_few_agree,
-    undo_recentring,
-)
-from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
+from megloc_kapture.geometry.cameras import focal_px, normalized_from_px
+from megloc_kapture.geometry.poses import cross_matrix, unstack_poses
+from megloc_kapture.localization.map_index import PoseProblem, View, undo_recentring
+from megloc_kapture.values import Camera, Failure, Options, Pose, RigidTransform
 
+# GP3P draws from C's rand(), one state for the whole process
+_RAND = threading.Lock()
 _ROUNDS = 2
 _MIN_SIGMA_PX = 0.1
 # the median of the length of a normal vector in two dimensions (Rayleigh), of deviation 1
@@ -43,6 +45,207 @@ _CAUCHY_EFFICIENT = 2.385
 # a handful of perfect matches is no proof of perfection
 _MIN_VARIANCE_PX2 = 0.1**2
 _MAX_CONDITION = 1e12
+Floats = NDArray[np.float64]
+
+
+class AbsolutePoseOptions(Options):
+    """Options of the pose estimation."""
+
+    max_error_px: float = Field(default=12.0, gt=0, description="reprojection error of an inlier")
+    min_inliers: int = Field(default=12, ge=4, description="fewer is a failure")
+    max_center_deviation: float = Field(
+        default=0.2,
+        gt=0,
+        description="largest standard deviation of the camera's centre, as a share of its "
+        "inliers' median depth; more is a failure",
+    )
+    map_noise: float = Field(
+        default=1 / 3,
+        ge=0,
+        description="noise of the keypoints that the map's points come from, as a share of the "
+        "residuals'; 0: points count as exact",
+    )
+    min_iterations: int = Field(default=100, gt=0, description="RANSAC's")
+    max_iterations: int = Field(default=20_000, gt=0, description="RANSAC's")
+    confidence: float = Field(
+        default=0.9999, gt=0, lt=1, description="RANSAC stops when it is as sure of its best pose"
+    )
+    seed: int = Field(default=0, ge=0, description="of RANSAC's samples")
+
+    def for_poselib(self) -> dict[str, Any]:
+        """The RANSAC options in poselib's names."""
+        return {
+            "max_reproj_error": self.max_error_px,
+            "min_iterations": self.min_iterations,
+            "max_iterations": self.max_iterations,
+            "success_prob": self.confidence,
+            "seed": self.seed,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class PoseEstimate:
+    """A pose that enough matches agree with, before its refinement.
+
+    Attributes
+    ----------
+    rig_from_world : the pose; ``cam_from_world`` where the only view is at the rig's origin.
+    usable, inliers : bool (N,) over the matches of all views in order: point and ray are finite;
+        the error under the camera's model is allowed as well.
+    errors_px : float64 (N,) reprojection errors; infinite behind a camera and where not usable.
+    """
+
+    rig_from_world: RigidTransform
+    usable: NDArray[np.bool_]
+    inliers: NDArray[np.bool_]
+    errors_px: Floats
+
+    @property
+    def num_inliers(self) -> int:
+        return int(np.count_nonzero(self.inliers))
+
+
+def absolute_pose(
+    points_px: NDArray[np.floating[Any]],
+    points_world: Floats,
+    camera: Camera,
+    options: AbsolutePoseOptions | None = None,
+    point_covariances: Floats | None = None,
+) -> Pose | Failure:
+    """Estimate ``cam_from_world`` of one camera, with inlier mask and covariance.
+
+    Of pixels (N, 2), the first one's centre at (0.5, 0.5), matched with world points float64 (N,
+    3), whose covariances (N, 6) are as :class:`View` has them, or None. Raises DataError for arrays
+    of other shapes.
+    """
+    view = View(camera, RigidTransform.identity(), points_px, points_world, point_covariances)
+    return rig_pose([view], options)
+
+
+def rig_pose(views: Sequence[View], options: AbsolutePoseOptions | None = None) -> Pose | Failure:
+    """Estimate ``rig_from_world`` of a rig, see :func:`estimate_pose` and :func:`refine_pose`."""
+    problem = PoseProblem.of(views)
+    estimate = estimate_pose(problem, options)
+    if isinstance(estimate, Failure):
+        return estimate
+    return refine_pose(problem, estimate, options)
+
+
+def estimate_pose(
+    problem: PoseProblem, options: AbsolutePoseOptions | None = None
+) -> PoseEstimate | Failure:
+    """Estimate ``rig_from_world`` from the matches of one camera or several.
+
+    A view without matches, or whose matches are all wrong, is no harm.
+    """
+    options = options or AbsolutePoseOptions()
+    count = len(problem.points)
+    if count < options.min_inliers:
+        return Failure(
+            f"{count} 2D-3D matches, at least {options.min_inliers} are needed", num_matches=count
+        )
+    # a camera's distortion cannot be undone everywhere: such rays are NaN
+    rays = np.concatenate([normalized_from_px(v.camera, v.points_px) for v in problem.views])
+    usable = np.isfinite(rays).all(axis=1) & np.isfinite(problem.points).all(axis=1)
+    num_usable = int(np.count_nonzero(usable))
+    if num_usable < options.min_inliers:
+        return Failure(
+            f"{num_usable} of {count} 2D-3D matches can be used, at least {options.min_inliers} "
+            "are needed",
+            num_matches=count,
+        )
+    rig_from_world = _ransac(problem, rays, usable, options)
+    errors_px, _ = _measured(problem, rig_from_world, usable)
+    inliers = errors_px <= options.max_error_px
+    num_inliers = int(np.count_nonzero(inliers))
+    if num_inliers < options.min_inliers:
+        return _too_few_agree(num_inliers, count, options)
+    pose = undo_recentring(rig_from_world, problem.offset)
+    return PoseEstimate(pose, usable, inliers, errors_px)
+
+
+def _too_few_agree(num_inliers: int, count: int, options: AbsolutePoseOptions) -> Failure:
+    return Failure(
+        f"{num_inliers} of {count} 2D-3D matches agree, at least {options.min_inliers} are needed",
+        num_matches=count,
+        num_inliers=num_inliers,
+    )
+
+
+def match_errors(problem: PoseProblem, rig_from_world: RigidTransform) -> tuple[Floats, Floats]:
+    """Errors in pixels (N,) of all matches, and the same by Mahalanobis' distance, where an error
+    of one pixel, and what the point's covariance makes of it, count as one.
+
+    Infinite behind the camera and where a point is not finite.
+    """
+    usable = np.asarray(np.isfinite(problem.points).all(axis=1))
+    return _measured(problem, undo_recentring(rig_from_world, -problem.offset), usable)
+
+
+def _measured(
+    problem: PoseProblem, rig_from_world: RigidTransform, usable: NDArray[np.bool_]
+) -> tuple[Floats, Floats]:
+    """:func:`match_errors` of the usable matches, by a pose in the recentred world."""
+    from megloc_kapture.localization import kernels
+
+    count = len(usable)
+    errors, squared = np.empty(count), np.full(count, np.inf)
+    rotation, translation = rig_from_world.rotation_matrix(), np.array(rig_from_world.translation)
+    whitening, depths = np.empty((count, 3)), np.empty(count)
+    kernels.measure(
+        problem.matches, usable, rotation, translation, errors, whitening, squared, depths
+    )
+    return errors, np.sqrt(squared)
+
+
+def _ransac(
+    problem: PoseProblem, rays: Floats, usable: NDArray[np.bool_], options: AbsolutePoseOptions
+) -> RigidTransform:
+    """``rig_from_world`` in the recentred world."""
+    import poselib
+
+    # its last bundle adjustment takes longer than the whole refinement that follows instead; the
+    # local optimisations of the RANSAC are not concerned
+    bundle = {"max_iterations": 0}
+    points_2d, points_3d, extrinsics, pinholes, cams_from_rig = [], [], [], [], []
+    starts = problem.starts.tolist()
+    for view, first, last in zip(problem.views, starts[:-1], starts[1:], strict=True):
+        rows = first + np.flatnonzero(usable[first:last])
+        if len(rows) == 0:
+            continue
+        # undistorted pixels of a pinhole with the same focal length: poselib's own list of camera
+        # models is shorter than COLMAP's
+        focal = focal_px(view.camera)
+        points_2d.append(rays[rows] * focal)
+        points_3d.append(problem.points[rows])
+        pinholes.append(
+            {"model": "PINHOLE", "width": 1, "height": 1, "params": [focal, focal, 0.0, 0.0]}
+        )
+        cams_from_rig.append(view.cam_from_rig)
+        extrinsic = poselib.CameraPose()
+        extrinsic.q = np.array(view.cam_from_rig.quat_wxyz)
+        extrinsic.t = np.array(view.cam_from_rig.translation)
+        extrinsics.append(extrinsic)
+    if len(points_2d) == 1:
+        found, _ = poselib.estimate_absolute_pose(
+            points_2d[0], points_3d[0], pinholes[0], options.for_poselib(), bundle
+        )
+        return cams_from_rig[0].inverse() @ _rigid_from_poselib(found)
+    # GP3P draws from C's rand() whatever poselib's own seed is, and the last digits follow; other
+    # threads must not draw in between, for the lock of the interpreter is not held
+    with _RAND:
+        ctypes.CDLL(None).srand(ctypes.c_uint(options.seed))
+        found, _ = poselib.estimate_generalized_absolute_pose(
+            points_2d, points_3d, extrinsics, pinholes, options.for_poselib(), bundle
+        )
+    return _rigid_from_poselib(found)
+
+
+def _rigid_from_poselib(found: Any) -> RigidTransform:
+    """poselib's pose as ours, its quaternion of unit length."""
+    quat = np.asarray(found.q, dtype=np.float64)
+    quat = quat / np.linalg.norm(quat)
+    return unstack_poses(quat[None], np.asarray(found.t, dtype=np.float64)[None])[0]
 
 
 def refine_pose(
@@ -56,7 +259,7 @@ def refine_pose(
     over the matches of all views in order (inliers by their error in pixels, whatever their
     points' uncertainty); or Failure with the reason.
     """
-    from megloc_kapture.localization import pose_kernels
+    from megloc_kapture.localization import kernels
 
     options = options or AbsolutePoseOptions()
     count = len(problem.points)
@@ -67,18 +270,18 @@ def refine_pose(
     errors, squared, depths = np.empty(count), np.empty(count), np.empty(count)
     whitening, gradient, information = np.empty((count, 3)), np.empty(6), np.empty((6, 6))
     for remaining in range(_ROUNDS, -1, -1):
-        pose_kernels.measure(matches, estimate.usable, *pose, errors, whitening, squared, depths)
+        kernels.measure(matches, estimate.usable, *pose, errors, whitening, squared, depths)
         inliers = errors <= options.max_error_px
         rows = np.flatnonzero(inliers)
         if len(rows) < options.min_inliers:
-            return too_few_agree(len(rows), count, options)
+            return _too_few_agree(len(rows), count, options)
         sigma = max(_median(squared[rows]) ** 0.5 / _RAYLEIGH_MEDIAN, _MIN_SIGMA_PX)
         squared_scale = (_CAUCHY_EFFICIENT * sigma) ** 2
         if remaining > 0:
-            pose = pose_kernels.levenberg_marquardt(
+            pose = kernels.levenberg_marquardt(
                 matches, rows, whitening, *pose, sigma, squared_scale
             )
-    pose_kernels.normal_equations(matches, rows, whitening, *pose, np.inf, gradient, information)
+    kernels.normal_equations(matches, rows, whitening, *pose, np.inf, gradient, information)
     covariance = pose_covariance(
         np.triu(information) + np.triu(information, 1).T, _variance(squared[rows], squared_scale)
     )
@@ -96,19 +299,17 @@ def refine_pose(
         inliers=inliers,
         covariance=covariance,
     )
-    return check_stable(found, _median(depths[rows]), options)
+    return check_stable(found, covariance, _median(depths[rows]), options)
 
 
-def check_stable(pose: Pose, depth: float, options: AbsolutePoseOptions) -> Pose | Failure:
+def check_stable(
+    pose: Pose, covariance: Floats, depth: float, options: AbsolutePoseOptions
+) -> Pose | Failure:
     """The pose, or a Failure where its covariance says that the centre may be anywhere.
 
-    Parameters
-    ----------
-    depth : the median of the inliers', unit of the map.
+    ``depth`` is the median of the inliers', in the unit of the map.
     """
-    if pose.covariance is None:
-        return pose
-    deviation = center_deviation(pose.covariance) / depth
+    deviation = center_deviation(covariance) / depth
     if deviation <= options.max_center_deviation:
         return pose
     return Failure(
@@ -119,7 +320,7 @@ def check_stable(pose: Pose, depth: float, options: AbsolutePoseOptions) -> Pose
     )
 
 
-def _variance(squared: NDArray[np.float64], squared_scale: float) -> float:
+def _variance(squared: Floats, squared_scale: float) -> float:
     """Variance by which the inverse normal matrix becomes the covariance of the Cauchy estimate.
 
     Of squared whitened residuals (M,). Huber's proposal (Robust Statistics, section 7.6) with
@@ -132,7 +333,7 @@ def _variance(squared: NDArray[np.float64], squared_scale: float) -> float:
     return float(squared_weights @ squared / degrees_of_freedom / squared_weights.mean() ** 2)
 
 
-def _median(values: NDArray[np.float64]) -> float:
+def _median(values: Floats) -> float:
     # np.median takes ten times as long for so few
     upper = len(values) // 2
     lower = (len(values) - 1) // 2
@@ -140,15 +341,12 @@ def _median(values: NDArray[np.float64]) -> float:
     return float(0.5 * (parted[lower] + parted[upper]))
 
 
-def pose_covariance(
-    information: NDArray[np.float64], variance_px2: float
-) -> NDArray[np.float64] | None:
+def pose_covariance(information: Floats, variance_px2: float) -> Floats | None:
     """Covariance (6, 6) of a pose from its normal matrix ``J^T J`` (6, 6) for a noise of 1 px.
 
     Order: rotation in radians, then translation in the unit of the map, both of a left
     perturbation: ``cam_from_world_true = exp(rotation, translation) cam_from_world``.
-
-    Returns None when the matrix does not determine the pose.
+    None when the matrix does not determine the pose.
     """
     if not np.isfinite(information).all() or not (np.diagonal(information) > 0).all():
         return None
@@ -161,7 +359,7 @@ def pose_covariance(
     return np.asarray(max(variance_px2, _MIN_VARIANCE_PX2) * (half @ half.T))
 
 
-def center_deviation(covariance: NDArray[np.float64]) -> float:
+def center_deviation(covariance: Floats) -> float:
     """Largest standard deviation of the camera's centre over all directions, in the map's unit.
 
     Of a ``covariance`` (6, 6) as :func:`pose_covariance` has it: a left perturbation moves the
@@ -170,44 +368,14 @@ def center_deviation(covariance: NDArray[np.float64]) -> float:
     return float(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]))
 
 
-def rig_pose(views: Sequence[View], options: AbsolutePoseOptions | None = None) -> Pose | Failure:
-    """Estimate ``rig_from_world`` of a rig; a camera without matches is no harm.
+def transform_covariance(covariance: Floats, cam_from_rig: RigidTransform) -> Floats:
+    """Covariance (6, 6) of ``cam_from_rig @ rig_from_world`` of one of ``rig_from_world``.
 
-    Returns
-    -------
-    Pose whose ``cam_from_world`` is ``rig_from_world``, with its covariance, or Failure with the
-    reason. The inlier mask runs over the matches of all views in order
-    (:func:`megloc_kapture.localization.estimation.split_by_view`).
+    Both of left perturbations, rotation first: with ``C exp(xi) = exp(Ad_C xi) C`` it is
+    ``Ad_C covariance Ad_C^T`` (Barfoot, State Estimation for Robotics, section 7.1.4).
     """
-    problem = PoseProblem.of(views)
-    estimate = estimate_pose(problem, options)
-    if isinstance(estimate, Failure):
-        return estimate
-    return refine_pose(problem, estimate, options)
-
-
-def absolute_pose(
-    points_px: NDArray[np.floating[Any]],
-    points_world: NDArray[np.float64],
-    camera: Camera,
-    options: AbsolutePoseOptions | None = None,
-    point_covariances: NDArray[np.float64] | None = None,
-) -> Pose | Failure:
-    """Estimate ``cam_from_world`` of one camera.
-
-    Parameters
-    ----------
-    points_px : (N, 2), first pixel's centre at (0.5, 0.5).
-    points_world : float64 (N, 3).
-    point_covariances : float64 (N, 6) of the points, as :class:`View` has them, or None.
-
-    Returns
-    -------
-    Pose with inlier mask and covariance, or Failure with the reason.
-
-    Raises
-    ------
-    DataError : the arrays do not have these shapes.
-    """
-    view = View(camera, RigidTransform.identity(), points_px, points_world, point_covariances)
-    return rig_pose([view], options)
+    rotation = cam_from_rig.rotation_matrix()
+    adjoint = np.zeros((6, 6))
+    adjoint[:3, :3] = adjoint[3:, 3:] = rotation
+    adjoint[3:, :3] = cross_matrix(np.array(cam_from_rig.translation)) @ rotation
+    return np.asarray(adjoint @ covariance @ adjoint.T)

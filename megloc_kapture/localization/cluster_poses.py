@@ -1,7 +1,10 @@
 """Cluster-wise localization: a pose for each cluster of candidates, the best of them refined.
 
-MegLoc, section "Cluster-wise localization". One view or the views of a rig are treated alike, and
-matches of several keypoints types.
+MegLoc, section "Cluster-wise localization": retrieval returns images of several places that look
+alike, and the matches of one place are outliers to the pose of another. So the retrieved images are
+clustered by the proximity of their centres, whatever they look at, or by co-visibility, and each
+cluster is localized in by itself. One view or the views of a rig are treated alike, and matches of
+several keypoints types.
 """
 
 from __future__ import annotations
@@ -11,41 +14,148 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import zip_longest
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, model_validator
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
-from megloc_kapture.geometry.cameras import focal_px
-from megloc_kapture.geometry.poses import cross_matrix
-from megloc_kapture.localization.absolute_pose import refine_pose
-from megloc_kapture.localization.alignment import displacements_px
-from megloc_kapture.localization.confidence import with_confidence
-from megloc_kapture.localization.estimation import (
+from megloc_kapture.localization.absolute_pose import (
     AbsolutePoseOptions,
     PoseEstimate,
-    PoseProblem,
     estimate_pose,
-    split_by_view,
+    refine_pose,
+    transform_covariance,
 )
+from megloc_kapture.localization.confidence import match_sources, with_confidence
 from megloc_kapture.localization.focal_length import (
     estimate_with_intrinsics,
     focal_remark,
     is_uncertain,
     refine_with_intrinsics,
 )
-from megloc_kapture.localization.map_index import Correspondences, observed_matches
-from megloc_kapture.localization.query_views import (
+from megloc_kapture.localization.map_index import (
+    Correspondences,
+    MapIndex,
+    PoseProblem,
     QueryView,
-    match_sources,
-    num_observed,
-    rows_of_images,
-    view_of,
+    observed_matches,
 )
 from megloc_kapture.localization.ranking import poses_agree
+from megloc_kapture.localization.structure import displacements_rad
 from megloc_kapture.plugins import HypothesisView, PoseHypothesis, RankingScene
-from megloc_kapture.values import ClusterPose, Failure, Pose, RigidTransform
+from megloc_kapture.values import ClusterPose, Failure, Options, Pose
 
 Rank = Callable[[Sequence[PoseHypothesis]], NDArray[np.float64]]
+Found = Sequence[Sequence[Correspondences]]
+"""2D-3D matches of each view, by keypoints type."""
+
+
+class ClusterOptions(Options):
+    """Options of the clusters of a query's candidates."""
+
+    by: Literal["none", "poses", "covisibility"] = Field(
+        default="covisibility",
+        description="none: all candidates are one cluster; poses: images whose centres are near; "
+        "covisibility: images that see the same points",
+    )
+    radius: float | None = Field(
+        default=None,
+        gt=0,
+        description="poses: centres this close, in the map's unit, belong together, and so do "
+        "all that are joined by such steps",
+    )
+    min_shared_points: int = Field(
+        default=10, gt=0, description="covisibility: images with so many points in common"
+    )
+    max_clusters: int = Field(
+        default=10, gt=0, description="clusters tried, those with the most matches"
+    )
+
+    def idle(self) -> dict[str, str]:
+        idle = {}
+        if self.by != "poses":
+            idle["radius"] = f"it is for clusters by poses, these are by {self.by}"
+        if self.by != "covisibility":
+            idle["min_shared_points"] = f"it is for covisibility, clusters are by {self.by}"
+        return idle
+
+    @model_validator(mode="after")
+    def _has_scale(self) -> ClusterOptions:
+        if self.by == "poses" and self.radius is None:
+            raise ValueError("clusters by poses need a radius, in the map's unit")
+        return self
+
+
+def cluster_by_centers(centers: NDArray[np.float64], radius: float) -> NDArray[np.int64]:
+    """Single linkage of centres (N, 3): labels int64 (N,), in the order of their first members."""
+    if len(centers) == 0:
+        return np.zeros(0, np.int64)
+    pairs = cKDTree(centers).query_pairs(radius, output_type="ndarray")
+    return _components(len(centers), pairs)
+
+
+def cluster_by_shared_points(
+    shared: NDArray[np.int64], min_shared_points: int
+) -> NDArray[np.int64]:
+    """Images joined by the points they share (N, N): labels int64 (N,), as of centres.
+
+    Where no two images share a point at all (a map lifted from depth) co-visibility says nothing,
+    and all are one cluster.
+    """
+    apart = shared - np.diag(np.diag(shared))
+    if not apart.any():
+        return np.zeros(len(shared), np.int64)
+    return _components(len(shared), np.argwhere(np.triu(apart) >= min_shared_points))
+
+
+def cluster_candidates(
+    images: Sequence[str],
+    frames: Sequence[str],
+    options: ClusterOptions,
+    *,
+    centers: Mapping[str, NDArray[np.float64]],
+    indices: Sequence[MapIndex],
+) -> list[tuple[str, ...]]:
+    """Divide candidates into clusters, in the order of their first members.
+
+    Parameters
+    ----------
+    images, frames : the candidates, best first, and the coordinate frame of each; different frames
+        are never joined.
+    centers : of the images in the world, (3,) each.
+    indices : the map's points by keypoints type; shared points of all types add up.
+    """
+    clusters: list[list[int]] = []
+    for frame in dict.fromkeys(frames):
+        members = [at for at, own in enumerate(frames) if own == frame]
+        names = [images[at] for at in members]
+        if options.by == "poses" and options.radius is not None:
+            labels = cluster_by_centers(np.array([centers[name] for name in names]), options.radius)
+        elif options.by == "covisibility":
+            shared = sum(
+                (index.shared_points(names) for index in indices),
+                np.zeros((len(names), len(names)), np.int64),
+            )
+            labels = cluster_by_shared_points(shared, options.min_shared_points)
+        else:
+            labels = np.zeros(len(names), np.int64)
+        clusters += [
+            [members[at] for at in np.flatnonzero(labels == label)]
+            for label in range(int(labels.max()) + 1 if len(labels) else 0)
+        ]
+    return [tuple(images[at] for at in cluster) for cluster in sorted(clusters)]
+
+
+def _components(count: int, pairs: NDArray[np.integer]) -> NDArray[np.int64]:
+    links = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    _, labels = connected_components(links, directed=False)
+    _, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
+    order = np.argsort(np.argsort(first))
+    return np.asarray(order[inverse], np.int64)
 
 
 def interleave(rankings: Sequence[Sequence[str]]) -> list[str]:
@@ -77,7 +187,8 @@ def localize_in_clusters(
     """Localize a query in each cluster by itself, rank the poses, and refine the best.
 
     Clusters whose poses explain each other are joined (images that look to different sides share no
-    points), and are localized in together.
+    points), and are localized in together. The pose of a rig is ``rig_from_world``; the mask of its
+    inliers runs over the views, and in each over the keypoints types, in their order.
 
     Parameters
     ----------
@@ -89,31 +200,24 @@ def localize_in_clusters(
     centers : of the map images, (3,) each; needed for ``min_confidence``.
     min_confidence : a pose of less is a failure; None: poses have no confidence.
     scene : looked at where the confidence is in doubt; None: nothing is.
-
-    Returns
-    -------
-    The pose, of a rig ``rig_from_world``; the mask of its inliers runs over the views, and in each
-    over the keypoints types, in their order. Or a failure with its reason.
     """
     clock = Clock()
     matched = interleave([view.matched_images() for view in views])
     rank_of = {image: rank for rank, image in enumerate(matched)}
     clusters = [[image for image in cluster if image in rank_of] for cluster in clusters]
-    gathered = [[observed_matches(m.index, m.matches) for m in view.matches] for view in views]
-    counts = [num_observed(views, gathered, cluster) for cluster in clusters]
+    gathered = [[(m, observed_matches(m.index, m.matches)) for m in v.matches] for v in views]
+    every = [both for own in gathered for both in own]
+    counts = [
+        sum(int(typed.rows_of(cluster)[found.image_rows].sum()) for typed, found in every)
+        for cluster in clusters
+    ]
     by_matches = sorted(range(len(clusters)), key=lambda at: (-counts[at], at))
     tried = sorted(at for at in by_matches[:max_clusters] if counts[at])
     clock.lap("correspondences")
 
     def attempt(cluster: Sequence[str], frame: str) -> _Attempt:
-        found = [
-            [
-                observed.resolve(rows_of_images(m, cluster))
-                for m, observed in zip(view.matches, own, strict=True)
-            ]
-            for view, own in zip(views, gathered, strict=True)
-        ]
-        problem = PoseProblem.of(list(map(view_of, views, found)))
+        found = [[one.resolve(typed.rows_of(cluster)) for typed, one in own] for own in gathered]
+        problem = PoseProblem.of([view.view(own) for view, own in zip(views, found, strict=True)])
         clock.lap("correspondences")
         if is_uncertain(problem):
             problem, estimate = estimate_with_intrinsics(problem, options)
@@ -132,12 +236,16 @@ def localize_in_clusters(
         return ClusterLocalization(failure, (0,) * len(views))
     hypotheses = [each.hypothesis for each in attempts if each.hypothesis is not None]
     scores = iter(rank(hypotheses).tolist() if hypotheses else ())
-    ranked = tuple(_cluster_pose(each, None if each.failed else next(scores)) for each in attempts)
+    ranked = tuple(
+        each.as_cluster_pose(None if each.hypothesis is None else next(scores)) for each in attempts
+    )
     clock.lap("ranking")
     best = _best(ranked)
     problem, estimate = attempts[best].problem, attempts[best].estimate
     if isinstance(estimate, Failure):
-        result: Pose | Failure = _failure(ranked, best)
+        others = f", the best of {len(ranked)} clusters" if len(ranked) > 1 else ""
+        counted = estimate.num_matches, estimate.num_inliers
+        result: Pose | Failure = Failure(estimate.reason + others, *counted)
     else:
         if is_uncertain(problem):
             problem, result = refine_with_intrinsics(problem, estimate, options, views[0].camera)
@@ -148,7 +256,7 @@ def localize_in_clusters(
             found = attempts[best].found
             sources = match_sources(views, found, ranked[best].images, centers or {})
             if scene is not None:
-                seen = partial(_displacements_rad, problem, views, found, scene)
+                seen = partial(displacements_rad, problem, views, found, scene)
                 sources = replace(sources, displacements_rad=seen)
             result = with_confidence(problem, result, sources, options.max_error_px, min_confidence)
             if isinstance(result, Pose) and result.camera is None:
@@ -172,14 +280,19 @@ class _Attempt:
 
     cluster: tuple[str, ...]
     frame: str
-    found: Sequence[Sequence[Correspondences]]  # of each view, by keypoints type
+    found: Found
     problem: PoseProblem
     estimate: PoseEstimate | Failure
     hypothesis: PoseHypothesis | None
 
-    @property
-    def failed(self) -> bool:
-        return self.hypothesis is None
+    def as_cluster_pose(self, score: float | None) -> ClusterPose:
+        """The attempt as it is reported."""
+        images, estimate = self.cluster, self.estimate
+        if isinstance(estimate, Failure):
+            counted = (estimate.num_matches, estimate.num_inliers)
+            return ClusterPose(images, *counted, reason=estimate.reason)
+        counted = (len(estimate.inliers), estimate.num_inliers)
+        return ClusterPose(images, *counted, estimate.rig_from_world, score)
 
 
 def _join_agreeing(
@@ -213,16 +326,6 @@ def _join_agreeing(
     return found
 
 
-def _cluster_pose(attempt: _Attempt, score: float | None) -> ClusterPose:
-    images = attempt.cluster
-    estimate = attempt.estimate
-    if isinstance(estimate, Failure):
-        counted = (estimate.num_matches, estimate.num_inliers)
-        return ClusterPose(images, *counted, reason=estimate.reason)
-    counted = (len(estimate.inliers), estimate.num_inliers)
-    return ClusterPose(images, *counted, estimate.rig_from_world, score)
-
-
 def _best(clusters: Sequence[ClusterPose]) -> int:
     """The first of the highest score; without any score the one that came nearest to a pose."""
 
@@ -234,41 +337,6 @@ def _best(clusters: Sequence[ClusterPose]) -> int:
     return max(range(len(clusters)), key=key)
 
 
-def _failure(clusters: Sequence[ClusterPose], best: int) -> Failure:
-    nearest = clusters[best]
-    others = f", the best of {len(clusters)} clusters" if len(clusters) > 1 else ""
-    return Failure(nearest.reason + others, nearest.num_matches, nearest.num_inliers)
-
-
-def _displacements_rad(
-    problem: PoseProblem,
-    views: Sequence[QueryView],
-    found: Sequence[Sequence[Correspondences]],
-    scene: RankingScene,
-    pose: Pose,
-) -> NDArray[np.float64]:
-    """See :attr:`MatchSources.displacements_rad`; of each match the first image that says so."""
-    assert pose.inliers is not None  # it was estimated here
-    angles = [np.zeros(0)]
-    inliers = split_by_view(problem.views, pose.inliers)
-    for query, view, of_types, kept in zip(views, problem.views, found, inliers, strict=True):
-        shown_by = [
-            typed.matches[row][0]
-            for typed, own in zip(query.matches, of_types, strict=True)
-            for row in own.image_rows[np.cumsum(own.support) - own.support].tolist()
-        ]
-        found_px = displacements_px(
-            query.name,
-            view.camera,
-            view.cam_from_rig @ pose.cam_from_world,
-            view.points_world[kept],
-            [shown_by[row] for row in np.flatnonzero(kept)],
-            scene,
-        )
-        angles.append(found_px / focal_px(view.camera))
-    return np.concatenate(angles)
-
-
 def _hypothesis(
     images: tuple[str, ...],
     views: Sequence[QueryView],
@@ -276,26 +344,22 @@ def _hypothesis(
     estimate: PoseEstimate,
     options: AbsolutePoseOptions,
 ) -> PoseHypothesis:
-    posed = []
-    parts = (
-        split_by_view(problem.views, of_matches)
-        for of_matches in (problem.points_px, estimate.errors_px, estimate.inliers)
-    )
-    for query, view, points_px, errors_px, inliers in zip(
-        views, problem.views, *parts, strict=True
-    ):
-        posed.append(
-            HypothesisView(
-                name=query.name,
-                camera=view.camera,
-                cam_from_world=view.cam_from_rig @ estimate.rig_from_world,
-                points_px=points_px,
-                points_world=view.points_world,
-                errors_px=errors_px,
-                inliers=inliers,
-            )
+    parts = map(problem.split, (problem.points_px, estimate.errors_px, estimate.inliers))
+    posed = tuple(
+        HypothesisView(
+            name=query.name,
+            camera=view.camera,
+            cam_from_world=view.cam_from_rig @ estimate.rig_from_world,
+            points_px=points_px,
+            points_world=view.points_world,
+            errors_px=errors_px,
+            inliers=inliers,
         )
-    return PoseHypothesis(images, tuple(posed), options.max_error_px)
+        for query, view, points_px, errors_px, inliers in zip(
+            views, problem.views, *parts, strict=True
+        )
+    )
+    return PoseHypothesis(images, posed, options.max_error_px)
 
 
 class Clock:
@@ -328,66 +392,36 @@ def poses_of_cameras(
     if not isinstance(result, Pose) or result.inliers is None:
         raise ValueError("the rig has no pose, or its inliers are not known")
     masks = np.split(result.inliers, np.cumsum(found.matches_of_views)[:-1])
-    last = np.cumsum([mask.sum() for mask in masks])
     cameras: list[Pose | Failure] = []
-    for view, inliers, end in zip(views, masks, last.tolist(), strict=True):
-        num_inliers = int(inliers.sum())
-        own = slice(end - num_inliers, end)
-        if num_inliers == 0:
-            cameras.append(
-                Failure(
-                    "no inlier in this camera; others of its rig were localized",
-                    num_matches=len(inliers),
-                    candidates=result.candidates,
-                    clusters=_of_camera(result.clusters, view.cam_from_rig),
-                    seconds=result.seconds,
-                )
-            )
-            continue
-        cameras.append(
-            replace(
-                result,
-                cam_from_world=view.cam_from_rig @ result.cam_from_world,
-                clusters=_of_camera(result.clusters, view.cam_from_rig),
-                num_matches=len(inliers),
-                num_inliers=num_inliers,
-                inliers=inliers,
-                inlier_points_px=_rows_of(result.inlier_points_px, own),
-                inlier_points_world=_rows_of(result.inlier_points_world, own),
-                covariance=None
-                if result.covariance is None
-                else transform_covariance(result.covariance, view.cam_from_rig),
-            )
+    end = 0
+    for view, inliers in zip(views, masks, strict=True):
+        start, end = end, end + int(inliers.sum())
+        clusters = tuple(
+            one
+            if one.cam_from_world is None
+            else replace(one, cam_from_world=view.cam_from_rig @ one.cam_from_world)
+            for one in result.clusters
         )
+        px, points = result.inlier_points_px, result.inlier_points_world
+        own = replace(
+            result,
+            cam_from_world=view.cam_from_rig @ result.cam_from_world,
+            clusters=clusters,
+            num_matches=len(inliers),
+            num_inliers=end - start,
+            inliers=inliers,
+            inlier_points_px=None if px is None else px[start:end],
+            inlier_points_world=None if points is None else points[start:end],
+        )
+        if own.covariance is not None:
+            moved = transform_covariance(own.covariance, view.cam_from_rig)
+            own = replace(own, covariance=moved)
+        failure = Failure(
+            "no inlier in this camera; others of its rig were localized",
+            num_matches=len(inliers),
+            candidates=result.candidates,
+            clusters=clusters,
+            seconds=result.seconds,
+        )
+        cameras.append(own if start < end else failure)
     return cameras
-
-
-def _rows_of(points: NDArray[np.float64] | None, rows: slice) -> NDArray[np.float64] | None:
-    return None if points is None else points[rows]
-
-
-def _of_camera(
-    clusters: Sequence[ClusterPose], cam_from_rig: RigidTransform
-) -> tuple[ClusterPose, ...]:
-    """The clusters of a rig, with the poses of one of its cameras."""
-    return tuple(
-        cluster
-        if cluster.cam_from_world is None
-        else replace(cluster, cam_from_world=cam_from_rig @ cluster.cam_from_world)
-        for cluster in clusters
-    )
-
-
-def transform_covariance(
-    covariance: NDArray[np.float64], cam_from_rig: RigidTransform
-) -> NDArray[np.float64]:
-    """Covariance (6, 6) of ``cam_from_rig @ rig_from_world`` of one of ``rig_from_world``.
-
-    Both of left perturbations, rotation first: with ``C exp(xi) = exp(Ad_C xi) C`` it is
-    ``Ad_C covariance Ad_C^T`` (Barfoot, State Estimation for Robotics, section 7.1.4).
-    """
-    rotation = cam_from_rig.rotation_matrix()
-    adjoint = np.zeros((6, 6))
-    adjoint[:3, :3] = adjoint[3:, 3:] = rotation
-    adjoint[3:, :3] = cross_matrix(np.array(cam_from_rig.translation)) @ rotation
-    return np.asarray(adjoint @ covariance @ adjoint.T)

@@ -21,15 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.geometry.cameras import focal_px, project
-from megloc_kapture.localization.absolute_pose import center_deviation
-from megloc_kapture.localization.estimation import (
-    PoseProblem,
-    reprojection_errors_px,
-    split_by_view,
-    whitened_errors_px,
-)
+from megloc_kapture.localization.absolute_pose import center_deviation, match_errors
+from megloc_kapture.localization.map_index import Correspondences, PoseProblem, QueryView
 from megloc_kapture.values import Failure, Pose, RigidTransform
 
+Floats = NDArray[np.float64]
 # of an a contrario test: matches that a pose is made of
 _SAMPLE = 3
 # inliers so near to each other count once, as a share of the image's diagonal
@@ -76,13 +72,13 @@ class MatchSources:
     """
 
     support: NDArray[np.int64]
-    centers: NDArray[np.float64]
+    centers: Floats
     images: NDArray[np.int64]
     num_keypoints: int
-    noise: NDArray[np.float64]
-    seen: Sequence[NDArray[np.float64]]
+    noise: Floats
+    seen: Sequence[Floats]
     local_types: Collection[str] = ()
-    displacements_rad: Callable[[Pose], NDArray[np.float64]] | None = None
+    displacements_rad: Callable[[Pose], Floats] | None = None
 
 
 def evidence_of(
@@ -90,19 +86,14 @@ def evidence_of(
 ) -> dict[str, float]:
     """The terms that speak for a pose or against it, by the names of :data:`TERMS`.
 
-    Parameters
-    ----------
-    pose : of the problem, refined, with its covariance and inliers; of a rig ``rig_from_world``.
-
-    Raises
-    ------
-    ValueError : the pose brings no inliers or no covariance.
+    The pose is of the problem, refined; of a rig ``rig_from_world``. Raises ValueError where it
+    brings no inliers or no covariance.
     """
     if pose.inliers is None or pose.covariance is None:
         raise ValueError("evidence needs the inliers and the covariance of a pose")
     rig_from_world = pose.cam_from_world
     inliers = pose.inliers
-    errors_px = reprojection_errors_px(problem, rig_from_world)
+    errors_px, _ = match_errors(problem, rig_from_world)
     count, num = int(inliers.sum()), len(inliers)
     center = rig_from_world.center()
     points = problem.points[inliers] + problem.offset
@@ -137,19 +128,20 @@ def with_confidence(
     evidence = evidence_of(problem, pose, sources, max_error_px)
     model = calibration_for(sources.local_types)
     confidence = model.probability(evidence)
+    weakest = min(model.weights, key=lambda name: model.weights[name] * evidence[name])
     if confidence >= min_confidence:
         return replace(pose, confidence=confidence, evidence=evidence)
     return Failure(
         f"confidence {confidence:.2g} of the pose, at least {min_confidence:g} is needed: "
         f"{pose.num_inliers} of {pose.num_matches} 2D-3D matches agree, and "
-        f"{model.weakest(evidence)}",
+        f"{TERMS[weakest]}",
         num_matches=pose.num_matches,
         num_inliers=pose.num_inliers,
         confidence=confidence,
     )
 
 
-def _surprise(problem: PoseProblem, errors_px: NDArray[np.float64], max_error_px: float) -> float:
+def _surprise(problem: PoseProblem, errors_px: Floats, max_error_px: float) -> float:
     """How unlikely it is that so many matches agree by chance: -log10 of the number of false
     alarms, at least 0.
 
@@ -160,7 +152,7 @@ def _surprise(problem: PoseProblem, errors_px: NDArray[np.float64], max_error_px
     The radius is the one that surprises most. Matches that stand together count once.
     """
     errors, shares = [], []
-    for view, of_view in zip(problem.views, split_by_view(problem.views, errors_px), strict=True):
+    for view, of_view in zip(problem.views, problem.split(errors_px), strict=True):
         width, height = view.camera.width, view.camera.height
         cells = np.floor(view.points_px / max(_CELL * math.hypot(width, height), 1))
         order = np.argsort(of_view, kind="stable")
@@ -187,7 +179,7 @@ def _surprise(problem: PoseProblem, errors_px: NDArray[np.float64], max_error_px
     return max(0.0, -float(log_alarms.min()) / math.log(10))
 
 
-def _log_choose(n: int | NDArray[np.int64], k: int | NDArray[np.int64]) -> NDArray[np.float64]:
+def _log_choose(n: int | NDArray[np.int64], k: int | NDArray[np.int64]) -> Floats:
     from scipy.special import gammaln
 
     return np.asarray(
@@ -197,7 +189,7 @@ def _log_choose(n: int | NDArray[np.int64], k: int | NDArray[np.int64]) -> NDArr
 
 def _misfit(
     problem: PoseProblem,
-    errors_px: NDArray[np.float64],
+    errors_px: Floats,
     pose: Pose,
     inliers: NDArray[np.bool_],
     sources: MatchSources,
@@ -220,7 +212,7 @@ def _misfit(
     # points that little parallax placed are off by more where they are seen from elsewhere
     share = (noise_px / own_px)[:, None] ** 2
     relative = replace(problem, covariances=problem.covariances * share[: len(problem.covariances)])
-    explained = whitened_errors_px(relative, pose.cam_from_world)
+    _, explained = match_errors(relative, pose.cam_from_world)
     known = inliers & np.isfinite(own_px)
     if known.sum() <= _FEW:
         return 0.0
@@ -235,7 +227,7 @@ def _misfit(
 
 
 def _num_visible(
-    problem: PoseProblem, rig_from_world: RigidTransform, seen: Sequence[NDArray[np.float64]]
+    problem: PoseProblem, rig_from_world: RigidTransform, seen: Sequence[Floats]
 ) -> int:
     """Of the points that the map's images observe, those that fall into a view."""
     total = 0.0
@@ -249,8 +241,8 @@ def _num_visible(
 
 
 def _viewpoints(
-    points: NDArray[np.float64],
-    center: NDArray[np.float64],
+    points: Floats,
+    center: Floats,
     sources: MatchSources,
     inliers: NDArray[np.bool_],
     sighted: NDArray[np.bool_],
@@ -269,12 +261,9 @@ def _viewpoints(
 
 @dataclass(frozen=True)
 class Calibration:
-    """A logistic model of the confidence.
+    """A logistic model of the confidence, and the data that it was fitted to.
 
-    Attributes
-    ----------
-    origin : the data that it was fitted to.
-    bias, weights : of the terms, by name; a term without a weight counts nothing.
+    Its weights are of the terms, by name; a term without a weight counts nothing.
     """
 
     origin: str
@@ -288,18 +277,13 @@ class Calibration:
         )
         return 1.0 / (1.0 + math.exp(-min(max(logit, -700.0), 700.0)))
 
-    def weakest(self, evidence: Mapping[str, float]) -> str:
-        """In words, the term that speaks most against a pose."""
-        return TERMS[min(self.weights, key=lambda name: self.weights[name] * evidence[name])]
-
 
 OF_ALL = "all"
 
 
 @lru_cache(maxsize=1)
 def calibrations() -> Mapping[str, Calibration]:
-    """The calibrations that the package brings: :data:`OF_ALL`, and those of keypoints types, by
-    what the types' names begin with."""
+    """The package's calibrations: :data:`OF_ALL`, and by what keypoints types' names begin with."""
     text = resources.files(__package__).joinpath("confidence.toml").read_text(encoding="utf-8")
     return {
         name: Calibration(table["origin"], table["bias"], table["weights"])
@@ -315,3 +299,35 @@ def calibration_for(local_types: Collection[str]) -> Calibration:
         for one in local_types
     }
     return known[found.pop() if len(found) == 1 else OF_ALL]
+
+
+def match_sources(
+    views: Sequence[QueryView],
+    found: Sequence[Sequence[Correspondences]],
+    cluster: Sequence[str],
+    centers: Mapping[str, Floats],
+) -> MatchSources:
+    """Where the matches of a cluster come from, and what its images see."""
+    number = {image: at for at, image in enumerate(cluster)}
+    center_of = np.array([centers[image] for image in cluster]).reshape(-1, 3)
+    support, images, noise, seen = [], [], [], []
+    for view, of_types in zip(views, found, strict=True):
+        for typed, own in zip(view.matches, of_types, strict=True):
+            rows = np.array([number.get(image, -1) for image, _, _ in typed.matches], np.int64)
+            support.append(own.support)
+            images.append(rows[own.image_rows])
+            index = typed.index
+            noise.append(np.tile([index.noise_rad, index.noise_px], (len(own.support), 1)))
+        seen.append(
+            np.concatenate([np.zeros((0, 3)), *(m.index.seen_by(cluster) for m in view.matches)])
+        )
+    rows_of_images = np.concatenate(images)
+    return MatchSources(
+        support=np.concatenate(support),
+        centers=center_of[rows_of_images],
+        images=rows_of_images,
+        num_keypoints=sum(len(m.keypoints_px) for view in views for m in view.matches),
+        noise=np.concatenate(noise),
+        seen=seen,
+        local_types={own.index.local_type for view in views for own in view.matches},
+    )

@@ -1,4 +1,4 @@
-"""Intrinsics of one camera, from the matches of its pose.
+"""Intrinsics of a camera, from the matches of its pose, or of the poses of several photographs.
 
 A wrong focal length hides in the pose: the camera is moved nearer or farther, and most matches
 still agree. What gives it away is perspective. With a pose at hand the focal length is set free
@@ -17,6 +17,7 @@ Of a flat scene seen straight on matches say nothing: then what was known before
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,15 +35,17 @@ from megloc_kapture.geometry.cameras import (
     with_distortion,
 )
 from megloc_kapture.io.colmap_cameras import focal_from_matches
-from megloc_kapture.localization.absolute_pose import check_stable, refine_pose
-from megloc_kapture.localization.estimation import (
+from megloc_kapture.localization.absolute_pose import (
     AbsolutePoseOptions,
     PoseEstimate,
-    PoseProblem,
+    check_stable,
     estimate_pose,
+    refine_pose,
 )
+from megloc_kapture.localization.map_index import PoseProblem, View
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
+Floats = NDArray[np.float64]
 # errors of a map are alike in neighbouring points, and lenses are no pinholes: deviations that
 # take every match for independent are too small by a factor (measured: docs/photos.md)
 _CORRELATED, _MIN_ERROR_PX = 5.0, 0.5
@@ -58,42 +61,40 @@ _MAX_DEVIATIONS = 3.0
 # standard deviations of what nobody tells of a camera: the principal point's as a share of the
 # larger side, and the radial distortion's
 _PRINCIPAL_POINT_DEVIATION, _DISTORTION_DEVIATION = 0.01, 0.1
+# an estimate this many standard deviations off is of another zoom
+_MAX_SIGMAS = 3.0
+# errors of a map, and a lens that is none of the model, are alike in photographs: their number
+# averages less out than if they were independent (measured: docs/photos.md)
+_ALIKE = 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """The best change of a camera.
+    """The best change of a camera, and the pose that goes with it.
 
     Attributes
     ----------
-    change : float64 (1, 3 or 4,): logarithm of the focal length's factor; the principal point's
-        shift, as a share of the focal length; the radial distortion's.
-    deviation : of the logarithm.
-    rig_from_world : the pose that goes with it.
+    change : float64 (1, 3 or 4,): logarithm of the focal length's factor, of which ``deviation``
+        is; the principal point's shift, as a share of the focal length; the radial distortion's.
     pose_covariance : float64 (6, 6), what the uncertainty of the camera adds to that of the pose.
     depth : median of the inliers', unit of the map.
     """
 
-    change: NDArray[np.float64]
+    change: Floats
     deviation: float
     rig_from_world: RigidTransform
-    pose_covariance: NDArray[np.float64]
+    pose_covariance: Floats
     depth: float
 
 
 def is_uncertain(problem: PoseProblem) -> bool:
-    """Whether the problem is of one camera whose focal length is not known for certain."""
+    """True if the problem is of one camera whose focal length is not known for certain."""
     return len(problem.views) == 1 and problem.views[0].camera.focal_deviation > 0
 
 
 def focal_remark(problem: PoseProblem, pose: Pose) -> str | None:
-    """In words, that another focal length fits better; None where the given one may be right.
-
-    Parameters
-    ----------
-    problem : of one camera on its own; of a rig nothing is said.
-    pose : of it, with its inliers.
-    """
+    """Say that another focal length fits better; None where the given one may be right, or of a
+    rig."""
     if len(problem.views) != 1 or pose.inliers is None or pose.num_inliers < _MIN_INLIERS:
         return None
     found = _fit(problem, pose.cam_from_world, pose.inliers)
@@ -108,7 +109,7 @@ def focal_remark(problem: PoseProblem, pose: Pose) -> str | None:
 
 
 def estimate_remark(camera: Camera, given: Camera) -> str:
-    """In words, the focal length that was estimated of an uncertain camera."""
+    """Name the focal length that was estimated of an uncertain camera."""
     found_px, given_px = focal_px(camera), focal_px(given)
     return (
         f"focal length estimated: {found_px:.0f} +- {camera.focal_deviation * found_px:.0f} px "
@@ -119,12 +120,7 @@ def estimate_remark(camera: Camera, given: Camera) -> str:
 def estimate_with_intrinsics(
     problem: PoseProblem, options: AbsolutePoseOptions
 ) -> tuple[PoseProblem, PoseEstimate | Failure]:
-    """Estimate the pose and the intrinsics of an uncertain camera.
-
-    Returns
-    -------
-    The problem of the camera with these intrinsics, and the estimate of its pose.
-    """
+    """Estimate pose and intrinsics of an uncertain camera; the problem is then that camera's."""
     given = problem.views[0].camera
     found = estimate_pose(problem, options)
     free = focal_from_matches(
@@ -152,14 +148,9 @@ def refine_with_intrinsics(
 ) -> tuple[PoseProblem, Pose | Failure]:
     """Refine pose and intrinsics of an uncertain camera, in turns.
 
-    Parameters
-    ----------
-    given : the camera as it was given, with the deviation of its focal length.
-
-    Returns
-    -------
-    The problem of the refined camera, and the Pose, its ``camera`` that one with the deviation that
-    remains; or a Failure.
+    ``given`` is the camera as it was given, with the deviation of its focal length. The problem is
+    then that of the refined camera, which is the Pose's ``camera``, with the deviation that
+    remains.
     """
     updates = 0
     while True:
@@ -174,31 +165,20 @@ def refine_with_intrinsics(
                 num_inliers=pose.num_inliers,
             )
         if abs(fit.change[0]) < _SETTLED or updates == _MAX_UPDATES:
-            camera = problem.views[0].camera
-            return problem, _with_uncertainty(pose, camera, fit, options)
+            covariance = pose.covariance + fit.pose_covariance
+            camera = replace(problem.views[0].camera, focal_deviation=fit.deviation)
+            pose = replace(pose, covariance=covariance, camera=camera)
+            return problem, check_stable(pose, covariance, fit.depth, options)
         updates += 1
         problem = _with_camera(problem, _changed(problem.views[0].camera, fit.change))
         estimate = replace(estimate, rig_from_world=fit.rig_from_world)
-
-
-def _with_uncertainty(
-    pose: Pose, camera: Camera, fit: _Fit, options: AbsolutePoseOptions
-) -> Pose | Failure:
-    if pose.covariance is None:
-        return pose
-    found = replace(
-        pose,
-        covariance=pose.covariance + fit.pose_covariance,
-        camera=replace(camera, focal_deviation=fit.deviation),
-    )
-    return check_stable(found, fit.depth, options)
 
 
 def _with_camera(problem: PoseProblem, camera: Camera) -> PoseProblem:
     return PoseProblem.of([replace(problem.views[0], camera=camera)])
 
 
-def _changed(camera: Camera, change: NDArray[np.float64]) -> Camera:
+def _changed(camera: Camera, change: Floats) -> Camera:
     focal = focal_px(camera)
     camera = shift_principal_point(camera, *(focal * change[1:3]).tolist())
     camera = scale_focal(camera, math.exp(change[0]))
@@ -207,7 +187,7 @@ def _changed(camera: Camera, change: NDArray[np.float64]) -> Camera:
     return with_distortion(camera, radial_distortion(camera) + float(change[3]))
 
 
-def _prior_of(camera: Camera, given: Camera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _prior_of(camera: Camera, given: Camera) -> tuple[Floats, Floats]:
     """The change that makes a camera the given one, and its standard deviations."""
     focal = focal_px(camera)
     shift = np.subtract(principal_point_px(given), principal_point_px(camera)) / focal
@@ -232,10 +212,8 @@ def _fit(
 ) -> _Fit | None:
     """The camera that fits the inliers best; None where nothing determines it.
 
-    Parameters
-    ----------
-    given : the camera as it is known before, with its deviation; None: nothing is known of the
-        focal length, and the rest is as it is.
+    Without ``given``, the camera as it is known before, with its deviation, nothing is known of the
+    focal length, and the rest is as it is.
     """
     (view,) = problem.views
     rays = normalized_from_px(view.camera, problem.points_px[inliers])
@@ -309,4 +287,73 @@ def _fit(
         rig_from_world=view.cam_from_rig.inverse() @ moved,
         pose_covariance=between @ np.linalg.solve(of_camera, between.T),
         depth=float(np.median(z)),
+    )
+
+
+def shared_camera(cameras: Sequence[Camera]) -> Camera:
+    """The camera that estimates of one camera agree on: medians, weighted by their certainty.
+
+    They are of one model and size, with their ``focal_deviation``; at least one.
+    """
+    weights = np.array([camera.focal_deviation**-2.0 for camera in cameras])
+    params = np.array([camera.params for camera in cameras])
+    order = np.argsort(params, axis=0, kind="stable")
+    below = np.cumsum(weights[order], axis=0)
+    middle = (below < 0.5 * below[-1]).sum(axis=0)
+    found = np.take_along_axis(params, order, axis=0)[middle, np.arange(params.shape[1])]
+    deviation = _ALIKE / math.sqrt(float(weights.sum()))
+    return replace(cameras[0], params=tuple(found.tolist()), focal_deviation=deviation)
+
+
+def solve_with_shared_camera(poses: Sequence[Pose], options: AbsolutePoseOptions) -> list[Pose]:
+    """Poses of photographs of one camera, solved again with what all of them tell of it.
+
+    A photograph whose own estimate contradicts the others', as one at another zoom, keeps it; and
+    so does one whose pose was refined by other means.
+
+    The poses come with the camera that was estimated of each, and their inliers.
+    """
+    usable = [p.camera for p in poses if p.camera is not None and p.camera.focal_deviation > 0]
+    if len(usable) < 2:
+        return list(poses)
+    shared = shared_camera(usable)
+    near = [
+        camera
+        for camera in usable
+        if abs(math.log(focal_px(camera) / focal_px(shared)))
+        <= _MAX_SIGMAS * math.hypot(camera.focal_deviation, shared.focal_deviation)
+    ]
+    if len(near) < 2:
+        return list(poses)
+    shared = shared_camera(near)
+    return [
+        _solved(pose, shared, len(near), options)
+        if pose.camera in near and not pose.refinements
+        else pose
+        for pose in poses
+    ]
+
+
+def _solved(pose: Pose, shared: Camera, number: int, options: AbsolutePoseOptions) -> Pose:
+    """The pose with the shared camera; the pose itself where its inliers do not allow it."""
+    if pose.inlier_points_px is None or pose.inlier_points_world is None:
+        return pose
+    inliers = pose.inlier_points_px, pose.inlier_points_world
+    problem = PoseProblem.of([View(shared, RigidTransform.identity(), *inliers)])
+    every = np.ones(len(problem.points), bool)
+    start = PoseEstimate(pose.cam_from_world, every, every, np.zeros(len(every)))
+    _, found = refine_with_intrinsics(problem, start, options, shared)
+    if not isinstance(found, Pose) or found.camera is None:
+        return pose
+    camera = found.camera
+    remark = (
+        f"focal length estimated of {number} photographs: {focal_px(camera):.0f} +- "
+        f"{camera.focal_deviation * focal_px(camera):.0f} px"
+    )
+    return replace(
+        pose,
+        cam_from_world=found.cam_from_world,
+        covariance=found.covariance,
+        camera=camera,
+        remarks=(*(r for r in pose.remarks if not r.startswith("focal length estimated")), remark),
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -30,14 +29,11 @@ class LpipsOptions(NetworkOptions):
 
 
 class LpipsDistance:
-    """Plugin ``lpips``: LPIPS 0.1 over the valid pixels.
+    """Plugin ``lpips``: LPIPS 0.1 (:class:`megloc_kapture.nets.lpips.Lpips`) over the valid pixels.
 
-    The formula is that of :class:`megloc_kapture.nets.lpips.Lpips`. Weights other than the
-    published ones make it ``lpips-like``: its values compare with each other, not with published
-    ones.
-
-    Features of the last few first images are kept with their valid pixels: who compares a query
-    with one view after another over the same pixels pays once for the query.
+    Weights other than the published ones make it ``lpips-like``: its values compare with each
+    other, not with published ones. Features of the last few first images are kept with their valid
+    pixels: who compares a query with one view after another over the same pixels pays once for it.
     """
 
     name = "lpips"
@@ -66,52 +62,40 @@ class LpipsDistance:
         if not valid.any() or min(valid.shape) < SMALLEST_PX:
             return float("inf")
         options = self.options
-        net = _Network(
-            options.net,
-            self._trunk,
-            self._heads,
-            pick_device(options.device),
-            options.half_precision,
-        )
+        device, half = pick_device(options.device), options.half_precision
+        made = options.net, self._trunk, self._heads, device
         pixels = valid.tobytes()
-        kept = _features_kept(net, a.shape, a.tobytes(), pixels)
-        with inference(net.device, net.half_precision):
-            counts = _counts(net, a.shape, pixels)
-            features = net.module().described(image_tensor(b, net.device), counts)
-            return float(net.module().between(kept, features, counts)[0])
-
-
-@dataclass(frozen=True)
-class _Network:
-    """A network, and how it runs; hashable."""
-
-    kind: Trunk
-    trunk: WeightsFile
-    heads: WeightsFile
-    device: torch.device
-    half_precision: bool
-
-    def module(self) -> Lpips:
-        return _module(self.kind, self.trunk, self.heads, self.device)
+        kept = _features_kept(made, half, a.shape, a.tobytes(), pixels)
+        network = _network(*made)
+        with inference(device, half):
+            counts = _counts(valid.shape, pixels, device)
+            features = network.described(image_tensor(b, device), counts)
+            return float(network.between(kept, features, counts)[0])
 
 
 # one for each camera of a rig; some 10 MB each at 320 x 240, VGG-16's 40
 @lru_cache(maxsize=4)
 def _features_kept(
-    net: _Network, shape: tuple[int, ...], image: bytes, valid: bytes
+    made: tuple[Trunk, WeightsFile, WeightsFile, torch.device],
+    half_precision: bool,
+    shape: tuple[int, ...],
+    image: bytes,
+    valid: bytes,
 ) -> list[torch.Tensor]:
+    device = made[-1]
     pixels = np.frombuffer(image, np.uint8).reshape(shape)
-    with inference(net.device, net.half_precision):
-        return net.module().described(image_tensor(pixels, net.device), _counts(net, shape, valid))
+    with inference(device, half_precision):
+        counts = _counts(shape, valid, device)
+        return _network(*made).described(image_tensor(pixels, device), counts)
 
 
-def _counts(net: _Network, shape: tuple[int, ...], valid: bytes) -> torch.Tensor:
+def _counts(shape: tuple[int, ...], valid: bytes, device: torch.device) -> torch.Tensor:
     """Valid pixels as the network takes them, (1, 1, H, W)."""
     mask = np.frombuffer(valid, np.bool_).reshape(shape[:2]).astype(np.float32)
-    return torch.from_numpy(mask).to(net.device)[None, None]
+    return torch.from_numpy(mask).to(device)[None, None]
 
 
 @lru_cache(maxsize=2)
-def _module(kind: Trunk, trunk: WeightsFile, heads: WeightsFile, device: torch.device) -> Lpips:
+def _network(kind: Trunk, trunk: WeightsFile, heads: WeightsFile, device: torch.device) -> Lpips:
     where = f"{trunk.path} and {heads.path}"
     return lpips_from(kind, read_weights(trunk), read_weights(heads), where).to(device)

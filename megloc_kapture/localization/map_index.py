@@ -1,15 +1,25 @@
-"""A map's points and observations as arrays, and the 2D-3D matches of a query with them."""
+"""A map's points as arrays, a query's matches with them, and the pose problem that they make.
+
+One view or the views of a rig are treated alike; each keypoints type has an index of its own.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.values import Camera, RigidTransform
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.integer[Any]]
+ImageMatches = tuple[str, NDArray[np.int64], NDArray[np.floating]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,12 +40,12 @@ class MapIndex:
         point, seen by the map's image; NaN where they are not known.
     """
 
-    xyz: NDArray[np.float64]
+    xyz: Floats
     row_of_image: dict[str, int]
     offsets: NDArray[np.int64]
     keypoint_ids: NDArray[np.int32]
     point_ids: NDArray[np.int32]
-    covariances: NDArray[np.float64] | None = None
+    covariances: Floats | None = None
     local_type: str = ""
     noise_rad: float = math.nan
     noise_px: float = math.nan
@@ -43,22 +53,22 @@ class MapIndex:
     @classmethod
     def build(
         cls,
-        xyz: NDArray[np.float64],
+        xyz: Floats,
         image_names: tuple[str, ...],
-        image_ids: NDArray[np.integer[Any]],
-        keypoint_ids: NDArray[np.integer[Any]],
-        point_ids: NDArray[np.integer[Any]],
-        covariances: NDArray[np.float64] | None = None,
+        image_ids: Integers,
+        keypoint_ids: Integers,
+        point_ids: Integers,
+        covariances: Floats | None = None,
     ) -> MapIndex:
         """Group observations, given as parallel arrays (O,), by image and keypoint."""
-        from megloc_kapture.localization import index_kernels
+        from megloc_kapture.localization import kernels
 
         counts = np.bincount(image_ids, minlength=len(image_names))
         offsets = np.zeros(len(image_names) + 1, dtype=np.int64)
         np.cumsum(counts, out=offsets[1:])
         keypoints = np.empty(len(image_ids), dtype=np.int32)
         points = np.empty(len(image_ids), dtype=np.int32)
-        index_kernels.group_by_image(image_ids, keypoint_ids, point_ids, offsets, keypoints, points)
+        kernels.group_by_image(image_ids, keypoint_ids, point_ids, offsets, keypoints, points)
         return cls(
             xyz=_read_only(np.ascontiguousarray(xyz, dtype=np.float64)),
             row_of_image={name: row for row, name in enumerate(image_names)},
@@ -81,20 +91,7 @@ class MapIndex:
         part = slice(self.offsets[row], self.offsets[row + 1])
         return self.keypoint_ids[part], self.point_ids[part]
 
-    def points_of_keypoints(
-        self, image: str, keypoint_ids: NDArray[np.integer]
-    ) -> NDArray[np.int64]:
-        """Point row of each keypoint of a map image, -1 where it observes none; int64 (K,)."""
-        keypoints, points = self.observed(image)
-        found = np.full(len(keypoint_ids), -1, dtype=np.int64)
-        if len(keypoints) == 0 or len(keypoint_ids) == 0:
-            return found
-        rows = np.minimum(np.searchsorted(keypoints, keypoint_ids), len(keypoints) - 1)
-        hit = keypoints[rows] == keypoint_ids
-        found[hit] = points[rows[hit]]
-        return found
-
-    def seen_by(self, images: Sequence[str]) -> NDArray[np.float64]:
+    def seen_by(self, images: Sequence[str]) -> Floats:
         """The points that some of the images observe, each once, (K, 3)."""
         seen = np.zeros(len(self.xyz), dtype=np.bool_)
         for image in images:
@@ -111,13 +108,13 @@ class MapIndex:
         The diagonal has the points that an image observes. The cost grows with these images'
         observations, not with the map; an image that is not in the map shares nothing.
         """
-        from megloc_kapture.localization import index_kernels
+        from megloc_kapture.localization import kernels
 
         rows = self.rows_of(images)
-        keys = index_kernels.sightings(self.offsets, self.point_ids, rows)
+        keys = kernels.sightings(self.offsets, self.point_ids, rows)
         keys.sort()
         shared = np.zeros((len(rows), len(rows)), dtype=np.int64)
-        index_kernels.count_shared(keys, shared)
+        kernels.count_shared(keys, shared)
         return shared
 
 
@@ -134,8 +131,8 @@ class Correspondences:
 
     Attributes
     ----------
-    keypoint_ids : int64 (N,), rows of the query's keypoints, ascending.
-    point_ids : int64 (N,), rows of the map's points.
+    keypoint_ids, point_ids : int64 (N,), rows of the query's keypoints, ascending, and of the
+        points.
     support : int64 (N,), number of map images that say so.
     image_rows : int64 (sum of support,), these images, match by match.
     """
@@ -152,17 +149,15 @@ class ObservedMatches:
 
     Attributes
     ----------
-    keypoint_ids : int64 (M,), rows of the query's keypoints, not negative.
-    point_ids : int64 (M,), rows of the map's points, not negative.
+    keypoint_ids, point_ids : int64 (M,), rows of the query's keypoints and of the map's points.
     similarities : float64 (M,), higher is better.
-    image_rows : int64 (M,), which of the map images the match is with, from 0.
-    num_images : int, of the map images, whether they have matches or not.
+    image_rows : int64 (M,), which of ``num_images`` map images the match is with, from 0.
     seen_once : bool (M,), of the points; None: none is.
     """
 
     keypoint_ids: NDArray[np.int64]
     point_ids: NDArray[np.int64]
-    similarities: NDArray[np.float64]
+    similarities: Floats
     image_rows: NDArray[np.int64]
     num_images: int
     seen_once: NDArray[np.bool_] | None = None
@@ -170,17 +165,13 @@ class ObservedMatches:
     def resolve(self, rows: NDArray[np.bool_] | None = None) -> Correspondences:
         """One point per keypoint and one keypoint per point, of the matches with some images.
 
-        The same keypoint can meet several points through different map images, and the reverse.
-        A point that several images observe comes before one that was lifted through one's depth;
-        then what most images say wins; then the best score; then the smaller ids.
-        Conflicts are settled greedily from the best on, so that a loser may still get its second
-        choice. Images that are left out have no say.
-
-        Parameters
-        ----------
-        rows : bool (num_images,), the images whose matches count; all where it is None.
+        The same keypoint can meet several points through different map images, and the reverse. A
+        point that several images observe comes before one that was lifted through one's depth; then
+        what most images say wins; then the best score; then the smaller ids. Conflicts are settled
+        greedily from the best on, so that a loser may still get its second choice. Only the images
+        of the mask ``rows`` (num_images,) have a say; all where it is None.
         """
-        from megloc_kapture.localization import index_kernels
+        from megloc_kapture.localization import kernels
 
         if rows is None:
             rows = np.ones(self.num_images, dtype=np.bool_)
@@ -194,15 +185,14 @@ class ObservedMatches:
         taken = taken[np.argsort((self.keypoint_ids[taken] << 32) | self.point_ids[taken])]
         keypoints, points = self.keypoint_ids[taken], self.point_ids[taken]
         # every distinct pair once, sorted by keypoint, then point
-        new = (np.diff(keypoints, prepend=-1) != 0) | (np.diff(points, prepend=-1) != 0)
-        first = np.flatnonzero(new)
+        first = np.flatnonzero(np.diff(keypoints, prepend=-1) | np.diff(points, prepend=-1))
         best = np.maximum.reduceat(self.similarities[taken], first)
         support = np.diff(first, append=len(taken))
         keypoints, points = keypoints[first], points[first]
         order = [-best, -support]
         if self.seen_once is not None:
             order.append(self.seen_once[taken][first])
-        chosen = index_kernels.choose(
+        chosen = kernels.choose(
             np.lexsort(order),
             np.cumsum(np.diff(keypoints, prepend=keypoints[0]) != 0),
             np.unique(points, return_inverse=True)[1],
@@ -216,24 +206,21 @@ class ObservedMatches:
 
 
 def observed_matches(
-    index: MapIndex,
-    matches: Sequence[tuple[str, NDArray[np.integer[Any]], NDArray[np.floating[Any]]]],
+    index: MapIndex, matches: Sequence[tuple[str, Integers, NDArray[np.floating[Any]]]]
 ) -> ObservedMatches:
     """The matches whose map keypoint observes a point.
 
-    Parameters
-    ----------
-    matches : of each map image: its name, rows of query and map keypoints (K, 2), scores (K,). An
-        image that is not in the map has nothing to say.
+    Of each map image: its name, rows of query and map keypoints (K, 2), scores (K,). One that is
+    not in the map has nothing to say.
     """
-    from megloc_kapture.localization import index_kernels
+    from megloc_kapture.localization import kernels
 
     if not matches:
         empty = np.zeros(0, dtype=np.int64)
         return ObservedMatches(empty, empty, np.zeros(0), empty, 0)
     starts = np.zeros(len(matches) + 1, dtype=np.int64)
     np.cumsum([len(pairs) for _, pairs, _ in matches], out=starts[1:])
-    keypoint_ids, point_ids, similarities, image_rows = index_kernels.observed(
+    keypoint_ids, point_ids, similarities, image_rows = kernels.observed(
         index.offsets,
         index.keypoint_ids,
         index.point_ids,
@@ -242,11 +229,177 @@ def observed_matches(
         np.concatenate([pairs for _, pairs, _ in matches], dtype=np.int64),
         np.concatenate([scores for _, _, scores in matches], dtype=np.float64),
     )
+    seen_once = index.seen_once[point_ids]
     return ObservedMatches(
-        keypoint_ids,
-        point_ids,
-        similarities,
-        image_rows,
-        len(matches),
-        index.seen_once[point_ids],
+        keypoint_ids, point_ids, similarities, image_rows, len(matches), seen_once
     )
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One camera and its matches; a camera on its own is a rig of one, at its origin.
+
+    Raises DataError where the arrays do not have these shapes.
+
+    Attributes
+    ----------
+    points_px, points_world : float (N, 2) pixels, first pixel's centre at (0.5, 0.5), and float64
+        (N, 3) the points that they are matched with.
+    point_covariances : float64 (N, 6) of the points as xx, xy, xz, yy, yz, zz in the map's unit
+        squared, for a measurement noise of 1 px, not finite where unknown; or None. An unknown
+        covariance counts as none at all.
+    """
+
+    camera: Camera
+    cam_from_rig: RigidTransform
+    points_px: NDArray[np.floating[Any]]
+    points_world: Floats
+    point_covariances: Floats | None = None
+
+    def __post_init__(self) -> None:
+        count = len(self.points_px)
+        if self.points_px.shape != (count, 2) or self.points_world.shape != (count, 3):
+            raise DataError(
+                f"pixels {self.points_px.shape} and points {self.points_world.shape} of a view "
+                "are not (N, 2) and (N, 3)"
+            )
+        if self.point_covariances is not None and self.point_covariances.shape != (count, 6):
+            raise DataError(
+                f"covariances {self.point_covariances.shape} of {count} points are not ({count}, 6)"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class PoseProblem:
+    """The matches of a camera, or of all cameras of a rig, that its pose is estimated from.
+
+    Attributes
+    ----------
+    points_px, points : float64 (N, 2) and (N, 3), the latter minus ``offset`` (3,), a point amid
+        the others: far from the origin (ECEF) float64 loses what a recentred world keeps.
+    covariances : float64 (N, 6), or (0, 6) where no view has any.
+    starts : int64 (V + 1,) first match of each view.
+    cameras : of the views in their rig, as :func:`~megloc_kapture.geometry.projection.packed_views`
+        has them.
+    """
+
+    views: tuple[View, ...]
+    points_px: Floats
+    points: Floats
+    covariances: Floats
+    starts: NDArray[np.int64]
+    cameras: tuple[NDArray[Any], ...]
+    offset: Floats
+
+    @classmethod
+    def of(cls, views: Sequence[View]) -> PoseProblem:
+        """The problem of any number of views, their matches in the same order."""
+        from megloc_kapture.geometry.projection import packed_views
+
+        starts = np.zeros(len(views) + 1, dtype=np.int64)
+        np.cumsum([len(view.points_px) for view in views], out=starts[1:])
+        world = _joined([view.points_world for view in views], 3)
+        offset = _amid(world)
+        given = [view.point_covariances for view in views]
+        known = any(own is not None for own in given)
+        covariances = [
+            np.zeros((len(view.points_px), 6)) if own is None else own
+            for view, own in zip(views, given, strict=True)
+            if known
+        ]
+        return cls(
+            views=tuple(views),
+            points_px=_joined([view.points_px for view in views], 2),
+            points=world - offset,
+            covariances=_joined(covariances, 6),
+            starts=starts,
+            cameras=packed_views([v.camera for v in views], [v.cam_from_rig for v in views]),
+            offset=offset,
+        )
+
+    @property
+    def matches(self) -> tuple[NDArray[Any], ...]:
+        """The arrays that :mod:`~megloc_kapture.localization.kernels` calls ``matches``."""
+        return (self.points_px, self.points, self.covariances, self.starts, *self.cameras)
+
+    def split(self, per_match: NDArray[Any]) -> list[NDArray[Any]]:
+        """One part for each view of what runs over the matches of all views, as inliers (N,)."""
+        return np.split(per_match, self.starts[1:-1])
+
+
+def _joined(parts: Sequence[NDArray[np.floating[Any]]], width: int) -> Floats:
+    return np.concatenate([np.zeros((0, width)), *parts], dtype=np.float64)
+
+
+def _amid(points: Floats) -> Floats:
+    # the median of some of them: any point nearby serves, and wrong points must not move it far
+    some = points[:: max(1, len(points) // 64)]
+    some = np.sort(some[np.isfinite(some).all(axis=1)], axis=0)
+    return some[len(some) // 2] if len(some) else np.zeros(3)
+
+
+def undo_recentring(pose: RigidTransform, offset: Floats) -> RigidTransform:
+    """``rig_from_world`` of a pose in a world that was moved by minus ``offset`` (3,)."""
+    t = np.array(pose.translation) - pose.rotation_matrix() @ offset
+    return RigidTransform(pose.quat_wxyz, (float(t[0]), float(t[1]), float(t[2])))
+
+
+@dataclass(frozen=True, eq=False)
+class TypedMatches:
+    """Matches of one query image in one keypoints type, and the map's points of the type.
+
+    Of the query's keypoints, float32 (N, 2 or more), with each candidate: its name, rows of query
+    and map keypoints (K, 2), scores (K,).
+    """
+
+    index: MapIndex
+    keypoints_px: NDArray[np.float32]
+    matches: Sequence[ImageMatches]
+
+    def rows_of(self, images: Sequence[str]) -> NDArray[np.bool_]:
+        """Mask of the candidates that are some of these images."""
+        members = set(images)
+        return np.array([image in members for image, _, _ in self.matches], bool)
+
+
+@dataclass(frozen=True, eq=False)
+class QueryView:
+    """One camera of a query: its pose on the rig, and its matches by keypoints type."""
+
+    name: str
+    camera: Camera
+    matches: tuple[TypedMatches, ...]
+    cam_from_rig: RigidTransform = RigidTransform.identity()
+
+    def matched_images(self) -> list[str]:
+        """Map images with a match, in the order given."""
+        named = (image for own in self.matches for image, pairs, _ in own.matches if len(pairs))
+        return list(dict.fromkeys(named))
+
+    def among(self, images: Sequence[str]) -> QueryView:
+        """With its matches with these map images only."""
+        members = set(images)
+        kept = (
+            replace(typed, matches=[one for one in typed.matches if one[0] in members])
+            for typed in self.matches
+        )
+        return replace(self, matches=tuple(kept))
+
+    def view(self, found: Sequence[Correspondences]) -> View:
+        """The camera with its 2D-3D matches of all types, one after another."""
+        pixels, points, covariances = [np.zeros((0, 2))], [np.zeros((0, 3))], [np.zeros((0, 6))]
+        for typed, own in zip(self.matches, found, strict=True):
+            pixels.append(typed.keypoints_px[own.keypoint_ids, :2].astype(np.float64))
+            points.append(typed.index.xyz[own.point_ids])
+            if typed.index.covariances is None:
+                covariances.append(np.full((len(own.point_ids), 6), np.nan))
+            else:
+                covariances.append(np.asarray(typed.index.covariances[own.point_ids]))
+        known = any(typed.index.covariances is not None for typed in self.matches)
+        return View(
+            camera=self.camera,
+            cam_from_rig=self.cam_from_rig,
+            points_px=np.concatenate(pixels),
+            points_world=np.concatenate(points),
+            point_covariances=np.concatenate(covariances) if known else None,
+        )

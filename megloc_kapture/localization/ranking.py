@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,14 +14,27 @@ from megloc_kapture.plugins import HypothesisView, PoseHypothesis, RankingScene
 from megloc_kapture.values import Options
 
 
-class InlierCount:
-    """Plugin ``inliers``: the number of inliers."""
+class _SumOfViews:
+    """Scores that are summed over the views of a hypothesis."""
 
     def score(
         self, hypotheses: Sequence[PoseHypothesis], scene: RankingScene
     ) -> NDArray[np.float64]:
         """Scores (H,)."""
-        return _sum_of_views(hypotheses, lambda view, _: float(view.inliers.sum()))
+        return np.array(
+            [sum(self._of(view, each.max_error_px) for view in each.views) for each in hypotheses],
+            dtype=np.float64,
+        )
+
+    def _of(self, view: HypothesisView, max_error_px: float) -> float:
+        raise NotImplementedError
+
+
+class InlierCount(_SumOfViews):
+    """Plugin ``inliers``: the number of inliers."""
+
+    def _of(self, view: HypothesisView, max_error_px: float) -> float:
+        return float(view.inliers.sum())
 
 
 class InlierSpreadOptions(Options):
@@ -30,7 +43,7 @@ class InlierSpreadOptions(Options):
     cells: int = Field(default=16, gt=1, description="along the longer side of the image")
 
 
-class InlierSpread:
+class InlierSpread(_SumOfViews):
     """Plugin ``spread``: the cells of a grid over the image that hold inliers.
 
     A repeated detail gives many inliers in one part of the image, the right pose has them all over
@@ -43,13 +56,7 @@ class InlierSpread:
     def __init__(self, options: InlierSpreadOptions | None = None) -> None:
         self.options = options or InlierSpreadOptions()
 
-    def score(
-        self, hypotheses: Sequence[PoseHypothesis], scene: RankingScene
-    ) -> NDArray[np.float64]:
-        """Scores (H,)."""
-        return _sum_of_views(hypotheses, lambda view, _: self._cells(view))
-
-    def _cells(self, view: HypothesisView) -> float:
+    def _of(self, view: HypothesisView, max_error_px: float) -> float:
         size_px = max(view.camera.width, view.camera.height) / self.options.cells
         inliers = view.points_px[view.inliers]
         occupied = np.unique(np.floor(inliers / size_px), axis=0)
@@ -57,31 +64,15 @@ class InlierSpread:
         return len(occupied) + len(inliers) / (1.0 + len(inliers))
 
 
-class ReprojectionScore:
+class ReprojectionScore(_SumOfViews):
     """Plugin ``reprojection``: inliers weighted by how well they fit.
 
     The sum of ``1 - (error / max_error)^2`` over the inliers: MSAC's score (Torr and Zisserman,
     "MLESAC", CVIU 2000, section 3) with its sign turned.
     """
 
-    def score(
-        self, hypotheses: Sequence[PoseHypothesis], scene: RankingScene
-    ) -> NDArray[np.float64]:
-        """Scores (H,)."""
-
-        def fit(view: HypothesisView, max_error_px: float) -> float:
-            return float((1.0 - (view.errors_px[view.inliers] / max_error_px) ** 2).sum())
-
-        return _sum_of_views(hypotheses, fit)
-
-
-def _sum_of_views(
-    hypotheses: Sequence[PoseHypothesis], score: Callable[[HypothesisView, float], float]
-) -> NDArray[np.float64]:
-    return np.array(
-        [sum(score(view, each.max_error_px) for view in each.views) for each in hypotheses],
-        dtype=np.float64,
-    )
+    def _of(self, view: HypothesisView, max_error_px: float) -> float:
+        return float((1.0 - (view.errors_px[view.inliers] / max_error_px) ** 2).sum())
 
 
 class DistinctiveInliersOptions(Options):
@@ -99,12 +90,10 @@ class DistinctiveInliers:
     Rooms that are alike all explain the query's walls and furniture, and which of them gives most
     inliers hangs on how well each was mapped. What only one of them explains tells them apart. So
     an inlier has the weight ``1 / n ** power``, where ``n`` counts the hypotheses with an inlier
-    there, its own included: after the geometric bursts between places of Sattler et al.,
-    "Large-scale location recognition and the geometric burstiness problem", CVPR 2016. It counts
-    within a radius, as no hypothesis has a match for every keypoint of what it explains.
-
-    Two hypotheses agree where either's pose explains the inliers of the other; they
-    do not count against each other.
+    within a radius, its own included (no hypothesis has a match for every keypoint of what it
+    explains): after the geometric bursts between places of Sattler et al., "Large-scale location
+    recognition and the geometric burstiness problem", CVPR 2016. Hypotheses of which either's pose
+    explains the other's inliers do not count against each other.
     """
 
     Options = DistinctiveInliersOptions

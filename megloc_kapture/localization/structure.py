@@ -1,16 +1,34 @@
-"""Image distance ``structure``: locally normalised correlation, which needs no weights."""
+"""Locally normalised correlation of images: the distance ``structure``, and displaced scenes."""
 
 from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.values import Options
+from megloc_kapture.errors import DataError
+from megloc_kapture.geometry.cameras import focal_px, project
+from megloc_kapture.localization.map_index import Correspondences, PoseProblem, QueryView
+from megloc_kapture.plugins import RankingScene
+from megloc_kapture.values import Camera, Options, Pose, RigidTransform
 
 _NOISE_VARIANCE = 9.0  # grey levels squared: what varies less is no structure
 _MIN_FILLED = 0.5  # of a window, the share that must be valid
+# surroundings of a point, and how far they are looked for; of a query as it is localized
+_HALF_PATCH_PX, _SEARCH_PX = 12, 6
+# of an image, and of a view: what is looked at takes time
+_MAX_POINTS, _MAX_IMAGES = 300, 4
+# surroundings without texture say nothing, and such that look alike less are not found
+_MIN_DEVIATION, _MIN_CORRELATION = 5.0, 0.6
+# surroundings are compared as planes that face the camera
+_MAX_SCALE = 2.0
+
 
 Float32 = NDArray[np.float32]
 
@@ -78,5 +96,123 @@ class StructureDistance:
 
 def _grey(image: NDArray[np.uint8], valid: NDArray[np.bool_]) -> Float32:
     """Brightness float32 (H, W), about zero: squares then lose no digits."""
-    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    grey = _grey_levels(image).astype(np.float32)
     return np.asarray(grey - grey[valid].mean(), np.float32)
+
+
+def _grey_levels(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
+
+
+def displacements_rad(
+    problem: PoseProblem,
+    views: Sequence[QueryView],
+    found: Sequence[Sequence[Correspondences]],
+    scene: RankingScene,
+    pose: Pose,
+) -> NDArray[np.float64]:
+    """Angles by which the scene stands elsewhere in a query than a pose says, of its inliers.
+
+    The keypoints of a photograph at night or in another season are off by pixels although its pose
+    is right: a detector finds another place on the same corner. The surroundings of the corner, as
+    the first map image of a match shows them, are where the pose says. In the scene's like, or its
+    mirror image, they are off as its keypoints are.
+
+    Of matches ``found`` in each view, by keypoints type. Only of those whose surroundings are
+    found, at most a few hundred of a view; none without pixels of the query or the map.
+    """
+    assert pose.inliers is not None  # it was estimated here
+    angles = [np.zeros(0)]
+    inliers = problem.split(pose.inliers)
+    for query, view, of_types, kept in zip(views, problem.views, found, inliers, strict=True):
+        shown_by = [
+            typed.matches[row][0]
+            for typed, own in zip(query.matches, of_types, strict=True)
+            for row in own.image_rows[np.cumsum(own.support) - own.support].tolist()
+        ]
+        found_px = _displacements_px(
+            query.name,
+            view.camera,
+            view.cam_from_rig @ pose.cam_from_world,
+            view.points_world[kept],
+            [shown_by[row] for row in np.flatnonzero(kept)],
+            scene,
+        )
+        angles.append(found_px / focal_px(view.camera))
+    return np.concatenate(angles)
+
+
+def _displacements_px(
+    query: str,
+    camera: Camera,
+    cam_from_world: RigidTransform,
+    points: NDArray[np.float64],
+    shown_by: Sequence[str],
+    scene: RankingScene,
+) -> NDArray[np.float64]:
+    """Distances of points' surroundings, where they are found in a query, from the projections.
+
+    Of points (N, 3) in the world, with a map image each that observes it.
+    """
+    most = [image for image, _ in Counter(shown_by).most_common(_MAX_IMAGES)]
+    rows = [row for row, image in enumerate(shown_by) if image in most]
+    rows = rows[:: max(1, math.ceil(len(rows) / _MAX_POINTS))]
+    found: list[float] = []
+    try:
+        pixels = _grey_levels(scene.query_image(query))
+        for image in most:
+            own = points[[row for row in rows if shown_by[row] == image]]
+            found += _found_in(pixels, camera, cam_from_world, own, image, scene)
+    except DataError:
+        return np.zeros(0)
+    return np.array(found)
+
+
+def _found_in(
+    pixels: NDArray[np.uint8],
+    camera: Camera,
+    cam_from_world: RigidTransform,
+    points: NDArray[np.float64],
+    image: str,
+    scene: RankingScene,
+) -> list[float]:
+    """The displacements of the points of one map image."""
+    map_camera, map_pose = scene.map_camera(image), scene.map_pose(image)
+    shown = _grey_levels(scene.map_image(image))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        here, there = project(camera, cam_from_world, points), project(map_camera, map_pose, points)
+        z_here, z_there = cam_from_world.apply(points)[:, 2], map_pose.apply(points)[:, 2]
+        scales = (focal_px(camera) / z_here) / (focal_px(map_camera) / z_there)
+        usable = (scales > 1 / _MAX_SCALE) & (scales < _MAX_SCALE) & (z_here > 0)
+    usable &= np.isfinite(here).all(axis=1) & np.isfinite(there).all(axis=1)
+    turn = (cam_from_world @ map_pose.inverse()).rotation_matrix()
+    angle = math.atan2(turn[1, 0], turn[0, 0])
+    side, found = 2 * _HALF_PATCH_PX + 1, []
+    for row in np.flatnonzero(usable):
+        cos, sin = math.cos(angle) / scales[row], -math.sin(angle) / scales[row]
+        map_from_patch = np.array([[cos, -sin, 0.0], [sin, cos, 0.0]])
+        middle = there[row] - 0.5  # OpenCV counts from the middle of the first pixel
+        map_from_patch[:, 2] = middle - map_from_patch[:, :2].sum(axis=1) * _HALF_PATCH_PX
+        patch = cv2.warpAffine(
+            shown, map_from_patch, (side, side), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        )
+        if patch.std() < _MIN_DEVIATION:
+            continue
+        around = cv2.getRectSubPix(
+            pixels, (side + 2 * _SEARCH_PX,) * 2, tuple((here[row] - 0.5).tolist())
+        )
+        likeness = cv2.matchTemplate(around, patch, cv2.TM_CCOEFF_NORMED)
+        y, x = np.unravel_index(int(np.argmax(likeness)), likeness.shape)
+        if likeness[y, x] >= _MIN_CORRELATION:
+            at = (_peak(likeness[y], int(x)), _peak(likeness[:, x], int(y)))
+            found.append(math.hypot(at[0] - _SEARCH_PX, at[1] - _SEARCH_PX))
+    return found
+
+
+def _peak(values: NDArray[Any], at: int) -> float:
+    """Position of a maximum between samples, by a parabola."""
+    if not 0 < at < len(values) - 1:
+        return float(at)
+    before, here, after = (float(value) for value in values[at - 1 : at + 2])
+    curvature = before - 2 * here + after
+    return at + 0.5 * (before - after) / curvature if curvature < 0 else float(at)

@@ -62,8 +62,8 @@ def lift_keypoints(
 
     Returns
     -------
-    points : float64 (N, 3) in the image camera's frame, metres; NaN where there is no depth.
-    valid : bool (N,).
+    Points float64 (N, 3) in the image camera's frame, metres, NaN where there is no depth; and a
+        mask.
     """
     options = options or LiftingOptions()
     rays = bearing_rays(image_camera, np.asarray(keypoints_px, np.float64)[:, :2])
@@ -99,17 +99,10 @@ def lift_with_covariances(
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     """:func:`lift_keypoints` through a depth map of the image's own centre, with covariances.
 
-    Across the ray a keypoint is off by its own noise; along it by the deviation of depth, which
-    is taken for that of keypoints with a noise of a third of a pixel (``map_noise`` of the pose).
-
-    Parameters
-    ----------
-    sigma_m : float32 (H, W), standard deviation of depth, 0 where unknown.
-
-    Returns
-    -------
-    points, valid : as of :func:`lift_keypoints`.
-    covariances : float64 (N, 3, 3) in the camera's frame for a noise of 1 px.
+    Across the ray a keypoint is off by its own noise; along it by the deviation of depth,
+    ``sigma_m`` float32 (H, W), 0 where unknown, which is taken for that of keypoints with a noise
+    of a third of a pixel (``map_noise`` of the pose). The covariances are float64 (N, 3, 3) in the
+    camera's frame for a noise of 1 px, between the points and the mask.
     """
     same = RigidTransform.identity()
     points, valid = lift_keypoints(keypoints_px, depth_m, image_camera, depth_camera, same, options)
@@ -131,7 +124,9 @@ def lift_with_covariances(
 def sample_depth(
     depth_m: NDArray[np.float32], pixels: Floats, max_jump: float, *, whole: bool = False
 ) -> Floats:
-    """Depth at pixels of a depth map, interpolated as :func:`lift_keypoints` does.
+    """Depth (N,) at pixels of a depth map, interpolated as :func:`lift_keypoints` does.
+
+    NaN outside, where the depth is unknown, and where it jumps.
 
     Parameters
     ----------
@@ -139,10 +134,6 @@ def sample_depth(
     pixels : float64 (N, 2) of the depth map, COLMAP's pixel origin; may be NaN.
     max_jump : see :class:`LiftingOptions`.
     whole : all four depths around a pixel must be known, else some of them.
-
-    Returns
-    -------
-    float64 (N,); NaN outside, where the depth is unknown, and where it jumps.
     """
     height, width = depth_m.shape
     result = np.full(len(pixels), np.nan)
@@ -155,14 +146,8 @@ def sample_depth(
     rows = np.clip(np.stack([top, top, top + 1, top + 1]), 0, height - 1)
     corners = depth_m[rows, columns].astype(np.float64)
     right, bottom = x - left, y - top
-    weights = np.stack(
-        [
-            (1 - right) * (1 - bottom),
-            right * (1 - bottom),
-            (1 - right) * bottom,
-            right * bottom,
-        ]
-    )
+    upper, lower = ((1 - right) * side for side in (1 - bottom, bottom))
+    weights = np.stack([upper, right * (1 - bottom), lower, right * bottom])
     there = np.isfinite(corners) & (corners > 0)
     smooth = (weights * corners).sum(axis=0)
     nearest = np.take_along_axis(corners, np.where(there, weights, -1.0).argmax(0)[None], 0)[0]
@@ -233,7 +218,7 @@ def contradicted_by_depth(
     *,
     deviations: Floats | None = None,
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Mask of the points that do not lie on the surface of a depth map.
+    """Find the points that do not lie on the surface of a depth map.
 
     Parameters
     ----------
@@ -245,8 +230,8 @@ def contradicted_by_depth(
 
     Returns
     -------
-    contradicted : bool (N,); never where there is no depth.
-    checked : bool (N,), where there is depth to compare with.
+    Masks (N,): contradicted, never where there is no depth; and where there is depth to compare
+        with.
     """
     options = options or DepthVerificationOptions()
     points = image_from_depth.inverse().apply(np.asarray(points_in_image, np.float64))
@@ -272,10 +257,9 @@ def contradicted_by_depth(
     own = np.zeros(len(rows)) if deviations is None else np.nan_to_num(deviations[rows])
     own = own * options.keypoint_noise_px
     checked[rows] = True
-    contradicted[rows] = z < low - options.max_sigmas * np.hypot(
-        depth_noise(low, options.noise), own
+    below, above = (
+        options.max_sigmas * np.hypot(depth_noise(depth, options.noise), own)
+        for depth in (low, high)
     )
-    contradicted[rows] |= z > high + options.max_sigmas * np.hypot(
-        depth_noise(high, options.noise), own
-    )
+    contradicted[rows] = (z < low - below) | (z > high + above)
     return contradicted, checked

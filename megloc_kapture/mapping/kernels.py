@@ -15,7 +15,7 @@ import numpy as np
 from numba import get_num_threads
 
 from megloc_kapture.compiling import compiled_loop
-from megloc_kapture.geometry.projection import PINHOLES, distorted, project_point
+from megloc_kapture.geometry.projection import PINHOLES, distorted, moved, project_point
 
 # information whose pivots are this far apart does not determine its point
 _MIN_RATIO = 1e-13
@@ -41,12 +41,9 @@ def most_shared(
 ):
     """Images that share most points with each of ``first`` to ``last``, rows of ``best`` (I, K).
 
-    Parameters
-    ----------
-    starts, of_image : observations of image i, ``of_image[starts[i]:starts[i + 1]]``.
-    images, track : of each observation; sorted by track, then image.
-    track_starts : observations of track t, from ``track_starts[t]`` to ``track_starts[t + 1]``.
-    window : how far in a track an image looks before and after itself.
+    Observations of image i are ``of_image[starts[i]:starts[i + 1]]``; they are sorted by track,
+    then image, and those of track t run from ``track_starts[t]`` to ``track_starts[t + 1]``. An
+    image looks no farther in a track than ``window`` before and after itself.
     """
     shared = np.zeros(len(best), np.int64)
     touched = np.empty(len(best), np.int64)
@@ -94,15 +91,8 @@ def shares_seen(
             r, t, p = rotations[other], translations[other], params[other]
             seen = 0
             for k in range(begin, end):
-                x, y, z = xyz[points[k], 0], xyz[points[k], 1], xyz[points[k], 2]
-                project_point(
-                    models[other],
-                    p,
-                    r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + t[0],
-                    r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + t[1],
-                    r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + t[2],
-                    out,
-                )
+                x, y, z = moved(r, t, xyz, points[k])
+                project_point(models[other], p, x, y, z, out)
                 inside = 0.0 <= out[0] < sizes[other, 0] and 0.0 <= out[1] < sizes[other, 1]
                 if inside and out[2] * out[6] > out[3] * out[5]:
                     seen += 1
@@ -119,16 +109,8 @@ def reprojection_errors(
     p = np.empty(8)
     for o in range(len(point_ids)):
         k = image_ids[o]
-        r = rotations[k]
-        x, y, z = xyz[point_ids[o], 0], xyz[point_ids[o], 1], xyz[point_ids[o], 2]
-        project_point(
-            models[k],
-            params[k],
-            r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + translations[k, 0],
-            r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + translations[k, 1],
-            r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + translations[k, 2],
-            p,
-        )
+        x, y, z = moved(rotations[k], translations[k], xyz, point_ids[o])
+        project_point(models[k], params[k], x, y, z, p)
         du, dv = p[0] - keypoints[o, 0], p[1] - keypoints[o, 1]
         error = math.sqrt(du * du + dv * dv)
         out[o] = error if error == error else math.inf

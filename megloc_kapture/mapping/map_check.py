@@ -1,4 +1,10 @@
-"""Whether a map agrees with itself: points seen through its cameras against its keypoints.
+"""A foreign map's conventions: its pixel origin, and whether it agrees with itself.
+
+COLMAP has (0, 0) at the corner of the first pixel, many networks and simulators at its centre.
+Keypoints and intrinsics of one map need not agree. What can be measured is their offset: half a
+pixel too much or too little shows in the reprojection error of the map's own points. Where the
+two agree, the principal points tell which origin they share: a camera whose principal point is
+((w - 1) / 2, (h - 1) / 2) exactly was described with the origin at the centre.
 
 A map whose observations do not fit is named with the mistake that explains it best: what files of
 other tools get wrong is mostly one of a few conventions, and each can be tried.
@@ -6,10 +12,12 @@ other tools get wrong is mostly one of a few conventions, and each can be tried.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import permutations, product
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,14 +25,19 @@ from numpy.typing import NDArray
 from megloc_kapture.geometry.cameras import (
     focal_px,
     normalized_from_px,
+    principal_point_px,
     project,
     scale_focal,
     swap_principal_point,
 )
-from megloc_kapture.geometry.cameras import principal_point_px as principal_point
-from megloc_kapture.mapping.pixel_origin import ObservedKeypoints
 from megloc_kapture.values import Camera, RigidTransform
 
+Origin = Literal["corner", "centre"]
+Floats = NDArray[np.float64]
+
+_HALF = 0.5
+# a smaller gain than this is noise, and the simpler explanation stands
+_MIN_GAIN = 0.005
 # of the larger side of an image: no map that serves is worse, none that is made wrongly is better
 _MAX_SHARE = 0.01
 _MIN_LIMIT_PX = 8.0
@@ -35,18 +48,114 @@ _COLMAP_FROM_OPENGL = RigidTransform((0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 _UNITS = {1000.0: "millimetres", 100.0: "centimetres", 1 / 1000: "kilometres", 1 / 0.3048: "feet"}
 
 
+@dataclass(frozen=True, eq=False)
+class ObservedKeypoints:
+    """A map image with its keypoints (K, 2) and its observations.
+
+    ``rows`` and ``points`` int (M,) are rows of its keypoints and of the map's points.
+    """
+
+    name: str
+    camera: Camera
+    cam_from_world: RigidTransform
+    keypoints_px: NDArray[np.floating]
+    rows: NDArray[np.integer]
+    points: NDArray[np.integer]
+
+    def errors_px(self, xyz: Floats, shift_px: float = 0.0) -> Floats:
+        """Distances (M,) of the points (N, 3), seen by the camera, from the keypoints moved by
+        ``shift_px``; NaN for a point behind it."""
+        with np.errstate(invalid="ignore"):
+            seen = project(self.camera, self.cam_from_world, xyz[self.points])
+            return np.linalg.norm(seen - (self.keypoints_px[self.rows] + shift_px), axis=1)
+
+
+@dataclass(frozen=True)
+class PixelOrigin:
+    """Pixel origins of a map's intrinsics and keypoints as stored, and the evidence in words.
+
+    ``error_px`` is the median reprojection error with the intrinsics' origin taken as corner or
+    centre, the keypoints' origin as found; NaN without observations.
+    """
+
+    intrinsics: Origin
+    keypoints: Origin
+    error_px: dict[Origin, float]
+    reason: str
+
+    @property
+    def intrinsics_shift_px(self) -> float:
+        """To be added to principal points to have COLMAP's."""
+        return _HALF if self.intrinsics == "centre" else 0.0
+
+    @property
+    def keypoints_shift_px(self) -> float:
+        """To be added to keypoints to have COLMAP's."""
+        return _HALF if self.keypoints == "centre" else 0.0
+
+
+def find_pixel_origin(
+    images: Sequence[ObservedKeypoints],
+    xyz: Floats,
+    *,
+    cameras: Sequence[Camera],
+    keypoints_at: Origin | None = None,
+) -> PixelOrigin:
+    """Find the pixel origin of intrinsics and keypoints.
+
+    Of a sample of the map's images, keypoints as stored, all points (N, 3) and all cameras;
+    ``keypoints_at`` is the keypoints' origin where it is known.
+    """
+    observed = [image for image in images if len(image.rows)]
+    errors = {
+        shift: float(np.nanmedian(np.concatenate([i.errors_px(xyz, shift) for i in observed])))
+        if observed
+        else math.nan
+        for shift in (0.0, _HALF, -_HALF)
+    }
+    centred = bool(cameras) and all(
+        principal_point_px(c) == ((c.width - 1) / 2, (c.height - 1) / 2) for c in cameras
+    )
+    shared: Origin = keypoints_at or ("centre" if centred else "corner")
+    best = 0.0
+    for shift in (_HALF, -_HALF):
+        if errors[shift] < (1.0 - _MIN_GAIN) * errors[best]:
+            best = shift
+    intrinsics: Origin
+    keypoints: Origin
+    if best > 0:
+        intrinsics, keypoints = "corner", "centre"
+        reason = "the points reproject best with half a pixel added to the keypoints"
+    elif best < 0:
+        intrinsics, keypoints = "centre", "corner"
+        reason = "the points reproject best with half a pixel added to the principal points"
+    else:
+        intrinsics = keypoints = shared
+        if keypoints_at:
+            where = "and the origin of this keypoints type is known"
+        elif centred:
+            where = "and every principal point is ((w-1)/2, (h-1)/2)"
+        else:
+            where = "and no principal point says otherwise"
+        fit = "keypoints and intrinsics fit each other as stored"
+        reason = f"{fit if images else 'no observation to compare with'}, {where}"
+    shift_of_keypoints = _HALF if keypoints == "centre" else 0.0
+    by_origin: dict[Origin, float] = {
+        "corner": errors[shift_of_keypoints],
+        "centre": errors[shift_of_keypoints - _HALF],
+    }
+    return PixelOrigin(intrinsics, keypoints, by_origin, reason)
+
+
 # of an image: camera, pose, observed pixels (M, 2) and points (M, 3)
-_View = tuple[Camera, RigidTransform, NDArray[np.float64], NDArray[np.float64]]
+_View = tuple[Camera, RigidTransform, Floats, Floats]
 _Reading = Callable[[ObservedKeypoints], _View]
 
 
-def map_fault(images: Sequence[ObservedKeypoints], xyz: NDArray[np.float64]) -> str | None:
-    """In words, why a map contradicts itself; None where it does not.
+def map_fault(images: Sequence[ObservedKeypoints], xyz: Floats) -> str | None:
+    """Say why a map contradicts itself; None where it does not.
 
-    Parameters
-    ----------
-    images : a sample, by name.
-    xyz : float64 (N, 3), all points.
+    Of a sample of its images, by name, and all its points, float64 (N, 3).
     """
     if not np.isfinite(xyz).all():
         count = int((~np.isfinite(xyz).all(axis=1)).sum())
@@ -59,10 +168,13 @@ def map_fault(images: Sequence[ObservedKeypoints], xyz: NDArray[np.float64]) -> 
     observed = [image for image in images if len(image.rows)]
     if not observed:
         return None
-    if len(images) > 2 and len({_rounded(image.cam_from_world) for image in images}) == 1:
+    poses = (image.cam_from_world for image in images)
+    rounded = {tuple(round(v, 9) for v in (*p.quat_wxyz, *p.translation)) for p in poses}
+    if len(images) > 2 and len(rounded) == 1:
         return f"all of {len(images)} images have one pose"
     errors = _errors_px(observed, lambda image: _as_it_is(image, xyz))
-    limits = [_limit_px(image.camera) for image in observed]
+    sides = (max(image.camera.width, image.camera.height) for image in observed)
+    limits = [max(_MIN_LIMIT_PX, _MAX_SHARE * side) for side in sides]
     failing = sum(not error <= limit for error, limit in zip(errors, limits, strict=True))
     if failing <= _MAX_FAILING * len(observed):
         return None
@@ -78,9 +190,9 @@ def map_fault(images: Sequence[ObservedKeypoints], xyz: NDArray[np.float64]) -> 
 
 
 def camera_fault(camera: Camera) -> str | None:
-    """Why no camera has these intrinsics; None where one may have."""
+    """Say why no camera has these intrinsics; None where one may have."""
     size = max(camera.width, camera.height)
-    cx, cy = principal_point(camera)
+    cx, cy = principal_point_px(camera)
     if not (-size <= cx <= 2 * size and -size <= cy <= 2 * size):
         return f"the principal point is ({cx:g}, {cy:g}) in {camera.width}x{camera.height} pixels"
     focal = focal_px(camera)
@@ -96,28 +208,17 @@ def camera_fault(camera: Camera) -> str | None:
     lengths, straight = np.linalg.norm(rays, axis=1), np.linalg.norm(flat, axis=1)
     ratios = lengths[straight > 0.02] / straight[straight > 0.02]
     if len(ratios) and not (ratios.min() > 0.5 and ratios.max() < 3.0):
-        return f"its distortion moves pixels by a factor of {_farthest(ratios):.2g}"
+        farthest = max(ratios.tolist(), key=lambda ratio: abs(math.log(max(ratio, 1e-6))))
+        return f"its distortion moves pixels by a factor of {farthest:.2g}"
     return None
 
 
-def _farthest(ratios: NDArray[np.float64]) -> float:
-    return float(max(ratios, key=lambda ratio: abs(np.log(max(ratio, 1e-6)))))
-
-
-def _limit_px(camera: Camera) -> float:
-    return max(_MIN_LIMIT_PX, _MAX_SHARE * max(camera.width, camera.height))
-
-
-def _rounded(pose: RigidTransform) -> tuple[float, ...]:
-    return tuple(round(value, 9) for value in (*pose.quat_wxyz, *pose.translation))
-
-
-def _as_it_is(image: ObservedKeypoints, xyz: NDArray[np.float64]) -> _View:
+def _as_it_is(image: ObservedKeypoints, xyz: Floats) -> _View:
     pixels = image.keypoints_px[image.rows].astype(np.float64)
     return image.camera, image.cam_from_world, pixels, xyz[image.points]
 
 
-def _errors_px(images: Iterable[ObservedKeypoints], read: _Reading) -> NDArray[np.float64]:
+def _errors_px(images: Iterable[ObservedKeypoints], read: _Reading) -> Floats:
     """Median reprojection error of each image, infinite where most points are not in front."""
     medians = []
     for image in images:
@@ -128,9 +229,7 @@ def _errors_px(images: Iterable[ObservedKeypoints], read: _Reading) -> NDArray[n
     return np.array(medians)
 
 
-def _likely_mistake(
-    images: Sequence[ObservedKeypoints], xyz: NDArray[np.float64]
-) -> tuple[str, float]:
+def _likely_mistake(images: Sequence[ObservedKeypoints], xyz: Floats) -> tuple[str, float]:
     """The reading of the map that fits best, and the median error of its images."""
     found = ("", np.inf)
     for name, read in _readings(images, xyz):
@@ -141,79 +240,69 @@ def _likely_mistake(
     return found
 
 
-def _readings(
-    images: Sequence[ObservedKeypoints], xyz: NDArray[np.float64]
-) -> Iterator[tuple[str, _Reading]]:
+def _readings(images: Sequence[ObservedKeypoints], xyz: Floats) -> Iterator[tuple[str, _Reading]]:
     """Other readings of a map: what is done to it, in words, and the views that come of it."""
 
     def changed(
-        pixels: Callable[[ObservedKeypoints], NDArray[np.float64]] | None = None,
-        points: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None,
-        pose: Callable[[RigidTransform], RigidTransform] | None = None,
-        camera: Callable[[Camera], Camera] | None = None,
+        pixels: Callable[[NDArray[np.floating], NDArray[np.integer]], NDArray[np.floating]]
+        | None = None,
+        points: Callable[[Floats], Floats] = lambda seen: seen,
+        pose: Callable[[RigidTransform], RigidTransform] = lambda pose: pose,
+        camera: Callable[[Camera], Camera] = lambda camera: camera,
         point_shift: int = 0,
     ) -> _Reading:
         def read(image: ObservedKeypoints) -> _View:
-            own = image.keypoints_px[image.rows].astype(np.float64)
+            keypoints, rows = image.keypoints_px, image.rows
+            found = keypoints[rows] if pixels is None else pixels(keypoints, rows)
             seen = xyz[(image.points + point_shift) % len(xyz)]
-            return (
-                camera(image.camera) if camera else image.camera,
-                pose(image.cam_from_world) if pose else image.cam_from_world,
-                pixels(image) if pixels else own,
-                points(seen) if points else seen,
-            )
+            where = camera(image.camera), pose(image.cam_from_world)
+            return *where, found.astype(np.float64), points(seen)
 
         return read
 
-    yield "keypoints read as (y, x)", changed(_swapped)
-    yield "keypoints in reverse order", changed(_reversed)
+    def next_rows(by: int) -> _Reading:
+        return changed(lambda keypoints, rows: keypoints[(rows + by) % max(len(keypoints), 1)])
+
+    def times(factor: float) -> _Reading:
+        return changed(lambda keypoints, rows: keypoints[rows].astype(np.float64) * factor)
+
+    def axes(order: tuple[int, ...], signs: tuple[float, ...]) -> _Reading:
+        return changed(points=lambda seen: seen[:, list(order)] * np.array(signs))
+
+    yield "keypoints read as (y, x)", changed(lambda keypoints, rows: keypoints[rows][:, ::-1])
+    yield "keypoints in reverse order", changed(lambda keypoints, rows: keypoints[::-1][rows])
     for by in (1, -1):
-        yield f"keypoint ids moved by {by:+d}", changed(partial(_next_to, by))
+        yield f"keypoint ids moved by {by:+d}", next_rows(by)
         yield f"point ids moved by {by:+d}", changed(point_shift=by)
     yield "poses read as world_from_cam", changed(pose=RigidTransform.inverse)
     yield "quaternions read as x, y, z, w", changed(pose=_quaternion_last)
     yield "translations read as camera centres", changed(pose=_centre_given)
-    yield (
-        "poses read with OpenGL's axes",
-        changed(pose=lambda p: _COLMAP_FROM_OPENGL @ p),
-    )
-    yield (
-        "poses read as OpenGL's world_from_cam",
-        changed(pose=lambda p: _COLMAP_FROM_OPENGL @ p.inverse()),
-    )
+    yield "poses read with OpenGL's axes", changed(pose=lambda p: _COLMAP_FROM_OPENGL @ p)
+    inverted = changed(pose=lambda p: _COLMAP_FROM_OPENGL @ p.inverse())
+    yield "poses read as OpenGL's world_from_cam", inverted
     for scale, unit in _UNITS.items():
         yield f"points in {unit}", changed(points=partial(np.multiply, 1 / scale))
         yield f"poses in {unit}", changed(pose=partial(_scaled, 1 / scale))
     yield "cx and cy exchanged", changed(camera=swap_principal_point)
     for by in (1, -1):
-        yield (
-            f"each pose given to the image {'after' if by > 0 else 'before'} it",
-            _moved(images, xyz, by),
-        )
+        where = "after" if by > 0 else "before"
+        yield f"each pose given to the image {where} it", _moved(images, xyz, by)
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         if order != (0, 1, 2) or min(signs) < 0:
-            axes = ", ".join(
+            named = (
                 f"{'-' if sign < 0 else ''}{'xyz'[axis]}"
                 for axis, sign in zip(order, signs, strict=True)
             )
-            yield (
-                f"points read as ({axes})",
-                changed(points=partial(_axes_read, order, signs)),
-            )
-    for name, factor in _factors(images, xyz).items():
-        if name == "keypoints":
-            yield (
-                f"keypoints of images {factor:.3g} times as large",
-                changed(partial(_pixels_times, factor)),
-            )
-        else:
-            yield (
-                f"a focal length {factor:.3g} times as long",
-                changed(camera=partial(scale_focal, factor=factor)),
-            )
+            yield f"points read as ({', '.join(named)})", axes(order, signs)
+    factors = _factors(images, xyz)
+    if (factor := factors.get("keypoints")) is not None:
+        yield f"keypoints of images {factor:.3g} times as large", times(factor)
+    if (factor := factors.get("focal")) is not None:
+        longer = changed(camera=partial(scale_focal, factor=factor))
+        yield f"a focal length {factor:.3g} times as long", longer
 
 
-def _moved(images: Sequence[ObservedKeypoints], xyz: NDArray[np.float64], by: int) -> _Reading:
+def _moved(images: Sequence[ObservedKeypoints], xyz: Floats, by: int) -> _Reading:
     """Each image with the pose of a neighbour in the sample, which must be of neighbours."""
     poses = {
         image.name: images[(at + by) % len(images)].cam_from_world
@@ -222,7 +311,7 @@ def _moved(images: Sequence[ObservedKeypoints], xyz: NDArray[np.float64], by: in
     return lambda image: _as_it_is(replace(image, cam_from_world=poses[image.name]), xyz)
 
 
-def _factors(images: Sequence[ObservedKeypoints], xyz: NDArray[np.float64]) -> dict[str, float]:
+def _factors(images: Sequence[ObservedKeypoints], xyz: Floats) -> dict[str, float]:
     """By how much keypoints, or the focal length, would have to be scaled to fit."""
     of_keypoints, of_focal = [], []
     for image in images:
@@ -230,35 +319,12 @@ def _factors(images: Sequence[ObservedKeypoints], xyz: NDArray[np.float64]) -> d
         with np.errstate(all="ignore"):
             seen = project(camera, pose, points)
             of_keypoints.append((seen / pixels).ravel())
-            centre = np.array(principal_point(camera))
+            centre = np.array(principal_point_px(camera))
             of_focal.append(((pixels - centre) / (seen - centre)).ravel())
     found = {"keypoints": np.concatenate(of_keypoints), "focal": np.concatenate(of_focal)}
     finite = {name: ratios[np.isfinite(ratios)] for name, ratios in found.items()}
     medians = {name: float(np.median(ratios)) for name, ratios in finite.items() if len(ratios)}
     return {name: value for name, value in medians.items() if 0.02 < value < 50.0}
-
-
-def _swapped(image: ObservedKeypoints) -> NDArray[np.float64]:
-    return image.keypoints_px[image.rows][:, ::-1].astype(np.float64)
-
-
-def _reversed(image: ObservedKeypoints) -> NDArray[np.float64]:
-    return image.keypoints_px[::-1][image.rows].astype(np.float64)
-
-
-def _next_to(by: int, image: ObservedKeypoints) -> NDArray[np.float64]:
-    rows = (image.rows + by) % max(len(image.keypoints_px), 1)
-    return image.keypoints_px[rows].astype(np.float64)
-
-
-def _pixels_times(factor: float, image: ObservedKeypoints) -> NDArray[np.float64]:
-    return image.keypoints_px[image.rows].astype(np.float64) * factor
-
-
-def _axes_read(
-    order: tuple[int, ...], signs: tuple[float, ...], points: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    return points[:, list(order)] * np.array(signs)
 
 
 def _quaternion_last(pose: RigidTransform) -> RigidTransform:

@@ -18,8 +18,8 @@ _BLOCK_ELEMENTS = 1 << 20  # distances held at once; each takes about 80 bytes o
 _MAX_SEARCHED = 1024
 # of a point that more images than this see, an image counts only those that near it
 _TRACK_WINDOW = 512
-_IMAGES_AT_ONCE = 256  # images; each is worked out by itself, so that chunks change nothing
-_PAIRS_AT_ONCE = 1024  # pairs; each is worked out by itself, so that chunks change nothing
+# each is worked out by itself, so that chunks change nothing
+_IMAGES_AT_ONCE, _PAIRS_AT_ONCE = 256, 1024
 # pixels looked at, across and down; depths, in distances of the two centres
 _GRID = (9, 7)
 _DEPTHS = 2.0 ** np.arange(-2, 8, 0.5)
@@ -65,14 +65,10 @@ class PairsByPosesOptions(Options):
 def pairs_by_poses(
     cams_from_world: list[RigidTransform], options: PairsByPosesOptions | None = None
 ) -> NDArray[np.int64]:
-    """Pairs of images that stand close and look the same way.
+    """Pairs (P, 2) of images that stand close and look the same way, i < j, sorted, each once.
 
     Candidates come from a k-d tree in growing neighbourhoods, block by block. An image looks at no
     more than the 1024 nearest centres, so that time and memory grow with the number of images.
-
-    Returns
-    -------
-    int64 (P, 2), indices i < j, sorted, each pair once.
     """
     options = options or PairsByPosesOptions()
     count = len(cams_from_world)
@@ -127,18 +123,11 @@ def pairs_by_covisibility(
 ) -> NDArray[np.int64]:
     """Pairs of each image with those that share most points with it; of equals the first.
 
-    The sparse product of the observations with themselves, row by row, of which only the best of
-    each row are kept. Its time is the number of observations times the length of a track, which is
-    bounded: of a point that very many images see, an image counts as seeing it only the 512 before
-    and the 512 after it in the order of the images.
-
-    Parameters
-    ----------
-    point_ids, image_ids : (O,), the observations; in any order, repeated ones count once.
-
-    Returns
-    -------
-    int64 (P, 2), indices i < j, sorted, each pair once.
+    Of observations (O,), in any order, repeated ones count once; int64 (P, 2), indices i < j,
+    sorted, each pair once. It is the sparse product of the observations with themselves, row by
+    row, of which only the best of each row are kept. Its time is the number of observations times
+    the length of a track, which is bounded: of a point that very many images see, an image counts
+    as seeing it only the 512 before and the 512 after it in the order of the images.
     """
     from megloc_kapture.mapping import kernels
 
@@ -154,13 +143,10 @@ def pairs_by_covisibility(
     of_image = np.argsort(images, kind="stable")
     starts = np.append(0, np.cumsum(np.bincount(images, minlength=num_images)))
     best = np.full((num_images, options.top_k), -1, dtype=np.int64)
-    arguments = (starts, of_image, images, track, track_starts, _TRACK_WINDOW)
+    observed = (starts, of_image, images, track, track_starts)
+    rest = (_TRACK_WINDOW, options.min_shared_points, best)
     kernels.in_chunks(
-        num_images,
-        _IMAGES_AT_ONCE,
-        lambda first, last: kernels.most_shared(
-            first, last, *arguments, options.min_shared_points, best
-        ),
+        num_images, _IMAGES_AT_ONCE, lambda a, b: kernels.most_shared(a, b, *observed, *rest)
     )
     rows, columns = np.nonzero(best >= 0)
     return unique_pairs(np.stack([rows, best[rows, columns]], axis=1))
@@ -176,16 +162,10 @@ class PairsBySequenceOptions(Options):
 def pairs_by_sequence(
     cameras: Sequence[str], timestamps: Sequence[int], options: PairsBySequenceOptions | None = None
 ) -> NDArray[np.int64]:
-    """Pairs of each image with the next ones of its camera.
+    """Pairs (P, 2) of each image with the next ones of its camera, i < j, sorted, each once.
 
-    Parameters
-    ----------
-    cameras, timestamps : (N,), which camera took an image and when; images of one camera at the
-        same time follow each other as they are given.
-
-    Returns
-    -------
-    int64 (P, 2), indices i < j, sorted, each pair once.
+    Of N images it is given which camera took each and when; images of one camera at the same time
+    follow each other as they are given.
     """
     options = options or PairsBySequenceOptions()
     sequences: dict[str, list[int]] = {}
@@ -218,7 +198,7 @@ def views_can_overlap(
 
 def _reaches(first: Camera, second: Camera, second_from_first: RigidTransform) -> bool:
     x, y = np.meshgrid(
-        *(np.linspace(0, size, n) for size, n in zip(_size(first), _GRID, strict=True))
+        np.linspace(0, first.width, _GRID[0]), np.linspace(0, first.height, _GRID[1])
     )
     rays = bearing_rays(first, np.stack([x.ravel(), y.ravel()], axis=1))
     turned = rays @ second_from_first.rotation_matrix().T
@@ -228,12 +208,8 @@ def _reaches(first: Camera, second: Camera, second_from_first: RigidTransform) -
     points = [turned, *(turned * depth + offset for depth in depths[depths > 0])]
     with np.errstate(invalid="ignore"):
         seen = px_from_cam(second, np.concatenate(points))
-        inside = ((seen >= 0) & (seen <= _size(second))).all(axis=1)
+        inside = ((seen >= 0) & (seen <= (second.width, second.height))).all(axis=1)
     return bool(inside.any())
-
-
-def _size(camera: Camera) -> tuple[int, int]:
-    return camera.width, camera.height
 
 
 def frustum_overlap(
@@ -277,6 +253,6 @@ def frustum_overlap(
         shares,
     )
     kernels.in_chunks(
-        len(pairs), _PAIRS_AT_ONCE, lambda first, last: kernels.shares_seen(first, last, *arguments)
+        len(pairs), _PAIRS_AT_ONCE, lambda a, b: kernels.shares_seen(a, b, *arguments)
     )
     return shares

@@ -1,4 +1,4 @@
-"""Covariances of the points of a map, from the images that observe them.
+"""Covariances of the points of a map, and rejection of points and of their observations.
 
 MegLoc, section "Mapping": a point's uncertainty from its observations, poses and cameras fixed.
 With ``p_c = R_cw p_w + t_cw`` and the camera's projection ``pi``, an observation has the Jacobian
@@ -11,19 +11,27 @@ For independent noise of one pixel the information about the point is ``sum J^T 
 observations, its inverse the point's covariance, and the roots of the covariance's eigenvalues are
 the deviations along three orthogonal axes. ``d pi / d p_c`` is that of the camera's own model,
 distortion included.
+
+Points are rejected by them, and by reprojection error, triangulation angle and track length as
+COLMAP's ``ObservationManager`` has them. Arrays in, masks out; nothing is moved.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.values import Camera, RigidTransform
+from megloc_kapture.geometry.poses import deviation_by_median
+from megloc_kapture.values import Camera, Options, RigidTransform
 
 Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 _CHUNK = 1 << 14  # points; each is worked out by itself, so that chunks change nothing
 
@@ -35,23 +43,16 @@ def point_covariances(
     cameras: Sequence[Camera],
     cams_from_world: Sequence[RigidTransform],
 ) -> Floats:
-    """Covariances of points for a noise of 1 px in their images, poses and cameras exact.
+    """Covariances of points (N, 3) for a noise of 1 px in their images, poses and cameras exact.
 
-    Parameters
-    ----------
-    xyz : float64 (N, 3) in the world.
-    point_ids, image_ids : (O,), rows of ``xyz`` and of ``cameras``; in any order, faster where the
-        points ascend.
+    Of observations (O,), rows of ``xyz`` and of ``cameras``, in any order, faster where the points
+    ascend. Raises DataError for ids that are no rows, or not as many poses as cameras.
 
     Returns
     -------
     float64 (N, 6): xx, xy, xz, yy, yz, zz in the map's unit squared; NaN where the observations do
-    not determine the point (a single view, no parallax). A point behind a camera is not observed
-    by it.
-
-    Raises
-    ------
-    DataError : ids that are no rows, or not as many poses as cameras.
+        not determine the point (a single view, no parallax). A point behind a camera is not
+        observed by it.
     """
     from megloc_kapture.geometry.projection import packed_views
     from megloc_kapture.mapping import kernels
@@ -76,14 +77,8 @@ def point_covariances(
 
 
 def point_deviations(covariances: Floats) -> Floats:
-    """Standard deviations of points along their three principal axes.
+    """Standard deviations of points along their three principal axes, of covariances (N, 6).
 
-    Parameters
-    ----------
-    covariances : float64 (N, 6), see :func:`point_covariances`.
-
-    Returns
-    -------
     float64 (N, 3) in the map's unit for a noise of 1 px, ascending; NaN where unknown.
     """
     from megloc_kapture.mapping import kernels
@@ -97,10 +92,7 @@ def point_deviations(covariances: Floats) -> Floats:
 
 
 def _by_point(
-    point_ids: NDArray[np.integer],
-    image_ids: NDArray[np.integer],
-    num_points: int,
-    num_images: int,
+    point_ids: NDArray[np.integer], image_ids: NDArray[np.integer], num_points: int, num_images: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
     """First observation of each point (N + 1,), and the images (O,) in that order.
 
@@ -117,6 +109,180 @@ def _by_point(
     if (point_ids[1:] < point_ids[:-1]).any():
         order = np.argsort(point_ids, kind="stable")
         point_ids, image_ids = point_ids[order], image_ids[order]
-    starts = np.zeros(num_points + 1, dtype=np.int64)
-    np.cumsum(np.bincount(point_ids, minlength=num_points), out=starts[1:])
-    return starts, np.ascontiguousarray(image_ids, dtype=np.int32)
+    return _starts(point_ids, num_points), np.ascontiguousarray(image_ids, dtype=np.int32)
+
+
+def _starts(ids: NDArray[np.integer], count: int) -> NDArray[np.int64]:
+    """First row of each of ``count`` ascending ids, and the end of the last one's (count + 1,)."""
+    starts = np.zeros(count + 1, dtype=np.int64)
+    np.cumsum(np.bincount(ids, minlength=count), out=starts[1:])
+    return starts
+
+
+class ConsistencyOptions(Options):
+    """Options: limits on reprojection errors, angles and tracks; none: no limit."""
+
+    max_reprojection_error_px: float | None = Field(
+        default=None, gt=0, description="an observation farther from its keypoint is dropped"
+    )
+    min_angle_deg: float | None = Field(
+        default=None,
+        ge=0,
+        le=90,
+        description="a point that no two images see at this angle is dropped, unless only one "
+        "image sees it",
+    )
+    min_track_length: int | None = Field(
+        default=None, ge=1, description="a point with fewer observations is dropped"
+    )
+
+
+class UncertaintyOptions(Options):
+    """Options: limits on the points' uncertainty; none: no limit.
+
+    The deviation of a point is the largest of its three, for a noise of 1 px in the images. Points
+    whose uncertainty is not known (lifted ones, which a single image sees) stay.
+    """
+
+    max_deviation: float | None = Field(default=None, gt=0, description="in the map's unit")
+    max_relative_deviation: float | None = Field(
+        default=None, gt=0, description="share of the point's mean depth in its images"
+    )
+    keep_quantile: float | None = Field(
+        default=None, gt=0, le=1, description="share of the points that stays, the surest ones"
+    )
+    max_robust_sigmas: float | None = Field(
+        default=None,
+        gt=0,
+        description="how far the logarithm of a point's share of its depth may lie above the "
+        "map's median, in standard deviations estimated from the median absolute deviation",
+    )
+
+    def needs_deviations(self) -> bool:
+        """True if any point can be rejected."""
+        return any(limit is not None for limit in self.model_dump().values())
+
+
+@dataclass(frozen=True, eq=False)
+class ObservedPoints:
+    """Points float64 (N, 3) and the images that observe them.
+
+    Of O observations, the rows of ``xyz``, int64, ascending, and of ``cameras`` and poses, int32.
+    """
+
+    xyz: Floats
+    point_ids: NDArray[np.int64]
+    image_ids: NDArray[np.int32]
+    cameras: Sequence[Camera]
+    cams_from_world: Sequence[RigidTransform]
+
+    def starts(self) -> NDArray[np.int64]:
+        """First observation of each point, and the end of the last one's; int64 (N + 1,)."""
+        return _starts(self.point_ids, len(self.xyz))
+
+    def by_image(self) -> Iterator[tuple[int, NDArray[np.int64]]]:
+        """Every image that observes something, and the rows of its observations, ascending."""
+        ids = self.image_ids
+        # numpy sorts integers of 16 bits in linear time
+        narrow = ids.astype(np.uint16) if len(self.cameras) < 1 << 16 else ids
+        order = np.argsort(narrow, kind="stable")
+        begin = 0
+        ends = np.cumsum(np.bincount(ids, minlength=len(self.cameras)))
+        for image, end in enumerate(ends.tolist()):
+            if end > begin:
+                yield image, order[begin:end]
+            begin = end
+
+
+def reprojection_errors_px(
+    observed: ObservedPoints, keypoints_px: NDArray[np.floating[Any]]
+) -> Floats:
+    """Distance (O,) of each observation's keypoint (O, 2) from its point; infinite behind."""
+    from megloc_kapture.geometry.projection import packed_views
+    from megloc_kapture.mapping import kernels
+
+    errors = np.empty(len(observed.point_ids))
+    if len(errors):
+        kernels.reprojection_errors(
+            observed.point_ids,
+            observed.image_ids,
+            np.ascontiguousarray(keypoints_px, dtype=np.float64),
+            observed.xyz,
+            *packed_views(observed.cameras, observed.cams_from_world),
+            errors,
+        )
+    return errors
+
+
+def mean_depths(observed: ObservedPoints) -> Floats:
+    """Mean depth (N,) of each point in the images that observe it; NaN where none does."""
+    from megloc_kapture.geometry.projection import packed_views
+    from megloc_kapture.mapping import kernels
+
+    depths = np.empty(len(observed.xyz))
+    poses = packed_views(observed.cameras, observed.cams_from_world)[:2]
+    kernels.mean_depths(observed.starts(), observed.image_ids, observed.xyz, *poses, depths)
+    return depths
+
+
+def track_lengths(observed: ObservedPoints) -> NDArray[np.int64]:
+    """Number of observations (N,) of each point."""
+    return np.bincount(observed.point_ids, minlength=len(observed.xyz))
+
+
+def seen_at_angle(observed: ObservedPoints, min_angle_deg: float) -> Mask:
+    """Mask (N,) of the points that two images see at this angle or a wider one.
+
+    The angle is COLMAP's: that between the rays, or between one and the other turned round, where
+    that is less.
+    """
+    from megloc_kapture.mapping import kernels
+
+    wide = np.empty(len(observed.xyz), dtype=bool)
+    centers = np.array([pose.center() for pose in observed.cams_from_world]).reshape(-1, 3)
+    max_cosine = np.cos(np.radians(min_angle_deg))
+    kernels.seen_at_angle(
+        observed.starts(), observed.image_ids, observed.xyz, centers, max_cosine, wide
+    )
+    return wide
+
+
+def too_uncertain(deviations: Floats, depths: Floats, options: UncertaintyOptions) -> Mask:
+    """Mask (N,) of the points to reject by their uncertainty.
+
+    Of deviations (N,), the largest of each point, in the map's unit, NaN where unknown, and the
+    :func:`mean_depths`.
+    """
+    rejected = np.zeros(len(deviations), dtype=bool)
+    with np.errstate(invalid="ignore"):  # comparisons with NaN are false, as they should be
+        if options.max_deviation is not None:
+            rejected |= deviations > options.max_deviation
+        if options.max_relative_deviation is not None:
+            rejected |= deviations > options.max_relative_deviation * depths
+        if options.keep_quantile is not None:
+            known = np.sort(deviations[~np.isnan(deviations)])
+            if len(known):
+                kept = max(1, round(options.keep_quantile * len(known)))
+                rejected |= deviations > known[kept - 1]
+        if options.max_robust_sigmas is not None:
+            relative = deviations / depths
+            usual = relative[np.isfinite(relative) & (relative > 0)]
+            if len(usual):
+                logarithms = np.log(usual)
+                median = float(np.median(logarithms))
+                deviation = float(deviation_by_median(logarithms - median))
+                rejected |= relative > np.exp(median + options.max_robust_sigmas * deviation)
+    return rejected
+
+
+def left_with_too_few(
+    point_ids: NDArray[np.int64], dropped: Mask, num_points: int, min_observations: int
+) -> Mask:
+    """Points (N,) that lost an observation and have fewer than ``min_observations`` left.
+
+    Of observations (O,). Who has lost nothing stays, however few there were: a lifted point has a
+    single one.
+    """
+    lost = np.bincount(point_ids[dropped], minlength=num_points)
+    left = np.bincount(point_ids[~dropped], minlength=num_points)
+    return (lost > 0) & (left < min_observations)

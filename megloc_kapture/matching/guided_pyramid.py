@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.geometry.image_variants import ImageVariant
 from megloc_kapture.values import ImageFeatures, LocalFeatures, Options
 
 _SUFFIX = "-pyramid"
@@ -38,6 +37,98 @@ _MIN_STEP = 1.2
 Extract = Callable[[NDArray[np.uint8], NDArray[np.bool_] | None], LocalFeatures]
 PairMatches = tuple[NDArray[np.int64], NDArray[np.floating[Any]]]
 Match = Callable[[ImageFeatures, Sequence[ImageFeatures]], Sequence[PairMatches]]
+
+
+@dataclass(frozen=True, order=True)
+class ImageVariant:
+    """An image scaled and turned by quarters, and the exact map of its pixels to the original's.
+
+    Pixel coordinates are continuous, the first pixel's centre at (0.5, 0.5): an image of size (w,
+    h) covers [0, w] x [0, h]. A variant covers the same scene from edge to edge, so that
+    coordinates scale by the ratio of the sizes, which is not exactly ``scale`` where a size had to
+    be rounded. After scaling it is turned by 0, 90, 180 or 270 degrees, counter-clockwise as one
+    sees it.
+    """
+
+    scale: float = 1.0
+    rotation_deg: int = 0
+
+    def __post_init__(self) -> None:
+        if self.rotation_deg not in (0, 90, 180, 270):
+            raise ValueError(f"a rotation is 0, 90, 180 or 270 degrees, got {self.rotation_deg}")
+        if not 0 < self.scale < np.inf:
+            raise ValueError(f"scale {self.scale} is not positive")
+
+    def __str__(self) -> str:
+        return f"{self.scale:.4g}@{self.rotation_deg}"
+
+    @property
+    def is_identity(self) -> bool:
+        """True if it is the image as it is."""
+        return self == ImageVariant()
+
+    def scaled_size(self, width: int, height: int) -> tuple[int, int]:
+        """Width and height before turning."""
+        return max(1, round(width * self.scale)), max(1, round(height * self.scale))
+
+    def size(self, width: int, height: int) -> tuple[int, int]:
+        """Width and height of the variant of an image of this size."""
+        scaled = self.scaled_size(width, height)
+        return scaled if self.rotation_deg % 180 == 0 else (scaled[1], scaled[0])
+
+    def of_image(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The variant of an image, uint8 (H, W) or (H, W, 3).
+
+        A smaller pixel is the mean of the area it covers, so that nothing aliases; a larger image
+        is interpolated linearly, rounded the same way on every processor.
+        """
+        import cv2  # 0.1 s, and most that imports this never looks at an image
+
+        height, width = image.shape[:2]
+        size = self.scaled_size(width, height)
+        if size != (width, height):
+            smaller = size[0] <= width and size[1] <= height
+            how = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR_EXACT
+            image = np.asarray(cv2.resize(image, size, interpolation=how), dtype=np.uint8)
+        return np.ascontiguousarray(np.rot90(image, self.rotation_deg // 90))
+
+    def of_mask(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """The variant of a mask (H, W): True where every pixel it covers a part of is True."""
+        height, width = mask.shape
+        scaled_width, scaled_height = self.scaled_size(width, height)
+        ignored = np.zeros((height + 1, width + 1), dtype=np.int64)
+        np.cumsum(np.cumsum(~mask, axis=0), axis=1, out=ignored[1:, 1:])
+        top, bottom = _covered(height, scaled_height)
+        left, right = _covered(width, scaled_width)
+        count = (
+            ignored[np.ix_(bottom, right)]
+            - ignored[np.ix_(top, right)]
+            - ignored[np.ix_(bottom, left)]
+            + ignored[np.ix_(top, left)]
+        )
+        return np.ascontiguousarray(np.rot90(count == 0, self.rotation_deg // 90))
+
+    def px_in_original(
+        self, px: NDArray[np.floating[Any]], width: int, height: int
+    ) -> NDArray[np.float64]:
+        """Pixels (N, 2) of the variant, in the original of this size; float64 (N, 2)."""
+        scaled = self.scaled_size(width, height)
+        x, y = np.asarray(px, dtype=np.float64).T
+        back = {
+            0: (x, y),
+            90: (scaled[0] - y, x),
+            180: (scaled[0] - x, scaled[1] - y),
+            270: (y, scaled[1] - x),
+        }
+        return np.stack(back[self.rotation_deg], axis=1) * (
+            np.array([width, height]) / np.array(scaled)
+        )
+
+
+def _covered(length: int, scaled: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First pixel, and the one behind the last, that each of ``scaled`` pixels covers a part of."""
+    at = np.arange(scaled, dtype=np.int64)
+    return at * length // scaled, -((at + 1) * -length // scaled)
 
 
 class GuidedPyramidOptions(Options):
@@ -92,7 +183,7 @@ class GuidedPyramidOptions(Options):
         return tuple(sorted({rotation % 360 for rotation in rotations}))
 
     def variants(self, width: int, height: int) -> list[ImageVariant]:
-        """The variants of an image of this size, sorted; the image as it is is none of them.
+        """List the variants of an image of this size, sorted; not the image as it is.
 
         A scale that would enlarge it beyond ``max_side_px`` is reduced to it, and left out where
         that is hardly more than the next smaller scale.
@@ -126,12 +217,9 @@ def equivalent_types(local_type: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True, eq=False)
 class VariantFeatures:
-    """Features of an image's variant.
+    """Features of an image's variant, as the matcher gets them, in the variant's own pixels.
 
-    Attributes
-    ----------
-    features : as the matcher gets them, in the variant's own pixels.
-    keypoints_px : float32 (N, C), x and y in pixels of the original; the other columns as found.
+    ``keypoints_px`` float32 (N, C) are x and y in pixels of the original; other columns as found.
     """
 
     variant: ImageVariant
@@ -139,24 +227,12 @@ class VariantFeatures:
     keypoints_px: NDArray[np.float32]
 
 
-@dataclass(frozen=True)
-class SkippedVariant:
-    """A variant that gave nothing, and why."""
-
-    variant: ImageVariant
-    reason: str
-
-
 @dataclass(frozen=True, eq=False)
 class VariantMatches:
     """Verified matches of a variant with another image.
 
-    Attributes
-    ----------
-    keypoints_px : float32 (K, C), in pixels of the original.
-    descriptors : (K, D).
-    other_rows : int64 (K,), keypoints of the other image.
-    scores : float32 (K,).
+    Keypoints float32 (K, C), in pixels of the original, descriptors (K, D), scores float32 (K,),
+    and the other image's keypoints int64 (K,).
     """
 
     variant: ImageVariant
@@ -179,24 +255,17 @@ class VariantMatches:
         )
 
 
-def as_they_are(found: list[VariantMatches]) -> list[VariantMatches]:
-    """The matches of every variant."""
-    return found
-
-
 @dataclass(frozen=True)
 class PairVerifier:
     """Verifies an image's matches with another one.
 
-    Attributes
-    ----------
-    verify : which matches (K, 2) of a variant, rows of it and of the other image, best first,
-        are right.
-    agree : what remains of several variants' verified matches that need not agree.
+    ``verify`` says which matches (K, 2) of a variant, rows of it and of the other image, best
+    first, are right; ``agree`` what remains of several variants' verified matches that need not
+    agree.
     """
 
     verify: Callable[[VariantFeatures, NDArray[np.int64]], NDArray[np.bool_]]
-    agree: Callable[[list[VariantMatches]], list[VariantMatches]] = as_they_are
+    agree: Callable[[list[VariantMatches]], list[VariantMatches]] = list
 
 
 def verify_best_first(
@@ -218,23 +287,19 @@ def extract_variants(
     extract: Extract,
     *,
     like: ImageFeatures,
-) -> tuple[list[VariantFeatures], list[SkippedVariant]]:
-    """Features of an image's variants.
+) -> tuple[list[VariantFeatures], dict[ImageVariant, str]]:
+    """Extract features of an image's variants; of those without any, say why.
 
     Parameters
     ----------
-    image : uint8 (H, W, 3), RGB.
-    mask : bool (H, W), True = use; changed along with the image.
+    image, mask : uint8 (H, W, 3), RGB; bool (H, W), True = use, changed along with the image.
     extract : image and mask to features; whatever it raises skips the variant, for networks refuse
         images that are too small for them in ways of their own.
-    like : features of the image as it is: what is added has as many columns.
-
-    Raises
-    ------
-    DataError : the extractor's features have another size than ``like``.
+    like : features of the image as it is: what is added has as many columns, else it is a
+        DataError.
     """
     height, width = image.shape[:2]
-    found, skipped = [], []
+    found, skipped = [], {}
     for variant in variants:
         try:
             features = extract(
@@ -242,35 +307,24 @@ def extract_variants(
             )
         except Exception as error:
             first_line = (str(error).splitlines() or [""])[0]
-            skipped.append(SkippedVariant(variant, f"{type(error).__name__}: {first_line}"))
+            skipped[variant] = f"{type(error).__name__}: {first_line}"
             continue
         if len(features.keypoints_px) == 0:
-            skipped.append(SkippedVariant(variant, "no keypoints"))
+            skipped[variant] = "no keypoints"
             continue
-        found.append(_checked(variant, features, width, height, like))
+        px, columns = features.keypoints_px, like.keypoints_px.shape[1]
+        values = like.descriptors.shape[1]
+        if px.shape[1] < columns or features.descriptors.shape[1] != values:
+            raise DataError(
+                f"the image's features have {columns} numbers per keypoint and {values} per "
+                f"descriptor, the extractor's {px.shape[1]} and {features.descriptors.shape[1]}"
+            )
+        size = variant.size(width, height)
+        own = ImageFeatures(px[:, :columns], features.descriptors, *size)
+        original_px = px[:, :columns].copy()
+        original_px[:, :2] = variant.px_in_original(px[:, :2], width, height)
+        found.append(VariantFeatures(variant, own, original_px))
     return found, skipped
-
-
-def _checked(
-    variant: ImageVariant,
-    features: LocalFeatures,
-    width: int,
-    height: int,
-    like: ImageFeatures,
-) -> VariantFeatures:
-    columns, values = like.keypoints_px.shape[1], like.descriptors.shape[1]
-    sizes = features.keypoints_px.shape[1], features.descriptors.shape[1]
-    if sizes[0] < columns or sizes[1] != values:
-        raise DataError(
-            f"the image's features have {columns} numbers per keypoint and {values} per "
-            f"descriptor, the extractor's {sizes[0]} and {sizes[1]}"
-        )
-    keypoints = features.keypoints_px[:, :columns].copy()
-    keypoints[:, :2] = variant.px_in_original(features.keypoints_px[:, :2], width, height)
-    own = ImageFeatures(
-        features.keypoints_px[:, :columns], features.descriptors, *variant.size(width, height)
-    )
-    return VariantFeatures(variant, own, keypoints)
 
 
 def match_variants(
@@ -279,16 +333,10 @@ def match_variants(
     match: Match,
     judgements: Sequence[PairVerifier],
 ) -> list[list[VariantMatches]]:
-    """Verified matches of an image's variants with each of several other images.
+    """Match an image's variants with each of several other images, and verify the matches.
 
-    Parameters
-    ----------
-    match : matches of one image with each of several, see ``plugins.Matcher``.
-    judgements : for each of ``others``.
-
-    Returns
-    -------
-    For each of ``others`` the variants that match it, in their order.
+    ``match`` gives matches of one image with each of several, see ``plugins.Matcher``; there is a
+    verifier for each of ``others``.
     """
     found: list[list[VariantMatches]] = [[] for _ in others]
     for variant in variants:
@@ -327,8 +375,7 @@ def match_probed(
 
     Returns
     -------
-    matches : for each of the images the variants that match it.
-    num_left : variants that were tried on the images behind the probed ones.
+    For each image the variants that match it, and the number that was tried on the last ones.
     """
     first = min(options.probed_pairs, num_others)
     found = list(match(variants, range(first)))

@@ -58,13 +58,9 @@ class PairNetwork(Checkpointed[PairOptions]):
     def match_many(self, a: ImageFeatures, others: Sequence[ImageFeatures]) -> list[Matches]:
         """The matches of one image with each of several, in their order, of one batch.
 
-        Pairs are padded to the keypoints of the largest; what is padding is masked out of
-        attention and assignment, so that scores are as one by one but for rounding.
-
-        Raises
-        ------
-        DataError : the checkpoint does not fit, or the descriptors do not fit it.
-        OptionError : the device is not there.
+        Pairs are padded to the keypoints of the largest; what is padding is masked out of attention
+        and assignment, so that scores are as one by one but for rounding. Raises DataError where
+        the checkpoint or the descriptors do not fit, OptionError where the device is not there.
         """
         network, device = self.network(self._load)
         for image in (a, *others):

@@ -39,10 +39,8 @@ def match_nearest(
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """Match descriptors by largest inner product (smallest distance for unit vectors).
 
-    Parameters
-    ----------
-    descriptors_a, descriptors_b : (N, D) and (M, D), any real type; rows of about one length, for
-        which the largest product is the smallest distance.
+    Descriptors (N, D) and (M, D) of any real type have rows of about one length, for which the
+    largest product is the smallest distance. Raises DataError for different dimensions.
 
     Returns
     -------
@@ -51,10 +49,6 @@ def match_nearest(
         second best (Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 2004,
         section 7.1), at most 1; 0 without a second. It tells right matches from wrong ones better
         than the similarity itself (docs/experiments/matching.md).
-
-    Raises
-    ------
-    DataError : different dimensions.
     """
     options = options or NearestNeighbourOptions()
     a = np.ascontiguousarray(descriptors_a, dtype=np.float32)

@@ -19,14 +19,11 @@ from scipy.spatial import cKDTree
 from megloc_kapture.matching.guided_pyramid import PairMatches, VariantMatches
 
 SAME_KEYPOINT_PX = 1.0
+Float32 = NDArray[np.float32]
 
 
-@dataclass(frozen=True, eq=False)
-class TriedVariant:
-    """A variant of the first (0) or the second (1) image of a pair, with its matches."""
-
-    side: Literal[0, 1]
-    matches: VariantMatches
+TriedVariant = tuple[int, VariantMatches]
+"""Matches of a variant of the first (0) or the second (1) image of a pair."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,10 +32,9 @@ class Combined:
 
     Attributes
     ----------
-    matches : int64 (K, 2), rows of the two images' keypoints; each row at most once.
-    scores : float64 (K,).
-    best : which of the tried variants has most matches, None where the images as they are have
-        as many.
+    matches, scores : int64 (K, 2), rows of both images' keypoints, each at most once; float64 (K,).
+    best : which of the tried variants has most matches, None where the images as they are have as
+        many.
     added : for both images, of each keypoint that was appended: the tried variant it comes from,
         and which of its matches; int64 (A, 2).
     """
@@ -57,18 +53,14 @@ def combine(
 ) -> Combined:
     """Put the matches of a pair and of its variants together, and append their keypoints.
 
-    The base's matches come first, then those of the richest variant, in each the best first; one
-    whose keypoint has a match already, in either image, has nothing to add. By ``max`` the richest
-    variant stands for the base where it has more.
-
-    Parameters
-    ----------
-    base : matches (K, 2) of the images as they are, and scores (K,).
-    keypoints : of both images, appended to; the second is not needed where no variant is of it.
+    The base's matches (K, 2) and scores (K,) of the images as they are come first, then those of
+    the richest variant, in each the best first; one whose keypoint has a match already, in either
+    image, has nothing to add. By ``max`` the richest variant stands for the base where it has more.
+    The second image's keypoints are not needed where no variant is of it.
     """
     base_matches, base_scores = base
-    order = sorted(range(len(tried)), key=lambda at: -len(tried[at].matches))
-    best = order[0] if order and len(tried[order[0]].matches) > len(base_matches) else None
+    order = sorted(range(len(tried)), key=lambda at: -len(tried[at][1]))
+    best = order[0] if order and len(tried[order[0]][1]) > len(base_matches) else None
     lengths = [0 if union is None else len(union) for union in keypoints]
     if mode == "max":
         if best is not None:
@@ -104,7 +96,7 @@ class _Combination:
 
     def take(self, number: int, tried: TriedVariant) -> None:
         """Add the matches of a variant whose keypoints have none yet."""
-        side, found = tried.side, tried.matches
+        side, found = tried
         union = self._keypoints[side]
         if union is None:
             raise ValueError("a variant of an image whose keypoints are not given")
@@ -140,19 +132,15 @@ class _Combination:
 class KeypointUnion:
     """Keypoints that were there, which keep their rows, and behind them those that are added.
 
-    A keypoint within a pixel of one that is there already is that one (the nearest, of equals the
-    first), and never adds a row.
-
-    Parameters
-    ----------
-    base : float32 (N, C), x and y first, in pixels of the original image.
-    added : float32 (M, C), what was added to it before.
+    Of keypoints float32 (N, C), x and y first, in pixels of the original image, and those (M, C)
+    that were added before. A keypoint within a pixel of one that is there already is that one (the
+    nearest, of equals the first), and never adds a row.
     """
 
-    def __init__(self, base: NDArray[np.float32], added: NDArray[np.float32] | None = None) -> None:
+    def __init__(self, base: Float32, added: Float32 | None = None) -> None:
         self._base = base
         self._tree = cKDTree(base[:, :2]) if len(base) else None
-        self._added: list[NDArray[np.float32]] = []
+        self._added: list[Float32] = []
         self._rows_in: dict[tuple[int, int], list[int]] = defaultdict(list)
         for keypoint in () if added is None else added:
             self.append(keypoint)
@@ -160,7 +148,7 @@ class KeypointUnion:
     def __len__(self) -> int:
         return len(self._base) + len(self._added)
 
-    def find(self, keypoints_px: NDArray[np.float32]) -> NDArray[np.int64]:
+    def find(self, keypoints_px: Float32) -> NDArray[np.int64]:
         """Row (K,) of the keypoint that stands where each of (K, C) does, -1 where none does."""
         found = np.full(len(keypoints_px), -1, dtype=np.int64)
         if self._tree is not None and len(keypoints_px):
@@ -174,7 +162,7 @@ class KeypointUnion:
             found[k] = self.find_added(keypoints_px[k])
         return found
 
-    def find_added(self, keypoint_px: NDArray[np.float32]) -> int:
+    def find_added(self, keypoint_px: Float32) -> int:
         """As :meth:`find` of one keypoint (C,), among those that were added."""
         x, y = _cell(keypoint_px)
         rows = [
@@ -185,7 +173,7 @@ class KeypointUnion:
         near = [row for row in sorted(rows) if self._distance(keypoint_px, row) <= SAME_KEYPOINT_PX]
         return self._nearest(keypoint_px, near) if near else -1
 
-    def append(self, keypoint_px: NDArray[np.float32]) -> int:
+    def append(self, keypoint_px: Float32) -> int:
         """Add a keypoint (C,) that stands nowhere yet; its row."""
         row = len(self)
         self._added.append(np.array(keypoint_px, dtype=np.float32))
@@ -197,26 +185,22 @@ class KeypointUnion:
         while len(self) > length:
             self._rows_in[_cell(self._added.pop())].pop()
 
-    def added(self) -> NDArray[np.float32]:
+    def added(self) -> Float32:
         """The keypoints that were added, float32 (M, C)."""
         if not self._added:
             return np.zeros((0, self._base.shape[1]), dtype=np.float32)
         return np.stack(self._added)
 
-    def keypoints_px(self) -> NDArray[np.float32]:
-        """All keypoints, float32 (N + M, C)."""
-        return np.concatenate([self._base, self.added()])
-
-    def _nearest(self, keypoint_px: NDArray[np.float32], rows: list[int]) -> int:
+    def _nearest(self, keypoint_px: Float32, rows: list[int]) -> int:
         return min(rows, key=lambda row: (self._distance(keypoint_px, row), row))
 
-    def _distance(self, keypoint_px: NDArray[np.float32], row: int) -> float:
+    def _distance(self, keypoint_px: Float32, row: int) -> float:
         n = len(self._base)
         there = self._base[row] if row < n else self._added[row - n]
         dx, dy = (float(keypoint_px[k]) - float(there[k]) for k in (0, 1))
         return float(np.hypot(dx, dy))
 
 
-def _cell(keypoint_px: NDArray[np.float32]) -> tuple[int, int]:
+def _cell(keypoint_px: Float32) -> tuple[int, int]:
     """The square of a pixel's size that a keypoint stands in."""
     return int(np.floor(keypoint_px[0])), int(np.floor(keypoint_px[1]))

@@ -43,16 +43,9 @@ class SuperGlue(Checkpointed[SuperGlueOptions]):
     Options = SuperGlueOptions
 
     def match(self, a: ImageFeatures, b: ImageFeatures) -> Matches:
-        """Match two images.
+        """Match two images: int64 (K, 2), rows sorted by a, each once; float32 (K,) in (0, 1].
 
-        Returns
-        -------
-        matches : int64 (K, 2), rows of a and b, sorted by a; each row at most once.
-        scores : float32 (K,), in (0, 1].
-
-        Raises
-        ------
-        DataError : keypoints without scores in (0, 1], or descriptors of another size.
+        Raises DataError for keypoints without scores in (0, 1], or descriptors of another size.
         """
         return self.match_many(a, [b])[0]
 
@@ -81,15 +74,9 @@ class SuperGlue(Checkpointed[SuperGlueOptions]):
 def network_input(
     image: ImageFeatures, descriptor_size: int, where: str, device: torch.device
 ) -> ImageKeypoints:
-    """Keypoints of an image as the network takes them.
+    """Keypoints of an image as the network takes them; ``where`` names the weights in messages.
 
-    Parameters
-    ----------
-    where : the weights, for messages.
-
-    Raises
-    ------
-    DataError : keypoints without scores in (0, 1], or descriptors of another size.
+    Raises DataError for keypoints without scores in (0, 1], or descriptors of another size.
     """
     table = np.asarray(image.keypoints_px, dtype=np.float32)
     descriptors = np.asarray(image.descriptors, dtype=np.float32)

@@ -16,6 +16,7 @@ distortion it is their eq. 11.9 times the focal length).
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -23,9 +24,13 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.geometry.cameras import bearing_rays, focal_px
-from megloc_kapture.geometry.image_variants import ImageVariant
 from megloc_kapture.geometry.poses import cross_matrix
-from megloc_kapture.matching.guided_pyramid import PairVerifier, VariantFeatures, VariantMatches
+from megloc_kapture.matching.guided_pyramid import (
+    ImageVariant,
+    PairVerifier,
+    VariantFeatures,
+    VariantMatches,
+)
 from megloc_kapture.values import Camera, Options, RigidTransform
 
 Floats = NDArray[np.float64]
@@ -33,6 +38,12 @@ Floats = NDArray[np.float64]
 _MAX_RAY_ERROR_PX = 0.1
 # of a variant's matches, whose own model is another one where fewer agree
 _MIN_AGREEING = 0.5
+_SAMPLE = 5  # matches that a relative pose of calibrated cameras is made of
+# shares of the threshold: the most telling one counts, as in the paper of false alarms
+_THRESHOLDS = (1.0, 0.5, 0.25)
+# matches of one thing in two images are not independent of each other, so few must be expected
+_MAX_FALSE_ALARMS = 1e-10
+_MAX_WRONG_PAIRS = 20_000
 
 
 class KnownPoseOptions(Options):
@@ -63,17 +74,11 @@ def essential_matrix(b_from_a: RigidTransform) -> Floats:
 
 
 def ray_slopes(camera: Camera, keypoints_px: NDArray[np.floating[Any]], rays: Floats) -> Floats:
-    """Derivatives of rays by their pixels, under the camera's own model.
+    """Derivatives d (x, y) / d px (N, 2, 2) of rays by their pixels, under the camera's own model.
 
-    Parameters
-    ----------
-    keypoints_px : (N, 2).
-    rays : float64 (N, 3), their homogeneous rays, last component 1.
-
-    Returns
-    -------
-    float64 (N, 2, 2), d (x, y) / d px. NaN where a ray is not that of its pixel: the distortion
-    cannot be undone there, or the pixel looks sideways or back, as pixels of a fisheye may.
+    Of pixels (N, 2) and their homogeneous rays float64 (N, 3), last component 1. NaN where a ray is
+    not that of its pixel: the distortion cannot be undone there, or the pixel looks sideways or
+    back, as pixels of a fisheye may.
     """
     from megloc_kapture.geometry.projection import project_with_jacobian
 
@@ -89,21 +94,12 @@ def ray_slopes(camera: Camera, keypoints_px: NDArray[np.floating[Any]], rays: Fl
 
 
 def sampson_error_px(
-    rays_a: Floats,
-    slopes_a: Floats,
-    rays_b: Floats,
-    slopes_b: Floats,
-    b_from_a: RigidTransform,
+    rays_a: Floats, slopes_a: Floats, rays_b: Floats, slopes_b: Floats, b_from_a: RigidTransform
 ) -> Floats:
-    """Sampson distance in pixels of matched rays (N, 3), last component 1, see above; (N,).
+    """Sampson distance in pixels (N,) of matched rays (N, 3), last component 1, see above.
 
-    Parameters
-    ----------
-    slopes_a, slopes_b : float64 (N, 2, 2), see :func:`ray_slopes`.
-
-    Returns
-    -------
-    float64 (N,); infinite where there is no epipolar line, NaN where a slope is.
+    Of slopes (N, 2, 2), see :func:`ray_slopes`. Infinite where there is no epipolar line, NaN where
+    a slope is.
     """
     essential = essential_matrix(b_from_a)
     line_b = rays_a @ essential.T
@@ -144,17 +140,10 @@ def verify_with_poses(
     b_from_a: RigidTransform,
     options: KnownPoseOptions | None = None,
 ) -> NDArray[np.bool_]:
-    """Mask of the matches that agree with a known relative pose.
+    """Mask (N,) of the matches that agree with a known relative pose.
 
-    Parameters
-    ----------
-    rays_a, rays_b : float64 (N, 3), matched homogeneous rays, last component 1.
-    slopes_a, slopes_b : float64 (N, 2, 2), see :func:`ray_slopes`; a match with NaN is refused.
-    b_from_a : the known pose.
-
-    Returns
-    -------
-    bool (N,); all False when fewer than ``min_matches`` agree.
+    Of matched homogeneous rays float64 (N, 3), last component 1, and their :func:`ray_slopes`; a
+    match with NaN is refused. All False when fewer than ``min_matches`` agree.
     """
     options = options or KnownPoseOptions()
     if len(rays_a) == 0:
@@ -173,20 +162,13 @@ def verify_two_view(
     camera_b: Camera,
     options: TwoViewOptions | None = None,
 ) -> NDArray[np.bool_]:
-    """Mask of the matches that agree with one relative pose of two calibrated cameras.
+    """Mask (N,) of the matches that agree with one relative pose of two calibrated cameras.
 
-    Parameters
-    ----------
-    keypoints_a_px, keypoints_b_px : (N, 2) matched keypoints, the best matches first, see
-        :func:`~.guided_pyramid.verify_best_first`; in any other order it takes more iterations.
-
-    Returns
-    -------
-    bool (N,); all False when no model has ``min_matches`` inliers. False where a camera's
-    distortion cannot be undone.
+    Of matched keypoints (N, 2), the best matches first, see
+    :func:`~.guided_pyramid.verify_best_first`; in any other order it takes more iterations. All
+    False when no model has ``min_matches`` inliers; False where a camera's distortion cannot be
+    undone.
     """
-    import poselib
-
     options = options or TwoViewOptions()
     none = np.zeros(len(keypoints_a_px), dtype=bool)
     rays_a = bearing_rays(camera_a, keypoints_a_px)
@@ -194,30 +176,11 @@ def verify_two_view(
     usable = np.isfinite(rays_a).all(axis=1) & np.isfinite(rays_b).all(axis=1)
     if usable.sum() < options.min_matches:
         return none
-    # in normalised coordinates poselib needs to know no camera model, and ours knows them all
     focal = 0.5 * (focal_px(camera_a) + focal_px(camera_b))
-    pinhole = {
-        "model": "PINHOLE",
-        "width": 1,
-        "height": 1,
-        "params": [focal, focal, 0.0, 0.0],
-    }
-    _, info = poselib.estimate_relative_pose(
-        rays_a[usable, :2] * focal,
-        rays_b[usable, :2] * focal,
-        pinhole,
-        pinhole,
-        {
-            "max_epipolar_error": options.max_error_px,
-            "min_iterations": options.min_iterations,
-            "max_iterations": options.max_iterations,
-            "success_prob": options.confidence,
-            "progressive_sampling": True,
-            "max_prosac_iterations": options.max_iterations,
-            "seed": options.seed,
-        },
-        {"max_iterations": 0},  # of the pose, which is not asked for; inliers are known before
-    )
+    best_first = {"progressive_sampling": True, "max_prosac_iterations": options.max_iterations}
+    # the pose is not asked for, and the inliers are known before it is refined
+    unrefined = {"max_iterations": 0}
+    _, info = _ransac(rays_a[usable], rays_b[usable], focal, options, best_first, unrefined)
     inliers = np.asarray(info["inliers"], dtype=bool)
     if len(inliers) != usable.sum() or inliers.sum() < options.min_matches:
         return none
@@ -236,11 +199,8 @@ def two_view_of_variants(
 ) -> PairVerifier:
     """Verification by a two-view model; the richest's decides which variants agree.
 
-    Parameters
-    ----------
-    camera, image_px : of the image the variants are of: its own keypoints (N, 2 or more).
-    other_camera, other_px : of the other image, (M, 2 or more).
-    base_matches : int64 (K, 2), the verified matches of the two as they are.
+    Of a camera, the image that the variants are of, with its own keypoints (N, 2 or more), the
+    other image's (M, 2 or more), and the verified matches int64 (K, 2) of the two as they are.
     """
     focal, other_focal = focal_px(camera), focal_px(other_camera)
     pairs = image_px[base_matches[:, 0], :2], other_px[base_matches[:, 1], :2]
@@ -291,18 +251,15 @@ def two_view_of_variants(
 
 def known_pose_of_variants(
     camera: Camera,
-    other_rays: NDArray[np.float64],
-    other_slopes: NDArray[np.float64],
+    other_rays: Floats,
+    other_slopes: Floats,
     other_from_image: RigidTransform,
     options: KnownPoseOptions,
 ) -> PairVerifier:
     """Verification with the known poses.
 
-    Parameters
-    ----------
-    camera : of the image the variants are of.
-    other_rays, other_slopes : float64 (M, 3) and (M, 2, 2) of the other image's keypoints, see
-        ``verification.ray_slopes``.
+    Of the camera of the image that the variants are of, and of the other image's keypoints the rays
+    float64 (M, 3) and slopes (M, 2, 2).
     """
 
     def verify(found: VariantFeatures, matches: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -317,46 +274,103 @@ def known_pose_of_variants(
 
 
 def relative_pose(
-    rays: NDArray[np.float64],
-    other_rays: NDArray[np.float64],
-    focal: float,
-    options: TwoViewOptions,
+    rays: Floats, other_rays: Floats, focal: float, options: TwoViewOptions
 ) -> RigidTransform | None:
-    """``other_from_image`` of matched rays, with a translation of length 1, by RANSAC.
+    """Estimate ``other_from_image`` of matched rays, with a translation of length 1, by RANSAC.
 
-    Parameters
-    ----------
-    rays, other_rays : float64 (N, 3), homogeneous, last component 1.
-    focal : pixels, at which an error counts.
-
-    Returns
-    -------
-    None where no model has ``min_matches`` inliers.
+    Of homogeneous rays (N, 3), last component 1, at a focal length in pixels, at which an error
+    counts. None where no model has ``min_matches`` inliers.
     """
-    import poselib
-
     if len(rays) < options.min_matches:
         return None
-    # normalised coordinates at a focal length, as verify_two_view has them
-    pinhole = {"model": "PINHOLE", "width": 1, "height": 1, "params": [focal, focal, 0.0, 0.0]}
-    pose, info = poselib.estimate_relative_pose(
-        rays[:, :2] * focal,
-        other_rays[:, :2] * focal,
-        pinhole,
-        pinhole,
-        {
-            "max_epipolar_error": options.max_error_px,
-            "min_iterations": options.min_iterations,
-            "max_iterations": options.max_iterations,
-            "success_prob": options.confidence,
-            "seed": options.seed,
-        },
-    )
+    pose, info = _ransac(rays, other_rays, focal, options, {}, {})
     if info["num_inliers"] < options.min_matches:
         return None
     return RigidTransform.from_matrix(np.asarray(pose.R), np.asarray(pose.t))
 
 
+def _ransac(
+    rays_a: Floats,
+    rays_b: Floats,
+    focal: float,
+    options: TwoViewOptions,
+    sampling: dict[str, Any],
+    refinement: dict[str, Any],
+) -> tuple[Any, dict[str, Any]]:
+    """poselib's relative pose, of normalised coordinates at a focal length: so it needs to know no
+    camera model, and ours knows them all."""
+    import poselib
+
+    pinhole = {"model": "PINHOLE", "width": 1, "height": 1, "params": [focal, focal, 0.0, 0.0]}
+    ransac = {
+        "max_epipolar_error": options.max_error_px,
+        "min_iterations": options.min_iterations,
+        "max_iterations": options.max_iterations,
+        "success_prob": options.confidence,
+        "seed": options.seed,
+    }
+    pixels = rays_a[:, :2] * focal, rays_b[:, :2] * focal
+    return poselib.estimate_relative_pose(*pixels, pinhole, pinhole, ransac | sampling, refinement)
+
+
 def _precision(variant: ImageVariant) -> float:
     """Pixels of the image that a keypoint was found in, for one of the original; 1 at most."""
     return min(1.0, variant.scale)
+
+
+def agree_by_chance(
+    keypoints_a_px: NDArray[np.floating[Any]],
+    camera_a: Camera,
+    keypoints_b_px: NDArray[np.floating[Any]],
+    camera_b: Camera,
+    num_matches: int,
+    options: TwoViewOptions,
+) -> bool:
+    """True if wrong matches of two images may agree with a relative pose as well as these do.
+
+    These are the matches (N, 2) that two-view verification kept of ``num_matches``. Of matches that
+    are all wrong some lie near the epipolar lines of any model, and RANSAC finds the model with
+    most of them. The number of false alarms (Moisan and Stival, A probabilistic criterion to detect
+    rigid point matches between two images, IJCV 2004) is how many models as good as this one are
+    expected among wrong matches. There a wrong match falls anywhere in the image; but keypoints
+    stand where the texture is, and wrong matches are of things that look alike. How often one is
+    near its line is therefore counted, on the keypoints themselves: each with the others' partners.
+    Few keypoints tell little of that, so it is never taken to be less than anywhere.
+    """
+    from scipy.special import gammaln
+    from scipy.stats import binom
+
+    number = len(keypoints_a_px)
+    if number <= max(_SAMPLE, options.min_matches - 1):
+        return True
+    rays_a = bearing_rays(camera_a, keypoints_a_px)
+    rays_b = bearing_rays(camera_b, keypoints_b_px)
+    focal = 0.5 * (focal_px(camera_a) + focal_px(camera_b))
+    b_from_a = relative_pose(rays_a, rays_b, focal, options)
+    if b_from_a is None:
+        return True
+    slopes_a = ray_slopes(camera_a, keypoints_a_px, rays_a)
+    slopes_b = ray_slopes(camera_b, keypoints_b_px, rays_b)
+
+    def errors_px(a: NDArray[np.integer[Any]], b: NDArray[np.integer[Any]]) -> Floats:
+        return sampson_error_px(rays_a[a], slopes_a[a], rays_b[b], slopes_b[b], b_from_a)
+
+    rows = np.arange(number)
+    right_px = errors_px(rows, rows)
+    num_shifts = min(number - 1, max(1, _MAX_WRONG_PAIRS // number))
+    shifts = 1 + (np.arange(num_shifts) * (number - 1)) // num_shifts
+    wrong_px = errors_px(np.tile(rows, num_shifts), ((rows + shifts[:, None]) % number).reshape(-1))
+    samples = gammaln(num_matches + 1) - gammaln(num_matches - _SAMPLE + 1) - gammaln(_SAMPLE + 1)
+    for share in _THRESHOLDS:
+        threshold_px = share * options.max_error_px
+        # a wrong match that falls anywhere in the image; a Sampson error is of both together
+        anywhere = max(
+            2 * math.sqrt(2) * threshold_px * math.hypot(c.width, c.height) / (c.width * c.height)
+            for c in (camera_a, camera_b)
+        )
+        near = min(1.0, max(anywhere, float((wrong_px <= threshold_px).mean())))
+        agreeing = int((right_px <= threshold_px).sum())
+        tail = binom.logsf(agreeing - _SAMPLE - 1, num_matches - _SAMPLE, near)
+        if samples + tail + math.log(len(_THRESHOLDS)) <= math.log(_MAX_FALSE_ALARMS):
+            return False
+    return True

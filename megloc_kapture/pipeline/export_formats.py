@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.report.scene import corner_rays
 from megloc_kapture.geometry.cameras import principal_point_px
-from megloc_kapture.geometry.earth import earth_from_enu, geodetic
+from megloc_kapture.geometry.poses import earth_from_enu, geodetic
 from megloc_kapture.io.colmap import MapImage, write_model
 from megloc_kapture.io.files import write_bytes
 from megloc_kapture.io.kapture import write_ply

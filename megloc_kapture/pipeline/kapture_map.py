@@ -17,8 +17,7 @@ from megloc_kapture.io.dataset_tables import tables_of, unit_of
 from megloc_kapture.io.kapture import FeatureReader, KaptureFolder
 from megloc_kapture.io.weights.registry import registry
 from megloc_kapture.localization.map_index import MapIndex
-from megloc_kapture.mapping.map_check import map_fault
-from megloc_kapture.mapping.pixel_origin import Origin, PixelOrigin, find_pixel_origin
+from megloc_kapture.mapping.map_check import Origin, PixelOrigin, find_pixel_origin, map_fault
 from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.plugin_loading import plugin_names
 from megloc_kapture.plugins import LOCAL_FEATURES, PluginChoice

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.weights import MissingWeightsError
-from megloc_kapture.localization.query_views import ImageMatches
+from megloc_kapture.localization.map_index import ImageMatches
 from megloc_kapture.matching.guided_pyramid import base_type, equivalent_types
 from megloc_kapture.pipeline.kapture_map import KaptureMap, MapKeypoints
 from megloc_kapture.pipeline.queries import QueryImage

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.localization.cluster_poses import Clock, interleave
-from megloc_kapture.localization.query_views import ImageMatches, QueryView, TypedMatches
+from megloc_kapture.localization.map_index import ImageMatches, QueryView, TypedMatches
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.kapture_queries import KaptureQueries, Unit

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 from pydantic import ValidationError
 
 from megloc_kapture.errors import OptionError, suggestion
-from megloc_kapture.mapping.rejection import UncertaintyOptions
+from megloc_kapture.mapping.uncertainty import UncertaintyOptions
 from megloc_kapture.matching.guided_pyramid import GuidedPyramidOptions
 from megloc_kapture.pipeline.assignments import check_assigned
 from megloc_kapture.plugins import PluginChoice

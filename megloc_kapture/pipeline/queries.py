@@ -21,7 +21,7 @@ from megloc_kapture.plugins import (
     GlobalFeatureExtractor,
     LocalFeatureExtractor,
 )
-from megloc_kapture.preprocessing.frames import FrameOptions, FramePlan, plan_frame
+from megloc_kapture.preprocessing.frames import FrameOptions, FramePlan, carry_points, plan_frame
 from megloc_kapture.preprocessing.masks import with_margin
 from megloc_kapture.stages.global_features import describe_images
 from megloc_kapture.stages.image_masks import ClassMasks, MaskOptions, ProcessedFrame
@@ -183,7 +183,8 @@ class QueryImage:
             remark = estimate_remark(camera, self.query.camera)
             pose = replace(pose, camera=camera, remarks=(*pose.remarks, remark))
         if pose.inlier_points_px is not None and self._plan.changes_pixels:
-            carried = self._plan.pixel_map().original_from_processed(pose.inlier_points_px)
+            cameras = self._plan.processed, self._plan.original
+            carried = carry_points(*cameras, pose.inlier_points_px)
             pose = replace(pose, inlier_points_px=carried)
         return pose
 

@@ -15,7 +15,7 @@ from megloc_kapture.io.dataset_tables import METRES, write_unit
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.output_folders import staged_output
 from megloc_kapture.io.tables import CONSISTENCY_FILE, write_consistency
-from megloc_kapture.localization.shared_camera import solve_with_shared_camera
+from megloc_kapture.localization.focal_length import solve_with_shared_camera
 from megloc_kapture.pipeline.kapture_queries import KaptureQueries
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.photographs import Photographs

@@ -71,10 +71,8 @@ class DeepLab(Checkpointed[DeepLabOptions]):
     def segment(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Labels uint8 (H, W), indices into ``classes``, of an RGB image, uint8 (H, W, 3).
 
-        Raises
-        ------
-        DataError : the checkpoint does not fit.
-        OptionError : the device that is asked for is not there.
+        Raises DataError where the checkpoint does not fit, OptionError where the device is not
+        there.
         """
         height, width = image.shape[:2]
         scale = self.options.max_size_px / max(height, width)

@@ -1,4 +1,4 @@
-"""Images and masks as a :class:`FramePlan` has them.
+"""Resizing and undistortion of images and masks, their cameras and their keypoints.
 
 An image is resampled once. Where it is undistorted, each pixel of the result is the mean of a
 square of samples taken from the original, as many as it spans pixels there: undistorting first and
@@ -16,10 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from megloc_kapture.errors import OptionError
 from megloc_kapture.geometry.cameras import (
     RADIAL_MODELS,
     bearing_rays,
     focal_px,
+    normalized_from_px,
     principal_point_px,
     px_from_cam,
     radial_distortion,
@@ -27,23 +29,31 @@ from megloc_kapture.geometry.cameras import (
     shift_principal_point,
     with_distortion,
 )
-from megloc_kapture.preprocessing.resampling import (
-    PixelMap,
-    cropped_size,
-    fitted_size,
-    resized,
-    same_lens,
-    scaled_camera,
-    sees,
-    undistorted_camera,
-)
-from megloc_kapture.values import Camera, Options
+from megloc_kapture.io.colmap_cameras import undistorted_pinhole
+from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, ONE_FOCAL_MODELS, Camera, Options
 
 # what lies between two points that belong to each other does so too: the models fold slowly
 _CHECKED_EVERY = 16
 # original pixels between which a map is interpolated, which costs it less than 0.005 px; the
 # library's own interpolation rounds positions to 1/32 px
 _INTERPOLATED_PX = 4
+# a point may leave the image by rounding
+_ROUNDING_PX = 1e-6
+# two that are one up to what COLMAP's iterations leave
+_SAME_PX = 1e-3
+Floats = NDArray[np.float64]
+# the model with two focal lengths that has each one's distortion among its own, in the same order
+_TWO_FOCAL_MODEL = {
+    "SIMPLE_PINHOLE": "PINHOLE",
+    "SIMPLE_RADIAL": "OPENCV",
+    "RADIAL": "OPENCV",
+    "SIMPLE_RADIAL_FISHEYE": "OPENCV_FISHEYE",
+    "RADIAL_FISHEYE": "OPENCV_FISHEYE",
+}
+PINHOLE_MODELS = frozenset({"PINHOLE", "SIMPLE_PINHOLE"})
+# models whose distortion is a polynomial of the tangent: without coefficients there is none (the
+# fisheye models' is one of the angle)
+_POLYNOMIAL_MODELS = frozenset({"OPENCV", "FULL_OPENCV"})
 Float32 = NDArray[np.float32]
 
 
@@ -78,8 +88,10 @@ def processed_mask(mask: NDArray[np.bool_], plan: FramePlan) -> NDArray[np.bool_
         return mask
     if not plan.warps:
         # not the library's nearest neighbour, which looks up the pixel's corner
-        rows = _nearest(size[0], mask.shape[0], plan.resized[1])
-        columns = _nearest(size[1], mask.shape[1], plan.resized[0])
+        rows, columns = (
+            (2 * np.arange(number) + 1) * old_side // (2 * side)
+            for number, old_side, side in zip(size, mask.shape, plan.resized[::-1], strict=True)
+        )
         return np.ascontiguousarray(mask[np.ix_(rows, columns)])
     x, y = _sampled_at(plan, 1)
     column = np.clip(np.floor(x + 0.5), 0, mask.shape[1] - 1).astype(np.int32)
@@ -93,22 +105,16 @@ def reached_region(plan: FramePlan) -> NDArray[np.bool_] | None:
     if not plan.warps:
         return None
     width, height = plan.processed.width, plan.processed.height
-    coarse = _reaches(plan, *(_every(side) for side in (width, height)))
-    if coarse.all():
+    # not all pixels along a side, but the first and the last
+    some = [
+        np.append(np.arange(0, side - 1, _CHECKED_EVERY), side - 1) + 0.5
+        for side in (width, height)
+    ]
+    if _reaches(plan, *some).all():
         return None
     full = _reaches(plan, np.arange(width) + 0.5, np.arange(height) + 0.5)
     full.setflags(write=False)
     return full
-
-
-def _nearest(number: int, old_side: int, side: int) -> NDArray[np.int64]:
-    """Index of the old pixel under the centre of each of the first pixels of a resized side."""
-    return (2 * np.arange(number, dtype=np.int64) + 1) * old_side // (2 * side)
-
-
-def _every(side: int) -> NDArray[np.float64]:
-    """Pixel centres along a side, not all, but the first and the last."""
-    return np.append(np.arange(0, side - 1, _CHECKED_EVERY), side - 1) + 0.5
 
 
 def _reaches(
@@ -190,14 +196,11 @@ class FrameOptions(Options):
 
 @dataclass(frozen=True, slots=True)
 class FramePlan:
-    """One camera and what pre-processing makes of it; the pose stays.
+    """One camera before and after pre-processing; the pose stays.
 
-    Parameters
-    ----------
-    original, processed : the cameras before and after.
-    resized : width and height before the crop.
-    shrink : how many original pixels of the undistorted image a processed one spans, the larger
-        of the two axes; 1 or less where nothing is made smaller.
+    ``resized`` is width and height before the crop, ``shrink`` how many original pixels of the
+    undistorted image a processed one spans, the larger of the two axes; 1 or less where nothing is
+    made smaller.
     """
 
     original: Camera
@@ -229,17 +232,11 @@ class FramePlan:
             found = with_distortion(found, radial_distortion(estimated))
         return replace(found, focal_deviation=estimated.focal_deviation)
 
-    def pixel_map(self) -> PixelMap:
-        """Carries keypoints between the two."""
-        return PixelMap(self.original, self.processed)
-
 
 def plan_frame(camera: Camera, options: FrameOptions) -> FramePlan:
     """Plan the frame of a camera.
 
-    Raises
-    ------
-    OptionError : its images are too small to be cropped.
+    Raises OptionError where its images are too small to be cropped.
     """
     lens = camera
     if options.undistort:
@@ -256,3 +253,133 @@ def plan_frame(camera: Camera, options: FrameOptions) -> FramePlan:
         processed = replace(processed, width=cropped_width, height=cropped_height)
     shrink = max(lens.width / width, lens.height / height)
     return FramePlan(camera, processed, (width, height), shrink)
+
+
+def same_lens(first: Camera, second: Camera) -> bool:
+    """True if two cameras differ by their focal lengths and principal points at most."""
+    a, b = with_two_focals(first), with_two_focals(second)
+    return a.model == b.model and a.params[4:] == b.params[4:]
+
+
+def carry_points(source: Camera, target: Camera, points_px: NDArray[np.floating[Any]]) -> Floats:
+    """Carry points (N, 2) of one camera's image into another's, in double precision; (N, 2).
+
+    Both look along the same axes from the same centre, as before and after pre-processing, so a
+    pixel is carried through its ray. Where they share their distortion that is a scale per axis,
+    else COLMAP's camera models. NaN where the target's image does not reach: cropped away, or
+    beyond what a pinhole sees.
+    """
+    points = np.asarray(points_px, np.float64).reshape(-1, 2)
+    if same_lens(source, target):
+        a, b = (np.array(with_two_focals(camera).params[:4]) for camera in (source, target))
+        found = (points - a[2:]) * (b[:2] / a[:2]) + b[2:]
+    else:
+        rays = bearing_rays(source, points)
+        found = px_from_cam(target, rays)
+        found[~(sees(source, rays, points) & sees(target, rays, found))] = np.nan
+    limit = np.array([target.width, target.height]) + _ROUNDING_PX
+    found[~((found >= -_ROUNDING_PX) & (found <= limit)).all(axis=1)] = np.nan
+    return found
+
+
+def sees(camera: Camera, rays: Floats, points_px: Floats) -> NDArray[np.bool_]:
+    """Mask (N,): ray (N, 3) and pixel (N, 2) of a camera belong to each other.
+
+    The polynomials of the models fold over beyond some angle: a ray out there has a pixel too,
+    but it is that of a ray nearer to the axis.
+    """
+    if camera.model in PINHOLE_MODELS:
+        return np.asarray(np.isfinite(points_px).all(axis=1))
+    focals = np.array(with_two_focals(camera).params[:2])
+    off = (normalized_from_px(camera, points_px) - rays[:, :2]) * focals
+    again = px_from_cam(camera, rays) - points_px
+    return np.asarray((np.hypot(*off.T) <= _SAME_PX) & (np.hypot(*again.T) <= _SAME_PX))
+
+
+def fitted_size(
+    width: int, height: int, max_size_px: int, *, upscale: bool = False
+) -> tuple[int, int]:
+    """Size whose larger side is ``max_size_px``, the ratio kept as whole pixels allow.
+
+    Smaller images stay unless ``upscale``, which adds pixels but nothing that can be seen.
+    """
+    larger = max(width, height)
+    if larger <= max_size_px and not upscale:
+        return width, height
+    # in whole numbers, half up: no rounding of a float can make two machines differ
+    smaller = max(1, (2 * min(width, height) * max_size_px + larger) // (2 * larger))
+    return (max_size_px, smaller) if width >= height else (smaller, max_size_px)
+
+
+def cropped_size(width: int, height: int, multiple_of: int) -> tuple[int, int]:
+    """The largest size within an image both of whose sides are multiples of a number.
+
+    Raises OptionError where a side is smaller than that number.
+    """
+    if min(width, height) < multiple_of:
+        raise OptionError(
+            f"an image of {width}x{height} cannot be cropped to multiples of {multiple_of}"
+        )
+    return width - width % multiple_of, height - height % multiple_of
+
+
+def with_two_focals(camera: Camera) -> Camera:
+    """The same camera in a model with two focal lengths; itself where it has them already."""
+    if camera.model not in ONE_FOCAL_MODELS:
+        return camera
+    model = _TWO_FOCAL_MODEL[camera.model]
+    params = (camera.params[0], *camera.params)
+    rest = (0.0,) * (CAMERA_MODEL_NUM_PARAMS[model] - len(params))
+    return replace(camera, model=model, params=params + rest)
+
+
+def scaled_camera(camera: Camera, width: int, height: int) -> Camera:
+    """The camera of an image that was resized as a whole to ``width`` x ``height``.
+
+    Rounded to whole pixels the two sides may be scaled differently; a model with one focal
+    length then becomes the one with two that has the same distortion.
+    """
+    scale_x, scale_y = width / camera.width, height / camera.height
+    # compared as whole numbers: equal ratios may round to different floats
+    if width * camera.height != height * camera.width:
+        camera = with_two_focals(camera)
+    else:
+        scale_y = scale_x
+    if camera.model in ONE_FOCAL_MODELS:
+        focal, cx, cy, *distortion = camera.params
+        params = (focal * scale_x, cx * scale_x, cy * scale_y, *distortion)
+    else:
+        fx, fy, cx, cy, *distortion = camera.params
+        params = (fx * scale_x, fy * scale_y, cx * scale_x, cy * scale_y, *distortion)
+    return replace(camera, width=width, height=height, params=params)
+
+
+def resized(image: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
+    """The image (H, W, ...) scaled as a whole to ``height`` x ``width``.
+
+    Smaller pixels are the means of what they cover, so that nothing is aliased; larger ones are
+    interpolated by cubics.
+    """
+    import cv2
+
+    old_height, old_width = image.shape[:2]
+    if (old_width, old_height) == (width, height):
+        return image
+    shrinks = width <= old_width and height <= old_height
+    interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC
+    return np.asarray(cv2.resize(image, (width, height), interpolation=interpolation))
+
+
+def undistorted_camera(camera: Camera, *, blank_pixels: float = 0.0) -> Camera:
+    """The pinhole camera of an undistorted image, as COLMAP chooses it, with the focal lengths.
+
+    The argument itself where it is a pinhole already. With 0 ``blank_pixels`` the image is as large
+    as it can be without a pixel that the distorted one does not show, with 1 as it must be to show
+    all of that; in between, in between.
+    """
+    if camera.model in PINHOLE_MODELS:
+        return camera
+    lens = with_two_focals(camera)
+    if lens.model in _POLYNOMIAL_MODELS and not any(lens.params[4:]):
+        return replace(lens, model="PINHOLE", params=lens.params[:4])
+    return undistorted_pinhole(camera, blank_pixels=blank_pixels)

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,12 +75,7 @@ class FixedMask(Options):
         return self.camera == sensor_id or fnmatchcase(image, self.camera)
 
     def drawn(self, width: int, height: int) -> NDArray[np.bool_]:
-        """The mask bool (H, W), True = use, of a polygon or a bottom share.
-
-        Raises
-        ------
-        ValueError : it is a file.
-        """
+        """The mask bool (H, W), True = use, of polygon or share; ValueError of a file."""
         if self.polygon is not None:
             return outside_polygon(np.array(self.polygon), width, height)
         if self.bottom_share is None:
@@ -91,9 +87,7 @@ class FixedMask(Options):
 def outside_polygon(corners: NDArray[np.floating], width: int, height: int) -> NDArray[np.bool_]:
     """Mask (H, W) of the pixels whose centres are not in a polygon.
 
-    Parameters
-    ----------
-    corners : (N, 2) x and y in shares of width and height; even-odd where edges cross.
+    Its corners (N, 2) are x and y in shares of width and height; even-odd where edges cross.
     """
     x0, y0 = (np.asarray(corners, np.float64) * [width, height]).T
     x1, y1 = np.roll(x0, -1), np.roll(y0, -1)
@@ -112,19 +106,11 @@ def outside_polygon(corners: NDArray[np.floating], width: int, height: int) -> N
 
 
 def with_margin(mask: NDArray[np.bool_], margin_px: float) -> NDArray[np.bool_]:
-    """The mask without the pixels that are near what it ignores.
+    """The mask bool (H, W), True = use, without the pixels that are near what it ignores.
 
-    The border of the image is no edge of the mask: nothing is taken away along it.
-
-    Parameters
-    ----------
-    mask : bool (H, W), True = use.
-    margin_px : a pixel is used where the nearest ignored one is farther away than this, between
-        the centres of the two (Euclidean); 0 and less leave the mask as it is.
-
-    Returns
-    -------
-    bool (H, W); the argument itself where there is nothing to do.
+    A pixel is used where the nearest ignored one is farther away than the margin, between the
+    centres of the two (Euclidean). The border of the image is no edge of the mask: nothing is taken
+    away along it. The argument itself where there is nothing to do.
     """
     if margin_px <= 0 or mask.all():
         return mask
@@ -138,13 +124,10 @@ def with_margin(mask: NDArray[np.bool_], margin_px: float) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class UnchangingRegion:
-    """Region below a frontier across the image; falsy where it is empty.
+    """Region below a frontier across the image; falsy where it is empty, for a reason.
 
-    Parameters
-    ----------
-    frontier : where the region starts, from the top in shares of the height, at the middles of
-        equally wide columns; 1: nowhere.
-    reason : why there is none, or "".
+    The frontier is where the region starts, from the top in shares of the height, at the middles of
+    equally wide columns; 1: nowhere.
     """
 
     frontier: tuple[float, ...]
@@ -165,9 +148,7 @@ class UnchangingRegion:
 def edge_directions(image: NDArray[np.uint8]) -> Float32:
     """Directions of an image's edges, small: float32 (h, w, 2), x and y, of length 0 to 1.
 
-    Parameters
-    ----------
-    image : uint8 (H, W, 3) RGB.
+    Of an RGB image uint8 (H, W, 3).
     """
     import cv2
 
@@ -188,22 +169,25 @@ def edge_directions(image: NDArray[np.uint8]) -> Float32:
 def find_unchanging_region(sequence: Iterable[Float32]) -> UnchangingRegion:
     """The region at the bottom that never changes.
 
-    Parameters
-    ----------
-    sequence : :func:`edge_directions` of at least MIN_IMAGES images of one camera that moved
-        between them.
-
-    Raises
-    ------
-    ValueError : fewer images.
+    Of :func:`edge_directions` of at least MIN_IMAGES images, else it is a ValueError, of one camera
+    that moved between them.
     """
-    total, lengths, squares, count = _sums(sequence)
+    total: Any
+    total = lengths = squares = np.float32(0)
+    count = 0
+    for directions in sequence:
+        length = np.linalg.norm(directions, axis=-1)
+        total, lengths, squares = total + directions, lengths + length, squares + length**2
+        count += 1
     if count < MIN_IMAGES:
         raise ValueError(f"{count} images; at least {MIN_IMAGES} are needed")
     # of all pairs of different images: products of their directions, and of the lengths alone
     agreeing = np.square(total).sum(axis=-1) - squares
     present = np.square(lengths) - squares
-    wide, narrow = (_share(agreeing, present, window) for window in (_WIDE_PX, _NARROW_PX))
+    wide, narrow = (
+        _mean(agreeing, window) / np.maximum(_mean(present, window), 1e-6)
+        for window in (_WIDE_PX, _NARROW_PX)
+    )
     persistent = np.minimum(wide, narrow) >= _MIN_AGREEMENT
     strength = _mean(present, _WIDE_PX)
     changing = (wide < _CHANGING_AGREEMENT) & (strength > _CHANGING_STRENGTH * np.median(strength))
@@ -219,30 +203,10 @@ def find_unchanging_region(sequence: Iterable[Float32]) -> UnchangingRegion:
     return UnchangingRegion(tuple(float(top) for top in tops / height))
 
 
-def _sums(sequence: Iterable[Float32]) -> tuple[Float32, Float32, Float32, int]:
-    """Sums over the images: directions (h, w, 2), their lengths (h, w), lengths squared."""
-    total = lengths = squares = np.zeros(0, np.float32)
-    count = 0
-    for directions in sequence:
-        length = np.linalg.norm(directions, axis=-1)
-        if count == 0:
-            total, lengths = np.zeros_like(directions), np.zeros_like(length)
-            squares = np.zeros_like(length)
-        total = total + directions
-        lengths = lengths + length
-        squares = squares + length**2
-        count += 1
-    return total, lengths, squares, count
-
-
 def _mean(values: Float32, window: int) -> Float32:
     import cv2
 
     return np.asarray(cv2.blur(values, (window, window)))
-
-
-def _share(part: Float32, whole: Float32, window: int) -> Float32:
-    return np.asarray(_mean(part, window) / np.maximum(_mean(whole, window), 1e-6))
 
 
 def _column_tops(persistent: NDArray[np.bool_], changing: NDArray[np.bool_]) -> NDArray[np.int64]:

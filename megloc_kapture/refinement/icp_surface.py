@@ -17,7 +17,7 @@ from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.geometry.cameras import pixel_rays, px_from_cam
-from megloc_kapture.geometry.robust import deviation_by_median
+from megloc_kapture.geometry.poses import deviation_by_median
 from megloc_kapture.plugins import DepthView
 from megloc_kapture.values import Camera, Options, RigidTransform
 

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.geometry.cameras import focal_px, project
-from megloc_kapture.geometry.robust import deviation_by_median
+from megloc_kapture.geometry.poses import deviation_by_median
 from megloc_kapture.refinement.pyramid import ChosenPoints, Level
 from megloc_kapture.values import Camera, RigidTransform
 

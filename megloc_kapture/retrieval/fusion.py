@@ -1,4 +1,4 @@
-"""Fusion of several global features: of their vectors, their similarities or their rankings.
+"""Fusion of several global features, by vectors, similarities or rankings; reranking.
 
 The operators are those of Csurka and Clinchant, "An empirical study of fusion operators for
 multimodal image retrieval", CBMI 2012, as kapture-localization has them, which MegLoc uses. With
@@ -16,7 +16,7 @@ villena_roman   ``(1 - alpha) max + alpha min ** 2 / (max + min)``
 harmonic_mean   ``1 / sum((1 / n) / (w_i s_i))``
 ghm             ``1 / sum((1 / n) / (gamma + w_i s_i)) - gamma``, the generalized harmonic mean
 early           as ``mean``, in one search: the vectors are concatenated, see :func:`concatenate`
-round_robin     first of each feature, second of each feature, ...; see :func:`round_robin`
+round_robin     first of each feature, second of each feature, ...; see :func:`fuse_rankings`
 ==============  ===================================================================================
 
 They are written for similarities that are not negative, as those of text are. A cosine may be
@@ -126,13 +126,10 @@ def fuse(
 
     Parameters
     ----------
-    similarities : per feature float (Q, M), finite; all of one shape and dtype.
+    similarities : per feature float (Q, M), finite; all of one shape and dtype, which is the
+        result's; that of ranks is float64.
     weights : one per feature, positive; all equal by default. Maximum, minimum, ``min_and_max``,
         ``villena_roman`` and ``round_robin`` have no use for them.
-
-    Returns
-    -------
-    float (Q, M), of the similarities' dtype; of ranks float64.
 
     Raises
     ------
@@ -211,8 +208,7 @@ def _by_ranks(
 ) -> NDArray[np.float64]:
     features = len(similarities)
     length = similarities[0].shape[1]
-    fused = np.zeros(similarities[0].shape)
-    fused[:] = -np.inf if options.method == "round_robin" else 0.0
+    fused = np.full(similarities[0].shape, -np.inf if options.method == "round_robin" else 0.0)
     for feature, (matrix, share) in enumerate(zip(similarities, shares, strict=True)):
         order = np.argsort(-matrix, axis=1, kind="stable")
         ranks = np.empty_like(order)
@@ -226,19 +222,11 @@ def _by_ranks(
     return fused
 
 
-def check_features(count: int, databases: int) -> None:
-    """Raise OptionError unless queries and database have the same number of features, any."""
-    if count == 0 or count != databases:
-        raise OptionError(f"{count} global features of the queries, {databases} of the map")
-
-
 def normalized_weights(weights: Sequence[float] | None, count: int) -> NDArray[np.float64]:
     """Weights (count,) that sum to one; all equal where none are given.
 
-    Raises
-    ------
-    OptionError : another number of weights, or one that is not finite and positive. A feature that
-        is not to count is left out: harmonic means and ranks know no weight of zero.
+    Raises OptionError for another number of weights, or one that is not finite and positive. A
+    feature that is not to count is left out: harmonic means and ranks know no weight of zero.
     """
     given = np.ones(count) if weights is None else np.asarray(weights, dtype=np.float64)
     if count == 0 or given.shape != (count,):
@@ -255,22 +243,13 @@ def concatenate(
     *,
     out: NDArray[np.float32] | None = None,
 ) -> NDArray[np.float32]:
-    """Concatenate the descriptors of several features, row by row.
+    """Concatenate the descriptors of several features, float (N, D_i), row by row; float32.
 
     The inner product of two rows is the weighted mean of the features' cosines: block i is scaled
     by the square root of ``w_i / sum(w)``. It is what late fusion by the mean gives, in one search.
     A row is of unit length where every feature's is; a feature of zeros, of an image that it finds
-    nothing in, takes its share away.
-
-    Parameters
-    ----------
-    vectors : float (N, D_i), rows of unit length or zero.
-    weights : one per feature, positive; all equal by default.
-    out : where to write the result.
-
-    Returns
-    -------
-    float32 (N, sum of D_i).
+    nothing in, takes its share away. Weights are positive, one per feature; all equal by default.
+    The result is written to ``out`` where it is given.
 
     Raises
     ------
@@ -290,68 +269,47 @@ def concatenate(
     return fused
 
 
-def round_robin(lists: Sequence[NDArray[np.int64]], top_k: int) -> Ranking:
-    """The first of each list in turn, then the second of each, without what was there already.
+def fuse_rankings(
+    lists: Sequence[NDArray[np.int64]],
+    top_k: int,
+    options: FusionOptions,
+    weights: Sequence[float] | None = None,
+) -> Ranking:
+    """Fuse the ranked lists of several features by one of RANK_METHODS.
+
+    ``round_robin`` takes the first of each list in turn, then the second of each, without what was
+    there already. ``reciprocal_rank`` sums ``w_i / (rank_constant + rank_i)``, ranks from 1
+    (Cormack, Clarke and Buettcher, "Reciprocal rank fusion outperforms Condorcet and individual
+    rank learning methods", SIGIR 2009, whose constant is 60). ``borda`` gives the last of the
+    longest list one point, each before it one more. A list without the image adds nothing; equal
+    sums are in the order of the images. Raises DataError for lists of different numbers of queries,
+    OptionError for no list, or weights that cannot be used.
 
     Parameters
     ----------
-    lists : per feature int64 (Q, K_i).
-    top_k : at most this many per row.
+    lists : per feature int64 (Q, K_i), best first, -1 where there are no more.
+    weights : one per feature, positive; all equal by default. ``round_robin`` has no use for them.
 
     Returns
     -------
     indices : int64 (Q, top_k), best first, -1 where the lists have no more.
-    scores : float32 (Q, top_k), ``top_k`` for the first, then one less each; -inf where -1.
-
-    Raises
-    ------
-    DataError : lists of different numbers of queries.
-    OptionError : no list.
+    scores : float32 (Q, top_k), the sums; of ``round_robin`` ``top_k`` for the first, then one less
+        each. -inf where -1.
     """
-    features = max(len(lists), 1)
-    turns = [
-        -(np.arange(ranked.shape[-1]) * features + feature) for feature, ranked in enumerate(lists)
-    ]
-    indices, _ = _best(lists, turns, top_k, np.maximum)
-    scores = np.arange(top_k, 0, -1, dtype=np.float32)
-    return indices, np.where(indices >= 0, scores, np.float32(-np.inf))
-
-
-def reciprocal_rank(
-    lists: Sequence[NDArray[np.int64]],
-    top_k: int,
-    weights: Sequence[float] | None = None,
-    *,
-    constant: float = 60.0,
-) -> Ranking:
-    """Reciprocal rank fusion: ``sum(w_i / (constant + rank_i))``, ranks from 1.
-
-    Cormack, Clarke and Buettcher, "Reciprocal rank fusion outperforms Condorcet and individual
-    rank learning methods", SIGIR 2009, whose constant is 60. A list without the image adds nothing.
-    Equal sums are in the order of the images. Parameters as of :func:`round_robin`; the weights
-    are positive and brought to a sum of one, scores are the sums.
-    """
+    if not lists:
+        raise OptionError("no ranked list to fuse")
+    ranks = [np.arange(ranked.shape[-1]) for ranked in lists]
+    if options.method == "round_robin":
+        turns = [-(own * len(lists) + feature) for feature, own in enumerate(ranks)]
+        indices, _ = _best(lists, turns, top_k, np.maximum)
+        scores = np.arange(top_k, 0, -1, dtype=np.float32)
+        return indices, np.where(indices >= 0, scores, np.float32(-np.inf))
     shares = normalized_weights(weights, len(lists))
-    points = [
-        share / (constant + 1 + np.arange(ranked.shape[-1]))
-        for ranked, share in zip(lists, shares, strict=True)
-    ]
-    return _best(lists, points, top_k, np.add)
-
-
-def borda(
-    lists: Sequence[NDArray[np.int64]], top_k: int, weights: Sequence[float] | None = None
-) -> Ranking:
-    """Borda count: the last of the longest list gets one point, each before it one more.
-
-    Parameters and result as of :func:`reciprocal_rank`.
-    """
-    shares = normalized_weights(weights, len(lists))
-    longest = max(ranked.shape[-1] for ranked in lists)
-    points = [
-        share * (longest - np.arange(ranked.shape[-1]))
-        for ranked, share in zip(lists, shares, strict=True)
-    ]
+    both = list(zip(shares, ranks, strict=True))
+    if options.method == "reciprocal_rank":
+        points = [share / (options.rank_constant + 1 + own) for share, own in both]
+    else:
+        points = [share * (max(map(len, ranks)) - own) for share, own in both]
     return _best(lists, points, top_k, np.add)
 
 
@@ -362,8 +320,6 @@ def _best(
     together: np.ufunc,
 ) -> Ranking:
     """The images with most points; ``together`` is what makes one of an image's points."""
-    if not lists:
-        raise OptionError("no ranked list to fuse")
     if any(ranked.ndim != 2 or len(ranked) != len(lists[0]) for ranked in lists):
         raise DataError(f"ranked lists of shapes {[ranked.shape for ranked in lists]}")
     every = np.concatenate(lists, axis=1)
@@ -378,7 +334,7 @@ def _best(
         return indices, scores
     order = np.lexsort((images, rows))
     rows, values, images = rows[order], values[order], images[order]
-    starts = np.flatnonzero((np.diff(rows, prepend=-1) != 0) | (np.diff(images, prepend=-1) != 0))
+    starts = np.flatnonzero(np.diff(rows, prepend=-1) | np.diff(images, prepend=-1))
     rows, images, values = rows[starts], images[starts], together.reduceat(values, starts)
     order = np.lexsort((images, -values, rows))
     rows, images, values = rows[order], images[order], values[order]
@@ -387,3 +343,67 @@ def _best(
     indices[rows[kept], ranks[kept]] = images[kept]
     scores[rows[kept], ranks[kept]] = values[kept]
     return indices, scores
+
+
+def greedy_coverage(
+    keypoint_ids: Sequence[NDArray[np.int64]], keep: int
+) -> tuple[list[int], list[int]]:
+    """Choose images one by one, each for the keypoints that those before it do not match.
+
+    By the number of matches alone, neighbours of the best image come next, which see the same from
+    nearly the same position. This is the greedy solution of maximum coverage, at least a share of 1
+    - 1/e of the best one (Nemhauser, Wolsey and Fisher, "An analysis of approximations for
+    maximizing submodular set functions", Mathematical Programming 1978).
+
+    Of each image, the query's keypoints that it matches are given, each once. The result is at most
+    ``keep`` indices, and the keypoints that each of them adds. Of images that add as many, the one
+    with more matches comes first, of those the first.
+    """
+    size = max((int(ids.max()) + 1 for ids in keypoint_ids if len(ids)), default=0)
+    missing = np.ones(size, dtype=bool)
+    left = list(range(len(keypoint_ids)))
+    order: list[int] = []
+    added: list[int] = []
+    while left and len(order) < keep:
+        gains = {at: int(missing[keypoint_ids[at]].sum()) for at in left}
+        best = max(left, key=lambda at: (gains[at], len(keypoint_ids[at]), -at))
+        missing[keypoint_ids[best]] = False
+        left.remove(best)
+        order.append(best)
+        added.append(gains[best])
+    return order, added
+
+
+class DiversityOptions(Options):
+    """Options of diversity: near-duplicates by pose, and how many a ranking may have."""
+
+    max_per_place: int = Field(default=3, gt=0, description="images within radius and angle")
+    radius: float = Field(default=2.0, gt=0, description="of camera centres, unit of the map")
+    angle_deg: float = Field(default=30.0, gt=0, le=180, description="between viewing directions")
+
+
+def diversify(
+    ranking: NDArray[np.int64],
+    centers: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    top_k: int,
+    options: DiversityOptions,
+) -> NDArray[np.int64]:
+    """Positions in a ranking, int64 (min(K, top_k),), of the images to keep, in its order.
+
+    Greedy: an image is passed over when ``max_per_place`` of those kept are near it. Passed-over
+    images fill what is left of ``top_k`` in the end, so that the ranking stays as long. The ranking
+    int64 (K,) has images as rows of camera centres and unit viewing directions, float64 (N, 3),
+    best first.
+    """
+    at, towards = centers[ranking], directions[ranking]
+    cosine = np.cos(np.deg2rad(options.angle_deg))
+    kept: list[int] = []
+    passed: list[int] = []
+    for position in range(len(ranking)):
+        if len(kept) == top_k:
+            break
+        distance = np.linalg.norm(at[kept] - at[position], axis=1)
+        near = (distance <= options.radius) & (towards[kept] @ towards[position] >= cosine)
+        (passed if near.sum() >= options.max_per_place else kept).append(position)
+    return np.array([*kept, *passed[: top_k - len(kept)]], dtype=np.int64)

@@ -6,6 +6,7 @@ what the search needs does not grow with the database.
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,16 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, OptionError, missing_extra
 from megloc_kapture.retrieval.fusion import (
     FusionOptions,
-    borda,
-    check_features,
     concatenate,
     fuse,
+    fuse_rankings,
     normalized_weights,
-    reciprocal_rank,
-    round_robin,
 )
 from megloc_kapture.retrieval.vectors import (
     ConcatenatedBlocks,
@@ -36,12 +34,17 @@ from megloc_kapture.retrieval.vectors import (
 _BLOCK_ELEMENTS = 1 << 24  # similarities held at once, per feature: 64 MiB of float32
 _VECTOR_ELEMENTS = 1 << 25  # of a block of database rows, per feature: 128 MiB of float32
 _MOST_ROWS = 1 << 14  # of a block, however short they are
-_CACHED_ELEMENTS = 1 << 18  # of similarities ranked at once: 1 MiB
+_CACHED_ELEMENTS = 1 << 18  # of similarities ranked at once: 1 MiB, which a cache holds
 Permitted = NDArray[np.bool_] | Callable[[int, int], NDArray[np.bool_]] | None
-Found = tuple[NDArray[np.int64], NDArray[np.float32]]
+Matrices = Sequence[NDArray[np.floating[Any]]]
+Float32 = NDArray[np.float32]
+Found = tuple[NDArray[np.int64], Float32]
 _GROUP = 8  # columns of which only the best is looked at first
 _NOTHING = np.iinfo(np.int64).max  # sorts last
 _SIGN = np.int32(0x7FFFFFFF)
+_SUBVECTOR = 16  # values that share a code of 4 bits, one of 16 centroids
+_SAMPLE = 16 * 39  # fewer rows than 39 for each centroid FAISS calls too few
+_LENGTH = 1000  # rows of a query whose exact similarity is found
 
 
 def rank_by_similarity(
@@ -58,14 +61,13 @@ def rank_by_similarity(
     queries : float (Q, D), rows of unit length for cosine similarity. A zero row, of an image
         without features, has similarity 0 with everything.
     database : float (M, D), or a source of blocks of them.
-    top_k : at most this many per query.
-    permitted : bool (Q, M), False for rows that a query must not get; or a function that gives
-        (Q, stop - start) of the database rows ``start`` to ``stop``; or None.
+    permitted : bool (Q, M), False for rows that a query must not get; or a function that gives (Q,
+        stop - start) of the database rows ``start`` to ``stop``; or None.
 
     Returns
     -------
-    indices : int64 (Q, min(top_k, M)), best first; equal scores keep the database's order;
-        -1 where fewer than ``top_k`` rows are permitted.
+    indices : int64 (Q, min(top_k, M)), best first; equal scores keep the database's order; -1 where
+        fewer than ``top_k`` rows are permitted.
     scores : float32 of the same shape; -inf where the index is -1.
 
     Raises
@@ -76,45 +78,12 @@ def rank_by_similarity(
     return found
 
 
-def rank_fused(
-    queries: Sequence[NDArray[np.floating[Any]]],
-    database: Sequence[VectorSource],
-    top_k: int,
-    *,
-    fusion: FusionOptions,
-    weights: Sequence[float] | None = None,
-    permitted: Permitted = None,
-) -> Found:
-    """The ``top_k`` best database rows of each query row by several features together.
-
-    Parameters
-    ----------
-    queries : per feature float (Q, D_i), rows of unit length or zero.
-    database : per feature float (M, D_i), or a source of blocks of them.
-    top_k, permitted : as of :func:`rank_by_similarity`.
-    fusion : the method, of similarities or of ranks. One feature alone is not fused.
-    weights : one per feature, positive; all equal by default.
-
-    Returns
-    -------
-    indices, scores : as of :func:`rank_by_similarity`; scores as the fusion makes them.
-
-    Raises
-    ------
-    DataError : different dimensions or numbers of rows, or values that are not finite.
-    OptionError : weights that cannot be used, or other features than those of the queries.
-    """
-    search = FusedSearch(top_k, fusion, weights)
-    return search.ranking([search.lists(queries, database, permitted)])
-
-
 @dataclass(frozen=True)
 class FusedSearch:
-    """What :func:`rank_fused` does, part by part of a database.
+    """The ``top_k`` best database rows of queries by several features, part by part of a database.
 
-    Attributes
-    ----------
-    top_k, fusion, weights : as of that function.
+    ``fusion`` is of similarities or of ranks; one feature alone is not fused. The weights are
+    positive, one per feature; all equal by default.
     """
 
     top_k: int
@@ -127,13 +96,17 @@ class FusedSearch:
         database: Sequence[VectorSource],
         permitted: Permitted = None,
     ) -> list[Found]:
-        """What is kept of a part: a ranking, or of methods that fuse ranks one per feature.
+        """Rank the rows of a part: one ranking, or of methods that fuse ranks one per feature.
 
-        Raises
-        ------
-        DataError, OptionError : as of :func:`rank_fused`.
+        Per feature queries are float (Q, D_i), rows of unit length or zero, the database float
+        (M, D_i), or a source of blocks of them. Raises DataError for different dimensions or
+        numbers of rows, or values that are not finite; OptionError for weights that cannot be used,
+        or other features than those of the queries.
         """
-        check_features(len(queries), len(database))
+        if len(queries) == 0 or len(queries) != len(database):
+            raise OptionError(
+                f"{len(queries)} global features of the queries, {len(database)} of the map"
+            )
         normalized_weights(self.weights, len(queries))  # refused before anything is read
         if len(queries) == 1:
             return [rank_by_similarity(queries[0], database[0], self.top_k, permitted=permitted)]
@@ -152,18 +125,15 @@ class FusedSearch:
         return _search(queries, database, lengths, lambda matrices: matrices, permitted)
 
     def ranking(self, parts: Sequence[Sequence[Found]]) -> Found:
-        """The ranking of the whole, from the lists of its parts, whose rows are the whole's."""
+        """Rank the whole, as :func:`rank_by_similarity`, from the lists of its parts, whose rows
+        are the whole's; scores are as the fusion makes them."""
         lists = [_merged(found, self._list_length()) for found in zip(*parts, strict=True)]
         if len(lists) == 1:
             indices, scores = lists[0]
             return indices[:, : self.top_k], scores[:, : self.top_k]
         rankings = [indices for indices, _ in lists]
         top_k = min(self.top_k, rankings[0].shape[1])
-        if self.fusion.method == "round_robin":
-            return round_robin(rankings, top_k)
-        if self.fusion.method == "borda":
-            return borda(rankings, top_k, self.weights)
-        return reciprocal_rank(rankings, top_k, self.weights, constant=self.fusion.rank_constant)
+        return fuse_rankings(rankings, top_k, self.fusion, self.weights)
 
     def _list_length(self) -> int:
         # a turn of the round gives one image at most, so longer lists would change nothing
@@ -179,9 +149,6 @@ def _merged(parts: Sequence[Found], length: int) -> Found:
     indices, scores = (np.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True))
     best = np.argsort(-scores, axis=1, kind="stable")[:, :length]
     return np.take_along_axis(indices, best, axis=1), np.take_along_axis(scores, best, axis=1)
-
-
-Matrices = Sequence[NDArray[np.floating[Any]]]
 
 
 def _search(
@@ -221,22 +188,19 @@ def _search(
                 for rows, block, out, finite in zip(vectors, blocks, products, finites, strict=True)
             ]
             mask = None if allowed is None else allowed[some]
-            for part in _parts(*matrices[0].shape):
+            count, width = matrices[0].shape
+            few = max(1, _CACHED_ELEMENTS // width)
+            for start in range(0, count, few):
+                part = slice(start, start + few)
                 fused = combine([matrix[part] for matrix in matrices])
                 for scores, ranking in zip(fused, best, strict=True):
                     if mask is not None:
                         scores = np.where(mask[part], scores, -np.inf)
-                    ranking.add(first + part.start, left, scores)
+                    ranking.add(first + start, left, scores)
     return [ranking.result() for ranking in best]
 
 
-def _parts(num_queries: int, width: int) -> list[slice]:
-    """Queries whose scores a processor's cache holds."""
-    step = max(1, _CACHED_ELEMENTS // width)
-    return [slice(start, start + step) for start in range(0, num_queries, step)]
-
-
-def _checked(queries: NDArray[np.floating[Any]], source: VectorBlocks) -> NDArray[np.float32]:
+def _checked(queries: NDArray[np.floating[Any]], source: VectorBlocks) -> Float32:
     rows = np.ascontiguousarray(queries, dtype=np.float32)
     if rows.ndim != 2 or rows.shape[1] != source.dimension:
         of_map = (len(source), source.dimension)
@@ -249,18 +213,9 @@ def _checked(queries: NDArray[np.floating[Any]], source: VectorBlocks) -> NDArra
 
 
 def _similarities(
-    queries: NDArray[np.float32],
-    rows: NDArray[np.float32],
-    first_row: int,
-    out: NDArray[np.float32],
-    finite: bool,
-) -> NDArray[np.float32]:
-    """Inner products (q, b), in the memory of ``out``, which is flat.
-
-    Parameters
-    ----------
-    finite : the rows are known to be.
-    """
+    queries: Float32, rows: Float32, first_row: int, out: Float32, finite: bool
+) -> Float32:
+    """Inner products (q, b), in the flat memory of ``out``; ``finite`` rows are known to be."""
     shape = (len(queries), len(rows))
     products = out[: shape[0] * shape[1]].reshape(shape)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -320,13 +275,13 @@ class BestRows:
         merged.sort(axis=1)
         keys[:] = merged[:, :top_k]
 
-    def result(self) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    def result(self) -> tuple[NDArray[np.int64], Float32]:
         """Indices int64 (Q, top_k), best first, and scores; -1 and -inf where fewer rows came."""
         indices = np.where(self._keys == _NOTHING, -1, self._keys & 0xFFFFFFFF)
         return indices, _scores(self._keys)
 
 
-def _keys(scores: NDArray[np.float32], rows: NDArray[np.int64]) -> NDArray[np.int64]:
+def _keys(scores: Float32, rows: NDArray[np.int64]) -> NDArray[np.int64]:
     """Integers (..., b) in whose order scores fall and, of equal ones, database rows (b,) rise."""
     # the two zeros are equal; a negative number's other bits grow as it falls
     bits = (scores + np.float32(0)).view(np.int32)
@@ -336,7 +291,7 @@ def _keys(scores: NDArray[np.float32], rows: NDArray[np.int64]) -> NDArray[np.in
     return keys
 
 
-def _scores(keys: NDArray[np.int64]) -> NDArray[np.float32]:
+def _scores(keys: NDArray[np.int64]) -> Float32:
     rising = np.invert((keys >> 32).astype(np.int32))
     scores = (rising ^ ((rising >> 31) & _SIGN)).view(np.float32)
     return np.where(keys == _NOTHING, np.float32(-np.inf), scores)
@@ -348,3 +303,89 @@ def _padded(query: NDArray[np.int64], keys: NDArray[np.int64], count: int) -> ND
     padded = np.full((count, int(np.diff(starts).max())), _NOTHING, dtype=np.int64)
     padded[query, np.arange(len(query)) - starts[query]] = keys
     return padded
+
+
+class QuantizedRows:
+    """Codes of the rows of a source, for short lists of their nearest neighbours.
+
+    Jégou, Douze, Schmid, "Product quantization for nearest neighbor search", TPAMI 2011; FAISS's
+    implementation with asymmetric distances by shuffles (André, Kermarrec, Le Scouarnec, "Quicker
+    ADC", TPAMI 2021), every code compared. A row takes a byte per 32 values in memory; the rows of
+    a short list are read again for their exact similarities, so that a ranking is exact search's as
+    long as the short list holds it. Raises OptionError where FAISS is not installed, or there are
+    too few rows.
+    """
+
+    def __init__(self, source: VectorSource) -> None:
+        try:
+            faiss: Any = importlib.import_module("faiss")
+        except ModuleNotFoundError as error:
+            raise OptionError(missing_extra(error) or str(error)) from error
+        rows = as_blocks(source)
+        if len(rows) < _SAMPLE:
+            raise OptionError(
+                f"{len(rows)} map images are too few for product quantisation, which needs "
+                f"{_SAMPLE}: query_pairs.quantized_above"
+            )
+        wanted = max(1, rows.dimension // _SUBVECTOR)
+        parts = next(n for n in range(wanted, 0, -1) if rows.dimension % n == 0)
+        self._index = faiss.IndexPQFastScan(rows.dimension, parts, 4, faiss.METRIC_INNER_PRODUCT)
+        sample = np.linspace(0, len(rows) - 1, min(len(rows), 4 * _SAMPLE)).astype(np.int64)
+        self._index.train(_picked(rows, np.unique(sample)))
+        step = max(1, _VECTOR_ELEMENTS // rows.dimension)
+        for start in range(0, len(rows), step):
+            self._index.add(rows.read(start, min(start + step, len(rows))))
+
+    def nearest(self, queries: Float32, count: int) -> NDArray[np.int64]:
+        """The ``count`` rows (Q, count) whose codes are most similar to each query (Q, D)."""
+        found: NDArray[np.int64] = self._index.search(np.ascontiguousarray(queries), count)[1]
+        return found
+
+
+def short_lists(
+    search: FusedSearch,
+    queries: Sequence[NDArray[np.floating[Any]]],
+    database: Sequence[VectorSource],
+    codes: Sequence[QuantizedRows],
+    *,
+    length: int = _LENGTH,
+) -> list[Found]:
+    """As :meth:`~.search.FusedSearch.lists`, among the short lists of each query.
+
+    Each feature's codes of the database give a short list of its own; of ``length`` rows, at least
+    ``search.top_k``.
+    """
+    sources = [as_blocks(source) for source in database]
+    length = min(max(length, search.top_k), len(sources[0]))
+    asked = [np.asarray(rows, np.float32) for rows in queries]
+    if not len(asked[0]):
+        return search.lists(asked, sources)
+    near = np.concatenate(
+        [own.nearest(rows, length) for own, rows in zip(codes, asked, strict=True)], axis=1
+    )
+    of_queries = []
+    for at, candidates in enumerate(near):
+        rows = np.unique(candidates[candidates >= 0])  # equal scores keep the database's order
+        of_rows = [_picked(source, rows) for source in sources]
+        found = search.lists([own[at : at + 1] for own in asked], of_rows)
+        of_queries.append([(np.where(i >= 0, rows[i], -1), scores) for i, scores in found])
+    return [_stacked(one) for one in zip(*of_queries, strict=True)]
+
+
+def _stacked(rankings: Sequence[Found]) -> Found:
+    """Rankings of a query each as one of all; where one is shorter, -1 and -inf."""
+    width = max(indices.shape[1] for indices, _ in rankings)
+    found = np.full((len(rankings), width), -1, np.int64)
+    scores = np.full((len(rankings), width), -np.inf, np.float32)
+    for at, (indices, own) in enumerate(rankings):
+        found[at, : indices.shape[1]], scores[at, : indices.shape[1]] = indices[0], own[0]
+    return found, scores
+
+
+def _picked(source: VectorBlocks, rows: NDArray[np.int64]) -> Float32:
+    """Some rows of a source, rising; neighbours are read at once."""
+    found = np.empty((len(rows), source.dimension), np.float32)
+    starts = np.flatnonzero(np.diff(rows, prepend=-2) != 1)
+    for start, stop in zip(starts, [*starts[1:].tolist(), len(rows)], strict=True):
+        found[start:stop] = source.read(int(rows[start]), int(rows[stop - 1]) + 1)
+    return found

@@ -44,12 +44,7 @@ VectorSource = VectorBlocks | NDArray[np.floating[Any]]
 
 
 class ArrayBlocks:
-    """An array (N, D) of unit or zero rows as a source of blocks.
-
-    Raises
-    ------
-    DataError : not two-dimensional.
-    """
+    """An array (N, D) of unit or zero rows as a source of blocks; DataError if it is not 2-D."""
 
     def __init__(self, rows: NDArray[np.floating[Any]]) -> None:
         if rows.ndim != 2:
@@ -73,10 +68,8 @@ class ArrayBlocks:
 class ConcatenatedBlocks:
     """Several features of the same images as one: early fusion, block by block.
 
-    Raises
-    ------
-    DataError : sources of different lengths.
-    OptionError : weights that cannot be used, see :func:`.fusion.concatenate`.
+    Raises DataError for sources of different lengths, OptionError for weights that cannot be used,
+    see :func:`.fusion.concatenate`.
     """
 
     def __init__(
@@ -107,12 +100,7 @@ def as_blocks(source: VectorSource) -> VectorBlocks:
 
 
 def common_length(sources: Sequence[VectorBlocks]) -> int:
-    """Number of rows that all sources have.
-
-    Raises
-    ------
-    DataError : none, or of different lengths.
-    """
+    """Number of rows that all sources have; DataError where there is none, or they differ."""
     lengths = {len(source) for source in sources}
     if len(lengths) != 1:
         raise DataError(f"features of one set of images have {sorted(lengths)} rows")

@@ -14,10 +14,8 @@ from pydantic import Field
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.kapture import FeatureReader, KaptureFolder
 from megloc_kapture.io.kapture.vectors import KaptureVectors
-from megloc_kapture.retrieval.fusion import FusionOptions
-from megloc_kapture.retrieval.reranking import DiversityOptions, diversify
-from megloc_kapture.retrieval.search import Found, FusedSearch
-from megloc_kapture.retrieval.short_list import QuantizedRows, short_lists
+from megloc_kapture.retrieval.fusion import DiversityOptions, FusionOptions, diversify
+from megloc_kapture.retrieval.search import Found, FusedSearch, QuantizedRows, short_lists
 from megloc_kapture.retrieval.vectors import VectorBlocks, as_blocks, common_length
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Options, RigidTransform

@@ -21,8 +21,7 @@ from pydantic import Field
 
 from megloc_kapture.errors import OptionError
 from megloc_kapture.geometry.cameras import bearing_rays
-from megloc_kapture.localization.absolute_pose import absolute_pose
-from megloc_kapture.localization.estimation import AbsolutePoseOptions
+from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions, absolute_pose
 from megloc_kapture.mapping.depth import sample_depth
 from megloc_kapture.plugin_loading import load_plugin, weights_of
 from megloc_kapture.plugins import (

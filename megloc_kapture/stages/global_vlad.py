@@ -17,8 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.features.pca_whitening import PcaWhitening
-from megloc_kapture.features.vlad import VladOptions, Vocabulary, aggregate, train_vlad
+from megloc_kapture.features.vlad import (
+    PcaWhitening,
+    VladOptions,
+    Vocabulary,
+    aggregate,
+    train_vlad,
+)
 from megloc_kapture.io.files import read_json_model, write_json_model
 from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
 from megloc_kapture.stages.kept_items import feature_inputs

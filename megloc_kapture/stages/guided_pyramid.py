@@ -8,7 +8,7 @@ however many pairs it is in.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -16,12 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.geometry.image_variants import ImageVariant
-from megloc_kapture.localization.query_views import ImageMatches
+from megloc_kapture.localization.map_index import ImageMatches
 from megloc_kapture.matching.guided_pyramid import (
     GuidedPyramidOptions,
+    ImageVariant,
     PairVerifier,
-    SkippedVariant,
     VariantFeatures,
     VariantMatches,
     extract_variants,
@@ -31,7 +30,6 @@ from megloc_kapture.matching.guided_pyramid import (
 from megloc_kapture.matching.pyramid_combination import (
     Combined,
     KeypointUnion,
-    TriedVariant,
     combine,
 )
 from megloc_kapture.matching.verification import (
@@ -72,7 +70,7 @@ class MatchedVariants:
 
     found: list[list[VariantMatches]]
     num_variants: list[int]
-    skipped: list[SkippedVariant]
+    skipped: dict[ImageVariant, str]
     seconds: float
 
 
@@ -249,8 +247,8 @@ def retry_query(
     for other, pairs, scores in matches:
         if other in of_other:
             found, num_variants = of_other[other]
-            variants = [TriedVariant(0, each) for each in found]
-            combined = combine((pairs, scores), variants, mode, (keypoints, None))
+            tried_ones = [(0, each) for each in found]
+            combined = combine((pairs, scores), tried_ones, mode, (keypoints, None))
             best = "" if combined.best is None else f"image {found[combined.best].variant}"
             why = f"image {skipped}" if skipped else ""
             tried.count((name, other), len(pairs), combined, num_variants, best, why)
@@ -261,11 +259,11 @@ def retry_query(
     return RetriedQuery(keypoints.added(), added, richer, tried)
 
 
-def described(skipped: Sequence[SkippedVariant]) -> str:
+def described(skipped: Mapping[ImageVariant, str]) -> str:
     """The variants that gave nothing, and why, as one line; those of one reason together."""
     by_reason: dict[str, list[ImageVariant]] = {}
-    for each in skipped:
-        by_reason.setdefault(each.reason, []).append(each.variant)
+    for variant, reason in skipped.items():
+        by_reason.setdefault(reason, []).append(variant)
     return "; ".join(
         f"{' '.join(map(str, variants))}: {reason}" for reason, variants in by_reason.items()
     )

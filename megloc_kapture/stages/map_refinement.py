@@ -27,16 +27,16 @@ from megloc_kapture.io.kapture import (
 )
 from megloc_kapture.io.kapture.points import write_point_covariances
 from megloc_kapture.mapping.depth import DepthVerificationOptions, contradicted_by_depth
-from megloc_kapture.mapping.rejection import (
+from megloc_kapture.mapping.uncertainty import (
     ConsistencyOptions,
     UncertaintyOptions,
     mean_depths,
+    point_deviations,
     reprojection_errors_px,
     seen_at_angle,
     too_uncertain,
     track_lengths,
 )
-from megloc_kapture.mapping.uncertainty import point_deviations
 from megloc_kapture.stages.layout import UNREFINED
 from megloc_kapture.stages.map_selection import FilterReport, Floats, MapSelection, Mask
 from megloc_kapture.stages.rigs import DepthRecord, depth_records

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
 from megloc_kapture.io.kapture import FeatureReader, KaptureData, KaptureFolder, Observations
-from megloc_kapture.mapping.pixel_origin import ObservedKeypoints, find_pixel_origin
-from megloc_kapture.mapping.rejection import ObservedPoints, left_with_too_few
-from megloc_kapture.mapping.uncertainty import point_covariances
+from megloc_kapture.mapping.map_check import ObservedKeypoints, find_pixel_origin
+from megloc_kapture.mapping.uncertainty import ObservedPoints, left_with_too_few, point_covariances
 
 _SAMPLED_IMAGES = 50
 

@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.geometry.image_variants import ImageVariant
 from megloc_kapture.io.csv_table import write_csv_table
 from megloc_kapture.io.files import remove, safe_join, write_bytes
 from megloc_kapture.io.kapture import (
@@ -31,6 +30,7 @@ from megloc_kapture.io.kapture import (
 from megloc_kapture.mapping.pairs import views_can_overlap
 from megloc_kapture.matching.guided_pyramid import (
     GuidedPyramidOptions,
+    ImageVariant,
     PairVerifier,
     VariantMatches,
     pyramid_type,
@@ -38,7 +38,6 @@ from megloc_kapture.matching.guided_pyramid import (
 from megloc_kapture.matching.pyramid_combination import (
     Combined,
     KeypointUnion,
-    TriedVariant,
     combine,
 )
 from megloc_kapture.matching.verification import KnownPoseOptions, known_pose_of_variants
@@ -285,9 +284,7 @@ class _AllMatched:
         if options.mode == "off":
             raise ValueError("only pairs that are tried again are combined")
         places = self.of_pair(pair)
-        tried = [
-            TriedVariant(0 if image == pair[0] else 1, spool.get(image, at)) for image, at in places
-        ]
+        tried = [(pair.index(image), spool.get(image, at)) for image, at in places]
         first, second = (KeypointUnion(keypoints.read(one), added[one].px) for one in pair)
         combined = combine(base, tried, options.mode, (first, second))
         for image, union, new in zip(pair, (first, second), combined.added, strict=True):

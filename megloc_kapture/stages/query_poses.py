@@ -21,16 +21,16 @@ from pydantic import Field
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs
 from megloc_kapture.io.tables import Fallback
+from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions
 from megloc_kapture.localization.cluster_poses import (
     ClusterLocalization,
+    ClusterOptions,
+    cluster_candidates,
     interleave,
     localize_in_clusters,
     poses_of_cameras,
 )
-from megloc_kapture.localization.clusters import ClusterOptions, cluster_candidates
-from megloc_kapture.localization.estimation import AbsolutePoseOptions
-from megloc_kapture.localization.map_index import MapIndex
-from megloc_kapture.localization.query_views import QueryView, TypedMatches
+from megloc_kapture.localization.map_index import MapIndex, QueryView, TypedMatches
 from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import POSE_RANKERS, PluginChoice, PoseRanker, RankingScene

@@ -16,7 +16,7 @@ from pydantic import Field
 
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs, write_pairs
 from megloc_kapture.io.tables import read_match_counts
-from megloc_kapture.retrieval.reranking import greedy_coverage
+from megloc_kapture.retrieval.fusion import greedy_coverage
 from megloc_kapture.stages.layout import (
     FEATURES,
     LOCAL_FEATURES,

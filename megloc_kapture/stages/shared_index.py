@@ -24,7 +24,7 @@ from megloc_kapture.io.files import atomic_write, output_error, owned_name, writ
 from megloc_kapture.io.kapture import KaptureFolder, Observations
 from megloc_kapture.io.kapture.points import read_point_covariances
 from megloc_kapture.localization.map_index import MapIndex
-from megloc_kapture.mapping.pixel_origin import ObservedKeypoints
+from megloc_kapture.mapping.map_check import ObservedKeypoints
 
 _IMAGES = "images.json"
 # name -> numbers per row (0: a plain list) and type

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.geometry.alignment import GeoPosition, align_to_earth
+from megloc_kapture.geometry.poses import GeoPosition, align_to_earth
 from megloc_kapture.io.colmap_mapping import Mapper, Model, Photograph, reconstruct
 from megloc_kapture.io.dataset_tables import (
     METRES,
@@ -27,7 +27,7 @@ from megloc_kapture.io.dataset_tables import (
 from megloc_kapture.io.files import link_images
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.io.tables import read_match_counts
-from megloc_kapture.matching.chance import agree_by_chance
+from megloc_kapture.matching.verification import agree_by_chance
 from megloc_kapture.stages.layout import FEATURES, LOCAL_FEATURES, PHOTOGRAPH_MATCHES, POSED
 from megloc_kapture.stages.matches import MATCHING_OPTIONS, MatchMapping, Verification
 from megloc_kapture.stages.options import PipelineOptions

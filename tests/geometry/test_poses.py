@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+from statistics import NormalDist
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.poses import (
+    GeoPosition,
+    align_to_earth,
     camera_centers,
     compose,
     cross_matrix,
+    deviation_by_median,
+    earth_from_enu,
+    geodetic,
     invert,
     invert_quats,
     movement,
@@ -57,8 +66,7 @@ def test_a_quaternion_and_its_negative_are_one_rotation(seed: int, signs: tuple[
     first, _ = random_poses(seed)
     second, _ = random_poses(seed + 1)
     np.testing.assert_array_equal(
-        rotation_angles_deg(signs[0] * first, signs[1] * second),
-        rotation_angles_deg(first, second),
+        rotation_angles_deg(signs[0] * first, signs[1] * second), rotation_angles_deg(first, second)
     )
 
 
@@ -176,3 +184,69 @@ def test_movement_is_of_the_centre_and_about_any_axis(
     moved_m, turned_deg = movement(old, new)
     assert moved_m == pytest.approx(np.linalg.norm(step_m), abs=1e-9)
     assert turned_deg == pytest.approx(angle_deg, abs=1e-6)
+
+
+def test_the_factor_is_that_of_the_normal_distribution() -> None:
+    quarter = NormalDist().inv_cdf(0.75)
+    assert deviation_by_median(np.array([-quarter, quarter])) == pytest.approx(1.0, rel=1e-15)
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.1])
+def test_outliers_hardly_move_it(wrong: float) -> None:
+    rng = np.random.default_rng(3)
+    values = rng.normal(scale=0.2, size=200_000)
+    values[rng.random(len(values)) < wrong] = 1e6
+    # of a tenth of outliers the median is the quantile of 5/9 of what is left
+    expected = 0.2 * NormalDist().inv_cdf(0.5 + 0.25 / (1 - wrong)) / NormalDist().inv_cdf(0.75)
+    assert deviation_by_median(values) == pytest.approx(expected, rel=0.01)
+
+
+EARTH = earth_from_enu(48.1, 11.6, 520.0)
+TURN = Rotation.from_rotvec([0.3, -1.2, 0.8]).as_matrix()
+
+
+def on_earth(enu: NDArray[np.float64]) -> dict[str, GeoPosition]:
+    return {f"{at}": geodetic(EARTH.apply(one[None])[0]) for at, one in enumerate(enu)}
+
+
+def in_map(enu: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+    return {f"{at}": one @ TURN / 7.5 + 3.0 for at, one in enumerate(enu)}
+
+
+def walk(number: int, width_m: float = 12.0) -> NDArray[np.float64]:
+    rng = np.random.default_rng(3)
+    return rng.uniform((-40, -width_m, -2), (40, width_m, 2), (number, 3))
+
+
+def test_scale_and_axes_of_exact_positions() -> None:
+    enu = walk(8)
+    found = align_to_earth(in_map(enu), on_earth(enu))
+    assert abs(found.scale / 7.5 - 1) < 1e-6 and found.residual_m < 1e-3
+    aligned = np.array([found.enu_from_map.apply(found.scale * p) for p in in_map(enu).values()])
+    apart = aligned - enu
+    np.testing.assert_allclose(apart, np.broadcast_to(apart[0], apart.shape), atol=1e-3)
+
+
+def test_noise_and_two_positions_far_off() -> None:
+    enu = walk(20)
+    noisy = enu + np.random.default_rng(5).normal(0, 1.0, enu.shape)
+    noisy[4] += 60
+    noisy[9] -= (200, 0, 30)
+    found = align_to_earth(in_map(enu), on_earth(noisy))
+    assert abs(found.scale / 7.5 - 1) < 0.03
+    assert 0.5 < found.residual_m < 3.0
+
+
+@pytest.mark.parametrize(
+    ("enu", "known", "reason"),
+    [
+        (walk(8), 2, "2 photographs of the map have a GPS position"),
+        (walk(8) * (1, 0.01, 0.01), 8, r"spread over 0\.\d m across"),
+        (walk(8) * 0.02, 8, "tell no scale"),
+        (np.ones((4, 3)), 4, "at one place"),
+    ],
+)
+def test_positions_that_tell_no_scale(enu: NDArray[np.float64], known: int, reason: str) -> None:
+    positions = dict(list(on_earth(enu).items())[:known])
+    with pytest.raises(DataError, match=reason):
+        align_to_earth(in_map(enu), positions)

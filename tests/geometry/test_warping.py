@@ -15,12 +15,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import bearing_rays, project
-from megloc_kapture.geometry.warping import (
-    WarpedView,
-    WarpSource,
-    scaled_camera,
-    warp_to_view,
-)
+from megloc_kapture.geometry.warping import WarpedView, WarpSource, scaled_camera, warp_to_view
 from megloc_kapture.values import Camera, RigidTransform
 
 CAMERAS = [
@@ -106,10 +101,7 @@ WALL: Plane = (np.array([0.1, -0.05, 1.0]), 4.0)
     normal=st.tuples(st.floats(-0.4, 0.4), st.floats(-0.4, 0.4), st.just(1.0)),
     distance=st.floats(0.5, 20.0),
     pose=st.builds(
-        turned,
-        st.floats(-180, 180),
-        st.floats(-180, 180),
-        st.tuples(*[st.floats(-5, 5)] * 3),
+        turned, st.floats(-180, 180), st.floats(-180, 180), st.tuples(*[st.floats(-5, 5)] * 3)
     ),
     seed=st.integers(0, 1000),
 )

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.stats import binom
 
 from megloc_kapture.geometry.cameras import project
-from megloc_kapture.localization.absolute_pose import rig_pose
+from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions, rig_pose
 from megloc_kapture.localization.confidence import (
     OF_ALL,
     TERMS,
@@ -24,7 +24,7 @@ from megloc_kapture.localization.confidence import (
     evidence_of,
     with_confidence,
 )
-from megloc_kapture.localization.estimation import AbsolutePoseOptions, PoseProblem, View
+from megloc_kapture.localization.map_index import PoseProblem, View
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
 CAMERA = Camera.pinhole(640, 480, 500.0)

@@ -15,14 +15,14 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from megloc_kapture.geometry.cameras import bearing_rays, focal_px, project, px_from_cam
-from megloc_kapture.localization import pose_kernels
-from megloc_kapture.localization.absolute_pose import absolute_pose, refine_pose
-from megloc_kapture.localization.estimation import (
+from megloc_kapture.localization import kernels
+from megloc_kapture.localization.absolute_pose import (
     AbsolutePoseOptions,
     PoseEstimate,
-    PoseProblem,
-    View,
+    absolute_pose,
+    refine_pose,
 )
+from megloc_kapture.localization.map_index import PoseProblem, View
 from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, Failure, Pose, RigidTransform
 
 Array = NDArray[np.float64]
@@ -125,7 +125,7 @@ def test_derivatives_are_finite_differences(model: str) -> None:
     whitening = np.empty((16, 3))
     errors, squared, depths = np.empty(16), np.empty(16), np.empty(16)
     matches = stacked.matches
-    pose_kernels.measure(
+    kernels.measure(
         matches, np.ones(16, bool), rotation, translation, errors, whitening, squared, depths
     )
 
@@ -145,9 +145,7 @@ def test_derivatives_are_finite_differences(model: str) -> None:
         cam_from_world = view.cam_from_rig @ pose
         for point, matrix in zip(view.points_world, matrices, strict=True):
             by_point = approx_fprime(
-                point,
-                lambda p, v=view, c=cam_from_world: project(v.camera, c, p[None])[0],
-                1e-6,
+                point, lambda p, v=view, c=cam_from_world: project(v.camera, c, p[None])[0], 1e-6
             )
             spread = np.eye(2) + by_point @ matrix @ by_point.T
             cholesky[row] = np.linalg.cholesky(spread)
@@ -168,7 +166,7 @@ def test_derivatives_are_finite_differences(model: str) -> None:
 
     gradient, hessian = np.empty(6), np.empty((6, 6))
     rows = np.arange(16)
-    found = pose_kernels.normal_equations(
+    found = kernels.normal_equations(
         matches, rows, inverse[:, [0, 1, 1], [0, 0, 1]].copy(), rotation, translation, 4.0,
         gradient, hessian,
     )  # fmt: skip
@@ -177,7 +175,7 @@ def test_derivatives_are_finite_differences(model: str) -> None:
     expected = np.array([(cost(s, 4.0) - cost(-s, 4.0)) / 2e-6 for s in steps])
     np.testing.assert_allclose(gradient, expected, rtol=1e-5, atol=1e-5 * abs(expected).max())
     # and the normal matrix of plain least squares is J^T J
-    pose_kernels.normal_equations(
+    kernels.normal_equations(
         matches, rows, inverse[:, [0, 1, 1], [0, 0, 1]].copy(), rotation, translation, np.inf,
         gradient, hessian,
     )  # fmt: skip

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from megloc_kapture.geometry.cameras import project
-from megloc_kapture.localization.absolute_pose import absolute_pose, rig_pose
-from megloc_kapture.localization.estimation import AbsolutePoseOptions, View, split_by_view
+from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions, absolute_pose, rig_pose
+from megloc_kapture.localization.map_index import PoseProblem, View
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
 PINHOLE = Camera("PINHOLE", 640, 480, (500.0, 510.0, 320.5, 239.0))
@@ -149,7 +149,7 @@ def test_a_camera_full_of_wrong_matches_is_survived(wrong: int) -> None:
     distance, angle = difference(found, truth)
     assert distance < 0.02 and np.degrees(angle) < 0.2
     assert found.inliers is not None
-    for k, inliers in enumerate(split_by_view(views, found.inliers)):
+    for k, inliers in enumerate(PoseProblem.of(views).split(found.inliers)):
         assert inliers.mean() < 0.1 if k == wrong else inliers.all()
 
 

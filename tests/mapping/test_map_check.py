@@ -134,10 +134,7 @@ MISTAKES: dict[str, tuple[Callable[[Map], Map], str]] = {
     "points as y, z, x": (with_points(lambda p: p[:, [1, 2, 0]]), r"points read as \(z, x, y\)"),
     "points mirrored": (with_points(lambda p: p * (1, -1, 1)), r"points read as \(x, -y, z\)"),
     "poses of neighbours": (poses_moved, "given to the image before it"),
-    "focal length": (
-        with_params(1000.0, 1020.0, 330.0, 235.0),
-        "focal length 0.5 times as long",
-    ),
+    "focal length": (with_params(1000.0, 1020.0, 330.0, 235.0), "focal length 0.5 times as long"),
     "cx, cy": (with_params(500.0, 510.0, 235.0, 330.0), "cx and cy exchanged"),
     "points not finite": (with_points(lambda p: one_with_nan(p)), "1 of 300 points are not finite"),
     "keypoints not finite": (with_pixels(one_with_nan), "keypoints of 00.jpg are not finite"),

@@ -8,16 +8,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from megloc_kapture.geometry.image_variants import ImageVariant
-from megloc_kapture.matching.guided_pyramid import (
-    VariantMatches,
-)
-from megloc_kapture.matching.pyramid_combination import (
-    SAME_KEYPOINT_PX,
-    KeypointUnion,
-    TriedVariant,
-    combine,
-)
+from megloc_kapture.matching.guided_pyramid import ImageVariant, VariantMatches
+from megloc_kapture.matching.pyramid_combination import SAME_KEYPOINT_PX, KeypointUnion, combine
 
 # a grid of quarter pixels: distances of exactly one pixel, and equal ones, are common
 POSITIONS = st.lists(
@@ -55,8 +47,7 @@ def test_against_looking_at_all_of_them(
         if found < 0:
             assert union.append(keypoint) == len(kept)
             kept = np.concatenate([kept, keypoint[None]])
-    np.testing.assert_array_equal(union.keypoints_px(), kept)
-    np.testing.assert_array_equal(union.keypoints_px()[: len(base)], array(base))
+    assert len(union) == len(kept)
     np.testing.assert_array_equal(union.added(), kept[len(base) :])
     # opened again with what was added, it finds the same
     again = KeypointUnion(array(base), union.added())
@@ -74,7 +65,7 @@ def test_what_is_taken_back_was_never_there(
     length = max(len(base), len(union) - taken_back)
     expected = KeypointUnion(array(base), union.added()[: length - len(base)])
     union.truncate(length)
-    np.testing.assert_array_equal(union.keypoints_px(), expected.keypoints_px())
+    np.testing.assert_array_equal(union.added(), expected.added())
     np.testing.assert_array_equal(union.find(array(more)), expected.find(array(more)))
 
 
@@ -87,7 +78,7 @@ def test_of_several_at_one_place_the_first_is_meant() -> None:
 def test_no_keypoints_at_all() -> None:
     union = KeypointUnion(np.zeros((0, 2), np.float32))
     assert union.find(np.zeros((0, 2), np.float32)).shape == (0,)
-    assert union.keypoints_px().shape == union.added().shape == (0, 2)
+    assert union.added().shape == (0, 2)
 
 
 def variant_matches(
@@ -117,20 +108,17 @@ def test_all_is_what_was_there_and_what_is_new() -> None:
         variant_matches([(20.5, 0.5), (5, 5), (6, 50), (10, 0)], [7, 8, 0, 9], [0.1, 0.2, 1, 1]),
         variant_matches([(5, 5.9)], [10]),  # the poorer one's keypoint is the other's: has a match
     ]
-    combined = combine(BASE, [TriedVariant(0, each) for each in tried], "all", (keypoints, None))
+    combined = combine(BASE, [(0, each) for each in tried], "all", (keypoints, None))
     assert combined.matches.tolist() == [[0, 0], [1, 1], [5, 8], [2, 7]]
     np.testing.assert_allclose(combined.scores, [0.9, 0.8, 0.2, 0.1])
     assert combined.best == 0
     assert combined.added[0].tolist() == [[0, 1]] and combined.added[1].tolist() == []
-    np.testing.assert_array_equal(keypoints.keypoints_px(), [*grid(5), (5, 5)])
+    np.testing.assert_array_equal(keypoints.added(), [(5, 5)])
 
 
 def test_variants_of_both_images_add_to_both() -> None:
     first, second = KeypointUnion(grid(3)), KeypointUnion(grid(4))
-    tried = [
-        TriedVariant(0, variant_matches([(5, 5)], [3])),
-        TriedVariant(1, variant_matches([(6, 6), (7, 60)], [2, 1])),
-    ]
+    tried = [(0, variant_matches([(5, 5)], [3])), (1, variant_matches([(6, 6), (7, 60)], [2, 1]))]
     combined = combine(BASE, tried, "all", (first, second))
     # the richer one first; row 1 of the first image has a match
     assert combined.matches.tolist() == [[0, 0], [1, 1], [2, 4], [3, 3]]
@@ -141,12 +129,10 @@ def test_max_is_the_richest() -> None:
     rich = variant_matches([(5, 5), (0, 0.5), (15, 5)], [0, 5, 6])
     richer = variant_matches([(5, 45), (10, 40), (15, 45), (20, 40)], [0, 5, 6, 7])
     keypoints = KeypointUnion(grid(5))
-    combined = combine(
-        BASE, [TriedVariant(0, rich), TriedVariant(0, richer)], "max", (keypoints, None)
-    )
+    combined = combine(BASE, [(0, rich), (0, richer)], "max", (keypoints, None))
     assert combined.matches.tolist() == [[5, 0], [6, 5], [7, 6], [8, 7]]
     assert combined.best == 1
-    combined = combine(BASE, [TriedVariant(0, rich)], "max", (KeypointUnion(grid(5)), None))
+    combined = combine(BASE, [(0, rich)], "max", (KeypointUnion(grid(5)), None))
     assert combined.matches.tolist() == [[5, 0], [0, 5], [6, 6]]
 
 
@@ -156,9 +142,7 @@ def test_max_keeps_the_images_as_they_are_where_no_variant_has_more() -> None:
     # three matches, but two of their keypoints are one
     seemingly = variant_matches([(5, 5), (5, 5.5), (15, 5)], [4, 5, 6])
     for tried in ([], [as_many], [seemingly]):
-        combined = combine(
-            BASE, [TriedVariant(0, each) for each in tried], "max", (keypoints, None)
-        )
+        combined = combine(BASE, [(0, each) for each in tried], "max", (keypoints, None))
         assert combined.matches.tolist() == BASE[0].tolist()
         assert combined.best is None
         assert len(combined.added[0]) == 0 and len(keypoints) == 5
@@ -176,7 +160,7 @@ def test_whatever_is_tried(
     unions = KeypointUnion(grid(8)), KeypointUnion(grid(9))
     base = (np.stack([rng.permutation(8)[:4], rng.permutation(9)[:4]], axis=1), rng.random(4))
     tried = [
-        TriedVariant(
+        (
             side,
             variant_matches(
                 rng.uniform(0, 30, (size, 2)).tolist(),
@@ -197,13 +181,13 @@ def test_whatever_is_tried(
         # every added keypoint is used, and stands where its match says
         assert set(range(length, len(union))) <= set(found[:, side].tolist())
         for keypoint, (number, match) in zip(union.added(), added.tolist(), strict=True):
-            assert tried[number].side == side
-            np.testing.assert_array_equal(keypoint, tried[number].matches.keypoints_px[match])
-        all_px = union.keypoints_px().astype(np.float64)
+            assert tried[number][0] == side
+            np.testing.assert_array_equal(keypoint, tried[number][1].keypoints_px[match])
+        all_px = np.concatenate([grid(length), union.added()]).astype(np.float64)
         gaps = np.linalg.norm(all_px[:, None] - all_px[None], axis=2)
         assert (gaps[length:] + 9 * np.eye(len(union))[length:] > 1.0).all()
     if mode == "all" or combined.best is None:
         assert found[:4].tolist() == base[0].tolist()
     if mode == "max":
-        most = max([len(each.matches) for each in tried], default=0)
-        assert combined.best is None or len(tried[combined.best].matches) == most > 4
+        most = max([len(each) for _, each in tried], default=0)
+        assert combined.best is None or len(tried[combined.best][1]) == most > 4

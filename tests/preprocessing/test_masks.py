@@ -12,10 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from matplotlib.path import Path as Outline
 from megloc_twins.render import PlaceRenderer
-from megloc_twins.robotcar import (
-    RobotCarTwinOptions,
-    build_robotcar_moments,
-)
+from megloc_twins.robotcar import RobotCarTwinOptions, build_robotcar_moments
 from megloc_twins.squares import build_place
 from numpy.typing import NDArray
 from pydantic import ValidationError

@@ -5,25 +5,27 @@ from __future__ import annotations
 import importlib.util
 from collections import defaultdict
 from collections.abc import Callable
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.retrieval.fusion import (
+    DiversityOptions,
     FusionOptions,
-    borda,
     concatenate,
+    diversify,
     fuse,
-    reciprocal_rank,
-    round_robin,
+    fuse_rankings,
+    greedy_coverage,
 )
-from megloc_kapture.retrieval.search import rank_by_similarity, rank_fused
+from megloc_kapture.retrieval.search import Found, FusedSearch, rank_by_similarity
 from megloc_kapture.retrieval.vectors import ConcatenatedBlocks
 
 needs_kapture_localization = pytest.mark.skipif(
@@ -31,6 +33,14 @@ needs_kapture_localization = pytest.mark.skipif(
     reason="kapture-localization is not installed (make test installs it)",
 )
 Matrices = list[NDArray[np.float64]]
+
+
+def rank_fused(
+    queries: Any, database: Any, top_k: int, *, fusion: FusionOptions, weights: Any = None,
+    permitted: Any = None,
+) -> Found:  # fmt: skip
+    search = FusedSearch(top_k, fusion, weights)
+    return search.ranking([search.lists(queries, database, permitted)])
 
 
 def theirs(matrices: Matrices, method: str, **parameters: Any) -> NDArray[np.float64]:
@@ -332,7 +342,7 @@ def naive_round_robin(lists: list[list[int]], top_k: int) -> list[int]:
 
 @given(ranked_lists(), st.integers(0, 12))
 def test_round_robin(lists: list[NDArray[np.int64]], top_k: int) -> None:
-    indices, scores = round_robin(lists, top_k)
+    indices, scores = fuse_rankings(lists, top_k, FusionOptions(method="round_robin"))
     assert indices.shape == scores.shape == (len(lists[0]), top_k)
     for row in range(len(lists[0])):
         expected = naive_round_robin([ranked[row].tolist() for ranked in lists], top_k)
@@ -345,11 +355,8 @@ def test_round_robin(lists: list[NDArray[np.int64]], top_k: int) -> None:
 def test_points_add_up(lists: list[NDArray[np.int64]], top_k: int, reciprocal: bool) -> None:
     weights = [float(k + 1) for k in range(len(lists))]
     longest = max(ranked.shape[1] for ranked in lists)
-    fused = (
-        reciprocal_rank(lists, top_k, weights, constant=7)
-        if reciprocal
-        else borda(lists, top_k, weights)
-    )
+    method = FusionOptions(method="reciprocal_rank" if reciprocal else "borda", rank_constant=7)
+    fused = fuse_rankings(lists, top_k, method, weights)
     for row in range(len(lists[0])):
         points: defaultdict[int, float] = defaultdict(float)
         for ranked, weight in zip(lists, weights, strict=True):
@@ -367,19 +374,101 @@ def test_points_add_up(lists: list[NDArray[np.int64]], top_k: int, reciprocal: b
 
 def test_equal_sums_keep_the_order_of_the_images() -> None:
     lists = [np.array([[5, 3, 9]]), np.array([[3, 5, 7]])]
-    assert reciprocal_rank(lists, 4)[0].tolist() == [[3, 5, 7, 9]]
-    assert borda(lists, 4)[0].tolist() == [[3, 5, 7, 9]]
+    for options in (FusionOptions(method="reciprocal_rank"), FusionOptions(method="borda")):
+        assert fuse_rankings(lists, 4, options)[0].tolist() == [[3, 5, 7, 9]]
 
 
 def test_the_papers_constant_is_the_default() -> None:
-    _, scores = reciprocal_rank([np.array([[4]]), np.array([[4]])], 1)
+    options = FusionOptions(method="reciprocal_rank")
+    _, scores = fuse_rankings([np.array([[4]]), np.array([[4]])], 1, options)
     np.testing.assert_allclose(scores, 1 / 61, rtol=1e-6)
 
 
-def test_lists_that_cannot_be_fused_are_refused() -> None:
+@pytest.mark.parametrize("method", ["round_robin", "borda", "reciprocal_rank"])
+def test_lists_that_cannot_be_fused_are_refused(method: Any) -> None:
     one, other = np.zeros((1, 2), dtype=np.int64), np.zeros((2, 2), dtype=np.int64)
-    for fused in (round_robin, borda, reciprocal_rank):
-        with pytest.raises(OptionError):
-            fused([], 3)
-        with pytest.raises(DataError, match="shapes"):
-            fused([one, other], 3)
+    options = FusionOptions(method=method)
+    with pytest.raises(OptionError):
+        fuse_rankings([], 3, options)
+    with pytest.raises(DataError, match="shapes"):
+        fuse_rankings([one, other], 3, options)
+
+
+AHEAD = np.array([0.0, 0.0, 1.0])
+
+
+def ids(*values: int) -> np.ndarray:
+    return np.array(values, dtype=np.int64)
+
+
+def test_a_neighbour_of_the_best_makes_way_for_what_adds_more() -> None:
+    images = [ids(0, 1, 2, 3), ids(0, 1, 2), ids(7, 8), ids()]
+    assert greedy_coverage(images, 2) == ([0, 2], [4, 2])
+    # what adds nothing comes in order of its matches, and of its place
+    assert greedy_coverage(images, 9) == ([0, 2, 1, 3], [4, 2, 0, 0])
+    assert greedy_coverage([ids(), ids()], 9) == ([0, 1], [0, 0])
+    assert greedy_coverage([], 3) == ([], [])
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.lists(st.sets(st.integers(0, 12)), max_size=6), st.integers(1, 4))
+def test_it_is_never_far_from_the_best(sets: list[set[int]], keep: int) -> None:
+    order, added = greedy_coverage([ids(*sorted(one)) for one in sets], keep)
+    assert len(order) == len(set(order)) == min(keep, len(sets))
+    covered = set().union(*(sets[at] for at in order))
+    assert sum(added) == len(covered)
+    best = max(
+        (len(set().union(*some)) for some in combinations(sets, min(keep, len(sets)))), default=0
+    )
+    assert len(covered) >= (1 - 1 / np.e) * best
+    assert sorted(added, reverse=True) == added
+
+
+def ahead(count: int) -> np.ndarray:
+    return np.tile(AHEAD, (count, 1))
+
+
+def test_near_duplicates_make_way_for_other_places() -> None:
+    centers = np.array([[0, 0, 0], [0.1, 0, 0], [0.2, 0, 0], [9, 0, 0], [9.1, 0, 0]], float)
+    options = DiversityOptions(max_per_place=2, radius=1.0)
+    found = diversify(np.arange(5), centers, ahead(5), 4, options)
+    assert found.tolist() == [0, 1, 3, 4]
+    assert diversify(np.arange(5), centers, ahead(5), 3, options).tolist() == [0, 1, 3]
+
+
+def test_what_was_passed_over_fills_the_rest() -> None:
+    centers = np.zeros((4, 3))
+    options = DiversityOptions(max_per_place=1, radius=1.0)
+    assert diversify(np.arange(4), centers, ahead(4), 3, options).tolist() == [0, 1, 2]
+
+
+def test_images_that_look_elsewhere_are_another_place() -> None:
+    directions = np.array([AHEAD, AHEAD, [1.0, 0.0, 0.0]])
+    options = DiversityOptions(max_per_place=1, radius=1.0, angle_deg=45)
+    found = diversify(np.array([0, 1, 2]), np.zeros((3, 3)), directions, 2, options)
+    assert found.tolist() == [0, 2]
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 12), st.integers(1, 3), st.floats(0.1, 3))
+def test_against_its_definition(seed: int, top_k: int, most: int, radius: float) -> None:
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(1, 15))
+    centers = rng.uniform(0, 4, (count, 3))
+    directions = rng.normal(size=(count, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    ranking = rng.permutation(count)
+    options = DiversityOptions(max_per_place=most, radius=radius, angle_deg=60)
+    found = diversify(ranking, centers, directions, top_k, options).tolist()
+
+    def near(a: int, b: int) -> bool:
+        angle = np.rad2deg(np.arccos(np.clip(directions[a] @ directions[b], -1, 1)))
+        return bool(np.linalg.norm(centers[a] - centers[b]) <= radius and angle <= 60)
+
+    kept: list[int] = []
+    for position in range(count):
+        others = [k for k in kept if near(ranking[k], ranking[position])]
+        if len(kept) < top_k and len(others) < most:
+            kept.append(position)
+    rest = [position for position in range(count) if position not in kept]
+    assert found == (kept + rest)[:top_k]

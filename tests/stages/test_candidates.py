@@ -16,8 +16,7 @@ from megloc_kapture.io.kapture import (
     KaptureFolder,
     write_sensors,
 )
-from megloc_kapture.retrieval.fusion import FusionOptions, fuse
-from megloc_kapture.retrieval.reranking import DiversityOptions
+from megloc_kapture.retrieval.fusion import DiversityOptions, FusionOptions, fuse
 from megloc_kapture.stages import candidates
 from megloc_kapture.stages.candidates import (
     Candidates,

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.features.pca_whitening import PcaWhitening
-from megloc_kapture.features.vlad import VladOptions, Vocabulary, aggregate
+from megloc_kapture.features.vlad import PcaWhitening, VladOptions, Vocabulary, aggregate
 from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.stages.global_vlad import (

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import project
-from megloc_kapture.geometry.image_variants import ImageVariant
 from megloc_kapture.io.colmap import TriangulationOptions
 from megloc_kapture.io.csv_table import read_csv_table
 from megloc_kapture.io.images import read_image_rgb, write_image
@@ -27,7 +26,7 @@ from megloc_kapture.io.kapture import (
     Sensor,
     write_sensors,
 )
-from megloc_kapture.matching.guided_pyramid import GuidedPyramidOptions
+from megloc_kapture.matching.guided_pyramid import GuidedPyramidOptions, ImageVariant
 from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
 from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
 from megloc_kapture.pipeline.executors import single_threaded

@@ -24,8 +24,8 @@ from megloc_kapture.io.files import read_json_model
 from megloc_kapture.io.images import image_size, read_depth_map, read_image_rgb, write_image
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.mapping.depth import lift_keypoints
+from megloc_kapture.preprocessing.frames import FramePlan, carry_points
 from megloc_kapture.preprocessing.masks import FixedMask
-from megloc_kapture.preprocessing.resampling import PixelMap
 from megloc_kapture.stages.image_masks import MaskOptions
 from megloc_kapture.stages.local_features import extract_local_features, read_mask
 from megloc_kapture.stages.preprocessing import (
@@ -42,11 +42,13 @@ Image = NDArray[np.uint8]
 FISHEYE = Camera("OPENCV_FISHEYE", 240, 180, (120.0, 121.0, 119.0, 92.0, -0.02, 0.004, 0.0, 0.0))
 
 
-def pixel_maps(report: PreprocessingReport) -> dict[str, PixelMap]:
+def pixel_maps(report: PreprocessingReport) -> dict[str, FramePlan]:
     """By sensor id: what carries keypoints between the original images and the processed ones."""
     return {
-        sensor_id: PixelMap(
-            *(Sensor("", "camera", params).camera() for params in (row.original, row.processed))
+        sensor_id: FramePlan(
+            *(Sensor("", "camera", params).camera() for params in (row.original, row.processed)),
+            (0, 0),
+            1.0,
         )
         for sensor_id, row in report.cameras.items()
     }
@@ -246,7 +248,8 @@ def test_keypoints_are_carried_back_by_the_report_alone(
             pixels.processed.width,
             pixels.processed.height,
         ]
-        back = pixels.processed_from_original(pixels.original_from_processed(points))
+        original = carry_points(pixels.processed, pixels.original, points)
+        back = carry_points(pixels.original, pixels.processed, original)
         np.testing.assert_allclose(back, points, rtol=0, atol=1e-6)
 
 
@@ -259,7 +262,7 @@ def test_features_of_the_new_images_are_those_of_the_old(
     pixels = pixel_maps(report)["side"]
     old = extractor.extract(read_image_rgb(street.image_path("side/1.jpg"))).keypoints_px
     found = extractor.extract(read_image_rgb(new.image_path("side/1.jpg"))).keypoints_px
-    carried = pixels.original_from_processed(found)
+    carried = carry_points(pixels.processed, pixels.original, found)
     distances = np.linalg.norm(carried[:, None] - old[None], axis=2).min(axis=1)
     assert len(found) > 150
     close = distances < 1
@@ -283,7 +286,7 @@ def test_real_photographs_keep_their_geometry(shared_data: Path, tmp_path: Path)
         extractor.extract(read_image_rgb(where.image_path(image))).keypoints_px
         for where in (folder, new)
     )
-    carried = pixels.original_from_processed(found)
+    carried = carry_points(pixels.processed, pixels.original, found)
     nearest = np.linalg.norm(carried[:, None] - old[None], axis=2)
     pairs = nearest.argmin(axis=1)
     close = nearest.min(axis=1) < 1.0
@@ -320,10 +323,11 @@ def test_lifting_through_depth_is_as_before(shared_data: Path, tmp_path: Path) -
     depth.tofile(records / "a.depth")
     new, report = run(KaptureFolder(root), tmp_path / "new", max_size_px=400)
     keypoints = np.random.default_rng(0).random((400, 2)) * [640, 460]
+    pixels = pixel_maps(report)[colour]
     lifted = []
     for folder, points in (
         (KaptureFolder(root), keypoints),
-        (new, pixel_maps(report)[colour].processed_from_original(keypoints)),
+        (new, carry_points(pixels.original, pixels.processed, keypoints)),
     ):
         record = depth_records(folder.read())[image]
         lifted.append(

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from megloc_kapture.errors import DataError, OutputError
-from megloc_kapture.geometry.image_variants import ImageVariant
 from megloc_kapture.io.kapture import (
     FeatureConfig,
     FeatureWriter,
@@ -19,7 +18,7 @@ from megloc_kapture.io.kapture import (
     write_sensors,
 )
 from megloc_kapture.io.kapture.features import FeatureReader, feature_folder
-from megloc_kapture.matching.guided_pyramid import VariantMatches
+from megloc_kapture.matching.guided_pyramid import ImageVariant, VariantMatches
 from megloc_kapture.stages.pyramid_mapping import MatchSpool, Spooled
 from megloc_kapture.stages.pyramid_queries import PyramidFeatures
 from megloc_kapture.values import Camera

@@ -15,9 +15,8 @@ from megloc_kapture.errors import PluginError
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder
-from megloc_kapture.localization.estimation import AbsolutePoseOptions
-from megloc_kapture.localization.map_index import MapIndex
-from megloc_kapture.localization.query_views import QueryView, TypedMatches
+from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions
+from megloc_kapture.localization.map_index import MapIndex, QueryView, TypedMatches
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import POSE_RANKERS, PluginChoice, RankingScene
 from megloc_kapture.stages.candidates import QueryPairsOptions, Retrieval

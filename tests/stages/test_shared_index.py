@@ -145,8 +145,10 @@ def test_the_index_is_of_one_keypoints_type(world: Any) -> None:
     observations = world.map().observations()["rootsift"]
     assert len(index.keypoint_ids) == len(observations.point_ids)
     rows = observations.image_ids == 2
-    points = index.points_of_keypoints("right/2.png", observations.keypoint_ids[rows])
-    np.testing.assert_array_equal(points, observations.point_ids[rows])
+    ascending = np.argsort(observations.keypoint_ids[rows], kind="stable")
+    keypoints, points = index.observed("right/2.png")
+    np.testing.assert_array_equal(keypoints, observations.keypoint_ids[rows][ascending])
+    np.testing.assert_array_equal(points, observations.point_ids[rows][ascending])
     assert index.covariances is None
     with pytest.raises(DataError, match="no observations of type 'other'"):
         index_map(world.map(), "other")
@@ -163,8 +165,7 @@ def test_a_type_that_nothing_was_triangulated_of_has_an_index_without_points(
     index = index_map(empty, "rootsift")
     assert index.xyz.shape == (0, 3) and not index.row_of_image
     image = whole.read().image_names()[0]
-    found = index.points_of_keypoints(image, np.arange(3, dtype=np.int32))
-    np.testing.assert_array_equal(found, -1)
+    assert [len(part) for part in index.observed(image)] == [0, 0]
     with shared_index({"rootsift": index}) as folders:
         assert open_index(folders["rootsift"]).xyz.shape == (0, 3)
 

@@ -19,7 +19,7 @@ from pydantic import Field
 
 from megloc_kapture.datasets.formats.sparse_points import SparsePoints
 from megloc_kapture.datasets.official import GROUND_TRUTH
-from megloc_kapture.geometry.earth import earth_from_enu, geodetic
+from megloc_kapture.geometry.poses import earth_from_enu, geodetic
 from megloc_kapture.io.files import write_bytes
 from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture import write_sensors

@@ -25,7 +25,7 @@ from megloc_kapture.datasets.formats.fourseasons_files import (
 )
 from megloc_kapture.datasets.fourseasons.adapter import FourSeasons, FourSeasonsOptions
 from megloc_kapture.datasets.official import OfficialDataset, write_official
-from megloc_kapture.geometry.earth import earth_from_enu, geodetic
+from megloc_kapture.geometry.poses import earth_from_enu, geodetic
 from megloc_kapture.io.images import read_depth_map, read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import RigidTransform

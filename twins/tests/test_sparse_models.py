@@ -310,7 +310,8 @@ def localized(
         for image in images:
             if (name, image) in matches:
                 rows, _ = matches.read(name, image)
-                found = index.points_of_keypoints(image, rows[:, 1])
+                point_of = dict(zip(*(ids.tolist() for ids in index.observed(image)), strict=True))
+                found = np.array([point_of.get(row, -1) for row in rows[:, 1].tolist()], int)
                 px.append(keypoints[rows[found >= 0, 0]])
                 points.append(xyz[found[found >= 0]])
         camera = query.read().camera_of(name)

@@ -29,7 +29,7 @@ from megloc_kapture.datasets.fourseasons.recordings import (
 )
 from megloc_kapture.datasets.official import Missing
 from megloc_kapture.errors import DataError
-from megloc_kapture.geometry.earth import earth_from_enu, geodetic
+from megloc_kapture.geometry.poses import earth_from_enu, geodetic
 from megloc_kapture.io.dataset_tables import SimilarityTransform, World
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import RigidTransform

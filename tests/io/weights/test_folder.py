@@ -32,7 +32,7 @@ from megloc_kapture.io.weights import (
     weights_folder,
 )
 from megloc_kapture.io.weights.registry import registry
-from megloc_kapture.nets.netvlad import VggNetVlad
+from megloc_kapture.nets.global_descriptors import VggNetVlad
 from megloc_kapture.pipeline.executors import open_executor
 
 BUNDLE = Path(__file__).parent / "data" / "tensor_bundle"

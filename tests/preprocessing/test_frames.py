@@ -18,15 +18,13 @@ from megloc_kapture.io.colmap_cameras import px_from_cam
 from megloc_kapture.preprocessing.frames import (
     FrameOptions,
     FramePlan,
+    carry_points,
+    cropped_size,
+    fitted_size,
     plan_frame,
     processed_image,
     processed_mask,
     reached_region,
-)
-from megloc_kapture.preprocessing.resampling import (
-    PixelMap,
-    cropped_size,
-    fitted_size,
     resized,
     scaled_camera,
     undistorted_camera,
@@ -133,7 +131,7 @@ def test_a_ramp_stays_the_same_function_of_the_ray(
     assert found.shape == (plan.processed.height, plan.processed.width)
     x, y = np.meshgrid(np.arange(found.shape[1]) + 0.5, np.arange(found.shape[0]) + 0.5)
     points = np.stack([x.ravel(), y.ravel()], axis=1)
-    at = plan.pixel_map().original_from_processed(points).reshape(*found.shape, 2)
+    at = carry_points(plan.processed, plan.original, points).reshape(*found.shape, 2)
     expected = slope_x * at[..., 0] + slope_y * at[..., 1]
     # cubics need two pixels beside the one that is asked for
     inner = ((at > 3) & (at < [93, 78])).all(axis=2)
@@ -153,7 +151,7 @@ def test_a_blob_is_where_the_pixel_map_says(painted: Callable[..., Any], max_siz
     found = processed_image(image, plan)[..., 0].astype(float)
     y, x = np.indices(found.shape) + 0.5
     centroid = np.array([[(found * x).sum(), (found * y).sum()]]) / found.sum()
-    back = plan.pixel_map().original_from_processed(centroid)
+    back = carry_points(plan.processed, plan.original, centroid)
     np.testing.assert_allclose(back[0], centre, atol=0.03)
 
 
@@ -187,7 +185,7 @@ def test_a_mask_is_that_of_the_pixel_under_each_centre(max_size_px: int) -> None
     assert found.shape == (plan.processed.height, plan.processed.width)
     rows, columns = np.indices(found.shape)
     centres = np.stack([columns.ravel(), rows.ravel()], axis=1) + 0.5
-    at = plan.pixel_map().original_from_processed(centres)
+    at = carry_points(plan.processed, plan.original, centres)
     # where a centre falls on the edge between two pixels, either is right
     clear = (np.abs(at - np.rint(at)) > 1e-9).all(axis=1)
     assert clear.mean() > 0.5
@@ -274,7 +272,7 @@ def test_every_model_as_colmap_undistorts_it(distorted: Camera, blank_pixels: fl
     np.testing.assert_allclose(plan.processed.params, camera.params, rtol=1e-12)
     # COLMAP blends the outermost pixels of the original with black
     y, x = np.indices((camera.height, camera.width)) + 0.5
-    at = plan.pixel_map().original_from_processed(np.stack([x.ravel(), y.ravel()], axis=1))
+    at = carry_points(plan.processed, plan.original, np.stack([x.ravel(), y.ravel()], axis=1))
     limit = np.array([distorted.width, distorted.height]) - 2
     inner = ((at > 2) & (at < limit)).all(axis=1).reshape(x.shape)
     difference = np.abs(processed_image(image, plan).astype(int) - picture.to_array())[inner]
@@ -286,36 +284,37 @@ def test_every_model_as_colmap_undistorts_it(distorted: Camera, blank_pixels: fl
 @pytest.mark.parametrize("options", [UNDISTORT, WHOLE, SMALL])
 def test_points_project_to_where_they_are_carried(distorted: Camera, options: FrameOptions) -> None:
     """The pose stays: a 3D point's pixel in one image is carried to its pixel in the other."""
-    pixels = plan_frame(distorted, options).pixel_map()
+    pixels = plan_frame(distorted, options)
     rng = np.random.default_rng(1)
     points = np.concatenate([rng.uniform(-0.5, 0.5, (300, 2)), np.ones((300, 1))], axis=1)
     points *= rng.uniform(1, 30, (300, 1))
     before, after = (px_from_cam(c, points) for c in (pixels.original, pixels.processed))
-    carried = pixels.processed_from_original(before)
+    carried = carry_points(pixels.original, pixels.processed, before)
     inside = np.isfinite(carried).all(axis=1)
     assert inside.mean() > 0.8
     np.testing.assert_allclose(carried[inside], after[inside], rtol=0, atol=1e-6)
-    back = pixels.original_from_processed(after[inside])
+    back = carry_points(pixels.processed, pixels.original, after[inside])
     np.testing.assert_allclose(back, before[inside], rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("options", [UNDISTORT, WHOLE, SMALL, FrameOptions(max_size_px=200)])
 def test_keypoints_come_back_exactly(camera: Camera, options: FrameOptions) -> None:
-    pixels = plan_frame(camera, options).pixel_map()
+    pixels = plan_frame(camera, options)
     points = random_pixels(pixels.processed)
-    original = pixels.original_from_processed(points)
+    original = carry_points(pixels.processed, pixels.original, points)
     reached = np.isfinite(original).all(axis=1)
     assert reached.all() if options.blank_pixels == 0 else reached.mean() > 0.6
-    back = pixels.processed_from_original(original[reached])
+    back = carry_points(pixels.original, pixels.processed, original[reached])
     np.testing.assert_allclose(back, points[reached], rtol=0, atol=1e-6)
 
 
 def test_what_the_other_image_does_not_show_is_nan(lens: Callable[[str], Camera]) -> None:
-    pixels = plan_frame(lens("OPENCV"), UNDISTORT).pixel_map()
-    corner = pixels.processed_from_original(np.array([[0.5, 0.5], [240.0, 180.0]]))
+    pixels = plan_frame(lens("OPENCV"), UNDISTORT)
+    corner = carry_points(pixels.original, pixels.processed, np.array([[0.5, 0.5], [240.0, 180.0]]))
     assert np.isnan(corner[0]).all() and np.isfinite(corner[1]).all()
-    cropped = plan_frame(lens("PINHOLE"), FrameOptions(max_size_px=1600)).pixel_map()
-    edge = cropped.processed_from_original(np.array([[482.5, 100.0], [479.5, 100.0]]))
+    cropped = plan_frame(lens("PINHOLE"), FrameOptions(max_size_px=1600))
+    columns = np.array([[482.5, 100.0], [479.5, 100.0]])
+    edge = carry_points(cropped.original, cropped.processed, columns)
     assert np.isnan(edge[0]).all()
     np.testing.assert_array_equal(edge[1], [479.5, 100.0])
 
@@ -334,20 +333,19 @@ def test_beyond_where_a_model_folds_nothing_is_seen() -> None:
     image = np.full((FOLDING.height, FOLDING.width, 3), 200, np.uint8)
     shown = processed_image(image, plan)
     assert (shown[reached] == 200).all() and (shown[~reached] == 0).all()
-    lost = plan.pixel_map().original_from_processed(np.array([[cx + fx, cy]]))
+    lost = carry_points(plan.processed, plan.original, np.array([[cx + fx, cy]]))
     assert np.isnan(lost).all()
 
 
 def test_a_fisheye_beyond_half_a_sphere_is_undistorted() -> None:
     camera = Camera("OPENCV_FISHEYE", 400, 400, (112.0, 112.0, 200.0, 200.0, 0.0, 0.0, 0.0, 0.0))
     plan = plan_frame(camera, FrameOptions(undistort=True))
-    pixels = plan.pixel_map()
+    off_axis = np.column_stack([200.0 + 112.0 * np.radians([101, 30]), [200.0, 200.0]])
+    behind, at = carry_points(plan.original, plan.processed, off_axis)
     # 101 degrees off the axis is behind a pinhole
-    behind = pixels.processed_from_original(np.array([[200.0 + 112.0 * np.radians(101), 200.0]]))
     assert np.isnan(behind).all()
-    at = pixels.processed_from_original(np.array([[200.0 + 112.0 * np.radians(30), 200.0]]))
     fx, _, cx, cy = plan.processed.params
-    np.testing.assert_allclose(at, [[cx + fx * np.tan(np.radians(30)), cy]], atol=1e-6)
+    np.testing.assert_allclose(at, [cx + fx * np.tan(np.radians(30)), cy], atol=1e-6)
 
 
 @pytest.mark.parametrize("model", ["SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"])
@@ -407,7 +405,7 @@ def test_a_blob_of_an_undistorted_image_is_where_the_pixel_map_says(
     y, x = np.indices(found.shape) + 0.5
     centroid = np.array([[(found * x).sum(), (found * y).sum()]]) / found.sum()
     np.testing.assert_allclose(
-        centroid, plan.pixel_map().processed_from_original(centre), atol=0.08
+        centroid, carry_points(plan.original, plan.processed, centre), atol=0.08
     )
 
 
@@ -415,6 +413,6 @@ def test_a_pixel_map_of_two_cameras_alone() -> None:
     before = Camera("SIMPLE_RADIAL", 1000, 800, (900.0, 500.0, 400.0, 0.1))
     after = Camera("SIMPLE_RADIAL", 500, 400, (450.0, 250.0, 200.0, 0.1))
     points = np.array([[10.0, 20.0], [999.0, 799.0]], np.float32)
-    found = PixelMap(before, after).processed_from_original(points)
+    found = carry_points(before, after, points)
     assert found.dtype == np.float64
     np.testing.assert_array_equal(found, points / 2)
