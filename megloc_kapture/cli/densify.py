@@ -12,7 +12,7 @@ from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.output_folders import staged_output
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.stages.densifying import densify_map, fitted_to_poses
-from megloc_kapture.stages.fusion import fuse_depth
+from megloc_kapture.stages.stereo_depth import fuse_depth
 from megloc_kapture.stages.work import Work
 
 

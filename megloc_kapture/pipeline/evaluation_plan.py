@@ -23,17 +23,9 @@ from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import STAGES
 from megloc_kapture.stages.densifying import Densify
 from megloc_kapture.stages.global_features import ExtractGlobalFeatures
-from megloc_kapture.stages.image_pairs import PairMapping, PairQueries
-from megloc_kapture.stages.layout import (
-    EVALUATION,
-    LOCALIZED,
-    MAPPING,
-    QUERY,
-    QUERY_GT,
-    REFERENCE,
-    SUBMISSIONS,
-)
+from megloc_kapture.stages.image_pairs import PairMapping, PairQueries, RerankQueries
 from megloc_kapture.stages.local_features import ExtractLocalFeatures
+from megloc_kapture.stages.localized_folder import set_aside_unreadable
 from megloc_kapture.stages.map_points import GivenMap, LiftPoints, TriangulatePoints
 from megloc_kapture.stages.map_refinement import RefineMap
 from megloc_kapture.stages.matches import MatchMapping, MatchQueries
@@ -43,9 +35,20 @@ from megloc_kapture.stages.preprocessing import Preprocess
 from megloc_kapture.stages.pyramid_mapping import PyramidMapping
 from megloc_kapture.stages.pyramid_queries import PyramidQueries
 from megloc_kapture.stages.query_poses import LocalizeQueries
-from megloc_kapture.stages.reranking import RerankQueries
-from megloc_kapture.stages.stage import Hashes, PipelineStage, Stage, StageWork, is_below
-from megloc_kapture.stages.unreadable import set_aside_unreadable
+from megloc_kapture.stages.stage import (
+    EVALUATION,
+    LOCALIZED,
+    MAPPING,
+    QUERY,
+    QUERY_GT,
+    REFERENCE,
+    SUBMISSIONS,
+    Hashes,
+    PipelineStage,
+    Stage,
+    StageWork,
+    is_below,
+)
 from megloc_kapture.values import Options
 
 WORLD = "world"

@@ -33,17 +33,16 @@ from megloc_kapture.pipeline.photographs import Photographs
 from megloc_kapture.pipeline.presets import PRESETS, options_of_preset
 from megloc_kapture.stages.global_features import ExtractGlobalFeatures
 from megloc_kapture.stages.image_pairs import PairMapping
-from megloc_kapture.stages.layout import MAP, MAPPING, QUERY
 from megloc_kapture.stages.local_features import ExtractLocalFeatures
+from megloc_kapture.stages.localized_folder import set_aside_unreadable
 from megloc_kapture.stages.map_points import TriangulatePoints
 from megloc_kapture.stages.map_refinement import RefineMap
 from megloc_kapture.stages.matches import MatchMapping
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.preprocessing import Preprocess
 from megloc_kapture.stages.pyramid_mapping import PyramidMapping
-from megloc_kapture.stages.stage import Hashes, PipelineStage, Stage, StageWork
+from megloc_kapture.stages.stage import MAP, MAPPING, QUERY, Hashes, PipelineStage, Stage, StageWork
 from megloc_kapture.stages.structure import FindPoses, MatchPhotographs, StructureOptions
-from megloc_kapture.stages.unreadable import set_aside_unreadable
 from megloc_kapture.values import Options
 
 GPS = "gps"

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.errors import DataError
+from megloc_kapture.io.dataset_tables import ImageGroup, read_groups, read_priors
 from megloc_kapture.io.kapture import FeatureReader, KaptureFolder
 from megloc_kapture.io.kapture.vectors import KaptureVectors
 from megloc_kapture.retrieval.fusion import FusionOptions
@@ -21,6 +23,77 @@ from megloc_kapture.retrieval.short_list import QuantizedRows, short_lists
 from megloc_kapture.retrieval.vectors import VectorBlocks, as_blocks, common_length
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Options, RigidTransform
+
+
+@dataclass(frozen=True, eq=False)
+class Restrictions:
+    """Priors of the queries, and the coordinate frames of the map's images.
+
+    Parameters
+    ----------
+    groups : image -> its group; of the map's images, frame and location count.
+    priors : query -> names of map images, locations or frames it may be matched with. A query
+        that is not in it may be matched with everything.
+    """
+
+    groups: Mapping[str, ImageGroup] = field(default_factory=dict)
+    priors: Mapping[str, Sequence[str]] = field(default_factory=dict)
+
+    @classmethod
+    def read(cls, side_tables: Path) -> Restrictions:
+        """From a workspace's ``megloc/`` folder; absent tables restrict nothing.
+
+        Raises
+        ------
+        DataError : a broken table.
+        """
+        return cls(read_groups(side_tables), read_priors(side_tables))
+
+    def frame(self, image: str) -> str:
+        """The coordinate frame of a map image; ``""`` where there is only one."""
+        group = self.groups.get(image)
+        return "" if group is None else group.frame
+
+    def frames(self, images: Sequence[str]) -> list[NDArray[np.int64]]:
+        """Positions in ``images`` by frame, frames in order of their names."""
+        members: dict[str, list[int]] = {}
+        for position, image in enumerate(images):
+            members.setdefault(self.frame(image), []).append(position)
+        return [np.array(members[name], np.int64) for name in sorted(members)]
+
+    def pools(
+        self, queries: Sequence[str], images: Sequence[str]
+    ) -> Iterator[tuple[list[int], NDArray[np.int64]]]:
+        """Queries that may be matched with the same images, and these images.
+
+        Yields
+        ------
+        Positions in ``queries``, and sorted positions in ``images``, int64 (M,); every query
+        once. M is 0 where nothing of what a prior permits is in the map.
+        """
+        together: dict[tuple[str, ...] | None, list[int]] = {}
+        for position, query in enumerate(queries):
+            prior = self.priors.get(query)
+            together.setdefault(None if prior is None else tuple(prior), []).append(position)
+        members = self._members(images) if set(together) != {None} else {}
+        for permitted, positions in together.items():
+            if permitted is None:
+                yield positions, np.arange(len(images))
+                continue
+            found = [position for name in permitted for position in members.get(name, ())]
+            yield positions, np.unique(np.array(found, dtype=np.int64))
+
+    def _members(self, images: Sequence[str]) -> dict[str, list[int]]:
+        members: dict[str, list[int]] = {}
+        for position, image in enumerate(images):
+            group = self.groups.get(image, ImageGroup())
+            for name in {image, group.location, group.frame} - {""}:
+                members.setdefault(name, []).append(position)
+        return members
+
+
+UNRESTRICTED = Restrictions()
+
 
 Vectors = KaptureVectors | NDArray[np.float32]  # unit rows
 _QUERY_ELEMENTS = 1 << 27  # of query vectors held at once: 512 MiB of float32

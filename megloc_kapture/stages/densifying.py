@@ -44,12 +44,11 @@ from megloc_kapture.plugins import (
     PluginChoice,
     StereoView,
 )
-from megloc_kapture.stages.layout import MAP
+from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.local_features import read_frame
-from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.rigs import depth_records
 from megloc_kapture.stages.shared_index import index_map, with_noise, write_array
-from megloc_kapture.stages.stage import PipelineStage, StageWork
+from megloc_kapture.stages.stage import MAP, PipelineStage, StageWork
 from megloc_kapture.stages.stereo_depth import (
     DEPTH_FILE,
     FOLDER,

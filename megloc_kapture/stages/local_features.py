@@ -27,11 +27,15 @@ from megloc_kapture.plugins import LocalFeatureExtractor
 from megloc_kapture.preprocessing.masks import with_margin
 from megloc_kapture.stages.devices import in_batches
 from megloc_kapture.stages.given_map import has_descriptors
-from megloc_kapture.stages.kept_items import Digest
-from megloc_kapture.stages.layout import LOCAL_FEATURES, REFERENCE
 from megloc_kapture.stages.map_points import check_given_type
-from megloc_kapture.stages.stage import LOCAL_TYPES, PipelineStage, StageWork
-from megloc_kapture.stages.work import HERE, Batched, FolderSpec, Work
+from megloc_kapture.stages.stage import (
+    LOCAL_FEATURES,
+    LOCAL_TYPES,
+    REFERENCE,
+    PipelineStage,
+    StageWork,
+)
+from megloc_kapture.stages.work import HERE, Batched, Digest, FolderSpec, Work
 from megloc_kapture.values import Camera, LocalFeatures
 
 _SIZE = attrgetter("size")

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from pydantic import TypeAdapter
 
+from megloc_kapture.errors import DataError
 from megloc_kapture.io.csv_table import write_csv_table
+from megloc_kapture.io.dataset_tables import read_unreadable, write_unreadable
 from megloc_kapture.io.files import link_images
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.io.tables import (
@@ -23,7 +25,9 @@ from megloc_kapture.io.tables import (
     write_refinement,
     write_status,
 )
+from megloc_kapture.stages.local_features import read_image_of
 from megloc_kapture.stages.rigs import poses_through_rig
+from megloc_kapture.stages.work import FolderSpec, Work
 from megloc_kapture.values import (
     Camera,
     ClusterPose,
@@ -168,3 +172,53 @@ def query_status(image: str, result: Pose | Failure, fallback: Fallback = "none"
         candidates=result.candidates,
         remarks="; ".join(result.remarks),
     )
+
+
+def set_aside_unreadable(query: Path, tables: Path, work: Work) -> Mapping[str, str]:
+    """Take images that cannot be read out of a workspace's queries; returns why, by name.
+
+    Their names and reasons go to ``tables``; the image files stay as they are.
+
+    Parameters
+    ----------
+    query : kapture folder in the workspace, which is written anew where an image is taken out.
+
+    Raises
+    ------
+    DataError : no image can be read; names the first.
+    """
+    folder = KaptureFolder(query)
+    data = folder.read()
+    names = data.image_names()
+    spec = FolderSpec(folder)
+    faults = work.map(_fault, [(spec, name) for name in names], "reading queries")
+    reasons = {name: fault for name, fault in zip(names, faults, strict=True) if fault}
+    if not reasons:
+        return {}
+    if len(reasons) == len(names):
+        raise DataError(reasons[names[0]], path=folder.image_path(names[0]))
+    records = {key: name for key, name in data.records_camera.items() if name not in reasons}
+    write_sensors(query, replace(data, records_camera=records))
+    write_unreadable(tables, reasons)
+    return reasons
+
+
+def unreadable_queries(tables: Path) -> Iterator[tuple[str, Failure]]:
+    """The queries that were set aside, as results."""
+    for name, reason in read_unreadable(tables).items():
+        yield name, unreadable_image(name, reason)
+
+
+def unreadable_image(name: str, reason: str) -> Failure:
+    """The result of a query whose image cannot be used."""
+    return Failure(f"the image cannot be used: {reason}", name=name)
+
+
+def _fault(job: tuple[FolderSpec, str]) -> str:
+    spec, name = job
+    folder = spec.open()
+    try:
+        read_image_of(folder.image_path(name), folder.read().camera_of(name))
+    except DataError as error:
+        return error.message
+    return ""

@@ -31,18 +31,26 @@ from megloc_kapture.matching.verification import (
 )
 from megloc_kapture.plugins import Matcher
 from megloc_kapture.stages.devices import in_batches
-from megloc_kapture.stages.kept_items import Digest, feature_inputs
-from megloc_kapture.stages.layout import (
+from megloc_kapture.stages.map_points import matched_images
+from megloc_kapture.stages.stage import (
     FEATURES,
     LOCAL_FEATURES,
     MAP,
     MAPPING_MATCHES,
     MAPPING_PAIRS,
     QUERY_MATCHES,
+    PipelineStage,
+    StageWork,
 )
-from megloc_kapture.stages.map_points import matched_images
-from megloc_kapture.stages.stage import PipelineStage, StageWork
-from megloc_kapture.stages.work import HERE, Batched, FolderSpec, Work, batched
+from megloc_kapture.stages.work import (
+    HERE,
+    Batched,
+    Digest,
+    FolderSpec,
+    Work,
+    batched,
+    feature_inputs,
+)
 from megloc_kapture.values import Camera, ImageFeatures, Options, RigidTransform
 
 if TYPE_CHECKING:

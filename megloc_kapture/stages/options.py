@@ -24,13 +24,12 @@ from megloc_kapture.stages.candidates import QueryPairsOptions, Retrieval
 from megloc_kapture.stages.densifying import DensifyOptions
 from megloc_kapture.stages.devices import Precision, placed, unheeded
 from megloc_kapture.stages.global_features import GlobalFeaturesChoice
-from megloc_kapture.stages.image_pairs import MappingPairsOptions
+from megloc_kapture.stages.image_pairs import MappingPairsOptions, RerankingOptions
 from megloc_kapture.stages.map_refinement import MapRefinementOptions
-from megloc_kapture.stages.map_refiners import PoseRefinementOptions
 from megloc_kapture.stages.matches import NoVerification, Verification
+from megloc_kapture.stages.pose_refinement import PoseRefinementOptions
 from megloc_kapture.stages.preprocessing import PreprocessingOptions
 from megloc_kapture.stages.query_poses import LocalizationOptions
-from megloc_kapture.stages.reranking import RerankingOptions
 from megloc_kapture.values import Device, Options
 
 

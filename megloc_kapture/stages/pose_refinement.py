@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import shutil
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, astuple, dataclass, replace
+import threading
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, astuple, dataclass, fields, replace
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pydantic import Field, TypeAdapter
+
+from megloc_kapture.errors import OptionError, PluginError
+from megloc_kapture.geometry.poses import movement
 from megloc_kapture.io.csv_table import write_csv_table
-from megloc_kapture.io.dataset_tables import SIDE_TABLES
+from megloc_kapture.io.dataset_tables import METRES, SIDE_TABLES, unit_of
 from megloc_kapture.io.files import link_images
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
 from megloc_kapture.io.tables import (
@@ -17,6 +26,7 @@ from megloc_kapture.io.tables import (
     CONSISTENCY_FILE,
     REFINEMENT_FILE,
     STATUS_FILE,
+    ConsistencyRow,
     QueryStatus,
     read_status,
     refinement_text,
@@ -24,19 +34,269 @@ from megloc_kapture.io.tables import (
     write_refinement,
     write_status,
 )
-from megloc_kapture.plugins import PoseRefiner
-from megloc_kapture.stages.kept_items import Digest
-from megloc_kapture.stages.layout import LOCALIZED, MAP, REFINEMENT_TIMING, UNREFINED_POSES
+from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugins import (
+    POSE_REFINERS,
+    PluginChoice,
+    PoseRefinement,
+    PoseRefiner,
+    RankingScene,
+    chosen_by_name,
+)
+from megloc_kapture.refinement.consistency import (
+    Consistency,
+    Displacement,
+    HoldsOut,
+    judge_consistency,
+    spread_names,
+)
+from megloc_kapture.refinement.references import ReferenceImages
+from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.localized_folder import plain_result, pose_of
-from megloc_kapture.stages.map_refiners import MapRefiners, PoseRefinementOptions, refine_pose
 from megloc_kapture.stages.ranking_scene import KaptureScene, image_inputs
-from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
-from megloc_kapture.stages.stage import PipelineStage, StageWork
-from megloc_kapture.stages.work import HERE, FolderSpec, Work
-from megloc_kapture.values import Pose
+from megloc_kapture.stages.stage import (
+    LOCALIZED,
+    MAP,
+    REFINEMENT_TIMING,
+    UNREFINED_POSES,
+    PipelineStage,
+    StageWork,
+)
+from megloc_kapture.stages.work import HERE, Digest, FolderSpec, Work, map_inputs, ordered_map
+from megloc_kapture.values import Camera, Options, Pose, RefinementRow, RigidTransform
 
 if TYPE_CHECKING:
     from megloc_kapture.stages.options import PipelineOptions
+
+
+# map images held out at once: of those, what comes behind the last that is needed is thrown away
+_WINDOW = 4
+
+
+class PoseRefinementOptions(Options):
+    """How the poses of localized queries are refined."""
+
+    by: tuple[PluginChoice, ...] = Field(
+        default=(), description="pose refiners, one after another; none: poses stay"
+    )
+    max_references: int = Field(
+        default=30,
+        gt=0,
+        description="map images a refiner may choose from: that look the query's way, the nearest",
+    )
+
+    def idle(self) -> dict[str, str]:
+        return {} if self.refines() else {"max_references": "pose_refinement.by is empty"}
+
+    def with_refiners(self, names: Sequence[str]) -> PoseRefinementOptions:
+        """With these refiners, in this order, each with the options that it has here."""
+        chosen = chosen_by_name(self.by, names)
+        return PoseRefinementOptions.model_validate({**self.model_dump(), "by": chosen})
+
+    def refines(self) -> bool:
+        """Whether anything is done."""
+        return bool(self.by)
+
+    def make_refiners(self) -> list[PoseRefiner]:
+        """The refiners, in order; raises PluginError, MissingWeightsError."""
+        return [load_plugin(POSE_REFINERS, one.name, one.options) for one in self.by]
+
+
+def _map_content(mapping: KaptureFolder, digest: Digest) -> str:
+    """A hash of a whole map: a refiner may look at any image, whatever its references are."""
+    of_image = image_inputs(mapping)
+    images = [[name, of_image(name, digest)] for name in sorted(mapping.read().image_names())]
+    content = json.dumps([map_inputs(mapping, digest), images])
+    return hashlib.sha256(content.encode()).hexdigest()
+
+
+_VERDICTS: TypeAdapter[list[Consistency | None]] = TypeAdapter(list[Consistency | None])
+
+
+class MapRefiners:
+    """The pose refiners of a map: the images they use, and the frames they are trusted in.
+
+    A refiner whose poses are as good as the map is consistent is used in those coordinate frames
+    only that prove to be: a sample of their images is held out. Threads may share it.
+
+    Parameters
+    ----------
+    mapping : kapture with poses, and whatever the refiners need: images, depth maps, points.
+    restrictions : the coordinate frames of the map's images, which are never mixed.
+
+    Raises
+    ------
+    PluginError, MissingWeightsError : there is no such refiner, or it cannot be made.
+    """
+
+    def __init__(
+        self, mapping: KaptureFolder, restrictions: Restrictions, options: PoseRefinementOptions
+    ) -> None:
+        if options.refines() and (unit := unit_of(mapping.root)) != METRES:
+            raise OptionError(
+                f"pose_refinement.by {options.by[0].name}: its limits are in metres, the map is in "
+                f"{unit} of its own; `megloc map --scale` makes a map in metres"
+            )
+        self.refiners = tuple(options.make_refiners())
+        self.map = FolderSpec(mapping)
+        self._mapping, self._restrictions, self._options = mapping, restrictions, options
+        self._verdicts: dict[str, list[Consistency | None]] = {}
+        self._lock = threading.Lock()
+        self.map_content = cache(partial(_map_content, mapping))
+
+    @cached_property
+    def _by_frame(self) -> dict[str, ReferenceImages]:
+        poses = self._mapping.read().poses()
+        images = sorted(poses)
+        return {
+            self._restrictions.frame(images[members[0]]): ReferenceImages(
+                {images[member]: poses[images[member]] for member in members}
+            )
+            for members in self._restrictions.frames(images)
+        }
+
+    def _frame(self, pose: Pose) -> str:
+        """The coordinate frame of a pose, by the map images that it comes from."""
+        return self._restrictions.frame(pose.candidates[0]) if pose.candidates else ""
+
+    def test(self, poses: Iterable[Pose], *, work: Work = HERE) -> None:
+        """Test the frames of these poses that have not been tested.
+
+        Raises
+        ------
+        DataError : an image or a depth map cannot be read.
+        """
+
+        def inputs(frame: str, digest: Digest) -> object:
+            return [self.map_content(digest), self._by_frame[frame].names]
+
+        with self._lock:
+            frames = sorted({self._frame(pose) for pose in poses} - set(self._verdicts))
+            items = work.items("consistency", frames, inputs)
+            for frame in frames:
+                if frame not in items.done:
+                    verdicts = [
+                        self._judge(refiner, self._by_frame[frame], work)
+                        if isinstance(refiner, HoldsOut) and refiner.require_consistent_map
+                        else None
+                        for refiner in self.refiners
+                    ]
+                    items.add(frame, (), _VERDICTS.dump_python(verdicts))
+                self._verdicts[frame] = _VERDICTS.validate_python(items.done[frame])
+
+    def _judge(self, refiner: HoldsOut, images: ReferenceImages, work: Work) -> Consistency:
+        jobs = (_HeldOut(self.map, refiner, image, images) for image in spread_names(images.names))
+        return judge_consistency(ordered_map(_hold_out, jobs, work.executor, window=_WINDOW))
+
+    def tested(self) -> list[ConsistencyRow]:
+        """The rows of ``map_consistency.csv``: by refiner, then by frame."""
+        return [
+            _consistency_row(frame, refiner.name, verdict)
+            for number, refiner in enumerate(self.refiners)
+            for frame, verdicts in sorted(self._verdicts.items())
+            if (verdict := verdicts[number]) is not None
+        ]
+
+    def uses(self, pose: Pose) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """References of a pose, and of each refiner why it is distrusted: see :func:`refine_pose`.
+
+        Its frame has been tested.
+        """
+        frame = self._frame(pose)
+        near = self._by_frame[frame].near(
+            pose.cam_from_world, pose.candidates, max_references=self._options.max_references
+        )
+        return tuple(near), tuple(one.reason if one else "" for one in self._verdicts[frame])
+
+    def refine(self, image: str, camera: Camera, pose: Pose, scene: RankingScene) -> Pose:
+        """Refine the pose of one query; raises DataError, PluginError."""
+        if not self.refiners:
+            return pose
+        self.test([pose])
+        return refine_pose(image, camera, pose, *self.uses(pose), self.refiners, scene)
+
+
+@dataclass(frozen=True)
+class _HeldOut:
+    map: FolderSpec
+    refiner: HoldsOut
+    image: str
+    images: ReferenceImages
+
+
+def _hold_out(job: _HeldOut) -> Displacement | None:
+    return job.refiner.hold_out(job.image, job.images, KaptureScene(job.map.open()))
+
+
+def _consistency_row(frame: str, method: str, found: Consistency) -> ConsistencyRow:
+    median = found.median or Displacement(*[float("nan")] * len(fields(Displacement)))
+    counts = (found.images, found.contradicting)
+    return ConsistencyRow(frame, method, *counts, **vars(median), reason=found.reason)
+
+
+def refine_pose(
+    image: str,
+    camera: Camera,
+    pose: Pose,
+    references: Sequence[str],
+    distrusted: Sequence[str],
+    refiners: Sequence[PoseRefiner],
+    scene: RankingScene,
+) -> Pose:
+    """Refine the pose of one query by one refiner after another.
+
+    Parameters
+    ----------
+    references : map images that may show what the query sees, best first.
+    distrusted : of each refiner, why it must not be used in this map; empty where it may.
+
+    Returns
+    -------
+    The pose that the last accepted refiner gave, with its covariance; what each made of it stands
+    in its ``refinements``.
+
+    Raises
+    ------
+    PluginError : a refiner breaks its protocol.
+    """
+    rows, seconds = [], dict(pose.seconds)
+    for refiner, reason in zip(refiners, distrusted, strict=True):
+        started = time.perf_counter()
+        before = pose.cam_from_world
+        if reason:
+            refined = PoseRefinement(before, reason)
+        else:
+            refined = refiner.refine(image, camera, before, references, scene)
+        rows.append(_row(refiner, image, before, refined))
+        if refined.accepted:
+            after = refined.cam_from_world
+            w, x, y, z = map(float, after.quat_wxyz)  # a plugin may count in another precision
+            t_x, t_y, t_z = map(float, after.translation)
+            after = RigidTransform((w, x, y, z), (t_x, t_y, t_z))
+            pose = replace(pose, cam_from_world=after, covariance=refined.covariance)
+        seconds[refiner.name] = time.perf_counter() - started
+    return replace(pose, refinements=tuple(rows), seconds=seconds)
+
+
+def _row(
+    refiner: PoseRefiner, image: str, before: RigidTransform, refined: PoseRefinement
+) -> RefinementRow:
+    if not isinstance(refined, PoseRefinement):
+        raise PluginError(
+            f"plugin {refiner.name!r} on image {image}: refine returned "
+            f"{type(refined).__name__}, not PoseRefinement"
+        )
+    after = refined.cam_from_world if refined.accepted else before
+    moved_m, turned_deg = movement(before, after)
+    return RefinementRow(
+        image=image,
+        method=refiner.name,
+        reason=refined.reason,
+        moved_m=moved_m,
+        turned_deg=turned_deg,
+        measures=tuple(f"{name}={value:.6g}" for name, value in refined.measures.items()),
+        before=before,
+    )
 
 
 @dataclass(frozen=True)

@@ -51,11 +51,16 @@ from megloc_kapture.stages.image_masks import (
     find_unchanging_regions,
     mask_files,
 )
-from megloc_kapture.stages.kept_items import Digest, content_of
-from megloc_kapture.stages.layout import MAPPING, PREPROCESSED, QUERY
 from megloc_kapture.stages.local_features import read_image_of
-from megloc_kapture.stages.stage import Hashes, PipelineStage, StageWork
-from megloc_kapture.stages.work import HERE, Work
+from megloc_kapture.stages.stage import (
+    MAPPING,
+    PREPROCESSED,
+    QUERY,
+    Hashes,
+    PipelineStage,
+    StageWork,
+)
+from megloc_kapture.stages.work import HERE, Digest, Work, content_of
 
 if TYPE_CHECKING:
     from megloc_kapture.stages.options import PipelineOptions

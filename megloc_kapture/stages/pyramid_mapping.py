@@ -51,14 +51,6 @@ from megloc_kapture.stages.guided_pyramid import (
     described,
     match_image_again,
 )
-from megloc_kapture.stages.kept_items import Digest, feature_inputs
-from megloc_kapture.stages.layout import (
-    FEATURES,
-    LOCAL_FEATURES,
-    MAPPING_MATCHES,
-    MAPPING_PAIRS,
-    MAPPING_PYRAMID,
-)
 from megloc_kapture.stages.local_features import image_inputs, read_frame
 from megloc_kapture.stages.matches import (
     MATCHING_OPTIONS,
@@ -67,8 +59,16 @@ from megloc_kapture.stages.matches import (
     mapping_pairs,
 )
 from megloc_kapture.stages.pyramid_queries import COLUMNS, PyramidFeatures, table_path
-from megloc_kapture.stages.stage import PipelineStage, StageWork
-from megloc_kapture.stages.work import HERE, FolderSpec, Work
+from megloc_kapture.stages.stage import (
+    FEATURES,
+    LOCAL_FEATURES,
+    MAPPING_MATCHES,
+    MAPPING_PAIRS,
+    MAPPING_PYRAMID,
+    PipelineStage,
+    StageWork,
+)
+from megloc_kapture.stages.work import HERE, Digest, FolderSpec, Work, feature_inputs
 
 if TYPE_CHECKING:
     from megloc_kapture.stages.options import PipelineOptions

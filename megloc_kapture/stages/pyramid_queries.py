@@ -38,20 +38,20 @@ from megloc_kapture.stages.guided_pyramid import (
     RetriedQuery,
     retry_query,
 )
-from megloc_kapture.stages.kept_items import Digest, content_of, feature_inputs
-from megloc_kapture.stages.layout import (
+from megloc_kapture.stages.local_features import image_inputs, read_frame
+from megloc_kapture.stages.map_points import matched_images
+from megloc_kapture.stages.matches import MATCHING_OPTIONS, cached_features
+from megloc_kapture.stages.stage import (
     FEATURES,
     LOCAL_FEATURES,
     MAP,
     QUERY_MATCHES,
     QUERY_PAIRS,
     QUERY_PYRAMID,
+    PipelineStage,
+    StageWork,
 )
-from megloc_kapture.stages.local_features import image_inputs, read_frame
-from megloc_kapture.stages.map_points import matched_images
-from megloc_kapture.stages.matches import MATCHING_OPTIONS, cached_features
-from megloc_kapture.stages.stage import PipelineStage, StageWork
-from megloc_kapture.stages.work import HERE, FolderSpec, Work
+from megloc_kapture.stages.work import HERE, Digest, FolderSpec, Work, content_of, feature_inputs
 
 if TYPE_CHECKING:
     from megloc_kapture.stages.options import PipelineOptions

@@ -34,25 +34,38 @@ from megloc_kapture.localization.query_views import QueryView, TypedMatches
 from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import POSE_RANKERS, PluginChoice, PoseRanker, RankingScene
-from megloc_kapture.stages.kept_items import Digest, content_of, feature_inputs, map_inputs
-from megloc_kapture.stages.layout import (
+from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
+from megloc_kapture.stages.localized_folder import (
+    plain_result,
+    result_of,
+    unreadable_queries,
+    write_localized,
+)
+from megloc_kapture.stages.matches import iterate_candidates
+from megloc_kapture.stages.ranking_scene import KaptureScene, image_inputs
+from megloc_kapture.stages.rigs import Unit, query_units
+from megloc_kapture.stages.shared_index import index_map, open_index, shared_index, with_noise
+from megloc_kapture.stages.stage import (
     FEATURES,
     LOCAL_FEATURES,
+    LOCAL_TYPES,
     MAP,
     MAPPING,
     QUERY,
     QUERY_PAIRS,
     TIMING,
+    PipelineStage,
+    StageWork,
 )
-from megloc_kapture.stages.localized_folder import plain_result, result_of, write_localized
-from megloc_kapture.stages.matches import iterate_candidates
-from megloc_kapture.stages.ranking_scene import KaptureScene, image_inputs
-from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
-from megloc_kapture.stages.rigs import Unit, query_units
-from megloc_kapture.stages.shared_index import index_map, open_index, shared_index, with_noise
-from megloc_kapture.stages.stage import LOCAL_TYPES, PipelineStage, StageWork
-from megloc_kapture.stages.unreadable import unreadable_queries
-from megloc_kapture.stages.work import HERE, FolderSpec, Work
+from megloc_kapture.stages.work import (
+    HERE,
+    Digest,
+    FolderSpec,
+    Work,
+    content_of,
+    feature_inputs,
+    map_inputs,
+)
 from megloc_kapture.values import Failure, Options, Pose, RigidTransform
 
 _FIRST_TURN = 5  # candidates; every turn has twice as many as the one before

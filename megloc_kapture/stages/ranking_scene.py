@@ -13,9 +13,9 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.io.images import read_depth_map
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.plugins import DepthView
-from megloc_kapture.stages.kept_items import Digest
 from megloc_kapture.stages.local_features import mask_path, read_image_of, read_mask
 from megloc_kapture.stages.rigs import DepthRecord, depth_records
+from megloc_kapture.stages.work import Digest
 from megloc_kapture.values import Camera, RigidTransform
 
 

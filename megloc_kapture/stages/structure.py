@@ -28,10 +28,17 @@ from megloc_kapture.io.files import link_images
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.io.tables import read_match_counts
 from megloc_kapture.matching.chance import agree_by_chance
-from megloc_kapture.stages.layout import FEATURES, LOCAL_FEATURES, PHOTOGRAPH_MATCHES, POSED
 from megloc_kapture.stages.matches import MATCHING_OPTIONS, MatchMapping, Verification
 from megloc_kapture.stages.options import PipelineOptions
-from megloc_kapture.stages.stage import LOCAL_TYPES, PipelineStage, StageWork
+from megloc_kapture.stages.stage import (
+    FEATURES,
+    LOCAL_FEATURES,
+    LOCAL_TYPES,
+    PHOTOGRAPH_MATCHES,
+    POSED,
+    PipelineStage,
+    StageWork,
+)
 from megloc_kapture.stages.triangulation import verified_matches
 from megloc_kapture.values import Options, RigidTransform
 

@@ -27,11 +27,11 @@ from megloc_kapture.localization.map_index import observed_matches
 from megloc_kapture.mapping.uncertainty import point_deviations
 from megloc_kapture.plugins import PluginChoice
 from megloc_kapture.stages.densifying import DensifyOptions, densify_map, fitted_to_poses
-from megloc_kapture.stages.fusion import fuse_depth
 from megloc_kapture.stages.rigs import depth_records
 from megloc_kapture.stages.shared_index import index_map
 from megloc_kapture.stages.stereo_depth import (
     DEPTH_FILE,
+    fuse_depth,
     read_beside,
     read_stereo_depth,
     side_file,

@@ -15,7 +15,7 @@ from megloc_kapture.features.pca_whitening import PcaWhitening
 from megloc_kapture.features.vlad import VladOptions, Vocabulary, aggregate
 from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
 from megloc_kapture.pipeline.executors import single_threaded
-from megloc_kapture.stages.global_vlad import (
+from megloc_kapture.stages.global_features import (
     MEAN_FILE,
     PROJECTION_FILE,
     SETTINGS_FILE,

@@ -28,13 +28,12 @@ from megloc_kapture.mapping.pairs import (
     PairsByPosesOptions,
     PairsBySequenceOptions,
 )
-from megloc_kapture.stages.candidates import QueryPairsOptions, Retrieval, vectors_of
+from megloc_kapture.stages.candidates import QueryPairsOptions, Restrictions, Retrieval, vectors_of
 from megloc_kapture.stages.image_pairs import (
     MappingPairsOptions,
     pair_map_images,
     pair_queries,
 )
-from megloc_kapture.stages.restrictions import Restrictions
 
 VECTORS = {
     # two copies, one near them, one across, one opposite

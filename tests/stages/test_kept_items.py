@@ -8,8 +8,7 @@ from typing import Any
 
 import pytest
 
-from megloc_kapture.stages.kept_items import KeptItems
-from megloc_kapture.stages.work import Work
+from megloc_kapture.stages.work import KeptItems, Work
 
 
 def kept_in(folder: Path, *sources: Path, settings: str = "s", **how: Any) -> KeptItems:

@@ -22,10 +22,9 @@ from megloc_kapture.io.tables import (
 )
 from megloc_kapture.plugins import PoseRefinement
 from megloc_kapture.refinement.consistency import Displacement
+from megloc_kapture.stages.candidates import Restrictions
 from megloc_kapture.stages.localized_folder import write_localized
-from megloc_kapture.stages.map_refiners import PoseRefinementOptions
-from megloc_kapture.stages.pose_refinement import refine_poses
-from megloc_kapture.stages.restrictions import Restrictions
+from megloc_kapture.stages.pose_refinement import PoseRefinementOptions, refine_poses
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Pose, RigidTransform
 

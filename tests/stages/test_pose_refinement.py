@@ -16,10 +16,9 @@ from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.tables import read_refinement, read_status
 from megloc_kapture.plugin_loading import plugin_names
 from megloc_kapture.plugins import POSE_REFINERS, PluginChoice, PoseRefinement
+from megloc_kapture.stages.candidates import Restrictions
 from megloc_kapture.stages.localized_folder import write_localized
-from megloc_kapture.stages.map_refiners import PoseRefinementOptions
-from megloc_kapture.stages.pose_refinement import refine_poses
-from megloc_kapture.stages.restrictions import Restrictions
+from megloc_kapture.stages.pose_refinement import PoseRefinementOptions, refine_poses
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 

@@ -17,8 +17,8 @@ from megloc_kapture.io.kapture import (
     write_pairs,
 )
 from megloc_kapture.io.tables import PairCount, match_counts_path, write_match_counts
+from megloc_kapture.stages.image_pairs import RerankingOptions, counted, rerank, reranked
 from megloc_kapture.stages.matches import VerifiedMatches, iterate_candidates
-from megloc_kapture.stages.reranking import RerankingOptions, counted, rerank, reranked
 
 PAIRS = [
     ImagePair("q1", "z", 0.9),

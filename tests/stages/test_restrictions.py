@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from megloc_kapture.io.dataset_tables import ImageGroup, write_groups, write_priors
-from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
+from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
 
 IMAGES = ["a.jpg", "b.jpg", "c.jpg", "d.jpg"]
 GROUPS = {
