@@ -48,6 +48,7 @@ from megloc_kapture.stages.stage import (
     Stage,
     StageWork,
     is_below,
+    wanted_stages,
 )
 from megloc_kapture.values import Options
 
@@ -98,7 +99,7 @@ def plan_evaluation(run: Run) -> list[Stage]:
     run.source.check()
     stages: list[Stage] = [Render(run)] if run.source.twin is not None else []
     stages.append(Import(run))
-    stages += [kind(options) for kind in PIPELINE if kind.is_wanted(options)]
+    stages += wanted_stages(PIPELINE, options)
     stages += [Submit(run), Evaluate(run)]
     for name, values in options.stages.items():
         _insert(stages, load_plugin(STAGES, name, dict(values)))
@@ -117,8 +118,7 @@ def plan_map(mapping: KaptureFolder, options: PipelineOptions) -> list[Stage]:
     if options.uses_given_map() or options.pairs_by_points():
         raise OptionError("images with poses come with no model: map, mapping_pairs.by")
     behind = PIPELINE.index(Densify) + 1
-    kinds = [kind for kind in PIPELINE[:behind] if kind.is_wanted(options)]
-    return [ImportMapping(mapping), *(kind(options) for kind in kinds)]
+    return [ImportMapping(mapping), *wanted_stages(PIPELINE[:behind], options)]
 
 
 def _insert(stages: list[Stage], stage: Stage) -> None:

@@ -41,7 +41,16 @@ from megloc_kapture.stages.matches import MatchMapping
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.preprocessing import Preprocess
 from megloc_kapture.stages.pyramid_mapping import PyramidMapping
-from megloc_kapture.stages.stage import MAP, MAPPING, QUERY, Hashes, PipelineStage, Stage, StageWork
+from megloc_kapture.stages.stage import (
+    MAP,
+    MAPPING,
+    QUERY,
+    Hashes,
+    PipelineStage,
+    Stage,
+    StageWork,
+    wanted_stages,
+)
 from megloc_kapture.stages.structure import FindPoses, MatchPhotographs, StructureOptions
 from megloc_kapture.values import Options
 
@@ -204,14 +213,12 @@ def plan_photographs(
     if len(photographs.names) < MIN_IMAGES:
         raise _too_few(len(photographs.names))
     stages: list[Stage] = [ImportPhotographs(photographs)]
-    stages += [kind(options) for kind in _WITHOUT_POSES if kind.is_wanted(options)]
+    stages += wanted_stages(_WITHOUT_POSES, options)
     stages.append(FindPoses(options, structure))
-    for kind in _WITH_POSES:
-        if kind.is_wanted(options):
-            stage = kind(options)
-            stage.layout = replace(stage.layout, posed=True)
-            stages.append(stage)
-    return stages
+    with_poses = wanted_stages(_WITH_POSES, options)
+    for stage in with_poses:
+        stage.layout = replace(stage.layout, posed=True)
+    return [*stages, *with_poses]
 
 
 def describe_map(workspace: Path, photographs: Photographs) -> list[str]:

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,7 +48,7 @@ from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.local_features import read_frame
 from megloc_kapture.stages.rigs import depth_records
 from megloc_kapture.stages.shared_index import index_map, with_noise, write_array
-from megloc_kapture.stages.stage import MAP, PipelineStage, StageWork
+from megloc_kapture.stages.stage import MAP, Layout, PipelineStage, StageWork
 from megloc_kapture.stages.stereo_depth import (
     DEPTH_FILE,
     FOLDER,
@@ -62,9 +62,6 @@ from megloc_kapture.stages.stereo_depth import (
 from megloc_kapture.stages.triangulation import copy_features
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
 from megloc_kapture.values import Camera, Options
-
-if TYPE_CHECKING:
-    from megloc_kapture.stages.options import PipelineOptions
 
 _NO_POINTS = np.zeros(0, np.int64)
 _ANCHOR_VIEWS = 2  # that agree with a keypoint's depth, for it to be lifted
@@ -399,25 +396,21 @@ class Densify(PipelineStage):
     name = "densify"
     version = 4
     uses = ("mvs",)
-    writes = (MAP,)
+    inputs = (Layout.sparse_map, SIDE_TABLES)
+    outputs = (MAP,)
 
-    @property
-    def reads(self) -> Sequence[str]:  # type: ignore[override]
-        return (self.layout.sparse_map, SIDE_TABLES)
-
-    @classmethod
-    def is_wanted(cls, options: PipelineOptions) -> bool:
-        return options.mvs.mode != "off"
+    def is_wanted(self) -> bool:
+        return self.options.mvs.mode != "off"
 
     def plugins(self) -> Sequence[object]:
         return (self.options.mvs.make_estimator(),)
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         return densify_map(
-            work.folder(self.layout.sparse_map),
+            work.folder(self.layout.sparse_map()),
             work.out / MAP,
             self.options.mvs,
-            restrictions=work.restrictions(),
+            restrictions=Restrictions.read(work.path(SIDE_TABLES)),
             link_features=True,
             work=work,
         )

@@ -430,12 +430,12 @@ class ExtractGlobalFeatures(PipelineStage):
     name = "global_features"
     version = 2
     uses = ("global_features.name", "global_features.options", *LOCAL_TYPES)
-    writes = (GLOBAL_FEATURES,)
+    outputs = (GLOBAL_FEATURES,)
 
     @property
     def reads(self) -> Sequence[str]:  # type: ignore[override]
-        images = (self.layout.mapping, self.layout.query)
-        return (*images, *self.layout.reference, LOCAL_FEATURES) if self._trains() else images
+        images = (self.layout.mapping(), self.layout.query())
+        return (*images, *self.layout.reference(), LOCAL_FEATURES) if self._trains() else images
 
     def _trains(self) -> bool:
         return any(chosen.is_vlad for chosen in self.options.global_features)
@@ -451,7 +451,7 @@ class ExtractGlobalFeatures(PipelineStage):
         return [chosen.make() for chosen in self.options.global_features if not chosen.is_vlad]
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        queries = work.folders((self.layout.query,), FEATURES)
+        queries = work.folders((self.layout.query(),), FEATURES)
         counts = {}
         for chosen in self.options.global_features:
             if chosen.is_vlad:
@@ -462,7 +462,7 @@ class ExtractGlobalFeatures(PipelineStage):
                     mapping, [mapping, *queries], local_type, work.out, vlad.of_vlad(), work=work
                 )
             else:
-                folders = [work.folder(self.layout.mapping), *queries]
+                folders = [work.folder(self.layout.mapping()), *queries]
                 found = extract_global_features(folders, chosen.make(), work.out, work=work)
             counts[chosen.name] = found["images"]
         return counts

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,15 +53,12 @@ from megloc_kapture.stages.stage import (
     QUERY_MATCHES,
     QUERY_PAIRS,
     REFERENCE,
+    Layout,
     PipelineStage,
     StageWork,
 )
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Options, RigidTransform
-
-if TYPE_CHECKING:
-    from megloc_kapture.stages.options import PipelineOptions
-
 
 PairingMethod = Literal["poses", "covisibility", "retrieval", "sequence", "exhaustive"]
 
@@ -286,23 +283,18 @@ class PairMapping(PipelineStage):
     name = "mapping_pairs"
     version = 4
     uses = ("mapping_pairs", *RETRIEVAL_OPTIONS)
-    writes = (MAPPING_PAIRS,)
+    inputs = (Layout.mapping, SIDE_TABLES, GLOBAL_FEATURES, Layout.pairing_points)
+    outputs = (MAPPING_PAIRS,)
 
-    @property
-    def reads(self) -> Sequence[str]:  # type: ignore[override]
-        by_points = (REFERENCE,) if self.options.pairs_by_points() else ()
-        return (self.layout.mapping, SIDE_TABLES, GLOBAL_FEATURES, *by_points)
-
-    @classmethod
-    def is_wanted(cls, options: PipelineOptions) -> bool:
-        return options.triangulates()
+    def is_wanted(self) -> bool:
+        return self.options.triangulates()
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         pairs = pair_map_images(
-            work.folder(self.layout.mapping, FEATURES),
+            work.folder(self.layout.mapping(), FEATURES),
             self.options.mapping_pairs,
             retrieval=self.options.retrieval(),
-            restrictions=work.restrictions(),
+            restrictions=Restrictions.read(work.path(SIDE_TABLES)),
             covisible=work.folder(REFERENCE) if self.options.pairs_by_points() else None,
             work=work,
         )
@@ -315,30 +307,23 @@ class PairQueries(PipelineStage):
 
     version = 3
     uses = ("query_pairs", *RETRIEVAL_OPTIONS)
+    inputs = (Layout.mapping, Layout.query, SIDE_TABLES, GLOBAL_FEATURES, Layout.reference)
+    outputs = (Layout.candidates,)
 
     @property
     def name(self) -> str:  # type: ignore[override]
-        return "query_pairs" if self.layout.candidates == QUERY_PAIRS else "query_candidates"
-
-    @property
-    def reads(self) -> Sequence[str]:  # type: ignore[override]
-        images = (self.layout.mapping, self.layout.query)
-        return (*images, SIDE_TABLES, GLOBAL_FEATURES, *self.layout.reference)
-
-    @property
-    def writes(self) -> Sequence[str]:  # type: ignore[override]
-        return (self.layout.candidates,)
+        return "query_pairs" if self.layout.candidates() == QUERY_PAIRS else "query_candidates"
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         pairs = pair_queries(
             described_images(work, self, self.options.main_type()),
-            work.folder(self.layout.query, FEATURES),
+            work.folder(self.layout.query(), FEATURES),
             self.options.query_pairs,
             retrieval=self.options.retrieval(),
-            restrictions=work.restrictions(),
+            restrictions=Restrictions.read(work.path(SIDE_TABLES)),
             work=work,
         )
-        write_pairs(work.out / self.layout.candidates, pairs)
+        write_pairs(work.out / self.layout.candidates(), pairs)
         return {"pairs": len(pairs)}
 
 
@@ -456,20 +441,16 @@ class RerankQueries(PipelineStage):
     name = "query_pairs"
     version = 4
     uses = ("reranking", *LOCAL_TYPES)
-    writes = (QUERY_PAIRS,)
+    inputs = (Layout.query, LOCAL_FEATURES, QUERY_CANDIDATES, QUERY_MATCHES)
+    outputs = (QUERY_PAIRS,)
 
-    @property
-    def reads(self) -> Sequence[str]:  # type: ignore[override]
-        return (self.layout.query, LOCAL_FEATURES, QUERY_CANDIDATES, QUERY_MATCHES)
-
-    @classmethod
-    def is_wanted(cls, options: PipelineOptions) -> bool:
-        return options.reranking.reranks()
+    def is_wanted(self) -> bool:
+        return self.options.reranking.reranks()
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         pairs = reranked(
             read_pairs(work.path(QUERY_CANDIDATES)),
-            work.folder(self.layout.query, FEATURES, QUERY_MATCHES),
+            work.folder(self.layout.query(), FEATURES, QUERY_MATCHES),
             work.path(QUERY_MATCHES),
             self.options.local_types(),
             self.options.reranking,

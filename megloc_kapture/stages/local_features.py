@@ -32,6 +32,7 @@ from megloc_kapture.stages.stage import (
     LOCAL_FEATURES,
     LOCAL_TYPES,
     REFERENCE,
+    Layout,
     PipelineStage,
     StageWork,
 )
@@ -270,17 +271,14 @@ class ExtractLocalFeatures(PipelineStage):
 
     name = "local_features"
     uses = ("mask_margin_px", *LOCAL_TYPES)
-    writes = (LOCAL_FEATURES,)
-
-    @property
-    def reads(self) -> Sequence[str]:  # type: ignore[override]
-        return (self.layout.mapping, self.layout.query, *self.layout.reference)
+    inputs = (Layout.mapping, Layout.query, Layout.reference)
+    outputs = (LOCAL_FEATURES,)
 
     def plugins(self) -> Sequence[object]:
         return self.options.query_extractors()
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        everything = work.folders((self.layout.mapping, self.layout.query))
+        everything = work.folders((self.layout.mapping(), self.layout.query()))
         todo = [(extractor, everything) for extractor in self.options.own_extractors()]
         if self.options.uses_given_map():
             extractor, reference = self.options.make_given_extractor(), work.folder(REFERENCE)

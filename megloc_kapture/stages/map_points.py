@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,14 +30,12 @@ from megloc_kapture.stages.stage import (
     MAP,
     REFERENCE,
     UNREFINED,
+    Layout,
     PipelineStage,
     StageWork,
 )
 from megloc_kapture.stages.triangulation import copy_features, triangulate_map
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
-
-if TYPE_CHECKING:
-    from megloc_kapture.stages.options import PipelineOptions
 
 
 @dataclass(frozen=True)
@@ -175,7 +172,7 @@ def described_images(work: StageWork, stage: PipelineStage, local_type: str) -> 
     # descriptors of its own: those that were extracted for it lie in the workspace
     if is_given(stage, local_type) and has_descriptors(work.folder(REFERENCE)):
         return work.folder(REFERENCE, FEATURES)
-    return work.folder(stage.layout.mapping, FEATURES)
+    return work.folder(stage.layout.mapping(), FEATURES)
 
 
 def matched_images(work: StageWork, stage: PipelineStage, local_type: str) -> KaptureFolder:
@@ -185,7 +182,7 @@ def matched_images(work: StageWork, stage: PipelineStage, local_type: str) -> Ka
     """
     if is_given(stage, local_type):
         return work.folder(MAP)
-    return work.folder(stage.layout.mapping, FEATURES, *stage.layout.mapping_matches)
+    return work.folder(stage.layout.mapping(), FEATURES, *stage.layout.mapping_matches())
 
 
 class GivenMap(PipelineStage):
@@ -193,15 +190,11 @@ class GivenMap(PipelineStage):
 
     name = "points"
     uses = ("map", "given_features")
-    writes = (UNREFINED,)
+    inputs = (REFERENCE, Layout.mapping, LOCAL_FEATURES, GLOBAL_FEATURES)
+    outputs = (UNREFINED,)
 
-    @property
-    def reads(self) -> Sequence[str]:  # type: ignore[override]
-        return (REFERENCE, self.layout.mapping, LOCAL_FEATURES, GLOBAL_FEATURES)
-
-    @classmethod
-    def is_wanted(cls, options: PipelineOptions) -> bool:
-        return options.map == "given"
+    def is_wanted(self) -> bool:
+        return self.options.map == "given"
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         return write_given_map(work, self, work.out / UNREFINED)
@@ -211,7 +204,7 @@ def write_given_map(work: StageWork, stage: PipelineStage, output: Path) -> dict
     """Write the given map of a run; see :func:`given_map`."""
     reference = work.folder(REFERENCE)
     check_given_type(reference, stage.options.make_given_extractor().name)
-    return given_map(reference, work.folder(stage.layout.mapping, FEATURES), output)
+    return given_map(reference, work.folder(stage.layout.mapping(), FEATURES), output)
 
 
 class LiftPoints(PipelineStage):
@@ -219,18 +212,14 @@ class LiftPoints(PipelineStage):
 
     name = "points"
     uses = ("map", "lifting", "local_features.name", "local_features.options")
-    writes = (UNREFINED,)
+    inputs = (Layout.mapping, LOCAL_FEATURES, GLOBAL_FEATURES)
+    outputs = (UNREFINED,)
 
-    @property
-    def reads(self) -> Sequence[str]:  # type: ignore[override]
-        return (self.layout.mapping, LOCAL_FEATURES, GLOBAL_FEATURES)
-
-    @classmethod
-    def is_wanted(cls, options: PipelineOptions) -> bool:
-        return options.map == "lift"
+    def is_wanted(self) -> bool:
+        return self.options.map == "lift"
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        mapping = work.folder(self.layout.mapping, FEATURES)
+        mapping = work.folder(self.layout.mapping(), FEATURES)
         types = self.options.own_types()
         return lift_map(mapping, types, work.out / UNREFINED, self.options.lifting, work=work)
 
@@ -241,25 +230,21 @@ class TriangulatePoints(PipelineStage):
     name = "points"
     version = 2
     uses = ("triangulation", "guided_pyramid.mode", *LOCAL_TYPES)
-    writes = (UNREFINED,)
+    inputs = (
+        Layout.mapping,
+        LOCAL_FEATURES,
+        GLOBAL_FEATURES,
+        Layout.mapping_matches,
+        Layout.reference,
+    )
+    outputs = (UNREFINED,)
 
-    @property
-    def reads(self) -> Sequence[str]:  # type: ignore[override]
-        features = (LOCAL_FEATURES, GLOBAL_FEATURES)
-        return (
-            self.layout.mapping,
-            *features,
-            *self.layout.mapping_matches,
-            *self.layout.reference,
-        )
-
-    @classmethod
-    def is_wanted(cls, options: PipelineOptions) -> bool:
-        return options.triangulates()
+    def is_wanted(self) -> bool:
+        return self.options.triangulates()
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         joined = self.options.uses_given_map()
-        mapping = work.folder(self.layout.mapping, FEATURES, *self.layout.mapping_matches)
+        mapping = work.folder(self.layout.mapping(), FEATURES, *self.layout.mapping_matches())
         own = work.out / ("map_own" if joined else UNREFINED)
         counts = triangulate_map(
             mapping,

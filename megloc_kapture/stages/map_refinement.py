@@ -46,7 +46,7 @@ from megloc_kapture.mapping.rejection import (
 )
 from megloc_kapture.mapping.uncertainty import point_covariances, point_deviations
 from megloc_kapture.stages.rigs import DepthRecord, depth_records
-from megloc_kapture.stages.stage import UNREFINED, PipelineStage, StageWork
+from megloc_kapture.stages.stage import UNREFINED, Layout, PipelineStage, StageWork
 from megloc_kapture.stages.triangulation import copy_features
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
 from megloc_kapture.values import Options
@@ -468,14 +468,11 @@ class RefineMap(PipelineStage):
     name = "map"
     version = 2
     uses = ("refinement",)
-    reads = (UNREFINED,)
-
-    @property
-    def writes(self) -> Sequence[str]:  # type: ignore[override]
-        return (self.layout.sparse_map,)
+    inputs = (UNREFINED,)
+    outputs = (Layout.sparse_map,)
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         folder, options = work.folder(UNREFINED), self.options.refinement
         return refine_map(
-            folder, work.out / self.layout.sparse_map, options, link_features=True, work=work
+            folder, work.out / self.layout.sparse_map(), options, link_features=True, work=work
         )

@@ -12,7 +12,7 @@ from dataclasses import astuple, dataclass
 from functools import cache, cached_property, partial
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,10 +35,10 @@ from megloc_kapture.stages.map_points import matched_images
 from megloc_kapture.stages.stage import (
     FEATURES,
     LOCAL_FEATURES,
-    MAP,
     MAPPING_MATCHES,
     MAPPING_PAIRS,
     QUERY_MATCHES,
+    Layout,
     PipelineStage,
     StageWork,
 )
@@ -52,10 +52,6 @@ from megloc_kapture.stages.work import (
     feature_inputs,
 )
 from megloc_kapture.values import Camera, ImageFeatures, Options, RigidTransform
-
-if TYPE_CHECKING:
-    from megloc_kapture.stages.options import PipelineOptions
-
 
 _CACHE_BYTES = 256 << 20  # descriptors kept per process: about a hundred images
 _PAIRS_PER_ITEM = 32  # of one image, whose features are read once for them
@@ -378,15 +374,11 @@ class MatchMapping(PipelineStage):
     name = "mapping_matches"
     version = 3
     uses = (*MATCHING_OPTIONS, "mapping_verification")
-    writes = (MAPPING_MATCHES,)
+    inputs = (Layout.mapping, LOCAL_FEATURES, MAPPING_PAIRS)
+    outputs = (MAPPING_MATCHES,)
 
-    @property
-    def reads(self) -> Sequence[str]:  # type: ignore[override]
-        return (self.layout.mapping, LOCAL_FEATURES, MAPPING_PAIRS)
-
-    @classmethod
-    def is_wanted(cls, options: PipelineOptions) -> bool:
-        return options.triangulates()
+    def is_wanted(self) -> bool:
+        return self.options.triangulates()
 
     def plugins(self) -> Sequence[object]:
         return [self.options.make_matcher(name) for name in self.options.own_types()]
@@ -396,7 +388,7 @@ class MatchMapping(PipelineStage):
         return self.options.verify_mapping()
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        mapping = work.folder(self.layout.mapping, FEATURES)
+        mapping = work.folder(self.layout.mapping(), FEATURES)
         pairs = mapping_pairs(work, mapping)
         counts: Counter[str] = Counter()
         for local_type in self.options.own_types():
@@ -420,25 +412,20 @@ class MatchQueries(PipelineStage):
     name = "query_matches"
     version = 4
     uses = (*MATCHING_OPTIONS, "query_verification")
-    writes = (QUERY_MATCHES,)
-
-    @property
-    def reads(self) -> Sequence[str]:  # type: ignore[override]
-        given = (MAP,) if self.options.uses_given_map() else ()
-        images = (self.layout.mapping, self.layout.query)
-        return (*images, LOCAL_FEATURES, self.layout.candidates, *given)
+    inputs = (Layout.mapping, Layout.query, LOCAL_FEATURES, Layout.candidates, Layout.given_map)
+    outputs = (QUERY_MATCHES,)
 
     def plugins(self) -> Sequence[object]:
         return [self.options.make_matcher(name) for name in self.options.local_types()]
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        pairs = read_pairs(work.path(self.layout.candidates))
+        pairs = read_pairs(work.path(self.layout.candidates()))
         counts: Counter[str] = Counter()
         for local_type in self.options.local_types():
             mapping = matched_images(work, self, local_type)
             described = mapping.descriptors(local_type)
             found = match_pairs(
-                work.folder(self.layout.query, FEATURES),
+                work.folder(self.layout.query(), FEATURES),
                 mapping,
                 [pair for pair in pairs if pair.map in described],
                 local_type,

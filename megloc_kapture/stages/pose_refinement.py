@@ -11,7 +11,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass, fields, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from pydantic import Field, TypeAdapter
 
@@ -59,15 +58,12 @@ from megloc_kapture.stages.stage import (
     MAP,
     REFINEMENT_TIMING,
     UNREFINED_POSES,
+    Layout,
     PipelineStage,
     StageWork,
 )
 from megloc_kapture.stages.work import HERE, Digest, FolderSpec, Work, map_inputs, ordered_map
 from megloc_kapture.values import Camera, Options, Pose, RefinementRow, RigidTransform
-
-if TYPE_CHECKING:
-    from megloc_kapture.stages.options import PipelineOptions
-
 
 # map images held out at once: of those, what comes behind the last that is needed is thrown away
 _WINDOW = 4
@@ -447,15 +443,11 @@ class RefinePoses(PipelineStage):
     name = "refine_poses"
     version = 2
     uses = ("pose_refinement",)
-    writes = (LOCALIZED, REFINEMENT_TIMING)
+    inputs = (SIDE_TABLES, Layout.query, MAP, UNREFINED_POSES)
+    outputs = (LOCALIZED, REFINEMENT_TIMING)
 
-    @property
-    def reads(self) -> Sequence[str]:  # type: ignore[override]
-        return (SIDE_TABLES, self.layout.query, MAP, UNREFINED_POSES)
-
-    @classmethod
-    def is_wanted(cls, options: PipelineOptions) -> bool:
-        return options.pose_refinement.refines()
+    def is_wanted(self) -> bool:
+        return self.options.pose_refinement.refines()
 
     def plugins(self) -> Sequence[object]:
         return self.options.pose_refinement.make_refiners()
@@ -463,11 +455,11 @@ class RefinePoses(PipelineStage):
     def run(self, work: StageWork) -> Mapping[str, float]:
         return refine_poses(
             work.folder(MAP),
-            work.folder(self.layout.query),
+            work.folder(self.layout.query()),
             work.folder(UNREFINED_POSES),
             work.out / LOCALIZED,
             self.options.pose_refinement,
-            restrictions=work.restrictions(),
+            restrictions=Restrictions.read(work.path(SIDE_TABLES)),
             work=work,
             timing=work.out / REFINEMENT_TIMING,
         )

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,9 +60,6 @@ from megloc_kapture.stages.stage import (
     StageWork,
 )
 from megloc_kapture.stages.work import HERE, Digest, Work, content_of
-
-if TYPE_CHECKING:
-    from megloc_kapture.stages.options import PipelineOptions
 
 CLASSES, CLASSES_FILE = "classes", "classes.json"
 REPORT_FILE = "preprocessing.json"
@@ -390,12 +386,11 @@ class Preprocess(PipelineStage):
 
     name = "preprocess"
     uses = ("preprocessing",)
-    reads = (MAPPING, QUERY)
-    writes = (PREPROCESSED,)
+    inputs = (MAPPING, QUERY)
+    outputs = (PREPROCESSED,)
 
-    @classmethod
-    def is_wanted(cls, options: PipelineOptions) -> bool:
-        return options.preprocesses()
+    def is_wanted(self) -> bool:
+        return self.options.preprocesses()
 
     def plugins(self) -> Sequence[object]:
         chosen = self.options.preprocessing.masks.segmenter

@@ -13,7 +13,7 @@ from contextlib import closing
 from dataclasses import astuple, dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -65,13 +65,11 @@ from megloc_kapture.stages.stage import (
     MAPPING_MATCHES,
     MAPPING_PAIRS,
     MAPPING_PYRAMID,
+    Layout,
     PipelineStage,
     StageWork,
 )
 from megloc_kapture.stages.work import HERE, Digest, FolderSpec, Work, feature_inputs
-
-if TYPE_CHECKING:
-    from megloc_kapture.stages.options import PipelineOptions
 
 _Pair = tuple[str, str]
 
@@ -404,15 +402,11 @@ class PyramidMapping(PipelineStage):
     name = "mapping_pyramid"
     version = 2
     uses = (*MATCHING_OPTIONS, "mapping_verification", "guided_pyramid", "mask_margin_px")
-    writes = (MAPPING_PYRAMID,)
+    inputs = (Layout.mapping, LOCAL_FEATURES, MAPPING_PAIRS, MAPPING_MATCHES)
+    outputs = (MAPPING_PYRAMID,)
 
-    @property
-    def reads(self) -> Sequence[str]:  # type: ignore[override]
-        return (self.layout.mapping, LOCAL_FEATURES, MAPPING_PAIRS, MAPPING_MATCHES)
-
-    @classmethod
-    def is_wanted(cls, options: PipelineOptions) -> bool:
-        return options.matches_again() and options.triangulates()
+    def is_wanted(self) -> bool:
+        return self.options.matches_again() and self.options.triangulates()
 
     def plugins(self) -> Sequence[object]:
         extractors = self.options.make_extractors()
@@ -420,7 +414,7 @@ class PyramidMapping(PipelineStage):
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         counts: dict[str, float] = {}
-        mapping = work.folder(self.layout.mapping, FEATURES, MAPPING_MATCHES)
+        mapping = work.folder(self.layout.mapping(), FEATURES, MAPPING_MATCHES)
         for extractor in self.options.make_extractors():
             found = pyramid_mapping(
                 mapping,

@@ -12,7 +12,7 @@ from contextlib import closing
 from dataclasses import astuple, dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,13 +48,11 @@ from megloc_kapture.stages.stage import (
     QUERY_MATCHES,
     QUERY_PAIRS,
     QUERY_PYRAMID,
+    Layout,
     PipelineStage,
     StageWork,
 )
 from megloc_kapture.stages.work import HERE, Digest, FolderSpec, Work, content_of, feature_inputs
-
-if TYPE_CHECKING:
-    from megloc_kapture.stages.options import PipelineOptions
 
 COLUMNS = (
     "image",
@@ -264,16 +262,11 @@ class PyramidQueries(PipelineStage):
     name = "query_pyramid"
     version = 2
     uses = (*MATCHING_OPTIONS, "query_verification", "guided_pyramid", "mask_margin_px")
-    writes = (QUERY_PYRAMID,)
+    inputs = (Layout.mapping, Layout.query, LOCAL_FEATURES, MAP, QUERY_PAIRS, QUERY_MATCHES)
+    outputs = (QUERY_PYRAMID,)
 
-    @property
-    def reads(self) -> Sequence[str]:  # type: ignore[override]
-        images = (self.layout.mapping, self.layout.query)
-        return (*images, LOCAL_FEATURES, MAP, QUERY_PAIRS, QUERY_MATCHES)
-
-    @classmethod
-    def is_wanted(cls, options: PipelineOptions) -> bool:
-        return options.matches_again()
+    def is_wanted(self) -> bool:
+        return self.options.matches_again()
 
     def plugins(self) -> Sequence[object]:
         extractors = self.options.query_extractors()
@@ -286,7 +279,7 @@ class PyramidQueries(PipelineStage):
             mapping = matched_images(work, self, extractor.name)
             described = mapping.descriptors(extractor.name)
             found = pyramid_queries(
-                work.folder(self.layout.query, FEATURES, QUERY_MATCHES),
+                work.folder(self.layout.query(), FEATURES, QUERY_MATCHES),
                 mapping,
                 [pair for pair in pairs if pair.map in described],
                 extractor.name,

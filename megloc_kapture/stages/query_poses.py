@@ -54,6 +54,7 @@ from megloc_kapture.stages.stage import (
     QUERY,
     QUERY_PAIRS,
     TIMING,
+    Layout,
     PipelineStage,
     StageWork,
 )
@@ -389,21 +390,23 @@ class LocalizeQueries(PipelineStage):
     name = "localization"
     version = 7
     uses = ("localization", "guided_pyramid.mode", *LOCAL_TYPES)
-
-    @property
-    def reads(self) -> Sequence[str]:  # type: ignore[override]
-        images = (MAPPING, QUERY, self.layout.query, SIDE_TABLES)
-        return (*images, LOCAL_FEATURES, MAP, QUERY_PAIRS, *self.layout.query_matches)
-
-    @property
-    def writes(self) -> Sequence[str]:  # type: ignore[override]
-        return (self.layout.poses, TIMING)
+    inputs = (
+        MAPPING,
+        QUERY,
+        Layout.query,
+        SIDE_TABLES,
+        LOCAL_FEATURES,
+        MAP,
+        QUERY_PAIRS,
+        Layout.query_matches,
+    )
+    outputs = (Layout.poses, TIMING)
 
     def plugins(self) -> Sequence[object]:
         return (self.options.localization.make_ranker(),)
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        query = work.folder(self.layout.query, FEATURES, *self.layout.query_matches)
+        query = work.folder(self.layout.query(), FEATURES, *self.layout.query_matches())
         pairs = read_pairs(work.path(QUERY_PAIRS))
         options = self.options.localization
         results = localize_from_matches(
@@ -413,12 +416,12 @@ class LocalizeQueries(PipelineStage):
             pairs,
             self.options.query_types(),
             options,
-            restrictions=work.restrictions(),
+            restrictions=Restrictions.read(work.path(SIDE_TABLES)),
             work=work,
             scratch=work.out,
         )
         return write_localized(
-            work.out / self.layout.poses,
+            work.out / self.layout.poses(),
             work.folder(QUERY),  # as imported: the poses are theirs as well
             chain(results, unreadable_queries(work.path(SIDE_TABLES))),
             fallback=options.fallback,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -36,6 +36,7 @@ from megloc_kapture.stages.stage import (
     LOCAL_TYPES,
     PHOTOGRAPH_MATCHES,
     POSED,
+    Layout,
     PipelineStage,
     StageWork,
 )
@@ -67,7 +68,7 @@ class MatchPhotographs(MatchMapping):
 
     name = "photograph_matches"
     uses = (*MATCHING_OPTIONS, "query_verification")
-    writes = (PHOTOGRAPH_MATCHES,)
+    outputs = (PHOTOGRAPH_MATCHES,)
 
     def verification(self) -> Verification:
         return self.options.verify_queries()
@@ -79,21 +80,18 @@ class FindPoses(PipelineStage):
     name = "poses"
     version = 2
     uses = (*LOCAL_TYPES, "query_verification")
-    writes = (POSED, f"{SIDE_TABLES}/{WORLD_FILE}", f"{SIDE_TABLES}/{UNREGISTERED_FILE}")
+    inputs = (Layout.mapping, SIDE_TABLES, LOCAL_FEATURES, PHOTOGRAPH_MATCHES)
+    outputs = (POSED, f"{SIDE_TABLES}/{WORLD_FILE}", f"{SIDE_TABLES}/{UNREGISTERED_FILE}")
 
     def __init__(self, options: PipelineOptions, structure: StructureOptions) -> None:
         super().__init__(options)
         self._structure = structure
 
-    @property
-    def reads(self) -> Sequence[str]:  # type: ignore[override]
-        return (self.layout.mapping, SIDE_TABLES, LOCAL_FEATURES, PHOTOGRAPH_MATCHES)
-
     def settings(self) -> dict[str, Any]:
         return {**super().settings(), "structure": self._structure.model_dump(mode="json")}
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        mapping = work.folder(self.layout.mapping, FEATURES, PHOTOGRAPH_MATCHES)
+        mapping = work.folder(self.layout.mapping(), FEATURES, PHOTOGRAPH_MATCHES)
         data, structure = mapping.read(), self._structure
         models = self._models(work, mapping, data)
         world, model, counts = _scaled(models[0], structure)
