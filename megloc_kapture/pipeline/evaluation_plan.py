@@ -32,8 +32,7 @@ from megloc_kapture.stages.matches import MatchMapping, MatchQueries
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.pose_refinement import RefinePoses
 from megloc_kapture.stages.preprocessing import Preprocess
-from megloc_kapture.stages.pyramid_mapping import PyramidMapping
-from megloc_kapture.stages.pyramid_queries import PyramidQueries
+from megloc_kapture.stages.pyramid_mapping import PyramidMapping, PyramidQueries
 from megloc_kapture.stages.query_poses import LocalizeQueries
 from megloc_kapture.stages.stage import (
     EVALUATION,
