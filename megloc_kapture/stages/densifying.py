@@ -171,8 +171,7 @@ def densify_map(
         output, with_depth_sensors(data, [job.image for job in done], options.max_size_px)
     )
     link_images_and_masks(source, output)
-    for type_name in sorted({*source.types("keypoints"), *source.types("descriptors")}):
-        copy_features(source, output, type_name, link_own=link_features)
+    copy_features(source, output, link_own=link_features)
     num_lifted = write_points(source, output, lifted)
     write_depth_rows(output / DEPTH_FILE, rows)
     return {

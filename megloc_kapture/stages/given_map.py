@@ -115,7 +115,7 @@ def given_map(reference: KaptureFolder, mapping: KaptureFolder, output: Path) ->
     number = np.cumsum(kept) - 1
     write_sensors(output, reference.read())
     link_images(reference.root, output)
-    copy_features(source, output, local_type)  # leaves what is there as it is
+    copy_features(source, output, [local_type])  # leaves what is there as it is
     write_points3d(output, xyz_rgb[kept])
     observations = Observations(
         local_type, seen.image_names, number[seen.point_ids], seen.image_ids, seen.keypoint_ids
@@ -163,8 +163,7 @@ def join_maps(first: KaptureFolder, second: KaptureFolder, output: Path) -> dict
     write_sensors(output, first.read())
     link_images(first.root, output)
     for folder, types in zip((first, second), types_of, strict=True):
-        for local_type in {*types, *map(base_type, types)}.intersection(folder.types("keypoints")):
-            copy_features(folder, output, local_type)
+        copy_features(folder, output, {*types, *map(base_type, types)})
     write_points3d(output, np.concatenate([first.points3d(), second.points3d()]))
     write_observations(output, observations)
     return {

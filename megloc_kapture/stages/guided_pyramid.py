@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import astuple, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -269,7 +269,8 @@ class PyramidFeatures:
             self.write(image, px, descriptors)
 
 
-class Spooled(NamedTuple):
+@dataclass(frozen=True)
+class Spooled:
     """Where in the spool the matches of a variant begin, and how many they are."""
 
     variant: ImageVariant

@@ -1,9 +1,14 @@
-"""The localized queries as a kapture folder, with what became of each beside it."""
+"""The localized queries as a kapture folder, with what became of each beside it.
+
+A query whose image cannot be used is set aside at import, and failed with the reason in the end:
+one broken photograph must not end the run of all others, and counts as a miss.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -62,11 +67,11 @@ def write_localized(
     """
     data = query.read() if isinstance(query, KaptureFolder) else query
     named = sorted(results, key=lambda result: result[0])
+    found = {image: result for image, result in named if isinstance(result, Pose)}
     guesses: Mapping[str, tuple[str, RigidTransform]] = {}
     if fallback == "retrieval":
         guesses = first_candidates or {}
     elif fallback == "rig":
-        found = {image: result for image, result in named if isinstance(result, Pose)}
         guesses = poses_through_rig(data, found)
     poses: dict[tuple[int, str], RigidTransform] = {}
     sensors, records = dict(data.sensors), dict(data.records_camera)
@@ -85,45 +90,38 @@ def write_localized(
             poses[record] = result.cam_from_world
         elif guess is not None:
             poses[data.record_of(image)] = guess[1]
-    write_sensors(
-        output,
-        KaptureData(
-            sensors=sensors,
-            rigs={},
-            trajectories=poses,
-            records_camera=records,
-            records_depth={},
-        ),
-    )
+    write_sensors(output, KaptureData(sensors=sensors, trajectories=poses, records_camera=records))
     if isinstance(query, KaptureFolder):
         link_images(query.root, output)
     write_status(output / STATUS_FILE, statuses)
     write_clusters(
         output / CLUSTERS_FILE,
         (
-            (image, result.clusters, result.cluster if isinstance(result, Pose) else None)
+            (image, result.clusters, found[image].cluster if result else None)
             for image, result in named
         ),
     )
-    refinements = [
-        row for _, result in named if isinstance(result, Pose) for row in result.refinements
-    ]
+    refinements = [row for pose in found.values() for row in pose.refinements]
     if refinements:
         write_refinement(output / REFINEMENT_FILE, refinements)
     if timing is not None:
-        rows = (
-            (image, step, f"{seconds:.5f}")
-            for image, result in named
-            for step, seconds in result.seconds.items()
-        )
-        write_csv_table(timing, ("image", "step", "seconds"), rows)
-    localized = sum(bool(result) for _, result in named)
+        write_timing(timing, named)
     return {
         "queries": len(named),
-        "localized": localized,
-        "failed": len(named) - localized,
-        "fallbacks": len(poses) - localized,
+        "localized": len(found),
+        "failed": len(named) - len(found),
+        "fallbacks": len(poses) - len(found),
     }
+
+
+def write_timing(path: Path, results: Iterable[tuple[str, Pose | Failure]]) -> None:
+    """Write the seconds of each query and step."""
+    rows = (
+        (image, step, f"{seconds:.5f}")
+        for image, result in results
+        for step, seconds in result.seconds.items()
+    )
+    write_csv_table(path, ("image", "step", "seconds"), rows)
 
 
 # fields of a pose that JSON gives back as something else
@@ -190,8 +188,7 @@ def set_aside_unreadable(query: Path, tables: Path, work: Work) -> Mapping[str, 
     folder = KaptureFolder(query)
     data = folder.read()
     names = data.image_names()
-    spec = FolderSpec(folder)
-    faults = work.map(_fault, [(spec, name) for name in names], "reading queries")
+    faults = work.map(partial(_fault, FolderSpec(folder)), names, "reading queries")
     reasons = {name: fault for name, fault in zip(names, faults, strict=True) if fault}
     if not reasons:
         return {}
@@ -214,8 +211,7 @@ def unreadable_image(name: str, reason: str) -> Failure:
     return Failure(f"the image cannot be used: {reason}", name=name)
 
 
-def _fault(job: tuple[FolderSpec, str]) -> str:
-    spec, name = job
+def _fault(spec: FolderSpec, name: str) -> str:
     folder = spec.open()
     try:
         read_image_of(folder.image_path(name), folder.read().camera_of(name))

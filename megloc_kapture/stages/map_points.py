@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.files import link_images
-from megloc_kapture.io.images import read_depth_map
 from megloc_kapture.io.kapture import (
     KaptureFolder,
     Observations,
@@ -21,7 +20,7 @@ from megloc_kapture.io.kapture import (
 )
 from megloc_kapture.mapping.depth import LiftingOptions, lift_keypoints
 from megloc_kapture.stages.given_map import given_map, given_type, has_descriptors, join_maps
-from megloc_kapture.stages.rigs import DepthRecord, depth_records
+from megloc_kapture.stages.rigs import DepthRecord, depth_records, read_depth
 from megloc_kapture.stages.stage import (
     FEATURES,
     GLOBAL_FEATURES,
@@ -36,15 +35,6 @@ from megloc_kapture.stages.stage import (
 )
 from megloc_kapture.stages.triangulation import copy_features, triangulate_map
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
-
-
-@dataclass(frozen=True)
-class _Job:
-    folder: FolderSpec
-    local_type: str
-    image: str
-    depth: DepthRecord
-    options: LiftingOptions
 
 
 def lift_map(
@@ -80,27 +70,33 @@ def lift_map(
             "rig with camera and depth sensor)",
             path=mapping.root,
         )
-    spec = FolderSpec(mapping)
-    row_of = {image: row for row, image in enumerate(images)}
+    spec, row_of = FolderSpec(mapping), {image: row for row, image in enumerate(images)}
+    jobs = [(image, records[image]) for image in with_depth]
     points: list[NDArray[np.float64]] = []
     seen: dict[str, Observations] = {}
     total = 0
     for local_type in local_types:
-        jobs = [_Job(spec, local_type, image, records[image], options) for image in with_depth]
         image_ids: list[NDArray[np.int32]] = []
         keypoint_ids: list[NDArray[np.int32]] = []
-        results = work.map(_lift, jobs, f"lifting {local_type}")
+        lift = partial(_lift, spec, local_type, options)
+        results = work.map(lift, jobs, f"lifting {local_type}")
         for image, (lifted, ids) in zip(with_depth, results, strict=True):
             points.append(poses[image].inverse().apply(lifted))
             image_ids.append(np.full(len(ids), row_of[image], np.int32))
             keypoint_ids.append(ids)
-        seen[local_type] = _observations(local_type, images, image_ids, keypoint_ids, total)
-        total += len(seen[local_type])
+        keypoints = np.concatenate(keypoint_ids)
+        seen[local_type] = Observations(
+            keypoints_type=local_type,
+            image_names=tuple(images),
+            point_ids=total + np.arange(len(keypoints)),
+            image_ids=np.concatenate(image_ids),
+            keypoint_ids=keypoints,
+        )
+        total += len(keypoints)
     xyz = np.concatenate(points)
     write_sensors(output, data)
     link_images(mapping.root, output)
-    for local_type in local_types:
-        copy_features(mapping, output, local_type)
+    copy_features(mapping, output, local_types)
     write_points3d(output, np.concatenate([xyz, np.zeros_like(xyz)], axis=1))
     write_observations(output, seen)
     return {
@@ -110,38 +106,19 @@ def lift_map(
     }
 
 
-def _observations(
-    local_type: str,
-    images: Sequence[str],
-    image_ids: Sequence[NDArray[np.int32]],
-    keypoint_ids: Sequence[NDArray[np.int32]],
-    first_point: int,
-) -> Observations:
-    keypoints = np.concatenate(keypoint_ids)
-    return Observations(
-        keypoints_type=local_type,
-        image_names=tuple(images),
-        point_ids=first_point + np.arange(len(keypoints)),
-        image_ids=np.concatenate(image_ids),
-        keypoint_ids=keypoints,
-    )
-
-
-def _lift(job: _Job) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+def _lift(
+    spec: FolderSpec, local_type: str, options: LiftingOptions, job: tuple[str, DepthRecord]
+) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     """Points in the image's camera frame (N, 3), and the keypoints they belong to (N,)."""
-    folder = job.folder.open()
-    depth_m = read_depth_map(
-        folder.image_path(job.depth.path),
-        width=job.depth.camera.width,
-        height=job.depth.camera.height,
-    )
+    image, depth = job
+    folder = spec.open()
     points, valid = lift_keypoints(
-        folder.keypoints(job.local_type).read(job.image),
-        depth_m,
-        folder.read().camera_of(job.image),
-        job.depth.camera,
-        job.depth.image_from_depth,
-        job.options,
+        folder.keypoints(local_type).read(image),
+        read_depth(folder, depth),
+        folder.read().camera_of(image),
+        depth.camera,
+        depth.image_from_depth,
+        options,
     )
     return points[valid], np.flatnonzero(valid).astype(np.int32)
 
@@ -243,21 +220,20 @@ class TriangulatePoints(PipelineStage):
         return self.options.triangulates()
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        joined = self.options.uses_given_map()
+        joined, options = self.options.uses_given_map(), self.options
         mapping = work.folder(self.layout.mapping(), FEATURES, *self.layout.mapping_matches())
-        own = work.out / ("map_own" if joined else UNREFINED)
+        own, given = work.out / ("map_own" if joined else UNREFINED), work.out / "map_given"
         counts = triangulate_map(
             mapping,
             mapping,
-            self.options.point_types(),
+            options.point_types(),
             own,
-            self.options.triangulation,
+            options.triangulation,
             num_threads=work.num_threads,
             work=work,
         )
         if not joined:
             return counts
-        given = work.out / "map_given"
         write_given_map(work, self, given)
         both = join_maps(KaptureFolder(own), KaptureFolder(given), work.out / UNREFINED)
         return {**both, "points_triangulated": counts["points"]}

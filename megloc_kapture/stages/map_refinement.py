@@ -8,8 +8,8 @@ in ``reconstruction/point_covariances.npy``.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,6 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.files import link_images, write_json_model
-from megloc_kapture.io.images import read_depth_map
 from megloc_kapture.io.kapture import (
     FeatureReader,
     KaptureData,
@@ -45,7 +44,7 @@ from megloc_kapture.mapping.rejection import (
     track_lengths,
 )
 from megloc_kapture.mapping.uncertainty import point_covariances, point_deviations
-from megloc_kapture.stages.rigs import DepthRecord, depth_records
+from megloc_kapture.stages.rigs import DepthRecord, depth_records, read_depth
 from megloc_kapture.stages.stage import UNREFINED, Layout, PipelineStage, StageWork
 from megloc_kapture.stages.triangulation import copy_features
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
@@ -92,16 +91,13 @@ class MapSelection:
         point_ids = _joined([seen.point_ids for seen in types], np.int64)
         image_ids = _joined(rows, np.int32)
         # of several types, sorted by point as those of one are
-        self._order = None if len(types) == 1 else np.argsort(point_ids, kind="stable")
-        self.point_ids, self.image_ids = self._sorted(point_ids), self._sorted(image_ids)
+        self._order: Any = slice(None) if len(types) == 1 else np.argsort(point_ids, kind="stable")
+        self.point_ids, self.image_ids = point_ids[self._order], image_ids[self._order]
         self.kept_points = np.ones(len(self.xyz), dtype=bool)
         self.kept = np.ones(len(self.point_ids), dtype=bool)
         self._placed = posed[self.image_ids] if len(posed) else self.kept.copy()
         self.reports: list[FilterReport] = []
         self._covariances: Floats | None = None
-
-    def _sorted(self, values: NDArray[Any]) -> NDArray[Any]:
-        return values if self._order is None else values[self._order]
 
     @cached_property
     def _views(self) -> tuple[list[Any], list[Any]]:
@@ -184,14 +180,12 @@ class MapSelection:
             posed = [self._poses[row] is not None for row in rows]
             reader = self.source.keypoints(name) if name in self.source.types("keypoints") else None
             found.append(_keypoints_of(reader, seen, in_type, posed))
-        return self._sorted(_joined(found, np.float32).reshape(-1, 2))
+        return _joined(found, np.float32).reshape(-1, 2)[self._order]
 
     def observations(self) -> dict[str, Observations]:
         """What is in, by type, points renumbered."""
-        kept = self.kept
-        if self._order is not None:
-            kept = np.empty_like(self.kept)
-            kept[self._order] = self.kept
+        kept = np.empty_like(self.kept)
+        kept[self._order] = self.kept
         number = np.cumsum(self.kept_points) - 1
         parts = np.split(kept, np.cumsum(self._sizes)[:-1]) if self._sizes else []
         return {
@@ -279,15 +273,6 @@ class RefinementReport(BaseModel):
     options: MapRefinementOptions
 
 
-@dataclass(frozen=True)
-class _DepthJob:
-    folder: FolderSpec
-    depth: DepthRecord
-    points_in_image: Floats
-    deviations: Floats
-    options: DepthVerificationOptions
-
-
 def refine_map(
     source: KaptureFolder,
     output: Path,
@@ -325,20 +310,18 @@ def refine_map(
     _verify_depth(selection, options.depth, work)
     _check_consistency(selection, options.consistency)
     _reject_uncertain(selection, options.uncertainty)
+    kept = selection.kept_points
     report = RefinementReport(
         points_before=len(selection.xyz),
         observations_before=len(selection.kept),
-        points_after=int(selection.kept_points.sum()),
+        points_after=int(kept.sum()),
         observations_after=int(selection.kept.sum()),
         filters=tuple(selection.reports),
         options=options,
     )
-
     write_sensors(output, selection.data)
     link_images(source.root, output)
-    for type_name in sorted({*source.types("keypoints"), *source.types("descriptors")}):
-        copy_features(source, output, type_name, link_own=link_features)
-    kept = selection.kept_points
+    copy_features(source, output, link_own=link_features)
     write_points3d(output, source.points3d()[kept])
     write_observations(output, selection.observations())
     covariances = selection.covariances()
@@ -373,7 +356,6 @@ def _verify_depth(
         return
     covariances = selection.covariances()
     observed, placed = selection.observed()
-    spec = FolderSpec(folder)
     rows_of = [(image, rows) for image, rows in observed.by_image() if image in with_depth]
 
     def job(image: int, rows: NDArray[np.int64]) -> _DepthJob:
@@ -381,16 +363,21 @@ def _verify_depth(
         pose = observed.cams_from_world[image]
         axis = (depth.image_from_depth.inverse() @ pose).rotation_matrix()[2]
         variances = _quadratic_form(covariances[points], axis)
-        return _DepthJob(spec, depth, pose.apply(observed.xyz[points]), np.sqrt(variances), options)
+        return depth, pose.apply(observed.xyz[points]), np.sqrt(variances)
 
     dropped = np.zeros(len(selection.kept), dtype=bool)
     num_checked = 0
     jobs = (job(image, rows) for image, rows in rows_of)
-    results = work.map(_compare, jobs, "depth", len(rows_of))
+    compare = partial(_compare, FolderSpec(folder), options)
+    results = work.map(compare, jobs, "depth", len(rows_of))
     for (_, rows), (contradicted, checked) in zip(rows_of, results, strict=True):
         dropped[placed[rows[contradicted]]] = True
         num_checked += checked
     selection.drop_observations("depth", dropped, num_checked)
+
+
+# of an image: its depth, points (N, 3) in its frame, their deviations (N,) along the depth's axis
+_DepthJob = tuple[DepthRecord, Floats, Floats]
 
 
 def _quadratic_form(covariances: Floats, axis: Floats) -> Floats:
@@ -400,18 +387,17 @@ def _quadratic_form(covariances: Floats, axis: Floats) -> Floats:
     return np.maximum(covariances @ weights, 0.0)
 
 
-def _compare(job: _DepthJob) -> tuple[Mask, int]:
-    camera = job.depth.camera
-    depth_m = read_depth_map(
-        job.folder.open().depth_path(job.depth.path), width=camera.width, height=camera.height
-    )
+def _compare(
+    folder: FolderSpec, options: DepthVerificationOptions, job: _DepthJob
+) -> tuple[Mask, int]:
+    depth, points, deviations = job
     contradicted, checked = contradicted_by_depth(
-        job.points_in_image,
-        depth_m,
-        camera,
-        job.depth.image_from_depth,
-        job.options,
-        deviations=job.deviations,
+        points,
+        read_depth(folder.open(), depth),
+        depth.camera,
+        depth.image_from_depth,
+        options,
+        deviations=deviations,
     )
     return contradicted, int(checked.sum())
 
@@ -472,7 +458,5 @@ class RefineMap(PipelineStage):
     outputs = (Layout.sparse_map,)
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        folder, options = work.folder(UNREFINED), self.options.refinement
-        return refine_map(
-            folder, work.out / self.layout.sparse_map(), options, link_features=True, work=work
-        )
+        folder, out = work.folder(UNREFINED), work.out / self.layout.sparse_map()
+        return refine_map(folder, out, self.options.refinement, link_features=True, work=work)

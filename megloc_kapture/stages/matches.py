@@ -152,7 +152,10 @@ def match_pairs(
     specs = FolderSpec(first), FolderSpec(second)
     read = partial(_read, specs, local_type)
     verify = partial(_verify, specs, local_type, verification)
-    steps = Batched(read, partial(_match, matcher), matcher, "match_many", None, verify)
+    match: Any = partial(_match, matcher)
+    steps: Batched[_Job, list[VerifiedMatches]] = Batched(
+        read, match, matcher, "match_many", None, verify
+    )
     writer = MatchesWriter(output, local_type, orphan=True)
     results = work.map(steps, jobs, items.label("matching"))
     for (image, others), found in zip(jobs, results, strict=True):

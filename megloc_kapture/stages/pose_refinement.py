@@ -8,7 +8,7 @@ import shutil
 import threading
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, astuple, dataclass, fields, replace
+from dataclasses import asdict, astuple, fields, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
 
@@ -16,7 +16,6 @@ from pydantic import Field, TypeAdapter
 
 from megloc_kapture.errors import OptionError, PluginError
 from megloc_kapture.geometry.poses import movement
-from megloc_kapture.io.csv_table import write_csv_table
 from megloc_kapture.io.dataset_tables import METRES, SIDE_TABLES, unit_of
 from megloc_kapture.io.files import link_images
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
@@ -51,7 +50,7 @@ from megloc_kapture.refinement.consistency import (
 )
 from megloc_kapture.refinement.references import ReferenceImages
 from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
-from megloc_kapture.stages.localized_folder import plain_result, pose_of
+from megloc_kapture.stages.localized_folder import plain_result, pose_of, write_timing
 from megloc_kapture.stages.ranking_scene import KaptureScene, image_inputs
 from megloc_kapture.stages.stage import (
     LOCALIZED,
@@ -181,8 +180,8 @@ class MapRefiners:
                 self._verdicts[frame] = _VERDICTS.validate_python(items.done[frame])
 
     def _judge(self, refiner: HoldsOut, images: ReferenceImages, work: Work) -> Consistency:
-        jobs = (_HeldOut(self.map, refiner, image, images) for image in spread_names(images.names))
-        return judge_consistency(ordered_map(_hold_out, jobs, work.executor, window=_WINDOW))
+        hold_out, spread = partial(_hold_out, self.map, refiner, images), spread_names(images.names)
+        return judge_consistency(ordered_map(hold_out, spread, work.executor, window=_WINDOW))
 
     def tested(self) -> list[ConsistencyRow]:
         """The rows of ``map_consistency.csv``: by refiner, then by frame."""
@@ -212,16 +211,10 @@ class MapRefiners:
         return refine_pose(image, camera, pose, *self.uses(pose), self.refiners, scene)
 
 
-@dataclass(frozen=True)
-class _HeldOut:
-    map: FolderSpec
-    refiner: HoldsOut
-    image: str
-    images: ReferenceImages
-
-
-def _hold_out(job: _HeldOut) -> Displacement | None:
-    return job.refiner.hold_out(job.image, job.images, KaptureScene(job.map.open()))
+def _hold_out(
+    mapping: FolderSpec, refiner: HoldsOut, images: ReferenceImages, image: str
+) -> Displacement | None:
+    return refiner.hold_out(image, images, KaptureScene(mapping.open()))
 
 
 def _consistency_row(frame: str, method: str, found: Consistency) -> ConsistencyRow:
@@ -295,17 +288,6 @@ def _row(
     )
 
 
-@dataclass(frozen=True)
-class _Job:
-    map: FolderSpec
-    query: FolderSpec
-    image: str
-    pose: Pose
-    references: tuple[str, ...]
-    distrusted: tuple[str, ...]
-    refiners: tuple[PoseRefiner, ...]
-
-
 def refine_poses(
     map_folder: KaptureFolder,
     query: KaptureFolder,
@@ -344,7 +326,6 @@ def refine_poses(
     refiners = MapRefiners(map_folder, restrictions, options)
     statuses = read_status(localized.root / STATUS_FILE)
     data = localized.read()
-    query_spec = FolderSpec(query)
     poses = {
         image: Pose(pose, row.num_matches, row.num_inliers, candidates=row.candidates)
         for image, row in statuses.items()
@@ -360,28 +341,20 @@ def refine_poses(
         return [refiners.map_content(digest), *own]
 
     items = work.items("refined", list(poses), inputs)
-    jobs = [
-        _Job(refiners.map, query_spec, image, pose, *uses[image], refiners.refiners)
-        for image, pose in poses.items()
-        if image not in items.done
-    ]
-    found = {image: pose_of(plain) for image, plain in items.done.items()}
-    results = work.map(_refine, jobs, items.label("refining"))
-    for job, refined in zip(jobs, results, strict=True):
-        found[job.image] = refined
-        items.add(job.image, (), plain_result(refined))
-    found = {image: found[image] for image in poses}
+    jobs = [(image, pose, *uses[image]) for image, pose in poses.items() if image not in items.done]
+    kept = {image: pose_of(plain) for image, plain in items.done.items()}
+    refine = partial(_refine, refiners.map, FolderSpec(query), refiners.refiners)
+    results = work.map(refine, jobs, items.label("refining"))
+    for (image, *_), refined in zip(jobs, results, strict=True):
+        kept[image] = refined
+        items.add(image, (), plain_result(refined))
+    found = {image: kept[image] for image in poses}
     _write(output, data, localized, statuses, found)
     tested = refiners.tested()
     if tested:
         write_consistency(output / CONSISTENCY_FILE, tested)
     if timing is not None:
-        rows = (
-            (image, step, f"{seconds:.5f}")
-            for image, refined in found.items()
-            for step, seconds in refined.seconds.items()
-        )
-        write_csv_table(timing, ("image", "step", "seconds"), rows)
+        write_timing(timing, found.items())
     counts: dict[str, float] = {"queries": len(jobs)}
     for refiner in refiners.refiners:
         counts[f"accepted_by_{refiner.name}"] = sum(
@@ -407,15 +380,10 @@ def _write(
         poses[data.record_of(image)] = refined.cam_from_world
     write_sensors(output, replace(data, trajectories=poses))
     link_images(localized.root, output)
-    write_status(
-        output / STATUS_FILE,
-        (
-            status.model_copy(update={"refinement": refinement_text(found[image].refinements)})
-            if image in found
-            else status
-            for image, status in statuses.items()
-        ),
-    )
+    for image, refined in found.items():
+        told = {"refinement": refinement_text(refined.refinements)}
+        statuses[image] = statuses[image].model_copy(update=told)
+    write_status(output / STATUS_FILE, statuses.values())
     clusters = localized.root / CLUSTERS_FILE
     if clusters.is_file():
         shutil.copyfile(clusters, output / CLUSTERS_FILE)
@@ -424,17 +392,15 @@ def _write(
     )
 
 
-def _refine(job: _Job) -> Pose:
-    mapping, query = job.map.open(), job.query.open()
-    return refine_pose(
-        job.image,
-        query.read().camera_of(job.image),
-        job.pose,
-        job.references,
-        job.distrusted,
-        job.refiners,
-        KaptureScene(mapping, query),
-    )
+def _refine(
+    mapping: FolderSpec,
+    query: FolderSpec,
+    refiners: Sequence[PoseRefiner],
+    job: tuple[str, Pose, Sequence[str], Sequence[str]],
+) -> Pose:
+    image, pose, references, distrusted = job
+    scene, camera = KaptureScene(mapping.open(), query.open()), query.open().read().camera_of(image)
+    return refine_pose(image, camera, pose, references, distrusted, refiners, scene)
 
 
 class RefinePoses(PipelineStage):

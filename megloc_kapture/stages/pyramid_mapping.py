@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from functools import cache, partial
 from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -249,6 +249,7 @@ class _AllMatched:
         """The matches of a pair with those of the variants of both its images, and its row."""
         if method.options.mode == "off":
             raise ValueError("only pairs that are tried again are combined")
+        sides: tuple[tuple[str, Literal[0, 1], _Pair], ...]
         sides = (("image", 0, pair), ("other", 1, pair[::-1]))
         directed = [(*side, self._found[side[2]]) for side in sides if side[2] in self._found]
         spooled = [(name, side, at) for name, side, _, (found, *_) in directed for at in found]

@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.images import read_depth_map
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.plugins import DepthView
 from megloc_kapture.stages.local_features import mask_path, read_image_of, read_mask
-from megloc_kapture.stages.rigs import DepthRecord, depth_records
+from megloc_kapture.stages.rigs import DepthRecord, depth_records, read_depth
 from megloc_kapture.stages.work import Digest
 from megloc_kapture.values import Camera, RigidTransform
 
@@ -39,11 +38,7 @@ class _Images:
         record = self._depth_records.get(name)
         if record is None:
             return None
-        depth_m = read_depth_map(
-            self.folder.depth_path(record.path),
-            width=record.camera.width,
-            height=record.camera.height,
-        )
+        depth_m = read_depth(self.folder, record)
         return DepthView(record.camera, depth_m, record.image_from_depth)
 
     def points(self, name: str) -> NDArray[np.float64]:

@@ -6,8 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from megloc_kapture.io.kapture import KaptureData
+from megloc_kapture.io.images import read_depth_map
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder
 from megloc_kapture.values import Camera, Pose, RigidTransform
 
 Unit = tuple[tuple[str, RigidTransform], ...]
@@ -110,6 +112,12 @@ def depth_records(data: KaptureData) -> dict[str, DepthRecord]:
             )
             found[image] = DepthRecord(path, data.sensors[sensor].camera(), image_from_depth)
     return found
+
+
+def read_depth(folder: KaptureFolder, record: DepthRecord) -> NDArray[np.float32]:
+    """Depth (H, W) of a record, 0 where nothing is known; raises DataError."""
+    size = {"width": record.camera.width, "height": record.camera.height}
+    return read_depth_map(folder.depth_path(record.path), **size)
 
 
 def _rigs_of(data: KaptureData) -> dict[str, list[str]]:

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.files import link_images, link_records
-from megloc_kapture.io.images import read_depth_map
 from megloc_kapture.io.kapture import (
     KaptureData,
     KaptureFolder,
@@ -37,7 +36,7 @@ from megloc_kapture.mvs.consistency import AgreementOptions, agreeing_views
 from megloc_kapture.mvs.views import pinhole_matrix, stereo_camera, stereo_view
 from megloc_kapture.plugins import StereoView
 from megloc_kapture.stages.local_features import read_image_of
-from megloc_kapture.stages.rigs import DepthRecord, depth_records
+from megloc_kapture.stages.rigs import depth_records, read_depth
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
 from megloc_kapture.values import RigidTransform
 
@@ -64,12 +63,6 @@ def stereo_images(folder: KaptureFolder) -> dict[str, tuple[str, ...]]:
     path = folder.root / DEPTH_FILE
     rows = read_depth_rows(path) if path.is_file() else []
     return {row.image: row.sources for row in sorted(rows, key=lambda r: r.image) if not row.reason}
-
-
-def read_stereo_depth(folder: KaptureFolder, record: DepthRecord) -> NDArray[np.float32]:
-    """Depth (H, W) of a record, 0 where nothing is known; raises DataError."""
-    size = {"width": record.camera.width, "height": record.camera.height}
-    return read_depth_map(folder.depth_path(record.path), **size)
 
 
 def depth_path(image: str) -> str:
@@ -292,4 +285,4 @@ def _view_with_depth(folder: KaptureFolder, image: str) -> tuple[StereoView, NDA
     pixels = read_image_of(folder.image_path(image), data.camera_of(image))
     longer = max(record.camera.width, record.camera.height)
     view = stereo_view(pixels, data.camera_of(image), data.poses()[image], None, longer)
-    return view, read_stereo_depth(folder, record)
+    return view, read_depth(folder, record)

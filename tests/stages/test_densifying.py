@@ -27,13 +27,12 @@ from megloc_kapture.localization.map_index import observed_matches
 from megloc_kapture.mapping.uncertainty import point_deviations
 from megloc_kapture.plugins import PluginChoice
 from megloc_kapture.stages.densifying import DensifyOptions, densify_map, fitted_to_poses
-from megloc_kapture.stages.rigs import depth_records
+from megloc_kapture.stages.rigs import depth_records, read_depth
 from megloc_kapture.stages.shared_index import index_map
 from megloc_kapture.stages.stereo_depth import (
     DEPTH_FILE,
     fuse_depth,
     read_beside,
-    read_stereo_depth,
     side_file,
 )
 from megloc_kapture.stages.work import Work
@@ -142,7 +141,7 @@ def test_depth_is_as_sure_and_as_fine_as_the_poses(
     for image, record in depth_records(found.read()).items():
         camera = record.camera
         assert max(camera.width, camera.height) == fitted.max_size_px
-        depth = read_stereo_depth(found, record)
+        depth = read_depth(found, record)
         size = depth.shape[::-1]
         exact = cv2.resize(depth_m(truth[image]), size, interpolation=cv2.INTER_NEAREST)
         known = (depth > 0) & (exact > 0)
