@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import lru_cache, partial
-from operator import attrgetter
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +24,7 @@ from megloc_kapture.plugins import (
 )
 from megloc_kapture.plugins import GlobalFeatureExtractor, PluginChoice
 from megloc_kapture.stages.devices import in_batches
-from megloc_kapture.stages.local_features import image_inputs, read_image_of
+from megloc_kapture.stages.local_features import image_inputs, images_of, read_image_of
 from megloc_kapture.stages.map_points import described_images
 from megloc_kapture.stages.shared_index import write_array
 from megloc_kapture.stages.stage import (
@@ -52,23 +50,8 @@ class VladSettings(Options):
     options: VladOptions
 
 
-@dataclass(frozen=True)
-class _Descriptors:
-    """Reads descriptors, here or in a worker."""
-
-    folder: FolderSpec
-    local_type: str
-
-    def __call__(self, image: str) -> NDArray[Any]:
-        return self.folder.open().descriptors(self.local_type).read(image)
-
-
-@dataclass(frozen=True)
-class _VladJob:
-    read: _Descriptors
-    image: str
-    vocabulary: Path
-    run: tuple[object, ...]
+def _descriptors(folder: FolderSpec, local_type: str, image: str) -> NDArray[Any]:
+    return folder.open().descriptors(local_type).read(image)
 
 
 def vlad_type(local_type: str) -> str:
@@ -93,7 +76,7 @@ def train_on_map(
     descriptors = mapping.descriptors(local_type)
     if not any(descriptors.length(image) for image in images):
         raise DataError(f"the map has no descriptors of type {local_type}", path=mapping.root)
-    read = _Descriptors(FolderSpec(mapping), local_type)
+    read = partial(_descriptors, FolderSpec(mapping), local_type)
     each = partial(ordered_map, executor=work.executor)
     return train_vlad(images, descriptors.length, read, options, each=each)
 
@@ -134,30 +117,30 @@ def extract_vlad(
         trained.add(type_name, files, said)
     num_centres, size, content = trained.done[type_name]
     config = FeatureConfig(type_name, np.dtype(np.float32), size, metric_type="L2")
-    run = FolderSpec(mapping).key
-    jobs, readers = [], {}
-    for folder in folders:
-        read, reader = _Descriptors(FolderSpec(folder), local_type), folder.descriptors(local_type)
-        for image in folder.read().image_names():
-            jobs.append(_VladJob(read, image, place, run))
-            readers[image] = reader
-    jobs.sort(key=lambda job: job.image)
+    spec_of, folder_of = cache(FolderSpec), images_of(folders, "describe")
+    readers = {folder: folder.descriptors(local_type) for folder in folders}
     items = work.items(
         type_name,
-        list(readers),
-        lambda image, digest: [content, feature_inputs(readers[image], image, digest)],
+        list(folder_of),
+        lambda image, digest: [content, feature_inputs(readers[folder_of[image]], image, digest)],
     )
-    todo = [job for job in jobs if job.image not in items.done]
+    todo = [
+        (image, spec_of(folder)) for image, folder in folder_of.items() if image not in items.done
+    ]
     writer = FeatureWriter(output, "global_features", type_name, config, orphan=True)
-    results = work.map(_aggregate, todo, items.label("VLAD"))
-    for job, vector in zip(todo, results, strict=True):
-        items.add(job.image, writer.write(job.image, vector))
-    return {"images": len(jobs), "clusters": num_centres, "dimensions": size}
+    describe = partial(_aggregate, local_type, place, FolderSpec(mapping).key)
+    results = work.map(describe, todo, items.label("VLAD"))
+    for (image, _), vector in zip(todo, results, strict=True):
+        items.add(image, writer.write(image, vector))
+    return {"images": len(folder_of), "clusters": num_centres, "dimensions": size}
 
 
-def _aggregate(job: _VladJob) -> NDArray[np.float32]:
-    vocabulary, settings = _read_once(job.vocabulary, job.run)
-    return aggregate(job.read(job.image), vocabulary, settings.options)
+def _aggregate(
+    local_type: str, place: Path, run: tuple[object, ...], job: tuple[str, FolderSpec]
+) -> NDArray[np.float32]:
+    vocabulary, settings = _read_once(place, run)
+    image, folder = job
+    return aggregate(_descriptors(folder, local_type, image), vocabulary, settings.options)
 
 
 @lru_cache(maxsize=1)
@@ -225,7 +208,6 @@ def _read_array(path: Path, what: str) -> NDArray[np.float32]:
 
 
 VLAD = "vlad"
-_SIZE = attrgetter("camera.width", "camera.height")
 
 
 class VladChoiceOptions(VladOptions):
@@ -288,12 +270,7 @@ class GlobalFeaturesChoice(PluginChoice):
         return self.make().name
 
 
-@dataclass(frozen=True)
-class _Job:
-    extractor: GlobalFeatureExtractor
-    image: str
-    path: Path
-    camera: Camera
+_Job = tuple[str, Path, Camera]  # an image
 
 
 def extract_global_features(
@@ -315,34 +292,36 @@ def extract_global_features(
         image of the same name; there are no images.
     PluginError : the extractor breaks its protocol.
     """
-    folder_of = _images(folders)
+    folder_of = images_of(folders, "describe")
     items = work.items(
         extractor.name,
         list(folder_of),
         lambda image, digest: image_inputs(folder_of[image], image, digest)[:3],
     )
     jobs = [
-        _Job(extractor, image, folder.image_path(image), folder.read().camera_of(image))
+        (image, folder.image_path(image), folder.read().camera_of(image))
         for image, folder in folder_of.items()
         if image not in items.done
     ]
-    jobs.sort(key=_SIZE)  # images of one size can be a batch
+    jobs.sort(key=_size)  # images of one size can be a batch
+    describe = partial(_describe, extractor)
     steps: Batched[_Job, NDArray[np.float32]] = Batched(
-        _read, _describe, extractor, "describe_many", _SIZE
+        _read, describe, extractor, "describe_many", _size
     )
     writer: FeatureWriter | None = None
     size = 0
-    for job, vector in zip(jobs, work.map(steps, jobs, items.label(extractor.name)), strict=True):
+    results = work.map(steps, jobs, items.label(extractor.name))
+    for (image, *_), vector in zip(jobs, results, strict=True):
         if writer is None:
             size = len(vector)
             config = FeatureConfig(extractor.name, np.dtype(np.float32), size, metric_type="L2")
             writer = FeatureWriter(output, "global_features", extractor.name, config, orphan=True)
         if len(vector) != size:
             raise PluginError(
-                f"plugin {extractor.name!r} on image {job.image}: {len(vector)} "
+                f"plugin {extractor.name!r} on image {image}: {len(vector)} "
                 f"values, {size} of the images before"
             )
-        items.add(job.image, writer.write(job.image, vector))
+        items.add(image, writer.write(image, vector))
     return {"images": len(items.done)}
 
 
@@ -402,26 +381,18 @@ def _checked(
     return vectors
 
 
-def _images(folders: Sequence[KaptureFolder]) -> dict[str, KaptureFolder]:
-    """All images in order of their names, with their folders."""
-    named = sorted(
-        ((image, folder) for folder in folders for image in folder.read().image_names()),
-        key=lambda item: item[0],
-    )
-    for before, after in zip(named, named[1:], strict=False):
-        if before[0] == after[0]:
-            raise DataError(f"image {before[0]} stands in two kapture folders at once")
-    if not named:
-        raise DataError("there are no images to describe")
-    return dict(named)
+def _size(job: _Job) -> tuple[int, int]:
+    return job[2].width, job[2].height
 
 
 def _read(job: _Job) -> NDArray[np.uint8]:
-    return read_image_of(job.path, job.camera)
+    return read_image_of(*job[1:])
 
 
-def _describe(jobs: Sequence[_Job], images: Sequence[NDArray[np.uint8]]) -> Sequence[Any]:
-    return list(describe_images(jobs[0].extractor, images, [job.image for job in jobs]))
+def _describe(
+    extractor: GlobalFeatureExtractor, jobs: Sequence[_Job], images: Sequence[NDArray[np.uint8]]
+) -> Sequence[Any]:
+    return list(describe_images(extractor, images, [name for name, *_ in jobs]))
 
 
 class ExtractGlobalFeatures(PipelineStage):
@@ -451,16 +422,14 @@ class ExtractGlobalFeatures(PipelineStage):
         return [chosen.make() for chosen in self.options.global_features if not chosen.is_vlad]
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        queries = work.folders((self.layout.query(),), FEATURES)
-        counts = {}
+        queries, counts = work.folders((self.layout.query(),), FEATURES), {}
         for chosen in self.options.global_features:
             if chosen.is_vlad:
                 vlad = chosen.vlad_options()
-                local_type = vlad.local_type or self.options.main_type()
-                mapping = described_images(work, self, local_type)
-                found = extract_vlad(
-                    mapping, [mapping, *queries], local_type, work.out, vlad.of_vlad(), work=work
-                )
+                name = vlad.local_type or self.options.main_type()
+                mapping = described_images(work, self, name)
+                folders = [mapping, *queries]
+                found = extract_vlad(mapping, folders, name, work.out, vlad.of_vlad(), work=work)
             else:
                 folders = [work.folder(self.layout.mapping()), *queries]
                 found = extract_global_features(folders, chosen.make(), work.out, work=work)

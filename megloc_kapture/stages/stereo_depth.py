@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -139,37 +140,31 @@ def write_points(
     """
     points = source.points3d()
     covariances = read_point_covariances(source.root, len(points))
-    parts, uncertain = [points], [np.full((len(points), 6), np.nan)]
-    if covariances is not None:
+    if covariances is None:
+        uncertain = [np.full((len(points), 6), np.nan)]
+    else:
         uncertain = [np.asarray(covariances)]
-    observations = {}
-    total = len(points)
+    xyz, observations, total = [points], {}, len(points)
     for local_type, seen in source.observations().items():
-        new = lifted.get(local_type, {})
-        names = tuple(sorted({*seen.image_names, *new}))
+        new = sorted(lifted.get(local_type, {}).items())
+        names = tuple(sorted({*seen.image_names, *(image for image, _ in new)}))
         row_of = {name: row for row, name in enumerate(names)}
         rows = np.array([row_of[name] for name in seen.image_names], np.int32)
-        point_ids, image_ids, keypoint_ids = (
-            [seen.point_ids],
-            [rows[seen.image_ids] if len(rows) else seen.image_ids],
-            [seen.keypoint_ids],
-        )
-        for image, own in sorted(new.items()):
-            count = len(own.xyz)
-            parts.append(np.concatenate([own.xyz, np.zeros_like(own.xyz)], axis=1))
-            uncertain.append(own.covariances)
-            point_ids.append(total + np.arange(count))
-            image_ids.append(np.full(count, row_of[image], np.int32))
-            keypoint_ids.append(own.keypoint_ids.astype(np.int32))
-            total += count
+        image_ids = [rows[seen.image_ids] if len(rows) else seen.image_ids]
+        image_ids += [np.full(len(own.xyz), row_of[image], np.int32) for image, own in new]
+        keypoint_ids = [own.keypoint_ids.astype(np.int32) for _, own in new]
+        xyz += [np.concatenate([own.xyz, np.zeros_like(own.xyz)], axis=1) for _, own in new]
+        uncertain += [own.covariances for _, own in new]
+        count = sum(map(len, keypoint_ids))
         observations[local_type] = Observations(
             local_type,
             names,
-            np.concatenate(point_ids),
+            np.concatenate([seen.point_ids, total + np.arange(count)]),
             np.concatenate(image_ids),
-            np.concatenate(keypoint_ids),
+            np.concatenate([seen.keypoint_ids, *keypoint_ids]),
         )
-    write_points3d(output, np.concatenate(parts))
+        total += count
+    write_points3d(output, np.concatenate(xyz))
     write_observations(output, observations)
     if covariances is not None or total > len(points):
         write_point_covariances(output, np.concatenate(uncertain))
@@ -185,16 +180,6 @@ class Cloud(NamedTuple):
     normals: NDArray[np.float64]
     sigma_m: NDArray[np.float64]
     image_ids: NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class _Job:
-    folder: FolderSpec
-    row: int
-    image: str
-    earlier: tuple[str, ...]
-    agreement: AgreementOptions
-    share: float
 
 
 def fused_cloud(
@@ -219,15 +204,16 @@ def fused_cloud(
     ------
     DataError : something is broken; names the file.
     """
-    spec, records = FolderSpec(densified), depth_records(densified.read())
+    records = depth_records(densified.read())
     cameras = [records[image].camera for image in images if image in records]
     total = sum(camera.width * camera.height for camera in cameras)
     share = 1.0 if max_points is None else min(1.0, max_points / max(total, 1))
     jobs = [
-        _Job(spec, row, image, tuple(o for o in own if o < image and o in images), agreement, share)
+        (row, image, [other for other in own if other < image and other in images])
         for row, (image, own) in enumerate(images.items())
     ]
-    parts = list(work.map(_points, jobs, "cloud"))
+    points = partial(_points, FolderSpec(densified), agreement, share)
+    parts = list(work.map(points, jobs, "cloud"))
     nothing = Cloud(*(np.zeros(shape) for shape in ((0, 3), (0, 3), (0, 3), (0,), (0,))))
     return Cloud(*(np.concatenate(column) for column in zip(nothing, *parts, strict=True)))
 
@@ -254,28 +240,33 @@ def fuse_depth(
     return len(found.xyz)
 
 
-def _points(job: _Job) -> Cloud:
-    folder = job.folder.open()
-    view, depth = _view_with_depth(folder, job.image)
-    others = [_view_with_depth(folder, other) for other in job.earlier]
-    new = (depth > 0) & (agreeing_views(view, depth, others, job.agreement) == 0)
-    if job.share < 1:
-        new &= np.random.default_rng(job.row).random(new.shape) < job.share
+def _points(
+    spec: FolderSpec,
+    agreement: AgreementOptions,
+    share: float,
+    job: tuple[int, str, Sequence[str]],
+) -> Cloud:
+    (row, image, earlier), folder = job, spec.open()
+    view, depth = _view_with_depth(folder, image)
+    others = [_view_with_depth(folder, other) for other in earlier]
+    new = (depth > 0) & (agreeing_views(view, depth, others, agreement) == 0)
+    if share < 1:
+        new &= np.random.default_rng(row).random(new.shape) < share
     rows, columns = np.nonzero(new)
     pixels = np.stack([columns, rows, np.ones(len(rows))], axis=1)
     in_camera = pixels @ np.linalg.inv(pinhole_matrix(view.camera)).T * depth[new][:, None]
-    sigma = read_beside(folder.root, job.image, "sigma")
-    normals = read_beside(folder.root, job.image, "normals")
+    sigma = read_beside(folder.root, image, "sigma")
+    normals = read_beside(folder.root, image, "normals")
     if sigma is None or normals is None or not sigma.shape == normals.shape[:2] == depth.shape:
         raise DataError(
-            f"no deviations and normals of {job.image}, of the size of its depth", path=folder.root
+            f"no deviations and normals of {image}, of the size of its depth", path=folder.root
         )
     return Cloud(
         view.cam_from_world.inverse().apply(in_camera),
         view.image[new].astype(np.float64),
         normals[new].astype(np.float64) @ view.cam_from_world.rotation_matrix(),
         sigma[new].astype(np.float64),
-        np.full(len(rows), float(job.row)),
+        np.full(len(rows), float(row)),
     )
 
 
