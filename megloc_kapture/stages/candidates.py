@@ -43,9 +43,7 @@ class Restrictions:
     def read(cls, side_tables: Path) -> Restrictions:
         """From a workspace's ``megloc/`` folder; absent tables restrict nothing.
 
-        Raises
-        ------
-        DataError : a broken table.
+        Raises DataError: a broken table.
         """
         return cls(read_groups(side_tables), read_priors(side_tables))
 
@@ -217,9 +215,7 @@ def _search_part(part: _Part) -> list[Found]:
 def vectors_of(readers: Sequence[FeatureReader], images: Sequence[str]) -> list[KaptureVectors]:
     """Vectors of the images by type, unit rows, read when they are asked for.
 
-    Raises
-    ------
-    DataError : an image has none.
+    Raises DataError: an image has none.
     """
     for reader in readers:
         missing = [image for image in images if image not in reader]

@@ -132,17 +132,13 @@ def densify_map(
     link_features: bool = False,
     work: Work = HERE,
 ) -> dict[str, float]:
-    """Write a map with depth of its images.
+    """Write a map with depth of its images; returns counts for the log.
 
     Parameters
     ----------
     estimator : that of the options unless given.
     restrictions : images are compared within a frame, location and condition only.
     link_features : as of :func:`~megloc_kapture.stages.map_refinement.refine_map`.
-
-    Returns
-    -------
-    Counts for the log.
 
     Raises
     ------

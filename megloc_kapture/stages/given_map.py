@@ -37,9 +37,7 @@ _SAME_PLACE_PX = 0.1
 def given_type(reference: KaptureFolder) -> str:
     """The keypoints type of a given map.
 
-    Raises
-    ------
-    DataError : no points, or no or several types that observe them.
+    Raises DataError: no points, or no or several types that observe them.
     """
     if not reference.has_points():
         raise DataError(
@@ -60,9 +58,7 @@ def has_descriptors(reference: KaptureFolder) -> bool:
     """Whether every image that sees a point of a given map has descriptors; else the images'
     features have to be extracted anew for :func:`given_map`.
 
-    Raises
-    ------
-    DataError : see :func:`given_type`.
+    Raises DataError: see :func:`given_type`.
     """
     local_type = given_type(reference)
     if local_type not in reference.types("descriptors"):
@@ -134,16 +130,9 @@ def join_maps(first: KaptureFolder, second: KaptureFolder, output: Path) -> dict
 
     The second's images are among the first's (a dataset's model may lack images that were added to
     the map). Each keypoints type keeps its own points, observations and features. Global features
-    are those of the first, and types that only the second has.
-
-    Returns
-    -------
-    Counts for the log.
-
-    Raises
-    ------
-    DataError : the maps share a keypoints type, the second has another image, or an image differs
-        in camera or pose.
+    are those of the first, and types that only the second has. Returns counts for the log; raises
+    DataError: the maps share a keypoints type, the second has another image, or an image differs in
+    camera or pose.
     """
     types_of = [sorted(folder.observations()) for folder in (first, second)]
     shared = sorted(set(types_of[0]).intersection(types_of[1]))

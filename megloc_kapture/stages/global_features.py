@@ -68,9 +68,7 @@ def train_on_map(
 ) -> Vocabulary:
     """Train on the descriptors of the map's images.
 
-    Raises
-    ------
-    DataError : they are missing, or too few.
+    Raises DataError: they are missing, or too few.
     """
     images = mapping.read().image_names()
     descriptors = mapping.descriptors(local_type)
@@ -171,9 +169,7 @@ def write_vocabulary(
 def read_vocabulary(folder: Path) -> tuple[Vocabulary, VladSettings] | None:
     """The vocabulary stored in a type's folder, None where there is none.
 
-    Raises
-    ------
-    DataError : a file is broken, or they do not fit each other.
+    Raises DataError: a file is broken, or they do not fit each other.
     """
     path = folder / VOCABULARY_FILE
     if not path.is_file():
@@ -245,10 +241,8 @@ class GlobalFeaturesChoice(PluginChoice):
     def make(self) -> GlobalFeatureExtractor:
         """The extractor of an image network.
 
-        Raises
-        ------
-        OptionError : there are no such global features.
-        PluginError, MissingWeightsError : it cannot be loaded, or refuses its options.
+        Raises OptionError: there are no such global features; PluginError, MissingWeightsError: it
+        cannot be loaded, or refuses its options.
         """
         known = plugin_names(PLUGINS)
         if self.name not in known:

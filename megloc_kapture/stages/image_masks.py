@@ -74,9 +74,7 @@ def mask_files(
 ) -> dict[str, dict[str, Path]]:
     """The mask files that there are, by image and source (``own`` or ``user``).
 
-    Raises
-    ------
-    DataError : the user's folder is not there, or has a mask of none of the images.
+    Raises DataError: the user's folder is not there, or has a mask of none of the images.
     """
     if user_masks is not None and not user_masks.is_dir():
         raise DataError("no such folder of masks", path=user_masks)
@@ -98,9 +96,7 @@ def mask_files(
 def read_masks(files: Mapping[str, Path], shape: tuple[int, ...]) -> dict[str, Mask]:
     """The masks of an image by source, bool (H, W), True = use.
 
-    Raises
-    ------
-    DataError : one is no image, or not of the image's size.
+    Raises DataError: one is no image, or not of the image's size.
     """
     masks = {source: read_mask(path, shape) for source, path in files.items()}
     return {source: mask for source, mask in masks.items() if mask is not None}
@@ -131,9 +127,7 @@ class StandingMasks:
     def of(self, sensor_id: str, image: str, camera: Camera) -> dict[str, Mask]:
         """The masks bool (H, W) of an image by source, in original pixels; shared, not to change.
 
-        Raises
-        ------
-        DataError : a drawn mask is absent, no image, or not of the camera's size.
+        Raises DataError: a drawn mask is absent, no image, or not of the camera's size.
         """
         width, height = camera.width, camera.height
         region = self._regions.get(sensor_id)
@@ -181,9 +175,7 @@ class ClassMasks:
     def of(cls, segmenter: Segmenter, dynamic: Sequence[str] | None = None) -> ClassMasks:
         """Of the classes asked for; without, of those the segmenter names itself.
 
-        Raises
-        ------
-        OptionError : a class it does not have; lists those it has.
+        Raises OptionError: a class it does not have; lists those it has.
         """
         wanted = segmenter.dynamic if dynamic is None else dynamic
         unknown = sorted(set(wanted) - set(segmenter.classes))
@@ -197,9 +189,7 @@ class ClassMasks:
     def labels(self, image: NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
         """The label of each pixel, uint8 (H, W), of an image (H, W, 3) called ``name``.
 
-        Raises
-        ------
-        PluginError : the segmenter returns something else.
+        Raises PluginError: the segmenter returns something else.
         """
         found = self.segmenter.segment(image)
         shape, dtype = getattr(found, "shape", None), getattr(found, "dtype", None)

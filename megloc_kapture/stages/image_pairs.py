@@ -238,11 +238,8 @@ def pair_queries(
 ) -> list[ImagePair]:
     """Candidates of every query among the posed map images its prior permits, best first.
 
-    Sorted by query. A query that nothing is permitted to has no candidate.
-
-    Raises
-    ------
-    DataError : global features are needed and not there.
+    Sorted by query. A query that nothing is permitted to has no candidate. Raises DataError: global
+    features are needed and not there.
     """
     poses = mapping.read().poses()
     images = sorted(poses)

@@ -118,9 +118,7 @@ def extract_local_features(
 def images_of(folders: Sequence[KaptureFolder], purpose: str) -> dict[str, KaptureFolder]:
     """All images in order of their names, with their folders.
 
-    Raises
-    ------
-    DataError : there is none, or two folders have an image of the same name.
+    Raises DataError: there is none, or two folders have an image of the same name.
     """
     named = [(image, folder) for folder in folders for image in folder.read().image_names()]
     named.sort(key=itemgetter(0))
@@ -160,9 +158,7 @@ def _extract(
 def image_inputs(folder: KaptureFolder, image: str, digest: Digest) -> list[object]:
     """What features of an image are made of: its file, its camera's size, its mask if it has one.
 
-    Raises
-    ------
-    DataError : a file cannot be read.
+    Raises DataError: a file cannot be read.
     """
     camera, mask = folder.read().camera_of(image), mask_path(folder, image)
     masked = digest(mask) if mask.is_file() else None

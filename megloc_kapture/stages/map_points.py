@@ -47,13 +47,11 @@ def lift_map(
 ) -> dict[str, float]:
     """Lift the keypoints of the map's images through their depth maps, and write the map.
 
+    Returns counts for the log.
+
     Parameters
     ----------
     local_types : keypoints types that get points, each its own.
-
-    Returns
-    -------
-    Counts for the log.
 
     Raises
     ------
@@ -126,9 +124,7 @@ def _lift(
 def check_given_type(reference: KaptureFolder, expected: str) -> None:
     """Check that a given map is of the keypoints type that is extracted for it.
 
-    Raises
-    ------
-    DataError : it is of another one, or no map.
+    Raises DataError: it is of another one, or no map.
     """
     found = given_type(reference)
     if found != expected:

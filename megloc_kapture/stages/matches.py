@@ -326,9 +326,7 @@ _cache = FeatureCache()
 def cached_features(spec: FolderSpec, local_type: str, image: str) -> Features:
     """The features of an image of a folder; kept in this process.
 
-    Raises
-    ------
-    DataError : features are missing, broken or not finite, or of different number.
+    Raises DataError: features are missing, broken or not finite, or of different number.
     """
 
     def read() -> Features:

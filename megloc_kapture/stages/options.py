@@ -134,12 +134,7 @@ class PipelineOptions(Options):
         return idle
 
     def check(self) -> None:
-        """Refuse steps that contradict each other.
-
-        Raises
-        ------
-        OptionError : names them.
-        """
+        """Refuse steps that contradict each other; raises OptionError: names them."""
         if self.matches_again() and self.verification == "none":
             raise OptionError(
                 "guided pyramid matching counts verified matches; verification = none has none"
@@ -216,10 +211,7 @@ class PipelineOptions(Options):
     def local_types(self) -> list[str]:
         """Keypoints types that queries are localized with, the one VLAD uses first.
 
-        Raises
-        ------
-        PluginError : an extractor cannot be made.
-        OptionError : two types of one name.
+        Raises PluginError: an extractor cannot be made; OptionError: two types of one name.
         """
         types = [extractor.name for extractor in self.query_extractors()]
         twice = sorted({name for name in types if types.count(name) > 1})
@@ -237,10 +229,8 @@ class PipelineOptions(Options):
     def retrieval(self) -> Retrieval:
         """The global features that are compared, and how they are fused.
 
-        Raises
-        ------
-        OptionError : two of one type, or options that VLAD cannot have.
-        PluginError, MissingWeightsError : an extractor cannot be made.
+        Raises OptionError: two of one type, or options that VLAD cannot have; PluginError,
+        MissingWeightsError: an extractor cannot be made.
         """
         main_type = self.main_type()
         types = [chosen.type_name(main_type) for chosen in self.global_features]

@@ -157,9 +157,7 @@ class MapRefiners:
     def test(self, poses: Iterable[Pose], *, work: Work = HERE) -> None:
         """Test the frames of these poses that have not been tested.
 
-        Raises
-        ------
-        DataError : an image or a depth map cannot be read.
+        Raises DataError: an image or a depth map cannot be read.
         """
 
         def inputs(frame: str, digest: Digest) -> object:
@@ -304,7 +302,7 @@ def refine_poses(
     A query that failed, or has a fallback pose, is left as it is. What became of each pose stands
     in ``status.csv``, with measures in ``refinement.csv``. A refiner whose poses are as good as the
     map is consistent is used in those coordinate frames only that prove to be; the measurement
-    stands in ``map_consistency.csv``.
+    stands in ``map_consistency.csv``. Returns counts for the log.
 
     Parameters
     ----------
@@ -313,10 +311,6 @@ def refine_poses(
     localized : what localization wrote.
     restrictions : the coordinate frames of the map's images, which are never mixed.
     timing : where to write seconds per query and refiner.
-
-    Returns
-    -------
-    Counts for the log.
 
     Raises
     ------

@@ -151,9 +151,7 @@ class PreprocessingReport(BaseModel):
 def read_report(root: Path) -> PreprocessingReport | None:
     """What was done to a kapture; None where nothing was.
 
-    Raises
-    ------
-    DataError : the report is broken.
+    Raises DataError: the report is broken.
     """
     path = root / "sensors" / REPORT_FILE
     return read_json_model(path, PreprocessingReport) if path.is_file() else None

@@ -199,9 +199,7 @@ class Stage(ABC):
     def run(self, work: StageWork) -> Mapping[str, float]:
         """Write the outputs; returns counts for the log.
 
-        Raises
-        ------
-        MeglocError : the data or the options cannot be used; the workspace stays as it was.
+        Raises MeglocError: the data or the options cannot be used; the workspace stays as it was.
         """
 
 
