@@ -119,34 +119,26 @@ class FindPoses(PipelineStage):
         }
 
     def _models(self, work: StageWork, mapping: KaptureFolder, data: KaptureData) -> list[Model]:
-        local_type = self.options.main_type()
+        local_type, structure = self.options.main_type(), self._structure
         keypoints, images = mapping.keypoints(local_type), data.image_names()
-        photographs = [
-            Photograph(
-                image,
-                data.record_of(image)[1],
-                data.camera_of(image),
-                keypoints.read(image)[:, :2],
-            )
-            for image in images
-        ]
+        photographs = []
+        for image in images:
+            sensor, px = data.record_of(image)[1], keypoints.read(image)[:, :2]
+            photographs.append(Photograph(image, sensor, data.camera_of(image), px))
         counts = read_match_counts(work.path(PHOTOGRAPH_MATCHES), local_type)
         putative = {(pair.image, pair.other): pair.matches for pair in counts}
-        verified = verified_matches(mapping.matches(local_type), images, putative.keys())
-        verification = self.options.query_verification
-        matches = {}
-        for (i, j), rows in verified.items():
+        matches = verified_matches(mapping.matches(local_type), images, putative.keys())
+        for (i, j), rows in list(matches.items()):
             first, second = photographs[i], photographs[j]
-            if not agree_by_chance(
+            if agree_by_chance(
                 first.keypoints_px[rows[:, 0]],
                 first.camera,
                 second.keypoints_px[rows[:, 1]],
                 second.camera,
                 putative[first.name, second.name],
-                verification,
+                self.options.query_verification,
             ):
-                matches[i, j] = rows
-        structure = self._structure
+                del matches[i, j]
         try:
             return reconstruct(
                 photographs,
@@ -183,20 +175,16 @@ def _scaled(model: Model, structure: StructureOptions) -> tuple[World, Model, di
         for name in (first, second):
             if name not in model.poses:
                 raise DataError(f"--scale: the map has no photograph {name!r}")
-        centers = [model.poses[name].center() for name in (first, second)]
-        apart = float(np.linalg.norm(np.subtract(*centers)))
+        one, other = (model.poses[name].center() for name in (first, second))
+        apart = float(np.linalg.norm(one - other))
         if apart == 0:
             raise DataError(f"--scale: {first} and {second} were taken at the same place")
-        return (
-            World(unit=METRES),
-            _moved(model, metres / apart),
-            {"metres_per_unit": metres / apart},
-        )
+        scale = metres / apart
+        return World(unit=METRES), _moved(model, scale), {"metres_per_unit": scale}
     if structure.gps is None:
         return World(unit=NO_METRES), model, {}
-    found = align_to_earth(
-        {name: pose.center() for name, pose in model.poses.items()}, structure.gps
-    )
+    centers = {name: pose.center() for name, pose in model.poses.items()}
+    found = align_to_earth(centers, structure.gps)
     counts = {
         "gps_positions": found.num_positions,
         "gps_residual_m": round(found.residual_m, 3),

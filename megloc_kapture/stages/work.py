@@ -1,8 +1,15 @@
-"""Per-image and per-pair work: in order, with bounded memory and a progress bar.
+"""Per-image and per-pair work: in order, with bounded memory, a progress bar and a journal.
 
 It runs on an executor, whose processes have a processor each. What computes on a GPU of this
 machine runs in this process, the only one that has it: threads read ahead, one computes batches,
 and the executor has what follows.
+
+A stage that is at work lists what it has done in the journal, a line per item: a hash of all that
+the item is made of (the stage's settings, the code of its plugins, the content of what is read),
+the files it became, and what the stage wants to know of it later. The next run takes over the
+items whose hash is the same and whose files are as they were written, from what stopped runs have
+left and from the finished output, by links; so it ends in the bytes that it would have made. A line
+follows its files, and half a line is none: whenever a run is killed, what is taken over is whole.
 """
 
 from __future__ import annotations
@@ -178,15 +185,6 @@ class Items:
     done: dict[str, Any] = field(default_factory=dict)
     _kept: KeptItems | None = None
     _keys: Mapping[str, str] = field(default_factory=dict)
-
-    @classmethod
-    def of(cls, kept: KeptItems | None, kind: str, names: Sequence[str], inputs: Inputs) -> Items:
-        """See :meth:`megloc_kapture.stages.work.Work.items`."""
-        if kept is None:
-            return cls()
-        keys = {name: kept.key(kind, name, inputs) for name in names}
-        found = {name: kept.take(key) for name, key in keys.items()}
-        return cls({name: one.said for name, one in found.items() if one}, kept, keys)
 
     def label(self, text: str) -> str:
         """The label of a progress bar, with the number of items that need not be done."""
@@ -367,7 +365,11 @@ class Work:
         inputs : what an item is made of beside the stage's settings and its own name; asked for
             only where something may be kept.
         """
-        return Items.of(self.kept, kind, names, inputs)
+        if self.kept is None:
+            return Items()
+        keys = {name: self.kept.key(kind, name, inputs) for name in names}
+        found = {name: self.kept.take(key) for name, key in keys.items()}
+        return Items({name: one.said for name, one in found.items() if one}, self.kept, keys)
 
 
 def _alike(
@@ -393,9 +395,6 @@ class FolderSpec:
 
 @lru_cache(maxsize=8)
 def _open_folder(
-    root: Path,
-    features_dirs: tuple[Path, ...],
-    allow_links_below: tuple[Path, ...],
-    run_id: str,
+    root: Path, features_dirs: tuple[Path, ...], links_below: tuple[Path, ...], run_id: str
 ) -> KaptureFolder:
-    return KaptureFolder(root, features_dirs=features_dirs, allow_links_below=allow_links_below)
+    return KaptureFolder(root, features_dirs=features_dirs, allow_links_below=links_below)
