@@ -21,11 +21,7 @@ from megloc_kapture.geometry.cameras import focal_px
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.files import remove
 from megloc_kapture.io.images import write_depth_map
-from megloc_kapture.io.kapture import (
-    KaptureData,
-    KaptureFolder,
-    write_sensors,
-)
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
 from megloc_kapture.io.paths import safe_join
 from megloc_kapture.io.tables import DepthRow, write_depth_rows
 from megloc_kapture.mapping.depth import LiftingOptions, lift_with_covariances
@@ -338,11 +334,9 @@ def _confirm(job: _Job) -> tuple[float, dict[str, LiftedPoints]]:
     agreement = job.options.agreement
     kept = confirmed(view, estimate, others, agreement)
     kept = with_pose_errors(view, sources, kept, job.range_m, _DEVIATION * job.error_px)
-    write_depth_map(
-        safe_join(job.out / "sensors" / "records_data", depth_path(job.image)), kept.depth_m
-    )
-    beside = side_file(job.out, job.image, "sigma")
-    write_array(beside, kept.sigma_m)
+    records = job.out / "sensors" / "records_data"
+    write_depth_map(safe_join(records, depth_path(job.image)), kept.depth_m)
+    write_array(side_file(job.out, job.image, "sigma"), kept.sigma_m)
     normals = np.rint(127 * kept.normals).astype(np.int8)
     write_array(side_file(job.out, job.image, "normals"), normals)
     lifted = {}
@@ -368,12 +362,7 @@ def _lift(
     sigma_m: NDArray[np.float32],
 ) -> LiftedPoints:
     points, covariances, valid = lift_with_covariances(
-        keypoints_px[ids],
-        depth_m,
-        sigma_m,
-        camera,
-        view.camera,
-        LiftingOptions(),
+        keypoints_px[ids], depth_m, sigma_m, camera, view.camera, LiftingOptions()
     )
     turned = view.cam_from_world.rotation_matrix()
     world = np.einsum("ji,njk,kl->nil", turned, covariances[valid], turned)

@@ -19,9 +19,7 @@ from megloc_kapture.features.vlad import VladOptions, Vocabulary, aggregate, tra
 from megloc_kapture.io.files import read_json_model, write_json_model
 from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
 from megloc_kapture.plugin_loading import load_plugin, plugin_names
-from megloc_kapture.plugins import (
-    GLOBAL_FEATURES as PLUGINS,
-)
+from megloc_kapture.plugins import GLOBAL_FEATURES as PLUGINS
 from megloc_kapture.plugins import GlobalFeatureExtractor, PluginChoice
 from megloc_kapture.stages.devices import in_batches
 from megloc_kapture.stages.local_features import image_inputs, images_of, read_image_of
@@ -60,11 +58,7 @@ def vlad_type(local_type: str) -> str:
 
 
 def train_on_map(
-    mapping: KaptureFolder,
-    local_type: str,
-    options: VladOptions,
-    *,
-    work: Work = HERE,
+    mapping: KaptureFolder, local_type: str, options: VladOptions, *, work: Work = HERE
 ) -> Vocabulary:
     """Train on the descriptors of the map's images.
 

@@ -25,11 +25,7 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.image_variants import ImageVariant
 from megloc_kapture.io.csv_table import write_csv_table
 from megloc_kapture.io.files import hard_link, write_bytes
-from megloc_kapture.io.kapture import (
-    FeatureReader,
-    FeatureWriter,
-    KaptureFolder,
-)
+from megloc_kapture.io.kapture import FeatureReader, FeatureWriter, KaptureFolder
 from megloc_kapture.io.kapture.features import SUFFIX, feature_folder
 from megloc_kapture.io.paths import safe_join
 from megloc_kapture.localization.query_views import ImageMatches
@@ -58,10 +54,7 @@ from megloc_kapture.matching.verification import (
 from megloc_kapture.plugins import LocalFeatureExtractor, Matcher
 from megloc_kapture.stages.devices import BATCH
 from megloc_kapture.stages.local_features import extract_all
-from megloc_kapture.stages.matches import (
-    Features,
-    match_all,
-)
+from megloc_kapture.stages.matches import Features, match_all
 from megloc_kapture.stages.work import batched
 
 COLUMNS = (

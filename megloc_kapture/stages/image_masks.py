@@ -103,23 +103,10 @@ def read_masks(files: Mapping[str, Path], shape: tuple[int, ...]) -> dict[str, M
 
 
 class StandingMasks:
-    """Masks of whole cameras, drawn once each: fixed ones and unchanging regions.
+    """Masks of whole cameras, drawn once each: fixed ones, and unchanging regions by sensor id."""
 
-    Parameters
-    ----------
-    root : of files with a relative path.
-    regions : by sensor id.
-    """
-
-    def __init__(
-        self,
-        fixed: Sequence[FixedMask],
-        regions: Mapping[str, UnchangingRegion],
-        root: Path | None = None,
-    ) -> None:
-        self._fixed = tuple(fixed)
-        self._regions = dict(regions)
-        self._root = root
+    def __init__(self, fixed: Sequence[FixedMask], regions: Mapping[str, UnchangingRegion]) -> None:
+        self._fixed, self._regions = tuple(fixed), dict(regions)
         self._used: set[FixedMask] = set()
         self._drawn: dict[tuple[FixedMask, int, int], Mask] = {}
         self._combined: dict[tuple[object, ...], dict[str, Mask]] = {}
@@ -153,14 +140,14 @@ class StandingMasks:
     def _draw(self, one: FixedMask, width: int, height: int) -> Mask:
         key = (one, width, height)
         if key not in self._drawn:
-            if one.file is None:
-                self._drawn[key] = one.drawn(width, height)
-            else:
-                path = one.file if self._root is None else self._root / one.file
-                mask = read_mask(path, (height, width))
-                if mask is None:
-                    raise DataError("no such mask", path=path)
-                self._drawn[key] = mask
+            mask = (
+                one.drawn(width, height)
+                if one.file is None
+                else read_mask(one.file, (height, width))
+            )
+            if mask is None:
+                raise DataError("no such mask", path=one.file)
+            self._drawn[key] = mask
         return self._drawn[key]
 
 
@@ -209,10 +196,7 @@ class ClassMasks:
 
 
 def find_unchanging_regions(
-    folder: KaptureFolder,
-    sequences: Sequence[KaptureFolder] = (),
-    *,
-    work: Work = HERE,
+    folder: KaptureFolder, sequences: Sequence[KaptureFolder] = (), *, work: Work = HERE
 ) -> dict[str, UnchangingRegion]:
     """The region of every camera of a folder, by sensor id; falsy with a reason where none is.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Literal
 
@@ -13,13 +14,7 @@ from pydantic import Field
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
-from megloc_kapture.io.kapture import (
-    ImagePair,
-    KaptureData,
-    KaptureFolder,
-    read_pairs,
-    write_pairs,
-)
+from megloc_kapture.io.kapture import ImagePair, KaptureData, KaptureFolder, read_pairs, write_pairs
 from megloc_kapture.io.kapture.vectors import KaptureVectors
 from megloc_kapture.io.tables import read_match_counts
 from megloc_kapture.mapping.pairs import (
@@ -153,8 +148,7 @@ def pair_map_images(
     seen = _NOTHING_SEEN
     if options.needs_points():
         seen = _SeenPoints.read(covisible or mapping, images)
-    found = [np.zeros((0, 2), dtype=np.int64)]
-    similarities = [np.zeros(0)]
+    found, similarities = [np.zeros((0, 2), dtype=np.int64)], [np.zeros(0)]
     for members in restrictions.frames(images):
         names = [images[member] for member in members]
         within = seen.of(members, len(images))
@@ -202,9 +196,9 @@ def _united(
     images: Sequence[str], pairs: NDArray[np.int64], similarities: NDArray[np.float64]
 ) -> list[ImagePair]:
     """Each pair of ``pairs`` (P, 2), i < j, once, with its best similarity, 1 for -infinity."""
-    keys, place = np.unique(pairs[:, 0] * len(images) + pairs[:, 1], return_inverse=True)
+    keys, rows = np.unique(pairs[:, 0] * len(images) + pairs[:, 1], return_inverse=True)
     scores = np.full(len(keys), -np.inf)
-    np.maximum.at(scores, place, similarities)
+    np.maximum.at(scores, rows, similarities)
     scores[np.isneginf(scores)] = 1.0
     first, second = np.divmod(keys, max(len(images), 1))
     return [
@@ -245,11 +239,12 @@ def pair_queries(
     images = sorted(poses)
     queries = query.read().image_names()
     of_query: list[list[ImagePair]] = [[] for _ in queries]
+    pools = restrictions.pools(queries, images)
     if options.by == "exhaustive":
-        for positions, permitted in restrictions.pools(queries, images):
+        for positions, permitted in pools:
             for at in positions:
                 of_query[at] = [ImagePair(queries[at], images[i], 1.0) for i in permitted]
-        return [pair for pairs in of_query for pair in pairs]
+        return list(chain(*of_query))
     if retrieval is None:
         raise DataError("retrieval needs global features of map and queries")
     database, described = retrieval.readers(mapping), retrieval.readers(query)
@@ -258,7 +253,7 @@ def pair_queries(
         [poses[image] for image in images],
         retrieval,
     )
-    for positions, permitted in restrictions.pools(queries, images):
+    for positions, permitted in pools:
         asked = vectors_of(described, [queries[at] for at in positions])
         index, scores = candidates.of(asked, permitted, options, work)
         for at, row, row_scores in zip(positions, index.tolist(), scores.tolist(), strict=True):
@@ -267,7 +262,7 @@ def pair_queries(
                 for i, score in zip(row, row_scores, strict=True)
                 if i >= 0
             ]
-    return [pair for pairs in of_query for pair in pairs]
+    return list(chain(*of_query))
 
 
 # what decides which global features there are, and how they are fused

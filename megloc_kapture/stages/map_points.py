@@ -97,11 +97,7 @@ def lift_map(
     copy_features(mapping, output, local_types)
     write_points3d(output, np.concatenate([xyz, np.zeros_like(xyz)], axis=1))
     write_observations(output, seen)
-    return {
-        "images": len(images),
-        "images_with_depth": len(with_depth),
-        "points": len(xyz),
-    }
+    return {"images": len(images), "images_with_depth": len(with_depth), "points": len(xyz)}
 
 
 def _lift(
@@ -192,8 +188,7 @@ class LiftPoints(PipelineStage):
         return self.options.map == "lift"
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        mapping = work.folder(self.layout.mapping(), FEATURES)
-        types = self.options.own_types()
+        mapping, types = work.folder(self.layout.mapping(), FEATURES), self.options.own_types()
         return lift_map(mapping, types, work.out / UNREFINED, self.options.lifting, work=work)
 
 

@@ -340,11 +340,7 @@ def refine_map(
     return counts
 
 
-def _verify_depth(
-    selection: MapSelection,
-    options: DepthVerificationOptions,
-    work: Work,
-) -> None:
+def _verify_depth(selection: MapSelection, options: DepthVerificationOptions, work: Work) -> None:
     records = depth_records(selection.data) if options.max_sigmas is not None else {}
     folder = selection.source
     with_depth = {

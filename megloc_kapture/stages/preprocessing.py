@@ -27,19 +27,11 @@ from megloc_kapture.io.files import (
     write_json,
     write_json_model,
 )
-from megloc_kapture.io.images import (
-    WRITABLE_SUFFIXES,
-    image_size,
-    write_image,
-)
+from megloc_kapture.io.images import WRITABLE_SUFFIXES, image_size, write_image
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import SEGMENTERS, Segmenter
-from megloc_kapture.preprocessing.frames import (
-    FrameOptions,
-    FramePlan,
-    plan_frame,
-)
+from megloc_kapture.preprocessing.frames import FrameOptions, FramePlan, plan_frame
 from megloc_kapture.preprocessing.masks import UnchangingRegion
 from megloc_kapture.stages.image_masks import (
     JPEG_QUALITY,
@@ -164,7 +156,6 @@ def preprocess_images(
     *,
     segmenter: Segmenter | None = None,
     sequences: Sequence[KaptureFolder] = (),
-    root: Path | None = None,
     work: Work = HERE,
 ) -> dict[str, float]:
     """Write a kapture with the images, cameras and masks that the options make of one.
@@ -177,7 +168,6 @@ def preprocess_images(
     ----------
     segmenter : the plugin; made of ``options.masks.segmenter`` unless given.
     sequences : more folders to find the cameras' unchanging regions in; the map's, for queries.
-    root : of the options' relative paths.
     work : its processes write the images, so they must see the same files.
 
     Returns
@@ -199,15 +189,13 @@ def preprocess_images(
     classes = _class_masks(options.masks, segmenter)
     data = folder.read()
     plans = _plans(data, options)
-    user_masks = options.masks.user_masks
-    if user_masks is not None and root is not None:
-        user_masks = root / user_masks
-    files = mask_files(folder, data.image_names(), user_masks)
+    images = data.image_names()
+    files = mask_files(folder, images, options.masks.user_masks)
     regions: dict[str, UnchangingRegion] = {}
     if options.masks.unchanging:
         regions = find_unchanging_regions(folder, sequences, work=work)
     remarks = _remarks(regions, any(one.fallback for one in options.masks.fixed))
-    standing = StandingMasks(options.masks.fixed, regions, root)
+    standing = StandingMasks(options.masks.fixed, regions)
 
     _unlink_folders(output)
     write_sensors(output, _with_cameras(data, plans))
@@ -227,7 +215,6 @@ def preprocess_images(
         plan = plans[data.record_of(image)[1]]
         return [digest(folder.image_path(image)), astuple(plan), given, drawn]
 
-    images = data.image_names()
     items = work.items(f"images of {folder.root.name}", images, inputs)
     todo = [image for image in images if image not in items.done]
     for image in items.done:

@@ -123,14 +123,12 @@ def localize_views(
     candidates : map images, best first, and ``frames``, the coordinate frame of each.
     centers : of the candidates in the world, (3,) each.
     """
-    none = (0,) * len(views)
-    if not candidates:
-        return ClusterLocalization(Failure("no map image is a candidate"), none)
     matched = {image for view in views for image in view.matched_images()}
     frame_of = dict(zip(candidates, frames, strict=True))
     images = [image for image in candidates if image in matched]
     if not images:
-        return ClusterLocalization(Failure("no map image matches"), none)
+        reason = "no map image matches" if candidates else "no map image is a candidate"
+        return ClusterLocalization(Failure(reason), (0,) * len(views))
     started = time.perf_counter()
     clusters = cluster_candidates(
         images,
@@ -151,8 +149,8 @@ def localize_views(
         min_confidence=options.min_confidence,
         scene=scene,
     )
-    result = replace(found.result, seconds={**seconds, **found.result.seconds})
-    return replace(found, result=result)
+    seconds |= found.result.seconds
+    return replace(found, result=replace(found.result, seconds=seconds))
 
 
 def localize_unit(

@@ -241,10 +241,7 @@ def fuse_depth(
 
 
 def _points(
-    spec: FolderSpec,
-    agreement: AgreementOptions,
-    share: float,
-    job: tuple[int, str, Sequence[str]],
+    spec: FolderSpec, agreement: AgreementOptions, share: float, job: tuple[int, str, Sequence[str]]
 ) -> Cloud:
     (row, image, earlier), folder = job, spec.open()
     view, depth = _view_with_depth(folder, image)

@@ -116,9 +116,7 @@ def triangulate_map(
 
 
 def verified_matches(
-    reader: MatchesReader,
-    images: Sequence[str],
-    asked: Collection[tuple[str, ...]] | None = None,
+    reader: MatchesReader, images: Sequence[str], asked: Collection[tuple[str, ...]] | None = None
 ) -> dict[tuple[int, int], NDArray[np.int64]]:
     """Matches by pairs of rows of ``images``; of the pairs asked for alone (first name first)."""
     return _read(reader, images, _matched_pairs(reader, images, asked))
