@@ -64,9 +64,7 @@ class Restrictions:
     ) -> Iterator[tuple[list[int], NDArray[np.int64]]]:
         """Queries that may be matched with the same images, and these images.
 
-        Yields
-        ------
-        Positions in ``queries``, and sorted positions in ``images``, int64 (M,); every query
+        Yields positions in ``queries``, and sorted positions in ``images``, int64 (M,); every query
         once. M is 0 where nothing of what a prior permits is in the map.
         """
         together: dict[tuple[str, ...] | None, list[int]] = {}

@@ -198,11 +198,8 @@ def fitted_to_poses(source: KaptureFolder, options: DensifyOptions) -> tuple[Den
     The median distance between observations and their points tells how far poses can be trusted.
     Where it is more than half a pixel of the depth maps, beyond what keypoints err by, images are
     reduced until it is that, as no view could confirm finer detail, and compared with more sources
-    in proportion; views may differ by five times that median.
-
-    Returns
-    -------
-    Options, and the median error in pixels of the depth maps, 0 where the map does not tell it.
+    in proportion; views may differ by five times that median. Returns options, and the median error
+    in pixels of the depth maps, 0 where the map does not tell it.
     """
     indices = [index_map(source, local_type) for local_type in source.observations()]
     angles = [with_noise(source, index).noise_rad for index in indices]

@@ -168,12 +168,9 @@ def _moved(
     """Move the observations to the keypoints extracted again.
 
     An observation whose place has several keypoints (one per orientation) becomes one of each: any
-    may be the one that was matched, and all see the point.
-
-    Returns
-    -------
-    The observations, whose ``keypoint_ids`` count in an image's rows; image -> these rows of its
-    extracted features that see points, ascending; and how many of the stored ones were found.
+    may be the one that was matched, and all see the point. Returns the observations, whose
+    ``keypoint_ids`` count in an image's rows; image -> these rows of its extracted features that
+    see points, ascending; and how many of the stored ones were found.
     """
     local_type = seen.keypoints_type
     if local_type not in mapping.types("descriptors"):

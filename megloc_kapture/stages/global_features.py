@@ -84,11 +84,8 @@ def extract_vlad(
 ) -> dict[str, int]:
     """Train on ``mapping``, aggregate for all images of the folders, write to ``output``.
 
-    The descriptors are read from the folders and their features folders.
-
-    Returns
-    -------
-    Counts for the log: images, clusters, dimensions.
+    The descriptors are read from the folders and their features folders. Returns counts for the
+    log: images, clusters, dimensions.
     """
     type_name = vlad_type(local_type)
     place = output / "global_features" / type_name
@@ -249,9 +246,7 @@ class GlobalFeaturesChoice(PluginChoice):
     def type_name(self, main_local_type: str) -> str:
         """The kapture type name of the vectors; raises as :meth:`make` and :meth:`vlad_options`.
 
-        Parameters
-        ----------
-        main_local_type : local features that VLAD takes where its options name none.
+        ``main_local_type``: local features that VLAD takes where its options name none.
         """
         if self.is_vlad:
             return vlad_type(self.vlad_options().local_type or main_local_type)
@@ -270,15 +265,9 @@ def extract_global_features(
 ) -> dict[str, int]:
     """Describe all images of the folders, into ``output`` (orphan layout).
 
-    Returns
-    -------
-    Counts for the log: images.
-
-    Raises
-    ------
-    DataError : an image is absent, unreadable, or not of its camera's size; two folders have an
-        image of the same name; there are no images.
-    PluginError : the extractor breaks its protocol.
+    Returns counts for the log: images. Raises DataError: an image is absent, unreadable, or not of
+    its camera's size; two folders have an image of the same name; there are no images; PluginError:
+    the extractor breaks its protocol.
     """
     folder_of = images_of(folders, "describe")
     items = work.items(
@@ -318,16 +307,9 @@ def describe_images(
 ) -> NDArray[np.float32]:
     """Vectors of RGB images of one size: float32 (B, D), unit length.
 
-    Images of more than 8 megapixels are reduced to that, whatever the extractor.
-
-    Parameters
-    ----------
-    names : of the images, for messages.
-
-    Raises
-    ------
-    PluginError : the extractor returns something else.
-    DeviceMemoryError : there is no memory for one image.
+    Images of more than 8 megapixels are reduced to that, whatever the extractor. Raises
+    PluginError: the extractor returns something else; DeviceMemoryError: there is no memory for one
+    image.
     """
     many: Any = extractor
 

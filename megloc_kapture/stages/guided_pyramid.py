@@ -120,7 +120,6 @@ def match_image_again(
     load : features of another image; not all are in memory at once.
     judge : of the matches with another image, by its name and features.
     only_scaled : matched with the variants of another scale only; in the same order.
-    name : of the image, for messages.
 
     Returns
     -------
@@ -288,13 +287,8 @@ class MatchSpool:
     ) -> tuple[Path, list[list[Any]]]:
         """Keep the matches of an image's variants with each of the others.
 
-        Returns
-        -------
-        The file, and for ``found`` the fields of :class:`Spooled`, as plain values.
-
-        Raises
-        ------
-        OutputError : the disk is full.
+        Returns the file, and for ``found`` the fields of :class:`Spooled`, as plain values. Raises
+        OutputError: the disk is full.
         """
         path, content = safe_join(self.folder, f"{image}.variants"), bytearray()
         told: list[list[Any]] = []
@@ -375,7 +369,6 @@ def retry_query(
     matches : of each candidate, best first: its name, verified matches (K, 2), scores (K,).
     load : features of a candidate.
     frame : pixels and mask of the query; called only where a candidate has few matches.
-    name : of the query, for messages.
 
     Raises
     ------

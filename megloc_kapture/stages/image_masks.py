@@ -200,14 +200,9 @@ def find_unchanging_regions(
 ) -> dict[str, UnchangingRegion]:
     """The region of every camera of a folder, by sensor id; falsy with a reason where none is.
 
-    Parameters
-    ----------
-    sequences : folders whose images tell of its cameras as well, where they have a sensor of the
-        same id and image size: the map's, for queries.
-
-    Raises
-    ------
-    DataError : an image is absent, unreadable, or not of its camera's size.
+    ``sequences``: folders whose images tell of its cameras as well, where they have a sensor of the
+    same id and image size: the map's, for queries. Raises DataError: an image is absent,
+    unreadable, or not of its camera's size.
     """
     chosen: dict[str, list[tuple[Path, Camera]]] = {}
     regions: dict[str, UnchangingRegion] = {}

@@ -131,16 +131,9 @@ def pair_map_images(
 
     Where no image has a pose, of all of them, by methods that look at none. Images of different
     coordinate frames are never paired. The score is the cosine similarity where retrieval named the
-    pair, else 1.
-
-    Parameters
-    ----------
-    covisible : a map of the same images in the same frames, whose points co-visibility and overlap
-        look at; by default those of ``mapping`` itself.
-
-    Raises
-    ------
-    DataError : global features or points are needed and not there.
+    pair, else 1. ``covisible``: a map of the same images in the same frames, whose points
+    co-visibility and overlap look at; by default those of ``mapping`` itself. Raises DataError:
+    global features or points are needed and not there.
     """
     data = mapping.read()
     poses = data.poses()
@@ -346,12 +339,9 @@ def rerank(
 ) -> tuple[list[int], list[int]]:
     """Positions of the candidates of one query that stay, best first, and what each has.
 
-    Of equal counts, and so where nothing matches, retrieval's order stays.
-
-    Parameters
-    ----------
-    of_types : of each type of local features and each candidate, in retrieval's order, the number
-        of its matches; for coverage the rows (K,) of the query's keypoints that they are of.
+    Of equal counts, and so where nothing matches, retrieval's order stays. ``of_types``: of each
+    type of local features and each candidate, in retrieval's order, the number of its matches; for
+    coverage the rows (K,) of the query's keypoints that they are of.
     """
     num = len(of_types[0]) if of_types else 0
     if options.by == "coverage":

@@ -222,14 +222,7 @@ def extract_all(
 ) -> list[LocalFeatures]:
     """What a plugin makes of images of one size, very large ones reduced meanwhile.
 
-    Parameters
-    ----------
-    names : of the images, for messages.
-
-    Raises
-    ------
-    PluginError : it breaks the protocol.
-    DeviceMemoryError : there is no memory for one image.
+    Raises PluginError: it breaks the protocol; DeviceMemoryError: there is no memory for one image.
     """
     found = in_batches(
         extractor,

@@ -168,15 +168,9 @@ def query_status(image: str, result: Pose | Failure, fallback: Fallback = "none"
 def set_aside_unreadable(query: Path, tables: Path, work: Work) -> Mapping[str, str]:
     """Take images that cannot be read out of a workspace's queries; returns why, by name.
 
-    Their names and reasons go to ``tables``; the image files stay as they are.
-
-    Parameters
-    ----------
-    query : kapture folder in the workspace, which is written anew where an image is taken out.
-
-    Raises
-    ------
-    DataError : no image can be read; names the first.
+    Their names and reasons go to ``tables``; the image files stay as they are. ``query``: kapture
+    folder in the workspace, which is written anew where an image is taken out. Raises DataError: no
+    image can be read; names the first.
     """
     folder = KaptureFolder(query)
     data = folder.read()

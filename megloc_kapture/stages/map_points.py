@@ -47,15 +47,8 @@ def lift_map(
 ) -> dict[str, float]:
     """Lift the keypoints of the map's images through their depth maps, and write the map.
 
-    Returns counts for the log.
-
-    Parameters
-    ----------
-    local_types : keypoints types that get points, each its own.
-
-    Raises
-    ------
-    DataError : no image has a pose, or none has depth; a depth map is missing or broken.
+    Returns counts for the log. ``local_types``: keypoints types that get points, each its own.
+    Raises DataError: no image has a pose, or none has depth; a depth map is missing or broken.
     """
     data = mapping.read()
     poses = data.poses()

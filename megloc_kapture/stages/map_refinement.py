@@ -285,19 +285,10 @@ def refine_map(
 
     Points of any keypoints type, renumbered without gaps, and of several at once. Observations by
     images without a pose cannot be judged; they stay as long as their point does.
-
-    Parameters
-    ----------
-    link_features : the features in the source's own folder may become hard links (they are a map
-        of ours, not somebody's data); those beside it always do.
-
-    Returns
-    -------
-    Counts for the log: points and observations after, and what each filter removed.
-
-    Raises
-    ------
-    DataError : no points, or something broken; names the file.
+    ``link_features``: the features in the source's own folder may become hard links (they are a map
+    of ours, not somebody's data); those beside it always do. Returns counts for the log: points and
+    observations after, and what each filter removed. Raises DataError: no points, or something
+    broken; names the file.
     """
     options = options or MapRefinementOptions()
     if not source.has_points():

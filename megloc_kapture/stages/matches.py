@@ -123,11 +123,8 @@ def match_pairs(
     """Match each pair (image of ``first``, image of ``second``) and write what is verified.
 
     A pair without verified matches is written with none, so that it is known to be done. How many
-    matches each pair had before and has after verification stands in ``match_counts.csv``.
-
-    Returns
-    -------
-    Counts for the log: pairs, pairs with matches, matches.
+    matches each pair had before and has after verification stands in ``match_counts.csv``. Returns
+    counts for the log: pairs, pairs with matches, matches.
     """
     within_one = first.root == second.root
     # within a map (a, b) and (b, a) are one pair, kept in one file
@@ -232,13 +229,7 @@ def match_all(
 ) -> list[_PairMatches]:
     """Matches of one image with each of several, as many at once as there is memory for.
 
-    Parameters
-    ----------
-    names : of the pairs, for messages.
-
-    Raises
-    ------
-    DeviceMemoryError : there is no memory for one pair.
+    Raises DeviceMemoryError: there is no memory for one pair.
     """
     many: Any = matcher
 
@@ -267,9 +258,7 @@ def verification_of(
 ) -> Verify:
     """How the matches of two images are verified.
 
-    Parameters
-    ----------
-    b_from_a : for known poses, the second camera's; without, no match is right.
+    ``b_from_a``: for known poses, the second camera's; without, no match is right.
     """
 
     def verify(a: Features, b: Features, matches: NDArray[np.int64]) -> NDArray[np.bool_]:

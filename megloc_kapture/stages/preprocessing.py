@@ -72,15 +72,10 @@ def _process(
 ) -> tuple[list[Path], dict[str, float]]:
     """Write what becomes of one image and its mask.
 
-    Parameters
-    ----------
-    job : the image and its file; what becomes of it; whether it is linked where it does not change;
-        its mask files, and the masks of its camera in original pixels.
-
-    Returns
-    -------
-    The files, links left out; and the share of its pixels masked by each source of masks, and by
-    ``all`` of them, empty where there is none.
+    ``job``: the image and its file; what becomes of it; whether it is linked where it does not
+    change; its mask files, and the masks of its camera in original pixels. Returns the files, links
+    left out; and the share of its pixels masked by each source of masks, and by ``all`` of them,
+    empty where there is none.
     """
     image, source, plan, link, mask_paths, standing = job
     sensors, camera = output / "sensors", plan.original
@@ -322,9 +317,7 @@ def _unlink_folders(output: Path) -> None:
 def _link_records(folder: KaptureFolder, output: Path, plans: Mapping[str, FramePlan]) -> bool:
     """Link all records at once where no image changes; else the depth maps, one by one.
 
-    Returns
-    -------
-    Whether the images are linked.
+    Returns whether the images are linked.
     """
     records = folder.root / "sensors" / "records_data"
     if records.is_dir() and not any(plan.changes_pixels for plan in plans.values()):

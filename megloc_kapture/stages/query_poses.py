@@ -188,9 +188,7 @@ def in_turn(
 ) -> Solved:
     """What ``solve`` makes of the best few candidates where that is sure, else of all.
 
-    Parameters
-    ----------
-    solve : localizes with so many of the candidates, best first.
+    ``solve``: localizes with so many of the candidates, best first.
     """
     sure, few = options.sure_confidence, _FIRST_TURN
     while sure is not None and few < num_candidates:

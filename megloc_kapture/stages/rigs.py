@@ -19,10 +19,8 @@ Unit = tuple[tuple[str, RigidTransform], ...]
 def query_units(data: KaptureData, *, rigs: bool) -> list[Unit]:
     """The units of a query folder, sorted by their images; every image is in one.
 
-    Parameters
-    ----------
-    rigs : whether cameras of one rig and one timestamp are localized together. A camera on several
-        rigs goes with the first by name. Without, every image is by itself.
+    ``rigs``: whether cameras of one rig and one timestamp are localized together. A camera on
+    several rigs goes with the first by name. Without, every image is by itself.
     """
     rigs_of = _rigs_of(data) if rigs else {}
     together: dict[tuple[int, str, str], list[str]] = {}

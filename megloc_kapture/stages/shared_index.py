@@ -162,15 +162,8 @@ def shared_index(
 ) -> Iterator[dict[str, Path]]:
     """Indices by keypoints type as folders for :func:`open_index`; gone after the block.
 
-    Who has one open by then may go on using it.
-
-    Parameters
-    ----------
-    scratch : folder for them meanwhile, the system's unless given.
-
-    Raises
-    ------
-    OutputError : the folder cannot be written to.
+    Who has one open by then may go on using it. ``scratch``: folder for them meanwhile, the
+    system's unless given. Raises OutputError: the folder cannot be written to.
     """
     where = tempfile.gettempdir() if scratch is None else scratch
     try:

@@ -130,13 +130,7 @@ def write_points(
 ) -> int:
     """Write a map's points, unchanged, and behind them those of keypoints that were lifted.
 
-    Parameters
-    ----------
-    lifted : by keypoints type and image.
-
-    Returns
-    -------
-    The number of lifted points.
+    ``lifted``: by keypoints type and image. Returns the number of lifted points.
     """
     points = source.points3d()
     covariances = read_point_covariances(source.root, len(points))
@@ -223,13 +217,8 @@ def fuse_depth(
 ) -> int:
     """Write the depth maps of :mod:`.densifying` as a PLY cloud with normals and deviations.
 
-    Returns
-    -------
-    Number of points.
-
-    Raises
-    ------
-    DataError : no densified map, or something broken; names the file.
+    Returns number of points. Raises DataError: no densified map, or something broken; names the
+    file.
     """
     path = densified.root / DEPTH_FILE
     if not path.is_file():

@@ -233,14 +233,11 @@ def copy_features(
     """Put the map images' features of ``source`` into the kapture at ``output``; what is there
     stays.
 
-    Files of features folders are hard links where the file system has them: a map then stands
-    alone and takes no space twice. The kapture's own features, which come first as everywhere, are
-    somebody's data and copied, unless ``link_own`` says that they are ours; what comes out of a
-    tar is copied.
-
-    Parameters
-    ----------
-    local_types : all types of local features unless given; of global features all are copied.
+    Files of features folders are hard links where the file system has them: a map then stands alone
+    and takes no space twice. The kapture's own features, which come first as everywhere, are
+    somebody's data and copied, unless ``link_own`` says that they are ours; what comes out of a tar
+    is copied. ``local_types``: all types of local features unless given; of global features all are
+    copied.
     """
     wanted = None if local_types is None else set(local_types)
     for kind in _KINDS:

@@ -177,9 +177,7 @@ def _read_journal(path: Path) -> dict[str, _Entry]:
 class Items:
     """Items of one kind: those that are done, and how more of them get so.
 
-    Attributes
-    ----------
-    done : what is said of each item, by its name; grows as items are added.
+    ``done``: what is said of each item, by its name; grows as items are added.
     """
 
     done: dict[str, Any] = field(default_factory=dict)
