@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Literal
@@ -163,12 +164,10 @@ class Retrieval:
         total = common_length([as_blocks(source) for source in database])
         most = _ROWS if codes is None else _CODED_ROWS
         bounds = np.linspace(0, total, max(1, -(-total // most)) + 1).astype(int).tolist()
-        parts = [
-            _Part(search, asked, [_part(one, *of) for one in database], of[0], codes)
-            for of in pairwise(bounds)
-        ]
+        parts = [(of[0], [_part(one, *of) for one in database]) for of in pairwise(bounds)]
         shared = work if len(parts) > 1 else HERE
-        return search.ranking(list(shared.map(_search_part, parts, "retrieval")))
+        search_part = partial(_search_part, search, asked, codes)
+        return search.ranking(list(shared.map(search_part, parts, "retrieval")))
 
 
 def _part(source: Vectors, start: int, stop: int) -> VectorBlocks:
@@ -179,34 +178,28 @@ def _part(source: Vectors, start: int, stop: int) -> VectorBlocks:
 _Codes = dict[int, list[QuantizedRows]]  # of the part that begins at a row
 
 
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """A part of a database that is searched, by type, and the row it begins at."""
-
-    search: FusedSearch
-    queries: Sequence[VectorBlocks]
-    database: Sequence[VectorBlocks]
-    first_row: int
-    codes: _Codes | None
+_Part = tuple[int, Sequence[VectorBlocks]]  # of a database: the row it begins at, and it by type
 
 
-def _search_part(part: _Part) -> list[Found]:
-    if part.codes is not None and part.first_row not in part.codes:
-        part.codes[part.first_row] = [QuantizedRows(source) for source in part.database]
-    total, width = common_length(part.queries), sum(one.dimension for one in part.queries)
+def _search_part(
+    search: FusedSearch, queries: Sequence[VectorBlocks], codes: _Codes | None, part: _Part
+) -> list[Found]:
+    first_row, database = part
+    if codes is not None and first_row not in codes:
+        codes[first_row] = [QuantizedRows(source) for source in database]
+    total, width = common_length(queries), sum(one.dimension for one in queries)
     step = max(1, _QUERY_ELEMENTS // max(width, 1))
     found = []
     for start in range(0, total, step) or (0,):
-        rows = [source.read(start, min(start + step, total)) for source in part.queries]
-        if part.codes is None:
-            found.append(part.search.lists(rows, part.database))
+        rows = [source.read(start, min(start + step, total)) for source in queries]
+        if codes is None:
+            found.append(search.lists(rows, database))
         else:
-            codes = part.codes[part.first_row]
-            found.append(short_lists(part.search, rows, part.database, codes))
+            found.append(short_lists(search, rows, database, codes[first_row]))
     lists = []
     for blocks in zip(*found, strict=True):
         indices, scores = (np.concatenate(arrays) for arrays in zip(*blocks, strict=True))
-        lists.append((np.where(indices >= 0, indices + part.first_row, -1), scores))
+        lists.append((np.where(indices >= 0, indices + first_row, -1), scores))
     return lists
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,15 +24,17 @@ def query_units(data: KaptureData, *, rigs: bool) -> list[Unit]:
     several rigs goes with the first by name. Without, every image is by itself.
     """
     rigs_of = _rigs_of(data) if rigs else {}
-    together: dict[tuple[int, str, str], list[str]] = {}
+    units: list[Unit] = []
+    together: dict[tuple[int, str], list[str]] = {}
     for image in data.image_names():
         timestamp, sensor = data.record_of(image)
-        owner = ("rig", rigs_of[sensor][0]) if sensor in rigs_of else ("sensor", sensor)
-        together.setdefault((timestamp, *owner), []).append(image)
-    units: list[Unit] = []
-    for (_, kind, rig), images in together.items():
-        if kind == "sensor" or len(images) == 1:
-            units += [((image, RigidTransform.identity()),) for image in images]
+        if sensor in rigs_of:
+            together.setdefault((timestamp, rigs_of[sensor][0]), []).append(image)
+        else:
+            units.append(((image, RigidTransform.identity()),))
+    for (_, rig), images in together.items():
+        if len(images) == 1:
+            units.append(((images[0], RigidTransform.identity()),))
         else:
             members = data.rigs[rig]
             units.append(tuple((image, members[data.record_of(image)[1]]) for image in images))
@@ -58,17 +61,15 @@ def poses_through_rig(
     found = {}
     for image in sorted(set(data.records_camera.values()) - set(localized)):
         timestamp, sensor = data.record_of(image)
-        best: tuple[int, str, RigidTransform] | None = None
-        for other_sensor, other in at_time[timestamp]:
-            result = localized.get(other)
-            sensor_from_other = _between(data, rigs_of, sensor, other_sensor)
-            if result is None or sensor_from_other is None:
-                continue
-            key = (-result.num_inliers, other)
-            if best is None or key < best[:2]:
-                best = (*key, sensor_from_other @ result.cam_from_world)
-        if best is not None:
-            found[image] = (best[1], best[2])
+        poses = [
+            (-result.num_inliers, other, sensor_from_other @ result.cam_from_world)
+            for other_sensor, other in at_time[timestamp]
+            if (result := localized.get(other)) is not None
+            and (sensor_from_other := _between(data, rigs_of, sensor, other_sensor)) is not None
+        ]
+        if poses:
+            _, other, pose = min(poses, key=itemgetter(0, 1))
+            found[image] = (other, pose)
     return found
 
 

@@ -97,8 +97,8 @@ class FindPoses(PipelineStage):
         world, model, counts = _scaled(models[0], structure)
         tables = work.out / SIDE_TABLES
         reasons = read_unreadable(work.path(SIDE_TABLES))
-        for image in data.image_names():
-            reasons |= {} if image in model.poses else {image: "no model: too few matches agree"}
+        absent = set(data.image_names()) - model.poses.keys()
+        reasons |= dict.fromkeys(sorted(absent), "no model: too few matches agree")
         for number, other in enumerate(models[1:], start=2):
             reasons |= {
                 image: f"model {number}, of {len(other.poses)} photographs, which does not hang "

@@ -74,6 +74,7 @@ class _Entry(NamedTuple):
     said: Any
 
 
+@dataclass(eq=False)
 class KeptItems:
     """What a stage has done of its items, in this run and in those before.
 
@@ -85,27 +86,22 @@ class KeptItems:
     sources : folders that may have items, and their journals; the first that has one counts.
     verify : hash all files that are taken over, see
         :func:`~megloc_kapture.io.file_states.state_if_unchanged`.
+    states : of the files of items that are done, by path below the folder.
     """
 
-    def __init__(
-        self,
-        settings: str,
-        out: Path,
-        journal: Path,
-        sources: Sequence[tuple[Path, Path]],
-        digest: Digest,
-        *,
-        verify: bool = False,
-    ) -> None:
-        self._settings, self._out, self._journal = settings, out, journal
-        self._sources, self._digest, self._verify = sources, digest, verify
-        self.states: dict[str, FileState] = {}
-        """Of the files of items that are done, by path below the folder."""
-        self.num_kept = self.num_items = 0
+    settings: str
+    out: Path
+    journal: Path
+    sources: Sequence[tuple[Path, Path]]
+    digest: Digest
+    verify: bool = False
+    states: dict[str, FileState] = field(default_factory=dict, init=False)
+    num_kept: int = field(default=0, init=False)
+    num_items: int = field(default=0, init=False)
 
     def key(self, kind: str, name: str, inputs: Inputs) -> str:
         """The hash that an item is known by."""
-        content = [self._settings, kind, name, inputs(name, self._digest)]
+        content = [self.settings, kind, name, inputs(name, self.digest)]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     def take(self, key: str) -> _Entry | None:
@@ -121,16 +117,16 @@ class KeptItems:
 
     def add(self, key: str, files: Iterable[Path], said: Any) -> None:
         """Note that an item is done: its files below the folder, and what is said of it."""
-        paths = {file.relative_to(self._out).as_posix(): file for file in files}
+        paths = {file.relative_to(self.out).as_posix(): file for file in files}
         try:
             found = {path: self.states.get(path) or state_of(file) for path, file in paths.items()}
         except OSError as error:
-            raise output_error(self._out, error) from error
+            raise output_error(self.out, error) from error
         self._note(key, _Entry(found, said))
 
     @cached_property
     def _entries(self) -> list[tuple[Path, dict[str, _Entry]]]:
-        return [(root, _read_journal(path)) for root, path in self._sources]
+        return [(root, _read_journal(path)) for root, path in self.sources]
 
     def _link(self, root: Path, files: Mapping[str, FileState]) -> bool:
         """Link an item's files where all are as they were written."""
@@ -138,11 +134,11 @@ class KeptItems:
             there = self.states.get(path)  # a file that items share
             if there not in (None, state):
                 return False
-            if there is None and not state_if_unchanged(root / path, state, verify=self._verify):
+            if there is None and not state_if_unchanged(root / path, state, verify=self.verify):
                 return False
         try:
             for path in files.keys() - self.states.keys():
-                hard_link(root / path, self._out / path)
+                hard_link(root / path, self.out / path)
         except OutputError:
             return False
         return True
@@ -150,10 +146,10 @@ class KeptItems:
     def _note(self, key: str, entry: _Entry) -> None:
         self.states.update(entry.files)
         try:
-            with open(self._journal, "ab") as file:
+            with open(self.journal, "ab") as file:
                 file.write(f"{json.dumps([key, *entry], separators=(',', ':'))}\n".encode())
         except OSError as error:
-            raise output_error(self._journal, error) from error
+            raise output_error(self.journal, error) from error
 
 
 def _read_journal(path: Path) -> dict[str, _Entry]:
