@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import Literal
@@ -83,39 +82,26 @@ class MappingPairsOptions(Options):
         return overlap or "covisibility" in self.by
 
 
-@dataclass(frozen=True, eq=False)
-class _SeenPoints:
-    """Points (N, 3), and the observations (O,) of them by the images that are looked at."""
-
-    xyz: NDArray[np.float64]
-    point_ids: NDArray[np.int64]
-    image_ids: NDArray[np.int64]
-
-    @classmethod
-    def read(cls, folder: KaptureFolder, images: Sequence[str]) -> _SeenPoints:
-        if not folder.has_points():
-            raise DataError("co-visibility and overlap need a map's points", path=folder.root)
-        row_of = {image: row for row, image in enumerate(images)}
-        points, seeing = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
-        for _, observations in sorted(folder.observations().items()):
-            rows = np.array([row_of.get(name, -1) for name in observations.image_names], np.int64)
-            image_ids = rows[observations.image_ids]
-            points.append(observations.point_ids[image_ids >= 0])
-            seeing.append(image_ids[image_ids >= 0])
-        found = cls(folder.points3d()[:, :3], np.concatenate(points), np.concatenate(seeing))
-        if len(found.point_ids) == 0:
-            raise DataError("no image to be paired observes its points", path=folder.root)
-        return found
-
-    def of(self, members: NDArray[np.int64], num_images: int) -> _SeenPoints:
-        """What some of the images observe, by their place among these."""
-        row_of = np.full(num_images, -1, dtype=np.int64)
-        row_of[members] = np.arange(len(members))
-        rows = row_of[self.image_ids]
-        return _SeenPoints(self.xyz, self.point_ids[rows >= 0], rows[rows >= 0])
+def _seen_points(
+    folder: KaptureFolder, images: Sequence[str]
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
+    """Points (N, 3), and the points and images (O,) of what the images observe."""
+    if not folder.has_points():
+        raise DataError("co-visibility and overlap need a map's points", path=folder.root)
+    row_of = {image: row for row, image in enumerate(images)}
+    points, seeing = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
+    for _, observations in sorted(folder.observations().items()):
+        rows = np.array([row_of.get(name, -1) for name in observations.image_names], np.int64)
+        image_ids = rows[observations.image_ids]
+        points.append(observations.point_ids[image_ids >= 0])
+        seeing.append(image_ids[image_ids >= 0])
+    point_ids = np.concatenate(points)
+    if len(point_ids) == 0:
+        raise DataError("no image to be paired observes its points", path=folder.root)
+    return folder.points3d()[:, :3], point_ids, np.concatenate(seeing)
 
 
-_NOTHING_SEEN = _SeenPoints(np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0, np.int64))
+_NOTHING_SEEN = np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0, np.int64)
 
 
 def pair_map_images(
@@ -138,13 +124,16 @@ def pair_map_images(
     data = mapping.read()
     poses = data.poses()
     images = sorted(poses) or data.image_names()
-    seen = _NOTHING_SEEN
+    xyz, point_ids, image_ids = _NOTHING_SEEN
     if options.needs_points():
-        seen = _SeenPoints.read(covisible or mapping, images)
+        xyz, point_ids, image_ids = _seen_points(covisible or mapping, images)
     found, similarities = [np.zeros((0, 2), dtype=np.int64)], [np.zeros(0)]
     for members in restrictions.frames(images):
         names = [images[member] for member in members]
-        within = seen.of(members, len(images))
+        row_of = np.full(len(images), -1, dtype=np.int64)
+        row_of[members] = np.arange(len(members))
+        rows = row_of[image_ids]
+        seen = point_ids[rows >= 0], rows[rows >= 0]  # of these images, by their rows among them
         for method in options.by:
             similarity = None
             if method == "retrieval":
@@ -153,15 +142,13 @@ def pair_map_images(
                 vectors = vectors_of(retrieval.readers(mapping), names)
                 pairs, similarity = _most_similar(vectors, retrieval, options.top_k, work)
             elif method == "poses":
-                pairs = _by_poses(data, [poses[name] for name in names], names, within, options)
+                pairs = _by_poses(data, poses, names, xyz, seen, options.poses)
             elif method == "sequence":
                 records = [data.record_of(name) for name in names]
                 cameras, timestamps = [sensor for _, sensor in records], [t for t, _ in records]
                 pairs = pairs_by_sequence(cameras, timestamps, options.sequence)
             elif method == "covisibility":
-                pairs = pairs_by_covisibility(
-                    len(names), within.point_ids, within.image_ids, options.covisibility
-                )
+                pairs = pairs_by_covisibility(len(names), *seen, options.covisibility)
             else:
                 pairs = exhaustive_pairs(len(names))
             found.append(members[pairs])
@@ -171,18 +158,20 @@ def pair_map_images(
 
 def _by_poses(
     data: KaptureData,
-    poses: list[RigidTransform],
-    names: list[str],
-    seen: _SeenPoints,
-    options: MappingPairsOptions,
+    poses: Mapping[str, RigidTransform],
+    names: Sequence[str],
+    xyz: NDArray[np.float64],
+    seen: tuple[NDArray[np.int64], NDArray[np.int64]],
+    options: PairsByPosesOptions,
 ) -> NDArray[np.int64]:
-    pairs = pairs_by_poses(poses, options.poses)
-    if options.poses.min_overlap is None:
+    of_images = [poses[name] for name in names]
+    pairs = pairs_by_poses(of_images, options)
+    if options.min_overlap is None:
         return pairs
     cameras = [data.camera_of(name) for name in names]
-    overlap = frustum_overlap(pairs, cameras, poses, seen.xyz, seen.point_ids, seen.image_ids)
+    overlap = frustum_overlap(pairs, cameras, of_images, xyz, *seen)
     # where neither image observes anything nobody knows
-    return pairs[~(overlap < options.poses.min_overlap)]
+    return pairs[~(overlap < options.min_overlap)]
 
 
 def _united(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
 from typing import Any, Literal
 
 from pydantic import Field, field_validator, model_validator
@@ -31,6 +33,11 @@ from megloc_kapture.stages.pose_refinement import PoseRefinementOptions
 from megloc_kapture.stages.preprocessing import PreprocessingOptions
 from megloc_kapture.stages.query_poses import LocalizationOptions
 from megloc_kapture.values import Device, Options
+
+
+def _first_twice(names: Sequence[str]) -> str | None:
+    """The first name, by the alphabet, that stands in a list more than once."""
+    return min((name for name, count in Counter(names).items() if count > 1), default=None)
 
 
 class LocalFeaturesChoice(PluginChoice):
@@ -214,11 +221,10 @@ class PipelineOptions(Options):
         Raises PluginError: an extractor cannot be made; OptionError: two types of one name.
         """
         types = [extractor.name for extractor in self.query_extractors()]
-        twice = sorted({name for name in types if types.count(name) > 1})
-        if twice:
+        if twice := _first_twice(types):
             raise OptionError(
-                f"keypoints type {twice[0]!r} is asked for twice, in local_features or of the "
-                f"given map (map = {self.map})"
+                f"keypoints type {twice!r} is asked for twice, in local_features or of the given "
+                f"map (map = {self.map})"
             )
         return types
 
@@ -234,9 +240,8 @@ class PipelineOptions(Options):
         """
         main_type = self.main_type()
         types = [chosen.type_name(main_type) for chosen in self.global_features]
-        twice = sorted({name for name in types if types.count(name) > 1})
-        if twice:
-            raise OptionError(f"global features {twice[0]!r} are asked for twice")
+        if twice := _first_twice(types):
+            raise OptionError(f"global features {twice!r} are asked for twice")
         weights = tuple(chosen.weight for chosen in self.global_features)
         return Retrieval(tuple(types), weights, self.fusion)
 
