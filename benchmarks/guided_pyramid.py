@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.io.colmap import TriangulationOptions
 from megloc_kapture.io.csv_table import read_csv_table
+from megloc_kapture.io.dataset_tables import table_path
 from megloc_kapture.io.images import read_image_rgb, write_image
 from megloc_kapture.io.kapture import (
     ImagePair,
@@ -49,10 +50,10 @@ from megloc_kapture.plugins import (
     Matcher,
     PluginChoice,
 )
+from megloc_kapture.stages.guided_pyramid import COLUMNS, PyramidMethod
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.matches import match_pairs
-from megloc_kapture.stages.pyramid_mapping import pyramid_mapping
-from megloc_kapture.stages.pyramid_queries import COLUMNS, pyramid_queries, table_path
+from megloc_kapture.stages.pyramid_mapping import pyramid_mapping, pyramid_queries
 from megloc_kapture.stages.query_poses import LocalizationOptions, localize_from_matches
 from megloc_kapture.stages.triangulation import triangulate_map
 from megloc_kapture.stages.work import Work
@@ -188,8 +189,9 @@ class Bench:
                 KnownPoseOptions(), self.root / "features", work=Work(executor),
             )  # fmt: skip
             counts = pyramid_mapping(
-                self.mapping(), pairs, local_type, self.extractor, self.matcher,
-                KnownPoseOptions(), self.map_options, self.root / "pyramid", work=Work(executor),
+                self.mapping(), pairs, local_type,
+                PyramidMethod(self.extractor, self.matcher, KnownPoseOptions(), self.map_options),
+                self.root / "pyramid", work=Work(executor),
             )  # fmt: skip
         points = triangulate_map(
             self.mapping(), self.mapping(), pyramid_type(local_type), self.root / "map",
@@ -221,8 +223,9 @@ class Bench:
             for name, options in ways.items():
                 output = root / name.replace(" ", "_").replace("/", "-").replace(",", "")
                 counts = pyramid_queries(
-                    query, self.mapping(), pairs, local_type, self.extractor, self.matcher,
-                    TwoViewOptions(), options, output, work=Work(executor),
+                    query, self.mapping(), pairs, local_type,
+                    PyramidMethod(self.extractor, self.matcher, TwoViewOptions(), options),
+                    output, work=Work(executor),
                 )  # fmt: skip
                 found = self._localize(KaptureFolder(query.root, features_dirs=[output]), pairs)
                 rows.append((change.name, name, *_figures(found, truth, counts)))

@@ -48,8 +48,8 @@ from megloc_kapture.plugins import (
     StereoView,
 )
 from megloc_kapture.stages.densifying import DensifyOptions, densify_map
-from megloc_kapture.stages.rigs import depth_records
-from megloc_kapture.stages.stereo_depth import read_beside, read_stereo_depth
+from megloc_kapture.stages.rigs import depth_records, read_depth
+from megloc_kapture.stages.stereo_depth import read_beside
 from megloc_kapture.values import Camera, RigidTransform
 
 _SIZE = 768
@@ -208,7 +208,7 @@ def _at(
 def depth_of(folder: KaptureFolder, image: str) -> tuple[Camera, NDArray[np.float32]]:
     """The camera and the depth (H, W) of an image."""
     record = depth_records(folder.read())[image]
-    return record.camera, read_stereo_depth(folder, record)
+    return record.camera, read_depth(folder, record)
 
 
 def rephotography(densified: KaptureFolder, scene: Path) -> tuple[float, float]:

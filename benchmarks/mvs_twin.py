@@ -31,8 +31,8 @@ from megloc_kapture.mvs.views import AgreementOptions
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import DEPTH_ESTIMATORS
-from megloc_kapture.stages.rigs import depth_records
-from megloc_kapture.stages.stereo_depth import read_beside, read_stereo_depth
+from megloc_kapture.stages.rigs import depth_records, read_depth
+from megloc_kapture.stages.stereo_depth import read_beside
 
 CLASSES = ("facade", "ground", "thin", "textureless", "none")
 _THIN_PX, _NEARER, _FLAT, _GROUND_M = 9, 0.02, 2.0, 0.15
@@ -69,7 +69,7 @@ def measure(world: Path, out: Path, name: str) -> str:
     for image in sorted(depth_records(densified.read())):
         camera, depth = depth_of(densified, image)
         record, pose = records[image], data.poses()[image]
-        stored = read_stereo_depth(exact, record)
+        stored = read_depth(exact, record)
         nearest = cv2.resize(stored, depth.shape[::-1], interpolation=cv2.INTER_NEAREST)
         truth = np.asarray(nearest, np.float32)
         grey = cv2.cvtColor(read_image_rgb(exact.image_path(image)), cv2.COLOR_RGB2GRAY)

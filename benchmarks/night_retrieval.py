@@ -36,7 +36,7 @@ from megloc_kapture.matching.verification import TwoViewOptions
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.retrieval.fusion import FusionOptions, concatenate, fuse
-from megloc_kapture.stages.global_vlad import extract_vlad, vlad_type
+from megloc_kapture.stages.global_features import extract_vlad, vlad_type
 from megloc_kapture.stages.matches import match_pairs
 from megloc_kapture.stages.work import Work
 

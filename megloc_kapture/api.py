@@ -44,9 +44,8 @@ from megloc_kapture.pipeline.queries import Query
 from megloc_kapture.pipeline.results import Results
 from megloc_kapture.pipeline.run import choose_run
 from megloc_kapture.pipeline.workspace import Workspace
-from megloc_kapture.stages.layout import EVALUATION, LOCALIZED, MAP
 from megloc_kapture.stages.options import PipelineOptions
-from megloc_kapture.stages.stage import Stage
+from megloc_kapture.stages.stage import EVALUATION, LOCALIZED, MAP, Stage
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera, Failure, Pose
 

@@ -27,8 +27,8 @@ from megloc_kapture.pipeline.datasets import (
 )
 from megloc_kapture.pipeline.executors import open_executor
 from megloc_kapture.pipeline.presets import assigned, options_with
-from megloc_kapture.stages.layout import MAP
-from megloc_kapture.stages.unreadable import set_aside_unreadable
+from megloc_kapture.stages.localized_folder import set_aside_unreadable
+from megloc_kapture.stages.stage import MAP
 from megloc_kapture.stages.work import Work
 
 DATASET, COLMAP, MEGADEPTH = "dataset", "colmap", "megadepth"

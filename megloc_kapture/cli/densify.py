@@ -10,7 +10,7 @@ from megloc_kapture.cli.stage_command import StageCommand, restrictions_beside
 from megloc_kapture.cli.stages import MAP
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.stages.densifying import densify_map, fitted_to_poses
-from megloc_kapture.stages.fusion import fuse_depth
+from megloc_kapture.stages.stereo_depth import fuse_depth
 
 
 @dataclass(frozen=True, kw_only=True)

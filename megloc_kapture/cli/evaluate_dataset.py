@@ -41,8 +41,7 @@ from megloc_kapture.pipeline.plan import all_kept, describe, run_plan
 from megloc_kapture.pipeline.run import RunChoice, choose_run
 from megloc_kapture.pipeline.submissions_folder import FOLDER, keep_submission
 from megloc_kapture.pipeline.workspace import Workspace
-from megloc_kapture.stages.layout import EVALUATION, LOCALIZED
-from megloc_kapture.stages.stage import Stage
+from megloc_kapture.stages.stage import EVALUATION, LOCALIZED, Stage
 from megloc_kapture.stages.work import Work
 
 BELOW_RECALL = 3

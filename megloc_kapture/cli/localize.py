@@ -37,8 +37,8 @@ from megloc_kapture.pipeline.localizer import LOCALIZING, Localizer
 from megloc_kapture.pipeline.photographs import Photographs
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, assigned, options_of_preset
 from megloc_kapture.pipeline.results import Results
-from megloc_kapture.stages.layout import LOCALIZED
 from megloc_kapture.stages.matches import iterate_candidates
+from megloc_kapture.stages.stage import LOCALIZED
 
 
 @dataclass(frozen=True, kw_only=True)

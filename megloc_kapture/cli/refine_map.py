@@ -9,7 +9,8 @@ from megloc_kapture.cli.common import Force, Input, Output, Reading
 from megloc_kapture.cli.stage_command import StageCommand
 from megloc_kapture.cli.stages import MAP
 from megloc_kapture.io.files import read_json_model
-from megloc_kapture.stages.map_refinement import REPORT_FILE, RefinementReport, refine_map
+from megloc_kapture.stages.map_refinement import RefinementReport, refine_map
+from megloc_kapture.stages.preprocessing import REPORT_FILE
 
 
 @dataclass(frozen=True, kw_only=True)

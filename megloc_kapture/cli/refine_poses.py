@@ -14,8 +14,8 @@ from megloc_kapture.evaluation.report.refinement import consistency_sentence
 from megloc_kapture.io.tables import CONSISTENCY_FILE, read_consistency
 from megloc_kapture.plugin_loading import plugin_names
 from megloc_kapture.plugins import POSE_REFINERS
-from megloc_kapture.stages.layout import LOCALIZED
 from megloc_kapture.stages.pose_refinement import refine_poses
+from megloc_kapture.stages.stage import LOCALIZED
 
 
 @dataclass(frozen=True, kw_only=True)

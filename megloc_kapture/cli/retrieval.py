@@ -19,12 +19,16 @@ from megloc_kapture.errors import OptionError
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, write_pairs
 from megloc_kapture.retrieval.fusion import FusionMethod
 from megloc_kapture.stages.candidates import Retrieval
-from megloc_kapture.stages.global_features import extract_global_features
-from megloc_kapture.stages.global_vlad import extract_vlad, vlad_type
-from megloc_kapture.stages.image_pairs import PairingMethod, pair_map_images, pair_queries
+from megloc_kapture.stages.global_features import extract_global_features, extract_vlad, vlad_type
+from megloc_kapture.stages.image_pairs import (
+    PairingMethod,
+    RerankingOptions,
+    pair_map_images,
+    pair_queries,
+    reranked,
+)
 from megloc_kapture.stages.matches import match_pairs
 from megloc_kapture.stages.options import PipelineOptions
-from megloc_kapture.stages.reranking import RerankingOptions, reranked
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -70,7 +70,7 @@ def input_files(root: Path) -> Iterator[Path]:
         folder = KaptureFolder(root / part)
         if (folder.root / "sensors").is_dir():
             files = files_of(folder, images=part != QUERY_GT)
-            # a query without its image fails by itself, see stages/unreadable.py
+            # a query without its image fails by itself, see stages/localized_folder.py
             yield from (path for path in files if part != QUERY or path.is_file())
     if (nowhere := table_path(root / QUERY_GT, NOWHERE_FILE)).is_file():
         yield nowhere

@@ -15,9 +15,8 @@ from megloc_kapture.io.csv_table import write_csv_table
 from megloc_kapture.io.files import hard_link, output_error
 from megloc_kapture.pipeline.manifests import read_manifest
 from megloc_kapture.pipeline.workspace import LOCK, PARTIAL, Workspace
-from megloc_kapture.stages.layout import EVALUATION
 from megloc_kapture.stages.options import PipelineOptions
-from megloc_kapture.stages.stage import Stage
+from megloc_kapture.stages.stage import EVALUATION, Stage
 
 ABLATION, TABLE = "ablation", "ablation/ablation.csv"
 

@@ -40,7 +40,7 @@ from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.plan import run_plan
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, options_of_preset
 from megloc_kapture.pipeline.workspace import LOCK, Workspace
-from megloc_kapture.stages.layout import MAP
+from megloc_kapture.stages.stage import MAP
 from megloc_kapture.stages.work import HERE, Work
 
 _log = logging.getLogger(__name__)

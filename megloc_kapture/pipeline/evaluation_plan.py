@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
+from megloc_kapture.cli.refine_map import RefineMap
 from megloc_kapture.datasets.kapture_folders import import_mapping, mapping_files
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.evaluation.evaluate import evaluate, results_without_truth
@@ -23,8 +24,17 @@ from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import STAGES
 from megloc_kapture.stages.densifying import Densify
 from megloc_kapture.stages.global_features import ExtractGlobalFeatures
-from megloc_kapture.stages.image_pairs import PairMapping, PairQueries
-from megloc_kapture.stages.layout import (
+from megloc_kapture.stages.image_pairs import PairMapping, PairQueries, RerankQueries
+from megloc_kapture.stages.local_features import ExtractLocalFeatures
+from megloc_kapture.stages.localized_folder import set_aside_unreadable
+from megloc_kapture.stages.map_points import GivenMap, LiftPoints, TriangulatePoints
+from megloc_kapture.stages.matches import MatchMapping, MatchQueries
+from megloc_kapture.stages.options import PipelineOptions
+from megloc_kapture.stages.pose_refinement import RefinePoses
+from megloc_kapture.stages.preprocessing import Preprocess
+from megloc_kapture.stages.pyramid_mapping import PyramidMapping, PyramidQueries
+from megloc_kapture.stages.query_poses import LocalizeQueries
+from megloc_kapture.stages.stage import (
     EVALUATION,
     LOCALIZED,
     MAPPING,
@@ -32,20 +42,13 @@ from megloc_kapture.stages.layout import (
     QUERY_GT,
     REFERENCE,
     SUBMISSIONS,
+    Hashes,
+    PipelineStage,
+    Stage,
+    StageWork,
+    is_below,
+    wanted_stages,
 )
-from megloc_kapture.stages.local_features import ExtractLocalFeatures
-from megloc_kapture.stages.map_points import GivenMap, LiftPoints, TriangulatePoints
-from megloc_kapture.stages.map_refinement import RefineMap
-from megloc_kapture.stages.matches import MatchMapping, MatchQueries
-from megloc_kapture.stages.options import PipelineOptions
-from megloc_kapture.stages.pose_refinement import RefinePoses
-from megloc_kapture.stages.preprocessing import Preprocess
-from megloc_kapture.stages.pyramid_mapping import PyramidMapping
-from megloc_kapture.stages.pyramid_queries import PyramidQueries
-from megloc_kapture.stages.query_poses import LocalizeQueries
-from megloc_kapture.stages.reranking import RerankQueries
-from megloc_kapture.stages.stage import Hashes, PipelineStage, Stage, StageWork, is_below
-from megloc_kapture.stages.unreadable import set_aside_unreadable
 from megloc_kapture.values import Options
 
 WORLD = "world"
@@ -95,7 +98,7 @@ def plan_evaluation(run: Run) -> list[Stage]:
     run.source.check()
     stages: list[Stage] = [Render(run)] if run.source.twin is not None else []
     stages.append(Import(run))
-    stages += [kind(options) for kind in PIPELINE if kind.is_wanted(options)]
+    stages += wanted_stages(PIPELINE, options)
     stages += [Submit(run), Evaluate(run)]
     for name, values in options.stages.items():
         _insert(stages, load_plugin(STAGES, name, dict(values)))
@@ -114,8 +117,7 @@ def plan_map(mapping: KaptureFolder, options: PipelineOptions) -> list[Stage]:
     if options.uses_given_map() or options.pairs_by_points():
         raise OptionError("images with poses come with no model: map, mapping_pairs.by")
     behind = PIPELINE.index(Densify) + 1
-    kinds = [kind for kind in PIPELINE[:behind] if kind.is_wanted(options)]
-    return [ImportMapping(mapping), *(kind(options) for kind in kinds)]
+    return [ImportMapping(mapping), *wanted_stages(PIPELINE[:behind], options)]
 
 
 def _insert(stages: list[Stage], stage: Stage) -> None:

@@ -25,9 +25,11 @@ from megloc_kapture.pipeline.map_retrieval import MapRetrieval
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.queries import Preprocessor, Query, QueryImage, QueryImages
 from megloc_kapture.stages.devices import Precision, unheeded
-from megloc_kapture.stages.map_refiners import MapRefiners
+from megloc_kapture.stages.image_pairs import counted, rerank
+from megloc_kapture.stages.localized_folder import unreadable_image
 from megloc_kapture.stages.matches import FeatureCache, Features, VerifiedMatches
 from megloc_kapture.stages.options import PipelineOptions
+from megloc_kapture.stages.pose_refinement import MapRefiners
 from megloc_kapture.stages.query_poses import (
     Solved,
     in_turn,
@@ -35,8 +37,6 @@ from megloc_kapture.stages.query_poses import (
     localize_views,
 )
 from megloc_kapture.stages.ranking_scene import KaptureScene
-from megloc_kapture.stages.reranking import counted, rerank
-from megloc_kapture.stages.unreadable import unreadable_image
 from megloc_kapture.stages.work import ordered_map
 from megloc_kapture.values import Camera, Device, Failure, Pose, RigidTransform
 

@@ -22,8 +22,12 @@ from megloc_kapture.plugin_loading import plugin_names
 from megloc_kapture.plugins import GLOBAL_FEATURES, GlobalFeatureExtractor
 from megloc_kapture.stages.candidates import Candidates, Retrieval, vectors_of
 from megloc_kapture.stages.devices import placed
-from megloc_kapture.stages.global_features import GlobalFeaturesChoice
-from megloc_kapture.stages.global_vlad import VladSettings, read_vocabulary, vlad_type
+from megloc_kapture.stages.global_features import (
+    GlobalFeaturesChoice,
+    VladSettings,
+    read_vocabulary,
+    vlad_type,
+)
 from megloc_kapture.stages.local_features import read_image_of
 from megloc_kapture.stages.matches import Features
 from megloc_kapture.stages.options import PipelineOptions

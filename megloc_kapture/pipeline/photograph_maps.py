@@ -15,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from megloc_kapture.cli.refine_map import RefineMap
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.colmap_mapping import MIN_IMAGES, Mapper
 from megloc_kapture.io.dataset_tables import (
@@ -33,17 +34,24 @@ from megloc_kapture.pipeline.photographs import Photographs
 from megloc_kapture.pipeline.presets import PRESETS, options_of_preset
 from megloc_kapture.stages.global_features import ExtractGlobalFeatures
 from megloc_kapture.stages.image_pairs import PairMapping
-from megloc_kapture.stages.layout import MAP, MAPPING, QUERY
 from megloc_kapture.stages.local_features import ExtractLocalFeatures
+from megloc_kapture.stages.localized_folder import set_aside_unreadable
 from megloc_kapture.stages.map_points import TriangulatePoints
-from megloc_kapture.stages.map_refinement import RefineMap
 from megloc_kapture.stages.matches import MatchMapping
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.preprocessing import Preprocess
 from megloc_kapture.stages.pyramid_mapping import PyramidMapping
-from megloc_kapture.stages.stage import Hashes, PipelineStage, Stage, StageWork
+from megloc_kapture.stages.stage import (
+    MAP,
+    MAPPING,
+    QUERY,
+    Hashes,
+    PipelineStage,
+    Stage,
+    StageWork,
+    wanted_stages,
+)
 from megloc_kapture.stages.structure import FindPoses, MatchPhotographs, StructureOptions
-from megloc_kapture.stages.unreadable import set_aside_unreadable
 from megloc_kapture.values import Options
 
 GPS = "gps"
@@ -205,14 +213,12 @@ def plan_photographs(
     if len(photographs.names) < MIN_IMAGES:
         raise _too_few(len(photographs.names))
     stages: list[Stage] = [ImportPhotographs(photographs)]
-    stages += [kind(options) for kind in _WITHOUT_POSES if kind.is_wanted(options)]
+    stages += wanted_stages(_WITHOUT_POSES, options)
     stages.append(FindPoses(options, structure))
-    for kind in _WITH_POSES:
-        if kind.is_wanted(options):
-            stage = kind(options)
-            stage.layout = replace(stage.layout, posed=True)
-            stages.append(stage)
-    return stages
+    with_poses = wanted_stages(_WITH_POSES, options)
+    for stage in with_poses:
+        stage.layout = replace(stage.layout, posed=True)
+    return [*stages, *with_poses]
 
 
 def describe_map(workspace: Path, photographs: Photographs) -> list[str]:

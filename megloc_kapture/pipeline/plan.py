@@ -18,9 +18,8 @@ from megloc_kapture.io.files import clear_temporary, hard_link, write_bytes, wri
 from megloc_kapture.pipeline.manifests import FileHashes, Manifest, fingerprint, read_manifest
 from megloc_kapture.pipeline.workspace import HASHES, JOURNAL, Workspace
 from megloc_kapture.pipeline.written_files import changed_file, remember_files, written_files
-from megloc_kapture.stages.kept_items import Digest, KeptItems
 from megloc_kapture.stages.stage import CODE_OF, Stage, StageWork, is_below
-from megloc_kapture.stages.work import HERE, Work
+from megloc_kapture.stages.work import HERE, Digest, KeptItems, Work
 
 State = Literal["run", "kept", "pending", "skipped"]
 

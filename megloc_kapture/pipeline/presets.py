@@ -17,11 +17,10 @@ from megloc_kapture.pipeline.assignments import check_assigned
 from megloc_kapture.plugins import PluginChoice
 from megloc_kapture.stages.candidates import QueryPairsOptions
 from megloc_kapture.stages.global_features import GlobalFeaturesChoice
-from megloc_kapture.stages.image_pairs import MappingPairsOptions
+from megloc_kapture.stages.image_pairs import MappingPairsOptions, RerankingOptions
 from megloc_kapture.stages.map_refinement import MapRefinementOptions
 from megloc_kapture.stages.options import LocalFeaturesChoice, PipelineOptions
 from megloc_kapture.stages.preprocessing import PreprocessingOptions
-from megloc_kapture.stages.reranking import RerankingOptions
 from megloc_kapture.values import Options
 
 OptionsT = TypeVar("OptionsT", bound=Options)

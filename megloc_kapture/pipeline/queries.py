@@ -101,7 +101,7 @@ class Query:
             )
         if isinstance(self.image, str | Path):
             image = turned_upright(read_image_rgb(Path(self.image)), self.orientation)
-            check_size(image, self.camera, self.image)
+            check_size(image.shape[1::-1], self.camera, self.image)
             return image
         image = np.asarray(self.image)
         if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:

@@ -19,9 +19,8 @@ from megloc_kapture.localization.focal_length import solve_with_shared_camera
 from megloc_kapture.pipeline.kapture_queries import KaptureQueries
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.photographs import Photographs
-from megloc_kapture.stages.layout import LOCALIZED
-from megloc_kapture.stages.localized_folder import query_status, write_localized
-from megloc_kapture.stages.unreadable import unreadable_image
+from megloc_kapture.stages.localized_folder import query_status, unreadable_image, write_localized
+from megloc_kapture.stages.stage import LOCALIZED
 from megloc_kapture.stages.work import Track, untracked
 from megloc_kapture.values import Failure, Pose, RigidTransform
 

@@ -20,8 +20,8 @@ from megloc_kapture.pipeline.paper_steps import (
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.submission import place_of
 from megloc_kapture.pipeline.workspace import Workspace
-from megloc_kapture.stages.layout import SUBMISSIONS
 from megloc_kapture.stages.options import PipelineOptions
+from megloc_kapture.stages.stage import SUBMISSIONS
 
 
 @dataclass(frozen=True)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import pairwise
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -12,6 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.errors import DataError
+from megloc_kapture.io.dataset_tables import ImageGroup, read_groups, read_priors
 from megloc_kapture.io.kapture import FeatureReader, KaptureFolder
 from megloc_kapture.io.kapture.vectors import KaptureVectors
 from megloc_kapture.retrieval.fusion import DiversityOptions, FusionOptions, diversify
@@ -19,6 +22,73 @@ from megloc_kapture.retrieval.search import Found, FusedSearch, QuantizedRows, s
 from megloc_kapture.retrieval.vectors import VectorBlocks, as_blocks, common_length
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Options, RigidTransform
+
+
+@dataclass(frozen=True, eq=False)
+class Restrictions:
+    """Priors of the queries, and the coordinate frames of the map's images.
+
+    Parameters
+    ----------
+    groups : image -> its group; of the map's images, frame and location count.
+    priors : query -> names of map images, locations or frames it may be matched with. A query
+        that is not in it may be matched with everything.
+    """
+
+    groups: Mapping[str, ImageGroup] = field(default_factory=dict)
+    priors: Mapping[str, Sequence[str]] = field(default_factory=dict)
+
+    @classmethod
+    def read(cls, side_tables: Path) -> Restrictions:
+        """From a workspace's ``megloc/`` folder; absent tables restrict nothing.
+
+        Raises DataError: a broken table.
+        """
+        return cls(read_groups(side_tables), read_priors(side_tables))
+
+    def frame(self, image: str) -> str:
+        """The coordinate frame of a map image; ``""`` where there is only one."""
+        group = self.groups.get(image)
+        return "" if group is None else group.frame
+
+    def frames(self, images: Sequence[str]) -> list[NDArray[np.int64]]:
+        """Positions in ``images`` by frame, frames in order of their names."""
+        members: dict[str, list[int]] = {}
+        for position, image in enumerate(images):
+            members.setdefault(self.frame(image), []).append(position)
+        return [np.array(members[name], np.int64) for name in sorted(members)]
+
+    def pools(
+        self, queries: Sequence[str], images: Sequence[str]
+    ) -> Iterator[tuple[list[int], NDArray[np.int64]]]:
+        """Queries that may be matched with the same images, and these images.
+
+        Yields positions in ``queries``, and sorted positions in ``images``, int64 (M,); every query
+        once. M is 0 where nothing of what a prior permits is in the map.
+        """
+        together: dict[tuple[str, ...] | None, list[int]] = {}
+        for position, query in enumerate(queries):
+            prior = self.priors.get(query)
+            together.setdefault(None if prior is None else tuple(prior), []).append(position)
+        members = self._members(images) if set(together) != {None} else {}
+        for permitted, positions in together.items():
+            if permitted is None:
+                yield positions, np.arange(len(images))
+                continue
+            found = [position for name in permitted for position in members.get(name, ())]
+            yield positions, np.unique(np.array(found, dtype=np.int64))
+
+    def _members(self, images: Sequence[str]) -> dict[str, list[int]]:
+        members: dict[str, list[int]] = {}
+        for position, image in enumerate(images):
+            group = self.groups.get(image, ImageGroup())
+            for name in {image, group.location, group.frame} - {""}:
+                members.setdefault(name, []).append(position)
+        return members
+
+
+UNRESTRICTED = Restrictions()
+
 
 Vectors = KaptureVectors | NDArray[np.float32]  # unit rows
 _QUERY_ELEMENTS = 1 << 27  # of query vectors held at once: 512 MiB of float32
@@ -92,12 +162,10 @@ class Retrieval:
         total = common_length([as_blocks(source) for source in database])
         most = _ROWS if codes is None else _CODED_ROWS
         bounds = np.linspace(0, total, max(1, -(-total // most)) + 1).astype(int).tolist()
-        parts = [
-            _Part(search, asked, [_part(one, *of) for one in database], of[0], codes)
-            for of in pairwise(bounds)
-        ]
+        parts = [(of[0], [_part(one, *of) for one in database]) for of in pairwise(bounds)]
         shared = work if len(parts) > 1 else HERE
-        return search.ranking(list(shared.map(_search_part, parts, "retrieval")))
+        search_part = partial(_search_part, search, asked, codes)
+        return search.ranking(list(shared.map(search_part, parts, "retrieval")))
 
 
 def _part(source: Vectors, start: int, stop: int) -> VectorBlocks:
@@ -108,43 +176,35 @@ def _part(source: Vectors, start: int, stop: int) -> VectorBlocks:
 _Codes = dict[int, list[QuantizedRows]]  # of the part that begins at a row
 
 
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """A part of a database that is searched, by type, and the row it begins at."""
-
-    search: FusedSearch
-    queries: Sequence[VectorBlocks]
-    database: Sequence[VectorBlocks]
-    first_row: int
-    codes: _Codes | None
+_Part = tuple[int, Sequence[VectorBlocks]]  # of a database: the row it begins at, and it by type
 
 
-def _search_part(part: _Part) -> list[Found]:
-    if part.codes is not None and part.first_row not in part.codes:
-        part.codes[part.first_row] = [QuantizedRows(source) for source in part.database]
-    total, width = common_length(part.queries), sum(one.dimension for one in part.queries)
+def _search_part(
+    search: FusedSearch, queries: Sequence[VectorBlocks], codes: _Codes | None, part: _Part
+) -> list[Found]:
+    first_row, database = part
+    if codes is not None and first_row not in codes:
+        codes[first_row] = [QuantizedRows(source) for source in database]
+    total, width = common_length(queries), sum(one.dimension for one in queries)
     step = max(1, _QUERY_ELEMENTS // max(width, 1))
     found = []
     for start in range(0, total, step) or (0,):
-        rows = [source.read(start, min(start + step, total)) for source in part.queries]
-        if part.codes is None:
-            found.append(part.search.lists(rows, part.database))
+        rows = [source.read(start, min(start + step, total)) for source in queries]
+        if codes is None:
+            found.append(search.lists(rows, database))
         else:
-            codes = part.codes[part.first_row]
-            found.append(short_lists(part.search, rows, part.database, codes))
+            found.append(short_lists(search, rows, database, codes[first_row]))
     lists = []
     for blocks in zip(*found, strict=True):
         indices, scores = (np.concatenate(arrays) for arrays in zip(*blocks, strict=True))
-        lists.append((np.where(indices >= 0, indices + part.first_row, -1), scores))
+        lists.append((np.where(indices >= 0, indices + first_row, -1), scores))
     return lists
 
 
 def vectors_of(readers: Sequence[FeatureReader], images: Sequence[str]) -> list[KaptureVectors]:
     """Vectors of the images by type, unit rows, read when they are asked for.
 
-    Raises
-    ------
-    DataError : an image has none.
+    Raises DataError: an image has none.
     """
     for reader in readers:
         missing = [image for image in images if image not in reader]

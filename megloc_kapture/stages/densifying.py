@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,12 +45,11 @@ from megloc_kapture.plugins import (
     PluginChoice,
     StereoView,
 )
-from megloc_kapture.stages.layout import MAP
+from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.local_features import read_frame
-from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.rigs import depth_records
 from megloc_kapture.stages.shared_index import index_map, with_noise, write_array
-from megloc_kapture.stages.stage import PipelineStage, StageWork
+from megloc_kapture.stages.stage import MAP, Layout, PipelineStage, StageWork
 from megloc_kapture.stages.stereo_depth import (
     DEPTH_FILE,
     FOLDER,
@@ -64,9 +63,6 @@ from megloc_kapture.stages.stereo_depth import (
 from megloc_kapture.stages.triangulation import copy_features
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
 from megloc_kapture.values import Camera, Options
-
-if TYPE_CHECKING:
-    from megloc_kapture.stages.options import PipelineOptions
 
 _NO_POINTS = np.zeros(0, np.int64)
 _ANCHOR_VIEWS = 2  # that agree with a keypoint's depth, for it to be lifted
@@ -137,17 +133,13 @@ def densify_map(
     link_features: bool = False,
     work: Work = HERE,
 ) -> dict[str, float]:
-    """Write a map with depth of its images.
+    """Write a map with depth of its images; returns counts for the log.
 
     Parameters
     ----------
     estimator : that of the options unless given.
     restrictions : images are compared within a frame, location and condition only.
     link_features : as of :func:`~megloc_kapture.stages.map_refinement.refine_map`.
-
-    Returns
-    -------
-    Counts for the log.
 
     Raises
     ------
@@ -176,8 +168,7 @@ def densify_map(
         output, with_depth_sensors(data, [job.image for job in done], options.max_size_px)
     )
     link_images_and_masks(source, output)
-    for type_name in sorted({*source.types("keypoints"), *source.types("descriptors")}):
-        copy_features(source, output, type_name, link_own=link_features)
+    copy_features(source, output, link_own=link_features)
     num_lifted = write_points(source, output, lifted)
     write_depth_rows(output / DEPTH_FILE, rows)
     return {
@@ -212,11 +203,8 @@ def fitted_to_poses(source: KaptureFolder, options: DensifyOptions) -> tuple[Den
     The median distance between observations and their points tells how far poses can be trusted.
     Where it is more than half a pixel of the depth maps, beyond what keypoints err by, images are
     reduced until it is that, as no view could confirm finer detail, and compared with more sources
-    in proportion; views may differ by five times that median.
-
-    Returns
-    -------
-    Options, and the median error in pixels of the depth maps, 0 where the map does not tell it.
+    in proportion; views may differ by five times that median. Returns options, and the median error
+    in pixels of the depth maps, 0 where the map does not tell it.
     """
     indices = [index_map(source, local_type) for local_type in source.observations()]
     angles = [with_noise(source, index).noise_rad for index in indices]
@@ -348,11 +336,9 @@ def _confirm(job: _Job) -> tuple[float, dict[str, LiftedPoints]]:
     agreement = job.options.agreement
     kept = confirmed(view, estimate, others, agreement)
     kept = with_pose_errors(view, sources, kept, job.range_m, _DEVIATION * job.error_px)
-    write_depth_map(
-        safe_join(job.out / "sensors" / "records_data", depth_path(job.image)), kept.depth_m
-    )
-    beside = side_file(job.out, job.image, "sigma")
-    write_array(beside, kept.sigma_m)
+    records = job.out / "sensors" / "records_data"
+    write_depth_map(safe_join(records, depth_path(job.image)), kept.depth_m)
+    write_array(side_file(job.out, job.image, "sigma"), kept.sigma_m)
     normals = np.rint(127 * kept.normals).astype(np.int8)
     write_array(side_file(job.out, job.image, "normals"), normals)
     lifted = {}
@@ -378,12 +364,7 @@ def _lift(
     sigma_m: NDArray[np.float32],
 ) -> LiftedPoints:
     points, covariances, valid = lift_with_covariances(
-        keypoints_px[ids],
-        depth_m,
-        sigma_m,
-        camera,
-        view.camera,
-        LiftingOptions(),
+        keypoints_px[ids], depth_m, sigma_m, camera, view.camera, LiftingOptions()
     )
     turned = view.cam_from_world.rotation_matrix()
     world = np.einsum("ji,njk,kl->nil", turned, covariances[valid], turned)
@@ -401,25 +382,21 @@ class Densify(PipelineStage):
     name = "densify"
     version = 4
     uses = ("mvs",)
-    writes = (MAP,)
+    inputs = (Layout.sparse_map, SIDE_TABLES)
+    outputs = (MAP,)
 
-    @property
-    def reads(self) -> Sequence[str]:  # type: ignore[override]
-        return (self.layout.sparse_map, SIDE_TABLES)
-
-    @classmethod
-    def is_wanted(cls, options: PipelineOptions) -> bool:
-        return options.mvs.mode != "off"
+    def is_wanted(self) -> bool:
+        return self.options.mvs.mode != "off"
 
     def plugins(self) -> Sequence[object]:
         return (self.options.mvs.make_estimator(),)
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         return densify_map(
-            work.folder(self.layout.sparse_map),
+            work.folder(self.layout.sparse_map()),
             work.out / MAP,
             self.options.mvs,
-            restrictions=work.restrictions(),
+            restrictions=Restrictions.read(work.path(SIDE_TABLES)),
             link_features=True,
             work=work,
         )

@@ -40,9 +40,7 @@ def on_gpu(plugin: object) -> bool:
 def most_at_once(plugin: object, many: str) -> int:
     """How many items a plugin gets at once, where there is memory for them.
 
-    Parameters
-    ----------
-    many : name of the method that takes several items; a plugin without it gets one.
+    ``many``: name of the method that takes several items; a plugin without it gets one.
     """
     if not hasattr(plugin, many):
         return 1
@@ -96,7 +94,6 @@ def in_batches(
     many : the plugin's method that takes several.
     run : of one item or several.
     size : memory grows with it.
-    name : of the item of an index, for messages.
 
     Raises
     ------
@@ -153,9 +150,7 @@ def _is_out_of_memory(error: RuntimeError) -> bool:
 def placed(value: Value, device: Device, precision: Precision) -> Value:
     """Options whose plugins compute on a device; those that say so themselves stay.
 
-    Parameters
-    ----------
-    value : options, or a tuple of them; the same object where there is nothing to say.
+    ``value``: options, or a tuple of them; the same object where there is nothing to say.
     """
     given: Any = value
     wanted = _wanted(device, precision)
@@ -170,9 +165,7 @@ def placed(value: Value, device: Device, precision: Precision) -> Value:
 def unheeded(chosen: object, device: Device, precision: Precision) -> list[str]:
     """Of device and precision those that are set, and that no plugin has which options choose.
 
-    Parameters
-    ----------
-    chosen : options, or a tuple of them.
+    ``chosen``: options, or a tuple of them.
     """
     lacking = _wanted(device, precision).keys() - _tell(chosen, {})
     return [name.replace("half_precision", "precision") for name in sorted(lacking)]

@@ -117,9 +117,7 @@ class FieldRefiner:
     ) -> PoseRefinement:
         """Refine the pose of a query; the references are not looked at.
 
-        Raises
-        ------
-        DataError : the query's pixels or the field cannot be read.
+        Raises DataError: the query's pixels or the field cannot be read.
         """
         from megloc_kapture.refinement.neural_field import FieldView
         from megloc_kapture.stages.neural_field import open_field

@@ -7,7 +7,7 @@ the images' features are extracted again, and the observations move to those at 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -37,9 +37,7 @@ _SAME_PLACE_PX = 0.1
 def given_type(reference: KaptureFolder) -> str:
     """The keypoints type of a given map.
 
-    Raises
-    ------
-    DataError : no points, or no or several types that observe them.
+    Raises DataError: no points, or no or several types that observe them.
     """
     if not reference.has_points():
         raise DataError(
@@ -60,9 +58,7 @@ def has_descriptors(reference: KaptureFolder) -> bool:
     """Whether every image that sees a point of a given map has descriptors; else the images'
     features have to be extracted anew for :func:`given_map`.
 
-    Raises
-    ------
-    DataError : see :func:`given_type`.
+    Raises DataError: see :func:`given_type`.
     """
     local_type = given_type(reference)
     if local_type not in reference.types("descriptors"):
@@ -98,8 +94,8 @@ def given_map(reference: KaptureFolder, mapping: KaptureFolder, output: Path) ->
     # what is the reference's own comes first
     source = reference.with_features(mapping.features_dirs)
     if not has_descriptors(reference):
-        moved = _moved(reference, mapping, seen)
-        found_again = moved.num_found / len(seen)
+        moved, rows, num_found = _moved(reference, mapping, seen)
+        found_again = num_found / len(seen)
         if found_again < _MIN_FOUND_AGAIN:
             raise DataError(
                 f"the given map has no descriptors, and of its {len(seen)} observations only "
@@ -107,20 +103,17 @@ def given_map(reference: KaptureFolder, mapping: KaptureFolder, output: Path) ->
                 "was made with another detector, other options or other images",
                 path=reference.root,
             )
-        seen = moved.observations
-        _write_rows(mapping, local_type, moved.rows, output)
+        seen = moved
+        _write_rows(mapping, local_type, rows, output)
         source = mapping
     xyz_rgb = reference.points3d()
     kept = np.bincount(seen.point_ids, minlength=len(xyz_rgb)) > 0
     number = np.cumsum(kept) - 1
     write_sensors(output, reference.read())
     link_images(reference.root, output)
-    copy_features(source, output, local_type)  # leaves what is there as it is
+    copy_features(source, output, [local_type])  # leaves what is there as it is
     write_points3d(output, xyz_rgb[kept])
-    observations = Observations(
-        local_type, seen.image_names, number[seen.point_ids], seen.image_ids, seen.keypoint_ids
-    )
-    write_observations(output, {local_type: observations})
+    write_observations(output, {local_type: replace(seen, point_ids=number[seen.point_ids])})
     return {
         "images": len(_observing(seen)),
         "points": int(kept.sum()),
@@ -134,16 +127,9 @@ def join_maps(first: KaptureFolder, second: KaptureFolder, output: Path) -> dict
 
     The second's images are among the first's (a dataset's model may lack images that were added to
     the map). Each keypoints type keeps its own points, observations and features. Global features
-    are those of the first, and types that only the second has.
-
-    Returns
-    -------
-    Counts for the log.
-
-    Raises
-    ------
-    DataError : the maps share a keypoints type, the second has another image, or an image differs
-        in camera or pose.
+    are those of the first, and types that only the second has. Returns counts for the log; raises
+    DataError: the maps share a keypoints type, the second has another image, or an image differs in
+    camera or pose.
     """
     types_of = [sorted(folder.observations()) for folder in (first, second)]
     shared = sorted(set(types_of[0]).intersection(types_of[1]))
@@ -157,14 +143,11 @@ def join_maps(first: KaptureFolder, second: KaptureFolder, output: Path) -> dict
     shift = len(first.points3d())
     observations = first.observations()
     for local_type, seen in second.observations().items():
-        observations[local_type] = Observations(
-            local_type, seen.image_names, seen.point_ids + shift, seen.image_ids, seen.keypoint_ids
-        )
+        observations[local_type] = replace(seen, point_ids=seen.point_ids + shift)
     write_sensors(output, first.read())
     link_images(first.root, output)
     for folder, types in zip((first, second), types_of, strict=True):
-        for local_type in {*types, *map(base_type, types)}.intersection(folder.types("keypoints")):
-            copy_features(folder, output, local_type)
+        copy_features(folder, output, {*types, *map(base_type, types)})
     write_points3d(output, np.concatenate([first.points3d(), second.points3d()]))
     write_observations(output, observations)
     return {
@@ -179,27 +162,15 @@ def _observing(seen: Observations) -> list[str]:
     return [seen.image_names[row] for row in np.unique(seen.image_ids).tolist()]
 
 
-@dataclass(frozen=True, eq=False)
-class _Moved:
-    """Observations of keypoints that were extracted again.
-
-    Attributes
-    ----------
-    observations : ``keypoint_ids`` count in the image's ``rows``.
-    rows : image -> rows of its extracted features that see points, ascending.
-    num_found : how many of the stored observations were found.
-    """
-
-    observations: Observations
-    rows: dict[str, NDArray[np.int64]]
-    num_found: int
-
-
-def _moved(reference: KaptureFolder, mapping: KaptureFolder, seen: Observations) -> _Moved:
+def _moved(
+    reference: KaptureFolder, mapping: KaptureFolder, seen: Observations
+) -> tuple[Observations, dict[str, NDArray[np.int64]], int]:
     """Move the observations to the keypoints extracted again.
 
     An observation whose place has several keypoints (one per orientation) becomes one of each: any
-    may be the one that was matched, and all see the point.
+    may be the one that was matched, and all see the point. Returns the observations, whose
+    ``keypoint_ids`` count in an image's rows; image -> these rows of its extracted features that
+    see points, ascending; and how many of the stored ones were found.
     """
     local_type = seen.keypoints_type
     if local_type not in mapping.types("descriptors"):
@@ -228,14 +199,13 @@ def _moved(reference: KaptureFolder, mapping: KaptureFolder, seen: Observations)
         keypoint_ids.append(numbers.astype(np.int32))
     points = np.concatenate(point_ids)
     by_point = np.argsort(points, kind="stable")
-    observations = Observations(
-        local_type,
-        seen.image_names,
-        points[by_point],
-        np.concatenate(image_ids)[by_point],
-        np.concatenate(keypoint_ids)[by_point],
+    observations = replace(
+        seen,
+        point_ids=points[by_point],
+        image_ids=np.concatenate(image_ids)[by_point],
+        keypoint_ids=np.concatenate(keypoint_ids)[by_point],
     )
-    return _Moved(observations, rows_of, num_found)
+    return observations, rows_of, num_found
 
 
 def _write_rows(
@@ -254,10 +224,8 @@ def _check_same_images(first: KaptureFolder, second: KaptureFolder) -> None:
     poses, other_poses = data.poses(), other.poses()
     unknown = set(other.image_names()) - set(data.image_names())
     if unknown:
-        raise DataError(
-            f"{min(unknown)} is no image of the map it is joined to, {first.root}",
-            path=second.root,
-        )
+        message = f"{min(unknown)} is no image of the map it is joined to, {first.root}"
+        raise DataError(message, path=second.root)
     for image in sorted(other.image_names()):
         same_camera = data.camera_of(image) == other.camera_of(image)
         if not same_camera or poses.get(image) != other_poses.get(image):
@@ -285,11 +253,8 @@ def rows_found_again(
     near = cKDTree(extracted).query_ball_point(stored, _SAME_PLACE_PX, return_sorted=True)
     used: set[int] = set()
     for row, candidates in enumerate(near):
-        for candidate in candidates:
-            if candidate not in used:
-                used.add(candidate)
-                rows[row] = candidate
-                break
+        rows[row] = next((one for one in candidates if one not in used), -1)
+        used.add(int(rows[row]))
     return rows
 
 
@@ -317,6 +282,4 @@ def rows_at_their_places(
     found = np.flatnonzero(distance <= max_shift_px)
     near = tree.query_ball_point(extracted[nearest[found]], _SAME_PLACE_PX, return_sorted=True)
     lengths = [len(rows) for rows in near]
-    if not lengths:
-        return none, none
-    return np.repeat(found, lengths), np.concatenate(near).astype(np.int64)
+    return np.repeat(found, lengths), np.concatenate([none, *near]).astype(np.int64)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from operator import attrgetter
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -14,24 +14,192 @@ from pydantic import Field, ValidationError
 
 from megloc_kapture.errors import DataError, OptionError, PluginError, suggestion
 from megloc_kapture.features.image_bound import bounded_image
-from megloc_kapture.features.vlad import VladOptions
+from megloc_kapture.features.vlad import (
+    PcaWhitening,
+    VladOptions,
+    Vocabulary,
+    aggregate,
+    train_vlad,
+)
+from megloc_kapture.io.files import read_json_model, write_json_model
 from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
 from megloc_kapture.plugin_loading import load_plugin, plugin_names
-from megloc_kapture.plugins import (
-    GLOBAL_FEATURES as PLUGINS,
-)
+from megloc_kapture.plugins import GLOBAL_FEATURES as PLUGINS
 from megloc_kapture.plugins import GlobalFeatureExtractor, PluginChoice
 from megloc_kapture.stages.devices import in_batches
-from megloc_kapture.stages.global_vlad import extract_vlad, vlad_type
-from megloc_kapture.stages.layout import FEATURES, GLOBAL_FEATURES, LOCAL_FEATURES
-from megloc_kapture.stages.local_features import image_inputs, read_image_of
+from megloc_kapture.stages.local_features import image_inputs, images_of, read_image_of
 from megloc_kapture.stages.map_points import described_images
-from megloc_kapture.stages.stage import LOCAL_TYPES, PipelineStage, StageWork
-from megloc_kapture.stages.work import HERE, Batched, Work
-from megloc_kapture.values import Camera
+from megloc_kapture.stages.shared_index import write_array
+from megloc_kapture.stages.stage import (
+    FEATURES,
+    GLOBAL_FEATURES,
+    LOCAL_FEATURES,
+    LOCAL_TYPES,
+    PipelineStage,
+    StageWork,
+)
+from megloc_kapture.stages.work import HERE, Batched, FolderSpec, Work, feature_inputs, ordered_map
+from megloc_kapture.values import Camera, Options
+
+VOCABULARY_FILE = "vocabulary.npy"
+MEAN_FILE, PROJECTION_FILE = "whitening_mean.npy", "whitening_projection.npy"
+SETTINGS_FILE = "vlad.json"
+
+
+class VladSettings(Options):
+    """What ``vlad.json`` says: how the vectors beside it were made."""
+
+    local_type: str
+    options: VladOptions
+
+
+def _descriptors(folder: FolderSpec, local_type: str, image: str) -> NDArray[Any]:
+    return folder.open().descriptors(local_type).read(image)
+
+
+def vlad_type(local_type: str) -> str:
+    """The kapture type name of VLAD over a local type."""
+    return f"vlad_{local_type}"
+
+
+def train_on_map(
+    mapping: KaptureFolder, local_type: str, options: VladOptions, *, work: Work = HERE
+) -> Vocabulary:
+    """Train on the descriptors of the map's images.
+
+    Raises DataError: they are missing, or too few.
+    """
+    images = mapping.read().image_names()
+    descriptors = mapping.descriptors(local_type)
+    if not any(descriptors.length(image) for image in images):
+        raise DataError(f"the map has no descriptors of type {local_type}", path=mapping.root)
+    read = partial(_descriptors, FolderSpec(mapping), local_type)
+    each = partial(ordered_map, executor=work.executor)
+    return train_vlad(images, descriptors.length, read, options, each=each)
+
+
+def extract_vlad(
+    mapping: KaptureFolder,
+    folders: Sequence[KaptureFolder],
+    local_type: str,
+    output: Path,
+    options: VladOptions,
+    *,
+    work: Work = HERE,
+) -> dict[str, int]:
+    """Train on ``mapping``, aggregate for all images of the folders, write to ``output``.
+
+    The descriptors are read from the folders and their features folders. Returns counts for the
+    log: images, clusters, dimensions.
+    """
+    type_name = vlad_type(local_type)
+    place = output / "global_features" / type_name
+    described = mapping.descriptors(local_type)
+    trained = work.items(
+        f"vocabulary of {type_name}",
+        [type_name],
+        lambda _, digest: [
+            [image, feature_inputs(described, image, digest)]
+            for image in mapping.read().image_names()
+        ],
+    )
+    if type_name not in trained.done:
+        vocabulary = train_on_map(mapping, local_type, options, work=work)
+        files = write_vocabulary(place, vocabulary, local_type, options)
+        content = hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
+        said = [vocabulary.centres.shape[1], vocabulary.size, content]
+        trained.add(type_name, files, said)
+    num_centres, size, content = trained.done[type_name]
+    config = FeatureConfig(type_name, np.dtype(np.float32), size, metric_type="L2")
+    spec_of, folder_of = cache(FolderSpec), images_of(folders, "describe")
+    readers = {folder: folder.descriptors(local_type) for folder in folders}
+    items = work.items(
+        type_name,
+        list(folder_of),
+        lambda image, digest: [content, feature_inputs(readers[folder_of[image]], image, digest)],
+    )
+    todo = [
+        (image, spec_of(folder)) for image, folder in folder_of.items() if image not in items.done
+    ]
+    writer = FeatureWriter(output, "global_features", type_name, config, orphan=True)
+    describe = partial(_aggregate, local_type, place, FolderSpec(mapping).key)
+    results = work.map(describe, todo, items.label("VLAD"))
+    for (image, _), vector in zip(todo, results, strict=True):
+        items.add(image, writer.write(image, vector))
+    return {"images": len(folder_of), "clusters": num_centres, "dimensions": size}
+
+
+def _aggregate(
+    local_type: str, place: Path, run: tuple[object, ...], job: tuple[str, FolderSpec]
+) -> NDArray[np.float32]:
+    vocabulary, settings = _read_once(place, run)
+    image, folder = job
+    return aggregate(_descriptors(folder, local_type, image), vocabulary, settings.options)
+
+
+@lru_cache(maxsize=1)
+def _read_once(folder: Path, run: tuple[object, ...]) -> tuple[Vocabulary, VladSettings]:
+    """A vocabulary may be large: not sent with every image, but read once by every process."""
+    found = read_vocabulary(folder)
+    if found is None:
+        raise DataError("the vocabulary is gone", path=folder / VOCABULARY_FILE)
+    return found
+
+
+def write_vocabulary(
+    folder: Path, vocabulary: Vocabulary, local_type: str, options: VladOptions
+) -> list[Path]:
+    """Write what describes images into the folder of a global-features type; returns the files.
+
+    ``vocabulary.npy`` and ``vlad.json``, and with whitening its mean and projection.
+    """
+    write_array(folder / VOCABULARY_FILE, vocabulary.centres)
+    if vocabulary.whitening is not None:
+        write_array(folder / MEAN_FILE, vocabulary.whitening.mean)
+        write_array(folder / PROJECTION_FILE, vocabulary.whitening.projection)
+    write_json_model(folder / SETTINGS_FILE, VladSettings(local_type=local_type, options=options))
+    whitening = () if vocabulary.whitening is None else (MEAN_FILE, PROJECTION_FILE)
+    return [folder / name for name in (VOCABULARY_FILE, *whitening, SETTINGS_FILE)]
+
+
+def read_vocabulary(folder: Path) -> tuple[Vocabulary, VladSettings] | None:
+    """The vocabulary stored in a type's folder, None where there is none.
+
+    Raises DataError: a file is broken, or they do not fit each other.
+    """
+    path = folder / VOCABULARY_FILE
+    if not path.is_file():
+        return None
+    settings = read_json_model(folder / SETTINGS_FILE, VladSettings)
+    centres = _read_array(path, "vocabulary")
+    if centres.ndim == 2:  # as it was written when there was one vocabulary only
+        centres = centres[None]
+    if centres.ndim != 3:
+        raise DataError(f"not a vocabulary: {centres.shape}", path=path)
+    if settings.options.dimensions is None:
+        return Vocabulary(centres), settings
+    mean = _read_array(folder / MEAN_FILE, "whitening")
+    projection = _read_array(folder / PROJECTION_FILE, "whitening")
+    if mean.shape != (centres.size,) or projection.shape[1:] != mean.shape:
+        raise DataError(
+            f"mean {mean.shape} and projection {projection.shape} do not fit the vocabulary "
+            f"{centres.shape}",
+            path=folder / PROJECTION_FILE,
+        )
+    return Vocabulary(centres, PcaWhitening(mean, projection)), settings
+
+
+def _read_array(path: Path, what: str) -> NDArray[np.float32]:
+    try:
+        array = np.load(path, allow_pickle=False)
+    except (ValueError, OSError, EOFError) as error:
+        raise DataError(f"not a {what}: {error}", path=path) from error
+    if array.dtype != np.float32 or not np.isfinite(array).all():
+        raise DataError(f"not a {what}: {array.dtype} {array.shape}", path=path)
+    return array
+
 
 VLAD = "vlad"
-_SIZE = attrgetter("camera.width", "camera.height")
 
 
 class VladChoiceOptions(VladOptions):
@@ -69,10 +237,8 @@ class GlobalFeaturesChoice(PluginChoice):
     def make(self) -> GlobalFeatureExtractor:
         """The extractor of an image network.
 
-        Raises
-        ------
-        OptionError : there are no such global features.
-        PluginError, MissingWeightsError : it cannot be loaded, or refuses its options.
+        Raises OptionError: there are no such global features; PluginError, MissingWeightsError: it
+        cannot be loaded, or refuses its options.
         """
         known = plugin_names(PLUGINS)
         if self.name not in known:
@@ -85,21 +251,14 @@ class GlobalFeaturesChoice(PluginChoice):
     def type_name(self, main_local_type: str) -> str:
         """The kapture type name of the vectors; raises as :meth:`make` and :meth:`vlad_options`.
 
-        Parameters
-        ----------
-        main_local_type : local features that VLAD takes where its options name none.
+        ``main_local_type``: local features that VLAD takes where its options name none.
         """
         if self.is_vlad:
             return vlad_type(self.vlad_options().local_type or main_local_type)
         return self.make().name
 
 
-@dataclass(frozen=True)
-class _Job:
-    extractor: GlobalFeatureExtractor
-    image: str
-    path: Path
-    camera: Camera
+_Job = tuple[str, Path, Camera]  # an image
 
 
 def extract_global_features(
@@ -111,44 +270,40 @@ def extract_global_features(
 ) -> dict[str, int]:
     """Describe all images of the folders, into ``output`` (orphan layout).
 
-    Returns
-    -------
-    Counts for the log: images.
-
-    Raises
-    ------
-    DataError : an image is absent, unreadable, or not of its camera's size; two folders have an
-        image of the same name; there are no images.
-    PluginError : the extractor breaks its protocol.
+    Returns counts for the log: images. Raises DataError: an image is absent, unreadable, or not of
+    its camera's size; two folders have an image of the same name; there are no images; PluginError:
+    the extractor breaks its protocol.
     """
-    folder_of = _images(folders)
+    folder_of = images_of(folders, "describe")
     items = work.items(
         extractor.name,
         list(folder_of),
         lambda image, digest: image_inputs(folder_of[image], image, digest)[:3],
     )
     jobs = [
-        _Job(extractor, image, folder.image_path(image), folder.read().camera_of(image))
+        (image, folder.image_path(image), folder.read().camera_of(image))
         for image, folder in folder_of.items()
         if image not in items.done
     ]
-    jobs.sort(key=_SIZE)  # images of one size can be a batch
+    jobs.sort(key=_size)  # images of one size can be a batch
+    describe = partial(_describe, extractor)
     steps: Batched[_Job, NDArray[np.float32]] = Batched(
-        _read, _describe, extractor, "describe_many", _SIZE
+        _read, describe, extractor, "describe_many", _size
     )
     writer: FeatureWriter | None = None
     size = 0
-    for job, vector in zip(jobs, work.map(steps, jobs, items.label(extractor.name)), strict=True):
+    results = work.map(steps, jobs, items.label(extractor.name))
+    for (image, *_), vector in zip(jobs, results, strict=True):
         if writer is None:
             size = len(vector)
             config = FeatureConfig(extractor.name, np.dtype(np.float32), size, metric_type="L2")
             writer = FeatureWriter(output, "global_features", extractor.name, config, orphan=True)
         if len(vector) != size:
             raise PluginError(
-                f"plugin {extractor.name!r} on image {job.image}: {len(vector)} "
+                f"plugin {extractor.name!r} on image {image}: {len(vector)} "
                 f"values, {size} of the images before"
             )
-        items.add(job.image, writer.write(job.image, vector))
+        items.add(image, writer.write(image, vector))
     return {"images": len(items.done)}
 
 
@@ -157,16 +312,9 @@ def describe_images(
 ) -> NDArray[np.float32]:
     """Vectors of RGB images of one size: float32 (B, D), unit length.
 
-    Images of more than 8 megapixels are reduced to that, whatever the extractor.
-
-    Parameters
-    ----------
-    names : of the images, for messages.
-
-    Raises
-    ------
-    PluginError : the extractor returns something else.
-    DeviceMemoryError : there is no memory for one image.
+    Images of more than 8 megapixels are reduced to that, whatever the extractor. Raises
+    PluginError: the extractor returns something else; DeviceMemoryError: there is no memory for one
+    image.
     """
     many: Any = extractor
 
@@ -208,26 +356,18 @@ def _checked(
     return vectors
 
 
-def _images(folders: Sequence[KaptureFolder]) -> dict[str, KaptureFolder]:
-    """All images in order of their names, with their folders."""
-    named = sorted(
-        ((image, folder) for folder in folders for image in folder.read().image_names()),
-        key=lambda item: item[0],
-    )
-    for before, after in zip(named, named[1:], strict=False):
-        if before[0] == after[0]:
-            raise DataError(f"image {before[0]} stands in two kapture folders at once")
-    if not named:
-        raise DataError("there are no images to describe")
-    return dict(named)
+def _size(job: _Job) -> tuple[int, int]:
+    return job[2].width, job[2].height
 
 
 def _read(job: _Job) -> NDArray[np.uint8]:
-    return read_image_of(job.path, job.camera)
+    return read_image_of(*job[1:])
 
 
-def _describe(jobs: Sequence[_Job], images: Sequence[NDArray[np.uint8]]) -> Sequence[Any]:
-    return list(describe_images(jobs[0].extractor, images, [job.image for job in jobs]))
+def _describe(
+    extractor: GlobalFeatureExtractor, jobs: Sequence[_Job], images: Sequence[NDArray[np.uint8]]
+) -> Sequence[Any]:
+    return list(describe_images(extractor, images, [name for name, *_ in jobs]))
 
 
 class ExtractGlobalFeatures(PipelineStage):
@@ -236,12 +376,12 @@ class ExtractGlobalFeatures(PipelineStage):
     name = "global_features"
     version = 2
     uses = ("global_features.name", "global_features.options", *LOCAL_TYPES)
-    writes = (GLOBAL_FEATURES,)
+    outputs = (GLOBAL_FEATURES,)
 
     @property
     def reads(self) -> Sequence[str]:  # type: ignore[override]
-        images = (self.layout.mapping, self.layout.query)
-        return (*images, *self.layout.reference, LOCAL_FEATURES) if self._trains() else images
+        images = (self.layout.mapping(), self.layout.query())
+        return (*images, *self.layout.reference(), LOCAL_FEATURES) if self._trains() else images
 
     def _trains(self) -> bool:
         return any(chosen.is_vlad for chosen in self.options.global_features)
@@ -257,18 +397,16 @@ class ExtractGlobalFeatures(PipelineStage):
         return [chosen.make() for chosen in self.options.global_features if not chosen.is_vlad]
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        queries = work.folders((self.layout.query,), FEATURES)
-        counts = {}
+        queries, counts = work.folders((self.layout.query(),), FEATURES), {}
         for chosen in self.options.global_features:
             if chosen.is_vlad:
                 vlad = chosen.vlad_options()
-                local_type = vlad.local_type or self.options.main_type()
-                mapping = described_images(work, self, local_type)
-                found = extract_vlad(
-                    mapping, [mapping, *queries], local_type, work.out, vlad.of_vlad(), work=work
-                )
+                name = vlad.local_type or self.options.main_type()
+                mapping = described_images(work, self, name)
+                folders = [mapping, *queries]
+                found = extract_vlad(mapping, folders, name, work.out, vlad.of_vlad(), work=work)
             else:
-                folders = [work.folder(self.layout.mapping), *queries]
+                folders = [work.folder(self.layout.mapping()), *queries]
                 found = extract_global_features(folders, chosen.make(), work.out, work=work)
             counts[chosen.name] = found["images"]
         return counts

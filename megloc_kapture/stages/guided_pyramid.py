@@ -1,21 +1,31 @@
-"""Guided pyramid matching of one image with others, from arrays.
+"""Guided pyramid matching of one image with others, and the files that hold what it adds.
 
 MegLoc, section "Guided pyramid matching": when mapping, both images of a pair are extracted again
 at other scales and turns, when localizing the query alone. An image is extracted again once,
 however many pairs it is in.
+
+What comes of it is a keypoints type of its own: ``T-pyramid`` has of every image the keypoints of T
+first, unchanged, then those that were added, and the matches of all pairs. So every index into T is
+one into T-pyramid, and what reads kapture reads it.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import astuple, dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.csv_table import write_csv_table
+from megloc_kapture.io.files import hard_link, safe_join, write_bytes
+from megloc_kapture.io.kapture import FeatureReader, FeatureWriter, KaptureFolder
+from megloc_kapture.io.kapture.features import SUFFIX, feature_folder
 from megloc_kapture.localization.map_index import ImageMatches
 from megloc_kapture.matching.guided_pyramid import (
     GuidedPyramidOptions,
@@ -26,6 +36,7 @@ from megloc_kapture.matching.guided_pyramid import (
     extract_variants,
     match_probed,
     match_variants,
+    pyramid_type,
 )
 from megloc_kapture.matching.pyramid_combination import (
     Combined,
@@ -43,15 +54,24 @@ from megloc_kapture.stages.local_features import extract_all
 from megloc_kapture.stages.matches import Features, match_all
 from megloc_kapture.stages.work import batched
 
+COLUMNS = (
+    *("image", "other", "matches_before", "matches_after", "added_to_image", "added_to_other"),
+    *("variants_tried", "best_variant", "skipped"),
+)
+
 
 @dataclass(frozen=True)
 class PyramidMethod:
-    """How pairs with few matches are tried again."""
+    """How pairs with few matches are tried again.
+
+    ``mask_margin_px``: keypoints nearer than this to a masked pixel are none.
+    """
 
     extractor: LocalFeatureExtractor
     matcher: Matcher
     verification: KnownPoseOptions | TwoViewOptions
     options: GuidedPyramidOptions
+    mask_margin_px: float = 0.0
 
     def is_hard(self, num_matches: int) -> bool:
         """Whether a pair with so many verified matches is tried again."""
@@ -66,11 +86,12 @@ class MatchedVariants:
     ----------
     found : for each of the other images the variants that match it.
     num_variants : that were tried with each of these, the skipped ones among them.
+    skipped : the variants that gave nothing, and why; those of one reason together.
     """
 
     found: list[list[VariantMatches]]
     num_variants: list[int]
-    skipped: dict[ImageVariant, str]
+    skipped: str
     seconds: float
 
 
@@ -96,7 +117,6 @@ def match_image_again(
     load : features of another image; not all are in memory at once.
     judge : of the matches with another image, by its name and features.
     only_scaled : matched with the variants of another scale only; in the same order.
-    name : of the image, for messages.
 
     Returns
     -------
@@ -123,9 +143,7 @@ def match_image_again(
         found = []
         for batch in batched(names[which.start : which.stop], BATCH):
             loaded = [load(other) for other in batch]
-            judgements = [
-                judge(other, features) for other, features in zip(batch, loaded, strict=True)
-            ]
+            judgements = list(map(judge, batch, loaded))
             pairs = [f"pair {name}, {other}" for other in batch]
             match_with = partial(match_all, method.matcher, names=pairs)
             found += match_variants(some, loaded, match_with, judgements)
@@ -139,46 +157,179 @@ def match_image_again(
         probed = min(len(names), method.options.probed_pairs)
         found += matches
         counts += [len(num)] * probed + [num_left] * (len(names) - probed)
-    return MatchedVariants(found, counts, skipped, time.perf_counter() - started)
+    return MatchedVariants(found, counts, _described(skipped), time.perf_counter() - started)
 
 
-@dataclass(eq=False)
-class RetriedPairs:
-    """Sums over the pairs that were tried, and a row of ``guided_pyramid.csv`` for each."""
+def _described(skipped: Mapping[ImageVariant, str]) -> str:
+    by_reason: dict[str, list[ImageVariant]] = {}
+    for variant, reason in skipped.items():
+        by_reason.setdefault(reason, []).append(variant)
+    return "; ".join(f"{' '.join(map(str, some))}: {reason}" for reason, some in by_reason.items())
 
-    rows: list[list[str]] = field(default_factory=list)
-    gained: int = 0
-    before: int = 0
-    after: int = 0
-    added: int = 0
-    seconds: float = 0.0
 
-    def count(
-        self, pair: tuple[str, str], before: int, combined: Combined, tried: int, *told: str
-    ) -> None:
-        """Add a pair: matches that it had, what it has, variants tried, best one, skipped ones."""
-        after, added = len(combined.matches), [len(new) for new in combined.added]
-        self.gained += after > before
-        self.before += before
-        self.after += after
-        self.added += sum(added)
-        self.rows.append([*pair, *map(str, (before, after, *added, tried)), *told])
+def tried_row(
+    pair: tuple[str, str], before: int, combined: Combined, tried: int, best: str, skipped: str
+) -> list[str]:
+    """A pair as ``guided_pyramid.csv`` has it, see :data:`COLUMNS`."""
+    added = [len(new) for new in combined.added]
+    return [*pair, *map(str, (before, len(combined.matches), *added, tried)), best, skipped]
 
-    def add(self, other: RetriedPairs) -> None:
-        """Add the pairs of another image."""
-        for name, value in vars(other).items():
-            setattr(self, name, getattr(self, name) + value)
 
-    def counts(self) -> dict[str, float]:
-        """For the log; seconds are of one worker."""
-        return {
-            "pairs_tried": len(self.rows),
-            "pairs_gained": self.gained,
-            "matches_before": self.before,
-            "matches_after": self.after,
-            "keypoints_added": self.added,
-            "seconds_per_tried_pair": round(self.seconds / max(len(self.rows), 1), 3),
-        }
+def write_tried(
+    output: Path, local_type: str, rows: Sequence[Sequence[str]], seconds: float
+) -> dict[str, float]:
+    """Write the table of pairs that were tried; returns its sums for the log.
+
+    ``seconds`` are those that all workers took together.
+    """
+    write_csv_table(table_path(output, local_type), COLUMNS, rows)
+    numbers = np.array([row[2:6] for row in rows], np.int64).reshape(-1, 4)
+    before, after = numbers[:, 0], numbers[:, 1]
+    return {
+        "pairs_tried": len(rows),
+        "pairs_gained": int((after > before).sum()),
+        "matches_before": int(before.sum()),
+        "matches_after": int(after.sum()),
+        "keypoints_added": int(numbers[:, 2:].sum()),
+        "seconds_per_tried_pair": round(seconds / max(len(rows), 1), 3),
+    }
+
+
+def table_path(output: Path, local_type: str) -> Path:
+    """The table of the pairs of ``local_type`` that were tried, beside their matches."""
+    matches = feature_folder(output, "matches", pyramid_type(local_type), orphan=True)
+    return matches.with_name("guided_pyramid.csv")
+
+
+class PyramidFeatures:
+    """Writes the type ``T-pyramid``: of each image the features of T, then those added.
+
+    Files of images that nothing was added to are hard links to those of T where the file system
+    has them, so that they take no space twice. Raises DataError where an image of ``folder`` has
+    more or fewer descriptors of ``local_type`` than keypoints.
+    """
+
+    def __init__(self, output: Path, folder: KaptureFolder, local_type: str) -> None:
+        name = pyramid_type(local_type)
+        keypoints, descriptors = folder.keypoints(local_type), folder.descriptors(local_type)
+        self._left = [one for one in sorted(folder.read().image_names()) if one in keypoints]
+        for image in self._left:
+            lengths = descriptors.length(image), keypoints.length(image)
+            if lengths[0] != lengths[1]:
+                told = f"{lengths[0]} descriptors for {lengths[1]} keypoints"
+                raise DataError(told, path=descriptors.where(image))
+        # the name in the files stays that of the method: by it the extractor is found again
+        configs = keypoints.config, replace(descriptors.config, keypoints_type=name)
+        self._kinds = [
+            (
+                source,
+                FeatureWriter(output, source.kind, name, config, orphan=True),
+                feature_folder(output, source.kind, name, orphan=True),
+            )
+            for source, config in zip((keypoints, descriptors), configs, strict=True)
+        ]
+
+    def leave(self, images: Iterable[str]) -> None:
+        """Let images be that have been written before."""
+        done = set(images)
+        self._left = [image for image in self._left if image not in done]
+
+    def write(
+        self, image: str, added_px: NDArray[np.float32], added_descriptors: NDArray[Any]
+    ) -> list[Path]:
+        """Write an image's features, with those added to it; the files. Raises OutputError."""
+        added, files = (added_px, added_descriptors), []
+        self._left.remove(image)
+        for (source, writer, folder), more in zip(self._kinds, added, strict=True):
+            stored, link = Path(source.where(image)), folder / f"{image}{SUFFIX[source.kind]}"
+            if len(more) == 0 and stored.is_file():  # else it is a member of a tar
+                hard_link(stored, link)
+                files.append(link)
+            else:
+                files += writer.write(image, np.concatenate([source.read(image), more]))
+        return files
+
+    def write_rest(self) -> None:
+        """Write the features of the images that nothing is added to; raises OutputError."""
+        px, descriptors = (
+            np.zeros((0, source.config.dsize), source.config.dtype) for source, *_ in self._kinds
+        )
+        for image in list(self._left):
+            self.write(image, px, descriptors)
+
+
+@dataclass(frozen=True)
+class Spooled:
+    """Where in the spool the matches of a variant begin, and how many they are."""
+
+    variant: ImageVariant
+    count: int
+    at: int
+
+
+class MatchSpool:
+    """Variants' matches on disk until all are there: a large map's are too many for memory.
+
+    A file per image below ``folder``: of each variant keypoints, rows, scores and descriptors.
+    """
+
+    def __init__(self, folder: Path, keypoints: FeatureReader, descriptors: FeatureReader) -> None:
+        self.folder = folder
+        self._columns, self._values = keypoints.config.dsize, descriptors.config.dsize
+        self._descriptor_type = descriptors.config.dtype
+        self._row_bytes = descriptors.config.row_bytes
+
+    def write(
+        self, image: str, found: Sequence[Sequence[VariantMatches]]
+    ) -> tuple[Path, list[list[Any]]]:
+        """Keep the matches of an image's variants with each of the others.
+
+        Returns the file, and for ``found`` the fields of :class:`Spooled`, as plain values. Raises
+        OutputError: the disk is full.
+        """
+        path, content = safe_join(self.folder, f"{image}.variants"), bytearray()
+        told: list[list[Any]] = []
+        for of_other in found:
+            told.append([])
+            for matches in of_other:
+                told[-1].append([astuple(matches.variant), len(matches), len(content)])
+                for part, kind in (
+                    (matches.keypoints_px, np.float32),
+                    (matches.other_rows, np.int64),
+                    (matches.scores, np.float32),
+                    (matches.descriptors, self._descriptor_type),
+                ):
+                    content += np.ascontiguousarray(part, kind).tobytes()
+        write_bytes(path, bytes(content))
+        return path, told
+
+    def get(self, image: str, place: Spooled) -> VariantMatches:
+        """The matches that were put there, without their descriptors."""
+        count, at = place.count, place.at
+        rows_at = at + 4 * self._columns * count
+        return VariantMatches(
+            place.variant,
+            self._read(image, at, (count, self._columns), np.float32),
+            np.zeros((count, 0), self._descriptor_type),
+            self._read(image, rows_at, (count,), np.int64),
+            self._read(image, rows_at + 8 * count, (count,), np.float32),
+        )
+
+    def descriptor_at(self, place: Spooled, match: int) -> int:
+        """Where the descriptor of one of a variant's matches begins."""
+        return place.at + (4 * self._columns + 8 + 4) * place.count + match * self._row_bytes
+
+    def descriptors(self, places: Sequence[tuple[str, int]]) -> NDArray[Any]:
+        """Descriptors (N, D) by the image whose variant they are of, and where they begin."""
+        found = np.empty((len(places), self._values), self._descriptor_type)
+        for row, (image, at) in enumerate(places):
+            found[row] = self._read(image, at, (self._values,), self._descriptor_type)
+        return found
+
+    def _read(self, image: str, at: int, shape: tuple[int, ...], kind: DTypeLike) -> NDArray[Any]:
+        path = safe_join(self.folder, f"{image}.variants")
+        count = int(np.prod(shape))
+        return np.fromfile(path, np.dtype(kind), count=count, offset=at).reshape(shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,12 +340,14 @@ class RetriedQuery:
     ----------
     added_px, added_descriptors : (A, C) and (A, D), keypoints behind the query's own.
     matches : of all candidates, in their order.
+    rows : of the candidates that were tried, see :data:`COLUMNS`; and the seconds it took.
     """
 
     added_px: NDArray[np.float32]
     added_descriptors: NDArray[Any]
     matches: list[ImageMatches]
-    tried: RetriedPairs
+    rows: list[list[str]]
+    seconds: float
 
 
 def retry_query(
@@ -213,21 +366,19 @@ def retry_query(
     matches : of each candidate, best first: its name, verified matches (K, 2), scores (K,).
     load : features of a candidate.
     frame : pixels and mask of the query; called only where a candidate has few matches.
-    name : of the query, for messages.
 
     Raises
     ------
     DataError : the image cannot be read, or its features are of another size than the query's.
     """
-    tried = RetriedPairs()
     base = {other: pairs for other, pairs, _ in matches}
     hard = [other for other, pairs in base.items() if method.is_hard(len(pairs))]
     hard.sort(key=lambda other: -len(base[other]))
-    mode = method.options.mode
+    mode, verification = method.options.mode, method.verification
     if mode == "off" or not hard:
-        nothing = query.keypoints_px[:0], query.descriptors[:0]
-        return RetriedQuery(*nothing, list(matches), tried)
-    verification = method.verification
+        return RetriedQuery(
+            query.keypoints_px[:0], query.descriptors[:0], list(matches), [], seconds=0.0
+        )
     if not isinstance(verification, TwoViewOptions):
         raise ValueError("a query has no pose to verify with")
 
@@ -238,32 +389,21 @@ def retry_query(
         )  # fmt: skip
 
     matched = match_image_again(query, *frame(), hard, load, judge, method, name=name)
-    tried.seconds = matched.seconds
     of_other = dict(zip(hard, zip(matched.found, matched.num_variants, strict=True), strict=True))
-    skipped = described(matched.skipped)
+    skipped = f"image {matched.skipped}" if matched.skipped else ""
     keypoints = KeypointUnion(query.keypoints_px)
     descriptors: list[NDArray[Any]] = []
     richer: list[ImageMatches] = []
+    rows = []
     for other, pairs, scores in matches:
         if other in of_other:
             found, num_variants = of_other[other]
             tried_ones = [(0, each) for each in found]
             combined = combine((pairs, scores), tried_ones, mode, (keypoints, None))
             best = "" if combined.best is None else f"image {found[combined.best].variant}"
-            why = f"image {skipped}" if skipped else ""
-            tried.count((name, other), len(pairs), combined, num_variants, best, why)
+            rows.append(tried_row((name, other), len(pairs), combined, num_variants, best, skipped))
             descriptors += [found[at].descriptors[k] for at, k in combined.added[0].tolist()]
             pairs, scores = combined.matches, combined.scores
         richer.append((other, pairs, scores))
     added = np.array(descriptors, query.descriptors.dtype).reshape(-1, query.descriptors.shape[1])
-    return RetriedQuery(keypoints.added(), added, richer, tried)
-
-
-def described(skipped: Mapping[ImageVariant, str]) -> str:
-    """The variants that gave nothing, and why, as one line; those of one reason together."""
-    by_reason: dict[str, list[ImageVariant]] = {}
-    for variant, reason in skipped.items():
-        by_reason.setdefault(reason, []).append(variant)
-    return "; ".join(
-        f"{' '.join(map(str, variants))}: {reason}" for reason, variants in by_reason.items()
-    )
+    return RetriedQuery(keypoints.added(), added, richer, rows, matched.seconds)

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -41,6 +42,7 @@ from megloc_kapture.values import Camera, Options
 JPEG_QUALITY = 98
 
 Mask = NDArray[np.bool_]
+_SIZE = attrgetter("width", "height")
 
 
 class MaskOptions(Options):
@@ -67,49 +69,22 @@ class MaskOptions(Options):
         return {} if self.segmenter else {"dynamic": "no segmenter tells classes apart"}
 
 
-@dataclass(frozen=True)
-class MaskFiles:
-    """The mask files of one image, by source; none where there are none."""
-
-    own: Path | None
-    user: Path | None
-
-    def read(self, shape: tuple[int, ...]) -> dict[str, Mask]:
-        """The masks bool (H, W), True = use.
-
-        Raises
-        ------
-        DataError : one is no image, or not of the image's size.
-        """
-        found = {}
-        for source, path in (("own", self.own), ("user", self.user)):
-            mask = None if path is None else read_mask(path, shape)
-            if mask is not None:
-                found[source] = mask
-        return found
-
-
 def mask_files(
     folder: KaptureFolder, images: Iterable[str], user_masks: Path | None
-) -> dict[str, MaskFiles]:
-    """The mask files that there are, by image.
+) -> dict[str, dict[str, Path]]:
+    """The mask files that there are, by image and source (``own`` or ``user``).
 
-    Raises
-    ------
-    DataError : the user's folder is not there, or has a mask of none of the images.
+    Raises DataError: the user's folder is not there, or has a mask of none of the images.
     """
     if user_masks is not None and not user_masks.is_dir():
         raise DataError("no such folder of masks", path=user_masks)
     found = {}
-    some = False
     for image in images:
-        own = mask_path(folder, image)
-        user = None if user_masks is None else user_masks / f"{image}.png"
-        own_file = own if own.is_file() else None
-        user_file = user if user is not None and user.is_file() else None
-        some = some or user_file is not None
-        found[image] = MaskFiles(own_file, user_file)
-    if user_masks is not None and not some:
+        paths = {"own": mask_path(folder, image)}
+        if user_masks is not None:
+            paths["user"] = user_masks / f"{image}.png"
+        found[image] = {source: path for source, path in paths.items() if path.is_file()}
+    if user_masks is not None and not any("user" in files for files in found.values()):
         example = next(iter(found), "a/b.jpg")
         raise DataError(
             f"no mask of any image in it; that of {example} is looked for as {example}.png",
@@ -118,24 +93,20 @@ def mask_files(
     return found
 
 
-class StandingMasks:
-    """Masks of whole cameras, drawn once each: fixed ones and unchanging regions.
+def read_masks(files: Mapping[str, Path], shape: tuple[int, ...]) -> dict[str, Mask]:
+    """The masks of an image by source, bool (H, W), True = use.
 
-    Parameters
-    ----------
-    root : of files with a relative path.
-    regions : by sensor id.
+    Raises DataError: one is no image, or not of the image's size.
     """
+    masks = {source: read_mask(path, shape) for source, path in files.items()}
+    return {source: mask for source, mask in masks.items() if mask is not None}
 
-    def __init__(
-        self,
-        fixed: Sequence[FixedMask],
-        regions: Mapping[str, UnchangingRegion],
-        root: Path | None = None,
-    ) -> None:
-        self._fixed = tuple(fixed)
-        self._regions = dict(regions)
-        self._root = root
+
+class StandingMasks:
+    """Masks of whole cameras, drawn once each: fixed ones, and unchanging regions by sensor id."""
+
+    def __init__(self, fixed: Sequence[FixedMask], regions: Mapping[str, UnchangingRegion]) -> None:
+        self._fixed, self._regions = tuple(fixed), dict(regions)
         self._used: set[FixedMask] = set()
         self._drawn: dict[tuple[FixedMask, int, int], Mask] = {}
         self._combined: dict[tuple[object, ...], dict[str, Mask]] = {}
@@ -143,9 +114,7 @@ class StandingMasks:
     def of(self, sensor_id: str, image: str, camera: Camera) -> dict[str, Mask]:
         """The masks bool (H, W) of an image by source, in original pixels; shared, not to change.
 
-        Raises
-        ------
-        DataError : a drawn mask is absent, no image, or not of the camera's size.
+        Raises DataError: a drawn mask is absent, no image, or not of the camera's size.
         """
         width, height = camera.width, camera.height
         region = self._regions.get(sensor_id)
@@ -171,14 +140,14 @@ class StandingMasks:
     def _draw(self, one: FixedMask, width: int, height: int) -> Mask:
         key = (one, width, height)
         if key not in self._drawn:
-            if one.file is None:
-                self._drawn[key] = one.drawn(width, height)
-            else:
-                path = one.file if self._root is None else self._root / one.file
-                mask = read_mask(path, (height, width))
-                if mask is None:
-                    raise DataError("no such mask", path=path)
-                self._drawn[key] = mask
+            mask = (
+                one.drawn(width, height)
+                if one.file is None
+                else read_mask(one.file, (height, width))
+            )
+            if mask is None:
+                raise DataError("no such mask", path=one.file)
+            self._drawn[key] = mask
         return self._drawn[key]
 
 
@@ -193,9 +162,7 @@ class ClassMasks:
     def of(cls, segmenter: Segmenter, dynamic: Sequence[str] | None = None) -> ClassMasks:
         """Of the classes asked for; without, of those the segmenter names itself.
 
-        Raises
-        ------
-        OptionError : a class it does not have; lists those it has.
+        Raises OptionError: a class it does not have; lists those it has.
         """
         wanted = segmenter.dynamic if dynamic is None else dynamic
         unknown = sorted(set(wanted) - set(segmenter.classes))
@@ -209,9 +176,7 @@ class ClassMasks:
     def labels(self, image: NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
         """The label of each pixel, uint8 (H, W), of an image (H, W, 3) called ``name``.
 
-        Raises
-        ------
-        PluginError : the segmenter returns something else.
+        Raises PluginError: the segmenter returns something else.
         """
         found = self.segmenter.segment(image)
         shape, dtype = getattr(found, "shape", None), getattr(found, "dtype", None)
@@ -230,55 +195,40 @@ class ClassMasks:
         return np.asarray(used[labels])
 
 
-@dataclass(frozen=True)
-class _Job:
-    path: Path
-    camera: Camera
-
-
 def find_unchanging_regions(
-    folder: KaptureFolder,
-    sequences: Sequence[KaptureFolder] = (),
-    *,
-    work: Work = HERE,
+    folder: KaptureFolder, sequences: Sequence[KaptureFolder] = (), *, work: Work = HERE
 ) -> dict[str, UnchangingRegion]:
     """The region of every camera of a folder, by sensor id; falsy with a reason where none is.
 
-    Parameters
-    ----------
-    sequences : folders whose images tell of its cameras as well, where they have a sensor of the
-        same id and image size: the map's, for queries.
-
-    Raises
-    ------
-    DataError : an image is absent, unreadable, or not of its camera's size.
+    ``sequences``: folders whose images tell of its cameras as well, where they have a sensor of the
+    same id and image size: the map's, for queries. Raises DataError: an image is absent,
+    unreadable, or not of its camera's size.
     """
-    data = folder.read()
-    sensors = sorted({sensor for _, sensor in data.records_camera})
-    chosen: dict[str, list[_Job]] = {}
+    chosen: dict[str, list[tuple[Path, Camera]]] = {}
     regions: dict[str, UnchangingRegion] = {}
-    for sensor in sensors:
-        jobs = _images_of(sensor, [folder, *sequences])
-        if len(jobs) < MIN_IMAGES:
-            regions[sensor] = UnchangingRegion(
-                (), f"it has {len(jobs)} images, and at least {MIN_IMAGES} of a sequence are needed"
+    for sensor in sorted({sensor for _, sensor in folder.read().records_camera}):
+        images = _images_of(sensor, [folder, *sequences])
+        if len(images) < MIN_IMAGES:
+            reason = (
+                f"it has {len(images)} images, and at least {MIN_IMAGES} of a sequence are needed"
             )
+            regions[sensor] = UnchangingRegion((), reason)
         else:
-            picked = np.linspace(0, len(jobs) - 1, min(len(jobs), MAX_IMAGES)).round().astype(int)
-            chosen[sensor] = [jobs[k] for k in picked]
-    everything = [job for jobs in chosen.values() for job in jobs]
+            number = min(len(images), MAX_IMAGES)
+            picked = np.linspace(0, len(images) - 1, number).round().astype(int)
+            chosen[sensor] = [images[k] for k in picked]
+    everything = [image for images in chosen.values() for image in images]
     results = iter(work.map(_edges, everything, "unchanging regions"))
-    for sensor, jobs in chosen.items():
-        regions[sensor] = find_unchanging_region(next(results) for _ in jobs)
-    # lets a progress bar see its end
-    for _ in results:
+    for sensor, images in chosen.items():
+        regions[sensor] = find_unchanging_region(next(results) for _ in images)
+    for _ in results:  # lets a progress bar see its end
         pass
     return regions
 
 
-def _images_of(sensor: str, folders: Sequence[KaptureFolder]) -> list[_Job]:
+def _images_of(sensor: str, folders: Sequence[KaptureFolder]) -> list[tuple[Path, Camera]]:
     """Images of a sensor in the order they were taken, folder by folder."""
-    jobs: list[_Job] = []
+    images: list[tuple[Path, Camera]] = []
     for folder in folders:
         data = folder.read()
         if sensor not in data.sensors or data.sensors[sensor].sensor_type != "camera":
@@ -286,17 +236,13 @@ def _images_of(sensor: str, folders: Sequence[KaptureFolder]) -> list[_Job]:
         taken = sorted((t, image) for (t, s), image in data.records_camera.items() if s == sensor)
         for _, image in taken:
             camera = data.camera_of(image)
-            if not jobs or _size(camera) == _size(jobs[0].camera):
-                jobs.append(_Job(folder.image_path(image), camera))
-    return jobs
+            if not images or _SIZE(camera) == _SIZE(images[0][1]):
+                images.append((folder.image_path(image), camera))
+    return images
 
 
-def _size(camera: Camera) -> tuple[int, int]:
-    return camera.width, camera.height
-
-
-def _edges(job: _Job) -> NDArray[np.float32]:
-    return edge_directions(read_image_of(job.path, job.camera))
+def _edges(image: tuple[Path, Camera]) -> NDArray[np.float32]:
+    return edge_directions(read_image_of(*image))
 
 
 class ProcessedFrame:

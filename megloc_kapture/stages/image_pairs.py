@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from collections.abc import Callable, Mapping, Sequence
+from itertools import chain
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,13 +13,9 @@ from pydantic import Field
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
-from megloc_kapture.io.kapture import (
-    ImagePair,
-    KaptureData,
-    KaptureFolder,
-    write_pairs,
-)
+from megloc_kapture.io.kapture import ImagePair, KaptureData, KaptureFolder, read_pairs, write_pairs
 from megloc_kapture.io.kapture.vectors import KaptureVectors
+from megloc_kapture.io.tables import read_match_counts
 from megloc_kapture.mapping.pairs import (
     PairsByCovisibilityOptions,
     PairsByPosesOptions,
@@ -29,28 +26,33 @@ from megloc_kapture.mapping.pairs import (
     pairs_by_poses,
     pairs_by_sequence,
 )
+from megloc_kapture.retrieval.fusion import greedy_coverage
 from megloc_kapture.stages.candidates import (
+    UNRESTRICTED,
     Candidates,
     QueryPairsOptions,
+    Restrictions,
     Retrieval,
     vectors_of,
 )
-from megloc_kapture.stages.layout import (
+from megloc_kapture.stages.map_points import described_images
+from megloc_kapture.stages.matches import VerifiedMatches, iterate_candidates
+from megloc_kapture.stages.stage import (
     FEATURES,
     GLOBAL_FEATURES,
+    LOCAL_FEATURES,
+    LOCAL_TYPES,
     MAPPING_PAIRS,
+    QUERY_CANDIDATES,
+    QUERY_MATCHES,
     QUERY_PAIRS,
     REFERENCE,
+    Layout,
+    PipelineStage,
+    StageWork,
 )
-from megloc_kapture.stages.map_points import described_images
-from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
-from megloc_kapture.stages.stage import LOCAL_TYPES, PipelineStage, StageWork
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Options, RigidTransform
-
-if TYPE_CHECKING:
-    from megloc_kapture.stages.options import PipelineOptions
-
 
 PairingMethod = Literal["poses", "covisibility", "retrieval", "sequence", "exhaustive"]
 
@@ -80,39 +82,26 @@ class MappingPairsOptions(Options):
         return overlap or "covisibility" in self.by
 
 
-@dataclass(frozen=True, eq=False)
-class _SeenPoints:
-    """Points (N, 3), and the observations (O,) of them by the images that are looked at."""
-
-    xyz: NDArray[np.float64]
-    point_ids: NDArray[np.int64]
-    image_ids: NDArray[np.int64]
-
-    @classmethod
-    def read(cls, folder: KaptureFolder, images: Sequence[str]) -> _SeenPoints:
-        if not folder.has_points():
-            raise DataError("co-visibility and overlap need a map's points", path=folder.root)
-        row_of = {image: row for row, image in enumerate(images)}
-        points, seeing = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
-        for _, observations in sorted(folder.observations().items()):
-            rows = np.array([row_of.get(name, -1) for name in observations.image_names], np.int64)
-            image_ids = rows[observations.image_ids]
-            points.append(observations.point_ids[image_ids >= 0])
-            seeing.append(image_ids[image_ids >= 0])
-        found = cls(folder.points3d()[:, :3], np.concatenate(points), np.concatenate(seeing))
-        if len(found.point_ids) == 0:
-            raise DataError("no image to be paired observes its points", path=folder.root)
-        return found
-
-    def of(self, members: NDArray[np.int64], num_images: int) -> _SeenPoints:
-        """What some of the images observe, by their place among these."""
-        row_of = np.full(num_images, -1, dtype=np.int64)
-        row_of[members] = np.arange(len(members))
-        rows = row_of[self.image_ids]
-        return _SeenPoints(self.xyz, self.point_ids[rows >= 0], rows[rows >= 0])
+def _seen_points(
+    folder: KaptureFolder, images: Sequence[str]
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
+    """Points (N, 3), and the points and images (O,) of what the images observe."""
+    if not folder.has_points():
+        raise DataError("co-visibility and overlap need a map's points", path=folder.root)
+    row_of = {image: row for row, image in enumerate(images)}
+    points, seeing = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
+    for _, observations in sorted(folder.observations().items()):
+        rows = np.array([row_of.get(name, -1) for name in observations.image_names], np.int64)
+        image_ids = rows[observations.image_ids]
+        points.append(observations.point_ids[image_ids >= 0])
+        seeing.append(image_ids[image_ids >= 0])
+    point_ids = np.concatenate(points)
+    if len(point_ids) == 0:
+        raise DataError("no image to be paired observes its points", path=folder.root)
+    return folder.points3d()[:, :3], point_ids, np.concatenate(seeing)
 
 
-_NOTHING_SEEN = _SeenPoints(np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0, np.int64))
+_NOTHING_SEEN = np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0, np.int64)
 
 
 def pair_map_images(
@@ -128,28 +117,23 @@ def pair_map_images(
 
     Where no image has a pose, of all of them, by methods that look at none. Images of different
     coordinate frames are never paired. The score is the cosine similarity where retrieval named the
-    pair, else 1.
-
-    Parameters
-    ----------
-    covisible : a map of the same images in the same frames, whose points co-visibility and overlap
-        look at; by default those of ``mapping`` itself.
-
-    Raises
-    ------
-    DataError : global features or points are needed and not there.
+    pair, else 1. ``covisible``: a map of the same images in the same frames, whose points
+    co-visibility and overlap look at; by default those of ``mapping`` itself. Raises DataError:
+    global features or points are needed and not there.
     """
     data = mapping.read()
     poses = data.poses()
     images = sorted(poses) or data.image_names()
-    seen = _NOTHING_SEEN
+    xyz, point_ids, image_ids = _NOTHING_SEEN
     if options.needs_points():
-        seen = _SeenPoints.read(covisible or mapping, images)
-    found = [np.zeros((0, 2), dtype=np.int64)]
-    similarities = [np.zeros(0)]
+        xyz, point_ids, image_ids = _seen_points(covisible or mapping, images)
+    found, similarities = [np.zeros((0, 2), dtype=np.int64)], [np.zeros(0)]
     for members in restrictions.frames(images):
         names = [images[member] for member in members]
-        within = seen.of(members, len(images))
+        row_of = np.full(len(images), -1, dtype=np.int64)
+        row_of[members] = np.arange(len(members))
+        rows = row_of[image_ids]
+        seen = point_ids[rows >= 0], rows[rows >= 0]  # of these images, by their rows among them
         for method in options.by:
             similarity = None
             if method == "retrieval":
@@ -158,15 +142,13 @@ def pair_map_images(
                 vectors = vectors_of(retrieval.readers(mapping), names)
                 pairs, similarity = _most_similar(vectors, retrieval, options.top_k, work)
             elif method == "poses":
-                pairs = _by_poses(data, [poses[name] for name in names], names, within, options)
+                pairs = _by_poses(data, poses, names, xyz, seen, options.poses)
             elif method == "sequence":
                 records = [data.record_of(name) for name in names]
                 cameras, timestamps = [sensor for _, sensor in records], [t for t, _ in records]
                 pairs = pairs_by_sequence(cameras, timestamps, options.sequence)
             elif method == "covisibility":
-                pairs = pairs_by_covisibility(
-                    len(names), within.point_ids, within.image_ids, options.covisibility
-                )
+                pairs = pairs_by_covisibility(len(names), *seen, options.covisibility)
             else:
                 pairs = exhaustive_pairs(len(names))
             found.append(members[pairs])
@@ -176,27 +158,29 @@ def pair_map_images(
 
 def _by_poses(
     data: KaptureData,
-    poses: list[RigidTransform],
-    names: list[str],
-    seen: _SeenPoints,
-    options: MappingPairsOptions,
+    poses: Mapping[str, RigidTransform],
+    names: Sequence[str],
+    xyz: NDArray[np.float64],
+    seen: tuple[NDArray[np.int64], NDArray[np.int64]],
+    options: PairsByPosesOptions,
 ) -> NDArray[np.int64]:
-    pairs = pairs_by_poses(poses, options.poses)
-    if options.poses.min_overlap is None:
+    of_images = [poses[name] for name in names]
+    pairs = pairs_by_poses(of_images, options)
+    if options.min_overlap is None:
         return pairs
     cameras = [data.camera_of(name) for name in names]
-    overlap = frustum_overlap(pairs, cameras, poses, seen.xyz, seen.point_ids, seen.image_ids)
+    overlap = frustum_overlap(pairs, cameras, of_images, xyz, *seen)
     # where neither image observes anything nobody knows
-    return pairs[~(overlap < options.poses.min_overlap)]
+    return pairs[~(overlap < options.min_overlap)]
 
 
 def _united(
     images: Sequence[str], pairs: NDArray[np.int64], similarities: NDArray[np.float64]
 ) -> list[ImagePair]:
     """Each pair of ``pairs`` (P, 2), i < j, once, with its best similarity, 1 for -infinity."""
-    keys, place = np.unique(pairs[:, 0] * len(images) + pairs[:, 1], return_inverse=True)
+    keys, rows = np.unique(pairs[:, 0] * len(images) + pairs[:, 1], return_inverse=True)
     scores = np.full(len(keys), -np.inf)
-    np.maximum.at(scores, place, similarities)
+    np.maximum.at(scores, rows, similarities)
     scores[np.isneginf(scores)] = 1.0
     first, second = np.divmod(keys, max(len(images), 1))
     return [
@@ -230,21 +214,19 @@ def pair_queries(
 ) -> list[ImagePair]:
     """Candidates of every query among the posed map images its prior permits, best first.
 
-    Sorted by query. A query that nothing is permitted to has no candidate.
-
-    Raises
-    ------
-    DataError : global features are needed and not there.
+    Sorted by query. A query that nothing is permitted to has no candidate. Raises DataError: global
+    features are needed and not there.
     """
     poses = mapping.read().poses()
     images = sorted(poses)
     queries = query.read().image_names()
     of_query: list[list[ImagePair]] = [[] for _ in queries]
+    pools = restrictions.pools(queries, images)
     if options.by == "exhaustive":
-        for positions, permitted in restrictions.pools(queries, images):
+        for positions, permitted in pools:
             for at in positions:
                 of_query[at] = [ImagePair(queries[at], images[i], 1.0) for i in permitted]
-        return [pair for pairs in of_query for pair in pairs]
+        return list(chain(*of_query))
     if retrieval is None:
         raise DataError("retrieval needs global features of map and queries")
     database, described = retrieval.readers(mapping), retrieval.readers(query)
@@ -253,7 +235,7 @@ def pair_queries(
         [poses[image] for image in images],
         retrieval,
     )
-    for positions, permitted in restrictions.pools(queries, images):
+    for positions, permitted in pools:
         asked = vectors_of(described, [queries[at] for at in positions])
         index, scores = candidates.of(asked, permitted, options, work)
         for at, row, row_scores in zip(positions, index.tolist(), scores.tolist(), strict=True):
@@ -262,7 +244,7 @@ def pair_queries(
                 for i, score in zip(row, row_scores, strict=True)
                 if i >= 0
             ]
-    return [pair for pairs in of_query for pair in pairs]
+    return list(chain(*of_query))
 
 
 # what decides which global features there are, and how they are fused
@@ -275,23 +257,18 @@ class PairMapping(PipelineStage):
     name = "mapping_pairs"
     version = 4
     uses = ("mapping_pairs", *RETRIEVAL_OPTIONS)
-    writes = (MAPPING_PAIRS,)
+    inputs = (Layout.mapping, SIDE_TABLES, GLOBAL_FEATURES, Layout.pairing_points)
+    outputs = (MAPPING_PAIRS,)
 
-    @property
-    def reads(self) -> Sequence[str]:  # type: ignore[override]
-        by_points = (REFERENCE,) if self.options.pairs_by_points() else ()
-        return (self.layout.mapping, SIDE_TABLES, GLOBAL_FEATURES, *by_points)
-
-    @classmethod
-    def is_wanted(cls, options: PipelineOptions) -> bool:
-        return options.triangulates()
+    def is_wanted(self) -> bool:
+        return self.options.triangulates()
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         pairs = pair_map_images(
-            work.folder(self.layout.mapping, FEATURES),
+            work.folder(self.layout.mapping(), FEATURES),
             self.options.mapping_pairs,
             retrieval=self.options.retrieval(),
-            restrictions=work.restrictions(),
+            restrictions=Restrictions.read(work.path(SIDE_TABLES)),
             covisible=work.folder(REFERENCE) if self.options.pairs_by_points() else None,
             work=work,
         )
@@ -304,28 +281,151 @@ class PairQueries(PipelineStage):
 
     version = 3
     uses = ("query_pairs", *RETRIEVAL_OPTIONS)
+    inputs = (Layout.mapping, Layout.query, SIDE_TABLES, GLOBAL_FEATURES, Layout.reference)
+    outputs = (Layout.candidates,)
 
     @property
     def name(self) -> str:  # type: ignore[override]
-        return "query_pairs" if self.layout.candidates == QUERY_PAIRS else "query_candidates"
-
-    @property
-    def reads(self) -> Sequence[str]:  # type: ignore[override]
-        images = (self.layout.mapping, self.layout.query)
-        return (*images, SIDE_TABLES, GLOBAL_FEATURES, *self.layout.reference)
-
-    @property
-    def writes(self) -> Sequence[str]:  # type: ignore[override]
-        return (self.layout.candidates,)
+        return "query_pairs" if self.layout.candidates() == QUERY_PAIRS else "query_candidates"
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         pairs = pair_queries(
             described_images(work, self, self.options.main_type()),
-            work.folder(self.layout.query, FEATURES),
+            work.folder(self.layout.query(), FEATURES),
             self.options.query_pairs,
             retrieval=self.options.retrieval(),
-            restrictions=work.restrictions(),
+            restrictions=Restrictions.read(work.path(SIDE_TABLES)),
             work=work,
         )
-        write_pairs(work.out / self.layout.candidates, pairs)
+        write_pairs(work.out / self.layout.candidates(), pairs)
         return {"pairs": len(pairs)}
+
+
+Matched = int | NDArray[np.int64]
+
+
+class RerankingOptions(Options):
+    """How the retrieved images of a query are put in a new order."""
+
+    by: Literal["none", "matches", "verified", "coverage"] = Field(
+        default="none",
+        description="matches: their number; verified: of those that two-view geometry leaves; "
+        "coverage: of these, at keypoints that the images before do not match. All types of local "
+        "features together",
+    )
+    keep: int = Field(default=20, gt=0, description="images that stay, N")
+
+    def idle(self) -> dict[str, str]:
+        return {} if self.reranks() else {"keep": "reranking.by is none"}
+
+    def reranks(self) -> bool:
+        """Whether anything is done."""
+        return self.by != "none"
+
+
+def rerank(
+    of_types: Sequence[Sequence[Matched]], options: RerankingOptions
+) -> tuple[list[int], list[int]]:
+    """Positions of the candidates of one query that stay, best first, and what each has.
+
+    Of equal counts, and so where nothing matches, retrieval's order stays. ``of_types``: of each
+    type of local features and each candidate, in retrieval's order, the number of its matches; for
+    coverage the rows (K,) of the query's keypoints that they are of.
+    """
+    num = len(of_types[0]) if of_types else 0
+    if options.by == "coverage":
+        rows = [[np.unique(np.asarray(matched)) for matched in own] for own in of_types]
+        # keypoints are numbered through the types
+        sizes = [max((int(ids[-1]) + 1 for ids in own if len(ids)), default=0) for own in rows]
+        starts = np.cumsum([0, *sizes[:-1]])
+        keypoints = [
+            np.concatenate([start + own[at] for start, own in zip(starts, rows, strict=True)])
+            for at in range(num)
+        ]
+        return greedy_coverage(keypoints, options.keep)
+    counts = [sum(int(own[at]) for own in of_types) for at in range(num)]
+    order = list(range(num))
+    if options.reranks():
+        order = sorted(order, key=lambda at: (-counts[at], at))[: options.keep]
+    return order, [counts[at] for at in order]
+
+
+def counted(pair: VerifiedMatches, by: str) -> Matched:
+    """What reranking looks at in the matches of a candidate, see :func:`rerank`."""
+    if by == "coverage":
+        return pair.matches[:, 0]
+    return pair.num_found if by == "matches" else len(pair.matches)
+
+
+def reranked(
+    pairs: Sequence[ImagePair],
+    query: KaptureFolder,
+    matches: Path,
+    local_types: Sequence[str],
+    options: RerankingOptions,
+) -> list[ImagePair]:
+    """Candidates as the options want them, from matches that are stored; sorted by query.
+
+    The score is what a candidate has, and below one a part that keeps their order in the file.
+
+    Parameters
+    ----------
+    query : with matches of the types.
+    matches : the features folder that the matches are in.
+
+    Raises
+    ------
+    DataError : matches, or the tables of their numbers, are missing or broken.
+    """
+    if not options.reranks():
+        return list(pairs)
+    stored = [_stored(query, matches, name, options.by) for name in local_types]
+    found = []
+    for image, candidates in iterate_candidates(pairs):
+        of_types = [[matched(image, other) for other in candidates] for matched in stored]
+        for place, (at, count) in enumerate(zip(*rerank(of_types, options), strict=True)):
+            found.append(ImagePair(image, candidates[at], count + 1.0 / (2.0 + place)))
+    return found
+
+
+def _stored(
+    query: KaptureFolder, matches_dir: Path, local_type: str, by: str
+) -> Callable[[str, str], Matched]:
+    """Reads what :func:`counted` says of a query and a candidate; of unmatched pairs nothing."""
+    if by != "coverage":
+        rows = read_match_counts(matches_dir, local_type)
+        counts = {
+            (row.image, row.other): row.matches if by == "matches" else row.verified for row in rows
+        }
+        return lambda image, other: counts.get((image, other), 0)
+    matches, none = query.matches(local_type), np.zeros(0, np.int64)
+
+    def matched(image: str, other: str) -> Matched:
+        return matches.read(image, other)[0][:, 0] if (image, other) in matches else none
+
+    return matched
+
+
+class RerankQueries(PipelineStage):
+    """Keep of each query's candidates those that its local features say are right."""
+
+    name = "query_pairs"
+    version = 4
+    uses = ("reranking", *LOCAL_TYPES)
+    inputs = (Layout.query, LOCAL_FEATURES, QUERY_CANDIDATES, QUERY_MATCHES)
+    outputs = (QUERY_PAIRS,)
+
+    def is_wanted(self) -> bool:
+        return self.options.reranking.reranks()
+
+    def run(self, work: StageWork) -> Mapping[str, float]:
+        pairs = reranked(
+            read_pairs(work.path(QUERY_CANDIDATES)),
+            work.folder(self.layout.query(), FEATURES, QUERY_MATCHES),
+            work.path(QUERY_MATCHES),
+            self.options.local_types(),
+            self.options.reranking,
+        )
+        write_pairs(work.out / QUERY_PAIRS, pairs)
+        matched = sum(pair.score >= 1 for pair in pairs)
+        return {"pairs": len(pairs), "with_correspondences": matched}

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
-from operator import attrgetter
+from collections.abc import Mapping, Sequence
+from functools import cache, partial
+from itertools import pairwise
+from operator import attrgetter, itemgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,24 +27,26 @@ from megloc_kapture.plugins import LocalFeatureExtractor
 from megloc_kapture.preprocessing.masks import with_margin
 from megloc_kapture.stages.devices import in_batches
 from megloc_kapture.stages.given_map import has_descriptors
-from megloc_kapture.stages.kept_items import Digest
-from megloc_kapture.stages.layout import LOCAL_FEATURES, REFERENCE
 from megloc_kapture.stages.map_points import check_given_type
-from megloc_kapture.stages.stage import LOCAL_TYPES, PipelineStage, StageWork
-from megloc_kapture.stages.work import HERE, Batched, FolderSpec, Work
+from megloc_kapture.stages.stage import (
+    LOCAL_FEATURES,
+    LOCAL_TYPES,
+    REFERENCE,
+    Layout,
+    PipelineStage,
+    StageWork,
+)
+from megloc_kapture.stages.work import HERE, Batched, Digest, FolderSpec, Work
 from megloc_kapture.values import Camera, LocalFeatures
 
 _SIZE = attrgetter("size")
 
 
-@dataclass(frozen=True)
-class _Job:
-    extractor: LocalFeatureExtractor
-    folder: FolderSpec
+class _Job(NamedTuple):
     image: str
+    folder: FolderSpec
     size: tuple[int, int]
     has_mask: bool
-    mask_margin_px: float
 
 
 def extract_local_features(
@@ -74,14 +76,10 @@ def extract_local_features(
     DataError : an image is absent, unreadable, or not of its camera's size; or two folders have
         an image of the same name.
     """
-    jobs = list(_jobs(folders, extractor, mask_margin_px))
-    duplicates = sorted(
-        {a.image for a, b in zip(jobs, jobs[1:], strict=False) if a.image == b.image}
-    )
-    if duplicates:
-        raise DataError(f"image {duplicates[0]} stands in two kapture folders at once")
-    if not jobs:
-        raise DataError("there are no images to extract features from")
+    spec_of, jobs = cache(FolderSpec), []
+    for image, folder in images_of(folders, "extract features from").items():
+        camera, has_mask = folder.read().camera_of(image), mask_path(folder, image).is_file()
+        jobs.append(_Job(image, spec_of(folder), (camera.width, camera.height), has_mask))
     folder_of = {job.image: job.folder for job in jobs}
 
     def inputs(image: str, digest: Digest) -> object:
@@ -90,7 +88,13 @@ def extract_local_features(
     items = work.items(extractor.name, list(folder_of), inputs)
     todo = [job for job in jobs if job.image not in items.done]
     todo.sort(key=_SIZE)  # images of one size can be a batch
-    steps: Batched[_Job, LocalFeatures] = Batched(_read, _extract, extractor, "extract_many", _SIZE)
+    steps: Batched[_Job, LocalFeatures] = Batched(
+        partial(_read, mask_margin_px),
+        partial(_extract, extractor),
+        extractor,
+        "extract_many",
+        _SIZE,
+    )
     writers: tuple[FeatureWriter, FeatureWriter] | None = None
     results = work.map(steps, todo, items.label(f"{extractor.name} features"))
     for job, features in zip(todo, results, strict=True):
@@ -111,54 +115,50 @@ def extract_local_features(
     return counts
 
 
-def _jobs(
-    folders: Sequence[KaptureFolder], extractor: LocalFeatureExtractor, mask_margin_px: float
-) -> Iterator[_Job]:
-    named = sorted(
-        ((image, k) for k, folder in enumerate(folders) for image in folder.read().image_names())
-    )
-    specs = [FolderSpec(folder) for folder in folders]
-    for image, k in named:
-        camera = folders[k].read().camera_of(image)
-        has_mask = mask_path(folders[k], image).is_file()
-        size = camera.width, camera.height
-        yield _Job(extractor, specs[k], image, size, has_mask, mask_margin_px)
+def images_of(folders: Sequence[KaptureFolder], purpose: str) -> dict[str, KaptureFolder]:
+    """All images in order of their names, with their folders.
+
+    Raises DataError: there is none, or two folders have an image of the same name.
+    """
+    named = [(image, folder) for folder in folders for image in folder.read().image_names()]
+    named.sort(key=itemgetter(0))
+    for (image, _), (other, _) in pairwise(named):
+        if image == other:
+            raise DataError(f"image {image} stands in two kapture folders at once")
+    if not named:
+        raise DataError(f"there are no images to {purpose}")
+    return dict(named)
 
 
 def _writers(
     output: Path, extractor: LocalFeatureExtractor, features: LocalFeatures
 ) -> tuple[FeatureWriter, FeatureWriter]:
-    name = extractor.name
-    keypoints = FeatureConfig(
-        name, np.dtype(features.keypoints_px.dtype), features.keypoints_px.shape[1]
-    )
-    descriptors = FeatureConfig(
-        name,
-        np.dtype(features.descriptors.dtype),
-        features.descriptors.shape[1],
-        keypoints_type=name,
-        metric_type=getattr(extractor, "metric", "L2"),
+    name, px, descriptors = extractor.name, features.keypoints_px, features.descriptors
+    metric = getattr(extractor, "metric", "L2")
+    configs = (
+        FeatureConfig(name, np.dtype(px.dtype), px.shape[1]),
+        FeatureConfig(name, np.dtype(descriptors.dtype), descriptors.shape[1], name, metric),
     )
     return (
-        FeatureWriter(output, "keypoints", name, keypoints, orphan=True),
-        FeatureWriter(output, "descriptors", name, descriptors, orphan=True),
+        FeatureWriter(output, "keypoints", name, configs[0], orphan=True),
+        FeatureWriter(output, "descriptors", name, configs[1], orphan=True),
     )
 
 
-def _read(job: _Job) -> Frame:
-    return read_frame(job.folder.open(), job.image, margin_px=job.mask_margin_px)
+def _read(margin_px: float, job: _Job) -> Frame:
+    return read_frame(job.folder.open(), job.image, margin_px=margin_px)
 
 
-def _extract(jobs: Sequence[_Job], frames: Sequence[Frame]) -> list[LocalFeatures]:
-    return extract_all(jobs[0].extractor, frames, [job.image for job in jobs])
+def _extract(
+    extractor: LocalFeatureExtractor, jobs: Sequence[_Job], frames: Sequence[Frame]
+) -> list[LocalFeatures]:
+    return extract_all(extractor, frames, [job.image for job in jobs])
 
 
 def image_inputs(folder: KaptureFolder, image: str, digest: Digest) -> list[object]:
     """What features of an image are made of: its file, its camera's size, its mask if it has one.
 
-    Raises
-    ------
-    DataError : a file cannot be read.
+    Raises DataError: a file cannot be read.
     """
     camera, mask = folder.read().camera_of(image), mask_path(folder, image)
     masked = digest(mask) if mask.is_file() else None
@@ -179,16 +179,15 @@ def read_frame(folder: KaptureFolder, image: str, *, margin_px: float = 0.0) -> 
 def read_image_of(path: Path, camera: Camera) -> NDArray[np.uint8]:
     """Read an image and check that it has the size its camera says; uint8 (H, W, 3) RGB."""
     image = read_image_rgb(path)
-    check_size(image, camera, path)
+    check_size(image.shape[1::-1], camera, path)
     return image
 
 
-def check_size(image: NDArray[np.uint8], camera: Camera, name: Path | str) -> None:
-    """Raise DataError when an image is not of the size its camera says."""
-    height, width = image.shape[:2]
-    if (width, height) != (camera.width, camera.height):
+def check_size(size: tuple[int, ...], camera: Camera, name: Path | str) -> None:
+    """Raise DataError when an image is not of the size (width, height) its camera says."""
+    if size != (camera.width, camera.height):
         raise DataError(
-            f"the image is {width}x{height}, its camera says {camera.width}x{camera.height}",
+            f"the image is {size[0]}x{size[1]}, its camera says {camera.width}x{camera.height}",
             path=name,
         )
 
@@ -223,14 +222,7 @@ def extract_all(
 ) -> list[LocalFeatures]:
     """What a plugin makes of images of one size, very large ones reduced meanwhile.
 
-    Parameters
-    ----------
-    names : of the images, for messages.
-
-    Raises
-    ------
-    PluginError : it breaks the protocol.
-    DeviceMemoryError : there is no memory for one image.
+    Raises PluginError: it breaks the protocol; DeviceMemoryError: there is no memory for one image.
     """
     found = in_batches(
         extractor,
@@ -266,28 +258,24 @@ class ExtractLocalFeatures(PipelineStage):
 
     name = "local_features"
     uses = ("mask_margin_px", *LOCAL_TYPES)
-    writes = (LOCAL_FEATURES,)
-
-    @property
-    def reads(self) -> Sequence[str]:  # type: ignore[override]
-        return (self.layout.mapping, self.layout.query, *self.layout.reference)
+    inputs = (Layout.mapping, Layout.query, Layout.reference)
+    outputs = (LOCAL_FEATURES,)
 
     def plugins(self) -> Sequence[object]:
         return self.options.query_extractors()
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        everything = work.folders((self.layout.mapping, self.layout.query))
+        everything = work.folders((self.layout.mapping(), self.layout.query()))
         todo = [(extractor, everything) for extractor in self.options.own_extractors()]
         if self.options.uses_given_map():
             extractor, reference = self.options.make_given_extractor(), work.folder(REFERENCE)
             check_given_type(reference, extractor.name)
             todo.append((extractor, everything[1:] if has_descriptors(reference) else everything))
         counts: Counter[str] = Counter()
+        margin_px = self.options.mask_margin_px
         for extractor, folders in todo:
-            margin_px = self.options.mask_margin_px
-            counts.update(
-                extract_local_features(
-                    folders, extractor, work.out, mask_margin_px=margin_px, work=work
-                )
+            found = extract_local_features(
+                folders, extractor, work.out, mask_margin_px=margin_px, work=work
             )
+            counts.update(found)
         return counts

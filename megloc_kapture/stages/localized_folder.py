@@ -1,15 +1,22 @@
-"""The localized queries as a kapture folder, with what became of each beside it."""
+"""The localized queries as a kapture folder, with what became of each beside it.
+
+A query whose image cannot be used is set aside at import, and failed with the reason in the end:
+one broken photograph must not end the run of all others, and counts as a miss.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from pydantic import TypeAdapter
 
+from megloc_kapture.errors import DataError
 from megloc_kapture.io.csv_table import write_csv_table
+from megloc_kapture.io.dataset_tables import read_unreadable, write_unreadable
 from megloc_kapture.io.files import link_images
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.io.tables import (
@@ -23,15 +30,10 @@ from megloc_kapture.io.tables import (
     write_refinement,
     write_status,
 )
+from megloc_kapture.stages.local_features import read_image_of
 from megloc_kapture.stages.rigs import poses_through_rig
-from megloc_kapture.values import (
-    Camera,
-    ClusterPose,
-    Failure,
-    Pose,
-    RefinementRow,
-    RigidTransform,
-)
+from megloc_kapture.stages.work import FolderSpec, Work
+from megloc_kapture.values import Camera, ClusterPose, Failure, Pose, RefinementRow, RigidTransform
 
 
 def write_localized(
@@ -58,11 +60,11 @@ def write_localized(
     """
     data = query.read() if isinstance(query, KaptureFolder) else query
     named = sorted(results, key=lambda result: result[0])
+    found = {image: result for image, result in named if isinstance(result, Pose)}
     guesses: Mapping[str, tuple[str, RigidTransform]] = {}
     if fallback == "retrieval":
         guesses = first_candidates or {}
     elif fallback == "rig":
-        found = {image: result for image, result in named if isinstance(result, Pose)}
         guesses = poses_through_rig(data, found)
     poses: dict[tuple[int, str], RigidTransform] = {}
     sensors, records = dict(data.sensors), dict(data.records_camera)
@@ -81,45 +83,38 @@ def write_localized(
             poses[record] = result.cam_from_world
         elif guess is not None:
             poses[data.record_of(image)] = guess[1]
-    write_sensors(
-        output,
-        KaptureData(
-            sensors=sensors,
-            rigs={},
-            trajectories=poses,
-            records_camera=records,
-            records_depth={},
-        ),
-    )
+    write_sensors(output, KaptureData(sensors=sensors, trajectories=poses, records_camera=records))
     if isinstance(query, KaptureFolder):
         link_images(query.root, output)
     write_status(output / STATUS_FILE, statuses)
     write_clusters(
         output / CLUSTERS_FILE,
         (
-            (image, result.clusters, result.cluster if isinstance(result, Pose) else None)
+            (image, result.clusters, found[image].cluster if result else None)
             for image, result in named
         ),
     )
-    refinements = [
-        row for _, result in named if isinstance(result, Pose) for row in result.refinements
-    ]
+    refinements = [row for pose in found.values() for row in pose.refinements]
     if refinements:
         write_refinement(output / REFINEMENT_FILE, refinements)
     if timing is not None:
-        rows = (
-            (image, step, f"{seconds:.5f}")
-            for image, result in named
-            for step, seconds in result.seconds.items()
-        )
-        write_csv_table(timing, ("image", "step", "seconds"), rows)
-    localized = sum(bool(result) for _, result in named)
+        write_timing(timing, named)
     return {
         "queries": len(named),
-        "localized": localized,
-        "failed": len(named) - localized,
-        "fallbacks": len(poses) - localized,
+        "localized": len(found),
+        "failed": len(named) - len(found),
+        "fallbacks": len(poses) - len(found),
     }
+
+
+def write_timing(path: Path, results: Iterable[tuple[str, Pose | Failure]]) -> None:
+    """Write the seconds of each query and step."""
+    rows = (
+        (image, step, f"{seconds:.5f}")
+        for image, result in results
+        for step, seconds in result.seconds.items()
+    )
+    write_csv_table(path, ("image", "step", "seconds"), rows)
 
 
 # fields of a pose that JSON gives back as something else
@@ -168,3 +163,45 @@ def query_status(image: str, result: Pose | Failure, fallback: Fallback = "none"
         candidates=result.candidates,
         remarks="; ".join(result.remarks),
     )
+
+
+def set_aside_unreadable(query: Path, tables: Path, work: Work) -> Mapping[str, str]:
+    """Take images that cannot be read out of a workspace's queries; returns why, by name.
+
+    Their names and reasons go to ``tables``; the image files stay as they are. ``query``: kapture
+    folder in the workspace, which is written anew where an image is taken out. Raises DataError: no
+    image can be read; names the first.
+    """
+    folder = KaptureFolder(query)
+    data = folder.read()
+    names = data.image_names()
+    faults = work.map(partial(_fault, FolderSpec(folder)), names, "reading queries")
+    reasons = {name: fault for name, fault in zip(names, faults, strict=True) if fault}
+    if not reasons:
+        return {}
+    if len(reasons) == len(names):
+        raise DataError(reasons[names[0]], path=folder.image_path(names[0]))
+    records = {key: name for key, name in data.records_camera.items() if name not in reasons}
+    write_sensors(query, replace(data, records_camera=records))
+    write_unreadable(tables, reasons)
+    return reasons
+
+
+def unreadable_queries(tables: Path) -> Iterator[tuple[str, Failure]]:
+    """The queries that were set aside, as results."""
+    for name, reason in read_unreadable(tables).items():
+        yield name, unreadable_image(name, reason)
+
+
+def unreadable_image(name: str, reason: str) -> Failure:
+    """The result of a query whose image cannot be used."""
+    return Failure(f"the image cannot be used: {reason}", name=name)
+
+
+def _fault(spec: FolderSpec, name: str) -> str:
+    folder = spec.open()
+    try:
+        read_image_of(folder.image_path(name), folder.read().camera_of(name))
+    except DataError as error:
+        return error.message
+    return ""

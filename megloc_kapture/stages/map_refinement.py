@@ -8,8 +8,10 @@ in ``reconstruction/point_covariances.npy``.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
+from functools import cached_property, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +19,11 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.files import link_images, write_json_model
-from megloc_kapture.io.images import read_depth_map
 from megloc_kapture.io.kapture import (
+    FeatureReader,
+    KaptureData,
     KaptureFolder,
+    Observations,
     write_observations,
     write_ply,
     write_points3d,
@@ -27,23 +31,213 @@ from megloc_kapture.io.kapture import (
 )
 from megloc_kapture.io.kapture.points import write_point_covariances
 from megloc_kapture.mapping.depth import DepthVerificationOptions, contradicted_by_depth
+from megloc_kapture.mapping.map_check import ObservedKeypoints, find_pixel_origin
 from megloc_kapture.mapping.uncertainty import (
     ConsistencyOptions,
+    ObservedPoints,
     UncertaintyOptions,
+    left_with_too_few,
     mean_depths,
+    point_covariances,
     point_deviations,
     reprojection_errors_px,
     seen_at_angle,
     too_uncertain,
     track_lengths,
 )
-from megloc_kapture.stages.layout import UNREFINED
-from megloc_kapture.stages.map_selection import FilterReport, Floats, MapSelection, Mask
-from megloc_kapture.stages.rigs import DepthRecord, depth_records
-from megloc_kapture.stages.stage import PipelineStage, StageWork
+from megloc_kapture.stages.rigs import DepthRecord, depth_records, read_depth
+from megloc_kapture.stages.stage import UNREFINED, Layout, PipelineStage, StageWork
 from megloc_kapture.stages.triangulation import copy_features
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
 from megloc_kapture.values import Options
+
+_SAMPLED_IMAGES = 50
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+class FilterReport(BaseModel):
+    """What one filter removed; ``checked`` is what it could judge, of observations or points."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str
+    checked: int
+    points: int
+    observations: int
+
+
+class MapSelection:
+    """A map's points and observations, and which of them are still in."""
+
+    def __init__(self, source: KaptureFolder, min_observations: int) -> None:
+        self.source = source
+        self.data: KaptureData = source.read()
+        self.xyz = np.ascontiguousarray(source.points3d()[:, :3])
+        self._of_type = source.observations()
+        self._min_observations = min_observations
+        types = list(self._of_type.values())
+        self.images = sorted({image for seen in types for image in seen.image_names})
+        poses = self.data.poses()
+        posed = np.array([image in poses for image in self.images], dtype=bool)
+        # images without a pose have one in the list, that no observation refers to
+        self._poses = [poses.get(image) for image in self.images]
+        row_of = {image: row for row, image in enumerate(self.images)}
+        rows = [
+            np.array([row_of[i] for i in seen.image_names], dtype=np.int32)[seen.image_ids]
+            for seen in types
+        ]
+        self._sizes = [len(seen) for seen in types]
+        point_ids = _joined([seen.point_ids for seen in types], np.int64)
+        image_ids = _joined(rows, np.int32)
+        # of several types, sorted by point as those of one are
+        self._order: Any = slice(None) if len(types) == 1 else np.argsort(point_ids, kind="stable")
+        self.point_ids, self.image_ids = point_ids[self._order], image_ids[self._order]
+        self.kept_points = np.ones(len(self.xyz), dtype=bool)
+        self.kept = np.ones(len(self.point_ids), dtype=bool)
+        self._placed = posed[self.image_ids] if len(posed) else self.kept.copy()
+        self.reports: list[FilterReport] = []
+        self._covariances: Floats | None = None
+
+    @cached_property
+    def _views(self) -> tuple[list[Any], list[Any]]:
+        posed = next((row for row, pose in enumerate(self._poses) if pose is not None), None)
+        if posed is None:
+            return [], []
+        stand_in = self.data.camera_of(self.images[posed]), self._poses[posed]
+        views = [
+            stand_in if pose is None else (self.data.camera_of(image), pose)
+            for image, pose in zip(self.images, self._poses, strict=True)
+        ]
+        cameras, poses = zip(*views, strict=True)
+        return list(cameras), list(poses)
+
+    def observed(self) -> tuple[ObservedPoints, NDArray[np.int64]]:
+        """What is in and can be judged, and the rows of these observations."""
+        rows = np.flatnonzero(self.kept & self._placed)
+        point_ids, image_ids = self.point_ids, self.image_ids
+        if len(rows) < len(point_ids):
+            point_ids, image_ids = point_ids[rows], image_ids[rows]
+        cameras, poses = self._views
+        return ObservedPoints(self.xyz, point_ids, image_ids, cameras, poses), rows
+
+    def covariances(self) -> Floats:
+        """Covariances (N, 6) from the observations that are in; NaN where not determined."""
+        if self._covariances is None:
+            observed, _ = self.observed()
+            self._covariances = point_covariances(
+                observed.xyz,
+                observed.point_ids,
+                observed.image_ids,
+                observed.cameras,
+                observed.cams_from_world,
+            )
+        return self._covariances
+
+    def drop_observations(self, name: str, dropped: Mask, checked: int) -> None:
+        """Take observations (O,) out, and the points that are left with too few."""
+        dropped = dropped & self.kept
+        ids = self.point_ids[self.kept]
+        gone = left_with_too_few(ids, dropped[self.kept], len(self.xyz), self._min_observations)
+        self._take_out(name, dropped, gone, checked)
+
+    def drop_points(self, name: str, dropped: Mask, checked: int) -> None:
+        """Take points (N,) out, with their observations."""
+        self._take_out(name, np.zeros(len(self.kept), dtype=bool), dropped, checked)
+
+    def _take_out(self, name: str, observations: Mask, points: Mask, checked: int) -> None:
+        gone = self.kept & (observations | points[self.point_ids])
+        self.reports.append(
+            FilterReport(
+                name=name,
+                checked=checked,
+                points=int((points & self.kept_points).sum()),
+                observations=int(gone.sum()),
+            )
+        )
+        if self._covariances is not None and (gone & ~points[self.point_ids]).any():
+            self._covariances = None  # a point that loses some but not all is less sure
+        self.kept &= ~gone
+        self.kept_points &= ~points
+
+    def keypoints_px(self) -> NDArray[np.float32]:
+        """Keypoint (O, 2) of every observation, as the cameras have the pixel origin.
+
+        NaN where an image has no pose or no keypoints of the type.
+        """
+        found = []
+        cameras, poses = self._views
+        row_of = {image: row for row, image in enumerate(self.images)}
+        for name, seen in self._of_type.items():
+            rows = [row_of[image] for image in seen.image_names]
+            in_type = ObservedPoints(
+                self.xyz,
+                seen.point_ids,
+                seen.image_ids,
+                [cameras[row] for row in rows] if cameras else [],
+                [poses[row] for row in rows] if poses else [],
+            )
+            posed = [self._poses[row] is not None for row in rows]
+            reader = self.source.keypoints(name) if name in self.source.types("keypoints") else None
+            found.append(_keypoints_of(reader, seen, in_type, posed))
+        return _joined(found, np.float32).reshape(-1, 2)[self._order]
+
+    def observations(self) -> dict[str, Observations]:
+        """What is in, by type, points renumbered."""
+        kept = np.empty_like(self.kept)
+        kept[self._order] = self.kept
+        number = np.cumsum(self.kept_points) - 1
+        parts = np.split(kept, np.cumsum(self._sizes)[:-1]) if self._sizes else []
+        return {
+            name: replace(
+                seen,
+                point_ids=number[seen.point_ids[part]],
+                image_ids=seen.image_ids[part],
+                keypoint_ids=seen.keypoint_ids[part],
+            )
+            for (name, seen), part in zip(self._of_type.items(), parts, strict=True)
+            if part.any()
+        }
+
+
+def _joined(parts: Sequence[NDArray[Any]], dtype: type) -> NDArray[Any]:
+    return np.concatenate([np.zeros(0, dtype), *(part.ravel() for part in parts)], dtype=dtype)
+
+
+def _keypoints_of(
+    reader: FeatureReader | None,
+    seen: Observations,
+    observed: ObservedPoints,
+    posed: Sequence[bool],
+) -> NDArray[np.float32]:
+    """Keypoints (O, 2) of one type's observations; see :meth:`MapSelection.keypoints_px`."""
+    keypoints = np.full((len(seen), 2), np.nan, dtype=np.float32)
+    if reader is None or not observed.cameras:
+        return keypoints
+    usable = [i for i, image in enumerate(seen.image_names) if posed[i] and image in reader]
+    sampled = set(usable[:: max(1, len(usable) // _SAMPLED_IMAGES)])
+    sample = []
+    for image, rows in observed.by_image():
+        if not posed[image] or seen.image_names[image] not in reader:
+            continue
+        keypoints[rows] = reader.read(seen.image_names[image])[seen.keypoint_ids[rows], :2]
+        if image in sampled:
+            sample.append(
+                ObservedKeypoints(
+                    seen.image_names[image],
+                    observed.cameras[image],
+                    observed.cams_from_world[image],
+                    keypoints[rows],
+                    np.arange(len(rows)),
+                    seen.point_ids[rows],
+                )
+            )
+    origin = find_pixel_origin(
+        sample, observed.xyz, cameras=[observed.cameras[image] for image in usable]
+    )
+    return keypoints + np.float32(origin.keypoints_shift_px - origin.intrinsics_shift_px)
+
 
 REPORT_FILE = "refinement.json"
 KEPT_FILE, REJECTED_FILE = "refinement_kept.ply", "refinement_rejected.ply"
@@ -80,15 +274,6 @@ class RefinementReport(BaseModel):
     options: MapRefinementOptions
 
 
-@dataclass(frozen=True)
-class _DepthJob:
-    folder: FolderSpec
-    depth: DepthRecord
-    points_in_image: Floats
-    deviations: Floats
-    options: DepthVerificationOptions
-
-
 def refine_map(
     source: KaptureFolder,
     output: Path,
@@ -101,19 +286,10 @@ def refine_map(
 
     Points of any keypoints type, renumbered without gaps, and of several at once. Observations by
     images without a pose cannot be judged; they stay as long as their point does.
-
-    Parameters
-    ----------
-    link_features : the features in the source's own folder may become hard links (they are a map
-        of ours, not somebody's data); those beside it always do.
-
-    Returns
-    -------
-    Counts for the log: points and observations after, and what each filter removed.
-
-    Raises
-    ------
-    DataError : no points, or something broken; names the file.
+    ``link_features``: the features in the source's own folder may become hard links (they are a map
+    of ours, not somebody's data); those beside it always do. Returns counts for the log: points and
+    observations after, and what each filter removed. Raises DataError: no points, or something
+    broken; names the file.
     """
     options = options or MapRefinementOptions()
     if not source.has_points():
@@ -126,20 +302,18 @@ def refine_map(
     _verify_depth(selection, options.depth, work)
     _check_consistency(selection, options.consistency)
     _reject_uncertain(selection, options.uncertainty)
+    kept = selection.kept_points
     report = RefinementReport(
         points_before=len(selection.xyz),
         observations_before=len(selection.kept),
-        points_after=int(selection.kept_points.sum()),
+        points_after=int(kept.sum()),
         observations_after=int(selection.kept.sum()),
         filters=tuple(selection.reports),
         options=options,
     )
-
     write_sensors(output, selection.data)
     link_images(source.root, output)
-    for type_name in sorted({*source.types("keypoints"), *source.types("descriptors")}):
-        copy_features(source, output, type_name, link_own=link_features)
-    kept = selection.kept_points
+    copy_features(source, output, link_own=link_features)
     write_points3d(output, source.points3d()[kept])
     write_observations(output, selection.observations())
     covariances = selection.covariances()
@@ -158,11 +332,7 @@ def refine_map(
     return counts
 
 
-def _verify_depth(
-    selection: MapSelection,
-    options: DepthVerificationOptions,
-    work: Work,
-) -> None:
+def _verify_depth(selection: MapSelection, options: DepthVerificationOptions, work: Work) -> None:
     records = depth_records(selection.data) if options.max_sigmas is not None else {}
     folder = selection.source
     with_depth = {
@@ -174,7 +344,6 @@ def _verify_depth(
         return
     covariances = selection.covariances()
     observed, placed = selection.observed()
-    spec = FolderSpec(folder)
     rows_of = [(image, rows) for image, rows in observed.by_image() if image in with_depth]
 
     def job(image: int, rows: NDArray[np.int64]) -> _DepthJob:
@@ -182,16 +351,21 @@ def _verify_depth(
         pose = observed.cams_from_world[image]
         axis = (depth.image_from_depth.inverse() @ pose).rotation_matrix()[2]
         variances = _quadratic_form(covariances[points], axis)
-        return _DepthJob(spec, depth, pose.apply(observed.xyz[points]), np.sqrt(variances), options)
+        return depth, pose.apply(observed.xyz[points]), np.sqrt(variances)
 
     dropped = np.zeros(len(selection.kept), dtype=bool)
     num_checked = 0
     jobs = (job(image, rows) for image, rows in rows_of)
-    results = work.map(_compare, jobs, "depth", len(rows_of))
+    compare = partial(_compare, FolderSpec(folder), options)
+    results = work.map(compare, jobs, "depth", len(rows_of))
     for (_, rows), (contradicted, checked) in zip(rows_of, results, strict=True):
         dropped[placed[rows[contradicted]]] = True
         num_checked += checked
     selection.drop_observations("depth", dropped, num_checked)
+
+
+# of an image: its depth, points (N, 3) in its frame, their deviations (N,) along the depth's axis
+_DepthJob = tuple[DepthRecord, Floats, Floats]
 
 
 def _quadratic_form(covariances: Floats, axis: Floats) -> Floats:
@@ -201,18 +375,17 @@ def _quadratic_form(covariances: Floats, axis: Floats) -> Floats:
     return np.maximum(covariances @ weights, 0.0)
 
 
-def _compare(job: _DepthJob) -> tuple[Mask, int]:
-    camera = job.depth.camera
-    depth_m = read_depth_map(
-        job.folder.open().depth_path(job.depth.path), width=camera.width, height=camera.height
-    )
+def _compare(
+    folder: FolderSpec, options: DepthVerificationOptions, job: _DepthJob
+) -> tuple[Mask, int]:
+    depth, points, deviations = job
     contradicted, checked = contradicted_by_depth(
-        job.points_in_image,
-        depth_m,
-        camera,
-        job.depth.image_from_depth,
-        job.options,
-        deviations=job.deviations,
+        points,
+        read_depth(folder.open(), depth),
+        depth.camera,
+        depth.image_from_depth,
+        options,
+        deviations=deviations,
     )
     return contradicted, int(checked.sum())
 
@@ -269,14 +442,9 @@ class RefineMap(PipelineStage):
     name = "map"
     version = 2
     uses = ("refinement",)
-    reads = (UNREFINED,)
-
-    @property
-    def writes(self) -> Sequence[str]:  # type: ignore[override]
-        return (self.layout.sparse_map,)
+    inputs = (UNREFINED,)
+    outputs = (Layout.sparse_map,)
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        folder, options = work.folder(UNREFINED), self.options.refinement
-        return refine_map(
-            folder, work.out / self.layout.sparse_map, options, link_features=True, work=work
-        )
+        folder, out = work.folder(UNREFINED), work.out / self.layout.sparse_map()
+        return refine_map(folder, out, self.options.refinement, link_features=True, work=work)

@@ -11,8 +11,9 @@ from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass
 from functools import cache, cached_property, partial
 from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,23 +32,27 @@ from megloc_kapture.matching.verification import (
 )
 from megloc_kapture.plugins import Matcher
 from megloc_kapture.stages.devices import in_batches
-from megloc_kapture.stages.kept_items import Digest, feature_inputs
-from megloc_kapture.stages.layout import (
+from megloc_kapture.stages.map_points import matched_images
+from megloc_kapture.stages.stage import (
     FEATURES,
     LOCAL_FEATURES,
-    MAP,
     MAPPING_MATCHES,
     MAPPING_PAIRS,
     QUERY_MATCHES,
+    Layout,
+    PipelineStage,
+    StageWork,
 )
-from megloc_kapture.stages.map_points import matched_images
-from megloc_kapture.stages.stage import PipelineStage, StageWork
-from megloc_kapture.stages.work import HERE, Batched, FolderSpec, Work, batched
+from megloc_kapture.stages.work import (
+    HERE,
+    Batched,
+    Digest,
+    FolderSpec,
+    Work,
+    batched,
+    feature_inputs,
+)
 from megloc_kapture.values import Camera, ImageFeatures, Options, RigidTransform
-
-if TYPE_CHECKING:
-    from megloc_kapture.stages.options import PipelineOptions
-
 
 _CACHE_BYTES = 256 << 20  # descriptors kept per process: about a hundred images
 _PAIRS_PER_ITEM = 32  # of one image, whose features are read once for them
@@ -93,17 +98,6 @@ Verify = Callable[[Features, Features, NDArray[np.int64]], NDArray[np.bool_]]
 """Which of the matches (K, 2) of two images, best first, are right, bool (K,)."""
 
 
-@dataclass(frozen=True)
-class _Job:
-    first: FolderSpec
-    second: FolderSpec
-    local_type: str
-    matcher: Matcher
-    verification: Verification
-    image: str
-    others: tuple[str, ...]
-
-
 _PairMatches = tuple[NDArray[np.int64], NDArray[np.float32]]
 
 
@@ -129,30 +123,19 @@ def match_pairs(
     """Match each pair (image of ``first``, image of ``second``) and write what is verified.
 
     A pair without verified matches is written with none, so that it is known to be done. How many
-    matches each pair had before and has after verification stands in ``match_counts.csv``.
-
-    Returns
-    -------
-    Counts for the log: pairs, pairs with matches, matches.
+    matches each pair had before and has after verification stands in ``match_counts.csv``. Returns
+    counts for the log: pairs, pairs with matches, matches.
     """
-    specs = FolderSpec(first), FolderSpec(second)
-    jobs = []
     within_one = first.root == second.root
-    ordered = sorted(
-        {
-            # within a map (a, b) and (b, a) are one pair, kept in one file
-            (min(pair.query, pair.map), max(pair.query, pair.map))
-            if within_one
-            else (pair.query, pair.map)
-            for pair in pairs
-        }
-    )
+    # within a map (a, b) and (b, a) are one pair, kept in one file
+    ordered = sorted({_one_way(pair) if within_one else (pair.query, pair.map) for pair in pairs})
     named = {f"{image}\0{other}": (image, other) for image, other in ordered}
+    posed = isinstance(verification, KnownPoseOptions)
 
     @cache
     def side(number: int, image: str, digest: Digest) -> object:
-        posed = isinstance(verification, KnownPoseOptions)
-        return _image_inputs((first, second)[number], local_type, image, digest, posed=posed)
+        found = matched_inputs((first, second)[number], local_type, image, digest, posed=posed)
+        return found if posed else [*found, None]
 
     items = work.items(
         local_type,
@@ -160,15 +143,22 @@ def match_pairs(
         lambda name, digest: [side(k, image, digest) for k, image in enumerate(named[name])],
     )
     todo = [pair for name, pair in named.items() if name not in items.done]
-    for image, group in groupby(todo, key=lambda pair: pair[0]):
-        for some in batched((other for _, other in group), _PAIRS_PER_ITEM):
-            jobs.append(_Job(*specs, local_type, matcher, verification, image, tuple(some)))
-    steps = Batched(_read, _match, matcher, "match_many", None, _verify)
+    jobs: list[_Job] = []
+    for image, group in groupby(todo, key=itemgetter(0)):
+        jobs += [(image, some) for some in batched((b for _, b in group), _PAIRS_PER_ITEM)]
+    specs = FolderSpec(first), FolderSpec(second)
+    read = partial(_read, specs, local_type)
+    verify = partial(_verify, specs, local_type, verification)
+    match: Any = partial(_match, matcher)
+    steps: Batched[_Job, list[VerifiedMatches]] = Batched(
+        read, match, matcher, "match_many", None, verify
+    )
     writer = MatchesWriter(output, local_type, orphan=True)
-    for job, found in zip(jobs, work.map(steps, jobs, items.label("matching")), strict=True):
-        for other, pair in zip(job.others, found, strict=True):
-            file = writer.write(job.image, other, pair.matches, pair.scores)
-            items.add(f"{job.image}\0{other}", [file], [pair.num_found, len(pair.matches)])
+    results = work.map(steps, jobs, items.label("matching"))
+    for (image, others), found in zip(jobs, results, strict=True):
+        for other, pair in zip(others, found, strict=True):
+            file = writer.write(image, other, pair.matches, pair.scores)
+            items.add(f"{image}\0{other}", [file], [pair.num_found, len(pair.matches)])
     counts = [PairCount(*pair, *items.done[name]) for name, pair in named.items()]
     write_match_counts(output, local_type, counts)
     return {
@@ -178,50 +168,59 @@ def match_pairs(
     }
 
 
-def _image_inputs(
-    folder: KaptureFolder, local_type: str, image: str, digest: Digest, *, posed: bool
-) -> object:
-    """What matches of an image are made of: its features and its camera, with poses its pose."""
-    camera = astuple(folder.read().camera_of(image))
+def matched_inputs(
+    folder: KaptureFolder, local_type: str, image: str, digest: Digest, *, posed: bool = False
+) -> list[object]:
+    """What matches of an image are made of: camera and features; where ``posed`` then the pose."""
     readers = folder.keypoints(local_type), folder.descriptors(local_type)
-    found = [camera, *(feature_inputs(reader, image, digest) for reader in readers)]
-    pose = folder.read().cam_from_world(image) if posed else None
-    return [*found, pose and astuple(pose)]
+    found: list[object] = [astuple(folder.read().camera_of(image))]
+    found += [feature_inputs(reader, image, digest) for reader in readers]
+    pose = folder.read().cam_from_world(image)
+    return [*found, pose and astuple(pose)] if posed else found
 
 
-def _read(job: _Job) -> list[Features]:
+_Job = tuple[str, Sequence[str]]  # an image of the first folder, and some of the second
+
+
+def _one_way(pair: ImagePair) -> tuple[str, str]:
+    return min(pair.query, pair.map), max(pair.query, pair.map)
+
+
+def _read(specs: tuple[FolderSpec, FolderSpec], local_type: str, job: _Job) -> list[Features]:
     """Features of the image, and of the others."""
-    first, second = job.first.open(), job.second.open()
-    return [
-        cached_features(job.first, first, job.local_type, job.image),
-        *(cached_features(job.second, second, job.local_type, other) for other in job.others),
-    ]
+    image, others = job
+    others_read = [cached_features(specs[1], local_type, other) for other in others]
+    return [cached_features(specs[0], local_type, image), *others_read]
 
 
 def _match(
-    jobs: Sequence[_Job], features: Sequence[Sequence[Features]]
+    matcher: Matcher, jobs: Sequence[_Job], features: Sequence[Sequence[Features]]
 ) -> list[list[_PairMatches]]:
     return [
-        match_all(job.matcher, a, others, [f"pair {job.image}, {other}" for other in job.others])
-        for job, (a, *others) in zip(jobs, features, strict=True)
+        match_all(matcher, a, read, [f"pair {image}, {other}" for other in others])
+        for (image, others), (a, *read) in zip(jobs, features, strict=True)
     ]
 
 
-def _verify(found: tuple[_Job, Sequence[_PairMatches]]) -> list[VerifiedMatches]:
-    job, matched = found
-    first, second = job.first.open(), job.second.open()
+def _verify(
+    specs: tuple[FolderSpec, FolderSpec],
+    local_type: str,
+    verification: Verification,
+    found: tuple[_Job, Sequence[_PairMatches]],
+) -> list[VerifiedMatches]:
+    (image, others), matched = found
+    first, second = (spec.open().read() for spec in specs)
 
     def relative(other: str) -> RigidTransform | None:
-        a_from_world = first.read().cam_from_world(job.image)
-        b_from_world = second.read().cam_from_world(other)
+        a_from_world, b_from_world = first.cam_from_world(image), second.cam_from_world(other)
         if a_from_world is None or b_from_world is None:
             return None
         return b_from_world @ a_from_world.inverse()
 
-    a, *others = _read(job)
+    a, *read = _read(specs, local_type, (image, others))
     return [
-        verified(a, b, pair, verification_of(job.verification, partial(relative, other)))
-        for other, b, pair in zip(job.others, others, matched, strict=True)
+        verified(a, b, pair, verification_of(verification, partial(relative, other)))
+        for other, b, pair in zip(others, read, matched, strict=True)
     ]
 
 
@@ -230,13 +229,7 @@ def match_all(
 ) -> list[_PairMatches]:
     """Matches of one image with each of several, as many at once as there is memory for.
 
-    Parameters
-    ----------
-    names : of the pairs, for messages.
-
-    Raises
-    ------
-    DeviceMemoryError : there is no memory for one pair.
+    Raises DeviceMemoryError: there is no memory for one pair.
     """
     many: Any = matcher
 
@@ -265,9 +258,7 @@ def verification_of(
 ) -> Verify:
     """How the matches of two images are verified.
 
-    Parameters
-    ----------
-    b_from_a : for known poses, the second camera's; without, no match is right.
+    ``b_from_a``: for known poses, the second camera's; without, no match is right.
     """
 
     def verify(a: Features, b: Features, matches: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -321,17 +312,14 @@ def _size(features: Features) -> int:
 _cache = FeatureCache()
 
 
-def cached_features(
-    spec: FolderSpec, folder: KaptureFolder, local_type: str, image: str
-) -> Features:
-    """The features of an image of a folder that a work item opened; kept in this process.
+def cached_features(spec: FolderSpec, local_type: str, image: str) -> Features:
+    """The features of an image of a folder; kept in this process.
 
-    Raises
-    ------
-    DataError : features are missing, broken or not finite, or of different number.
+    Raises DataError: features are missing, broken or not finite, or of different number.
     """
 
     def read() -> Features:
+        folder = spec.open()
         keypoints, descriptors = folder.keypoints(local_type), folder.descriptors(local_type)
         found, described = keypoints.read(image), descriptors.read(image)
         if len(found) != len(described):
@@ -370,15 +358,11 @@ class MatchMapping(PipelineStage):
     name = "mapping_matches"
     version = 3
     uses = (*MATCHING_OPTIONS, "mapping_verification")
-    writes = (MAPPING_MATCHES,)
+    inputs = (Layout.mapping, LOCAL_FEATURES, MAPPING_PAIRS)
+    outputs = (MAPPING_MATCHES,)
 
-    @property
-    def reads(self) -> Sequence[str]:  # type: ignore[override]
-        return (self.layout.mapping, LOCAL_FEATURES, MAPPING_PAIRS)
-
-    @classmethod
-    def is_wanted(cls, options: PipelineOptions) -> bool:
-        return options.triangulates()
+    def is_wanted(self) -> bool:
+        return self.options.triangulates()
 
     def plugins(self) -> Sequence[object]:
         return [self.options.make_matcher(name) for name in self.options.own_types()]
@@ -388,21 +372,12 @@ class MatchMapping(PipelineStage):
         return self.options.verify_mapping()
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        mapping = work.folder(self.layout.mapping, FEATURES)
-        pairs = mapping_pairs(work, mapping)
+        mapping = work.folder(self.layout.mapping(), FEATURES)
+        pairs, out = mapping_pairs(work, mapping), work.out / self.writes[0]
         counts: Counter[str] = Counter()
-        for local_type in self.options.own_types():
-            found = match_pairs(
-                mapping,
-                mapping,
-                pairs,
-                local_type,
-                self.options.make_matcher(local_type),
-                self.verification(),
-                work.out / self.writes[0],
-                work=work,
-            )
-            counts.update(found)
+        for name in self.options.own_types():
+            matcher, how = self.options.make_matcher(name), self.verification()
+            counts.update(match_pairs(mapping, mapping, pairs, name, matcher, how, out, work=work))
         return counts
 
 
@@ -412,32 +387,20 @@ class MatchQueries(PipelineStage):
     name = "query_matches"
     version = 4
     uses = (*MATCHING_OPTIONS, "query_verification")
-    writes = (QUERY_MATCHES,)
-
-    @property
-    def reads(self) -> Sequence[str]:  # type: ignore[override]
-        given = (MAP,) if self.options.uses_given_map() else ()
-        images = (self.layout.mapping, self.layout.query)
-        return (*images, LOCAL_FEATURES, self.layout.candidates, *given)
+    inputs = (Layout.mapping, Layout.query, LOCAL_FEATURES, Layout.candidates, Layout.given_map)
+    outputs = (QUERY_MATCHES,)
 
     def plugins(self) -> Sequence[object]:
         return [self.options.make_matcher(name) for name in self.options.local_types()]
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        pairs = read_pairs(work.path(self.layout.candidates))
+        query = work.folder(self.layout.query(), FEATURES)
+        pairs, out = read_pairs(work.path(self.layout.candidates())), work.out / QUERY_MATCHES
         counts: Counter[str] = Counter()
-        for local_type in self.options.local_types():
-            mapping = matched_images(work, self, local_type)
-            described = mapping.descriptors(local_type)
-            found = match_pairs(
-                work.folder(self.layout.query, FEATURES),
-                mapping,
-                [pair for pair in pairs if pair.map in described],
-                local_type,
-                self.options.make_matcher(local_type),
-                self.options.verify_queries(),
-                work.out / QUERY_MATCHES,
-                work=work,
-            )
-            counts.update(found)
+        for name in self.options.local_types():
+            mapping = matched_images(work, self, name)
+            described = mapping.descriptors(name)
+            some = [pair for pair in pairs if pair.map in described]
+            matcher, how = self.options.make_matcher(name), self.options.verify_queries()
+            counts.update(match_pairs(query, mapping, some, name, matcher, how, out, work=work))
         return counts

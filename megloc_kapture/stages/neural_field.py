@@ -132,9 +132,8 @@ def views_of(mapping: KaptureFolder) -> list[FieldView]:
 def open_field(folder: Path, device: Device = "auto") -> NeuralField:
     """A field out of its folder; one that has been opened stays in memory.
 
-    Raises
-    ------
-    DataError : missing, damaged, or the tensors are not those of the manifest; names the file.
+    Raises DataError: missing, damaged, or the tensors are not those of the manifest; names the
+    file.
     """
     return _opened(weights_file(folder), device)
 
@@ -161,11 +160,8 @@ def views_between(data: KaptureData) -> KaptureData:
     """Views that no camera took: halfway between each camera and the nearest that look its way.
 
     Poses, and cameras under sensors of their own, so that kapture merges the renderings with the
-    map; each has the camera of the first of its two images by name.
-
-    Raises
-    ------
-    DataError : no two cameras look the same way.
+    map; each has the camera of the first of its two images by name. Raises DataError: no two
+    cameras look the same way.
     """
     names, poses = data.image_names(), data.poses()
     names = [name for name in names if name in poses]

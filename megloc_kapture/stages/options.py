@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
 from typing import Any, Literal
 
 from pydantic import Field, field_validator, model_validator
@@ -24,14 +26,18 @@ from megloc_kapture.stages.candidates import QueryPairsOptions, Retrieval
 from megloc_kapture.stages.densifying import DensifyOptions
 from megloc_kapture.stages.devices import Precision, placed, unheeded
 from megloc_kapture.stages.global_features import GlobalFeaturesChoice
-from megloc_kapture.stages.image_pairs import MappingPairsOptions
+from megloc_kapture.stages.image_pairs import MappingPairsOptions, RerankingOptions
 from megloc_kapture.stages.map_refinement import MapRefinementOptions
-from megloc_kapture.stages.map_refiners import PoseRefinementOptions
 from megloc_kapture.stages.matches import NoVerification, Verification
+from megloc_kapture.stages.pose_refinement import PoseRefinementOptions
 from megloc_kapture.stages.preprocessing import PreprocessingOptions
 from megloc_kapture.stages.query_poses import LocalizationOptions
-from megloc_kapture.stages.reranking import RerankingOptions
 from megloc_kapture.values import Device, Options
+
+
+def _first_twice(names: Sequence[str]) -> str | None:
+    """The first name, by the alphabet, that stands in a list more than once."""
+    return min((name for name, count in Counter(names).items() if count > 1), default=None)
 
 
 class LocalFeaturesChoice(PluginChoice):
@@ -135,12 +141,7 @@ class PipelineOptions(Options):
         return idle
 
     def check(self) -> None:
-        """Refuse steps that contradict each other.
-
-        Raises
-        ------
-        OptionError : names them.
-        """
+        """Refuse steps that contradict each other; raises OptionError: names them."""
         if self.matches_again() and self.verification == "none":
             raise OptionError(
                 "guided pyramid matching counts verified matches; verification = none has none"
@@ -217,17 +218,13 @@ class PipelineOptions(Options):
     def local_types(self) -> list[str]:
         """Keypoints types that queries are localized with, the one VLAD uses first.
 
-        Raises
-        ------
-        PluginError : an extractor cannot be made.
-        OptionError : two types of one name.
+        Raises PluginError: an extractor cannot be made; OptionError: two types of one name.
         """
         types = [extractor.name for extractor in self.query_extractors()]
-        twice = sorted({name for name in types if types.count(name) > 1})
-        if twice:
+        if twice := _first_twice(types):
             raise OptionError(
-                f"keypoints type {twice[0]!r} is asked for twice, in local_features or of the "
-                f"given map (map = {self.map})"
+                f"keypoints type {twice!r} is asked for twice, in local_features or of the given "
+                f"map (map = {self.map})"
             )
         return types
 
@@ -238,16 +235,13 @@ class PipelineOptions(Options):
     def retrieval(self) -> Retrieval:
         """The global features that are compared, and how they are fused.
 
-        Raises
-        ------
-        OptionError : two of one type, or options that VLAD cannot have.
-        PluginError, MissingWeightsError : an extractor cannot be made.
+        Raises OptionError: two of one type, or options that VLAD cannot have; PluginError,
+        MissingWeightsError: an extractor cannot be made.
         """
         main_type = self.main_type()
         types = [chosen.type_name(main_type) for chosen in self.global_features]
-        twice = sorted({name for name in types if types.count(name) > 1})
-        if twice:
-            raise OptionError(f"global features {twice[0]!r} are asked for twice")
+        if twice := _first_twice(types):
+            raise OptionError(f"global features {twice!r} are asked for twice")
         weights = tuple(chosen.weight for chosen in self.global_features)
         return Retrieval(tuple(types), weights, self.fusion)
 

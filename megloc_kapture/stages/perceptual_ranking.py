@@ -8,7 +8,8 @@ cluster's map images with depth.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from functools import cache, partial
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -75,8 +76,7 @@ class PerceptualOptions(AlignedViewOptions):
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Compared:
+class _Compared(NamedTuple):
     """One view of a query and what a cluster shows at its pose."""
 
     query: NDArray[np.uint8]
@@ -124,7 +124,12 @@ class PerceptualRanker:
             shown.views(each) if count >= enough else None
             for each, count in zip(hypotheses, inliers, strict=True)
         ]
-        own = np.array([np.inf if each is None else self._alone(each) for each in compared])
+        own = np.array(
+            [
+                np.inf if v is None else self._mean_distance(v, [a.valid for a in v])
+                for v in compared
+            ]
+        )
         told = np.flatnonzero(np.isfinite(own))
         if not np.isfinite(own[int(np.argmax(otherwise))]):
             return otherwise
@@ -139,9 +144,6 @@ class PerceptualRanker:
         untold = ~np.isfinite(own)
         scores[untold] = scores[told].min() - 1.0 - 1.0 / (1.0 + otherwise[untold])
         return scores
-
-    def _alone(self, views: Sequence[_Compared]) -> float:
-        return self._mean_distance(views, [view.valid for view in views])
 
     def _against_each_other(
         self, finalists: Sequence[Sequence[_Compared] | None], own: Floats, at: NDArray[np.int64]
@@ -179,10 +181,9 @@ class _Shown:
     """A query's images and what clusters show in their place; reads everything once."""
 
     def __init__(self, scene: RankingScene, options: AlignedViewOptions) -> None:
-        self._scene = scene
-        self._options = options
+        self._scene, self._options = scene, options
         self._queries: dict[str, tuple[NDArray[np.uint8], Mask | None]] = {}
-        self._sources: dict[str, WarpSource | None] = {}
+        self._source = cache(partial(warp_source, scene=scene))
 
     def views(self, hypothesis: PoseHypothesis) -> list[_Compared]:
         """The views of a hypothesis."""
@@ -207,11 +208,6 @@ class _Shown:
         query, usable = self._queries[view.name]
         valid = warped.valid if usable is None else warped.valid & usable
         return _Compared(query, warped.image, valid)
-
-    def _source(self, name: str) -> WarpSource | None:
-        if name not in self._sources:
-            self._sources[name] = warp_source(name, self._scene)
-        return self._sources[name]
 
 
 def warp_source(name: str, scene: RankingScene) -> WarpSource | None:

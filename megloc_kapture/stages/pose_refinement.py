@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import shutil
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, astuple, dataclass, replace
+import threading
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, astuple, fields, replace
+from functools import cache, cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from megloc_kapture.io.csv_table import write_csv_table
-from megloc_kapture.io.dataset_tables import SIDE_TABLES
+from pydantic import Field, TypeAdapter
+
+from megloc_kapture.errors import OptionError, PluginError
+from megloc_kapture.geometry.poses import movement
+from megloc_kapture.io.dataset_tables import METRES, SIDE_TABLES, unit_of
 from megloc_kapture.io.files import link_images
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
 from megloc_kapture.io.tables import (
@@ -17,6 +24,7 @@ from megloc_kapture.io.tables import (
     CONSISTENCY_FILE,
     REFINEMENT_FILE,
     STATUS_FILE,
+    ConsistencyRow,
     QueryStatus,
     read_status,
     refinement_text,
@@ -24,30 +32,258 @@ from megloc_kapture.io.tables import (
     write_refinement,
     write_status,
 )
-from megloc_kapture.plugins import PoseRefiner
-from megloc_kapture.stages.kept_items import Digest
-from megloc_kapture.stages.layout import LOCALIZED, MAP, REFINEMENT_TIMING, UNREFINED_POSES
-from megloc_kapture.stages.localized_folder import plain_result, pose_of
-from megloc_kapture.stages.map_refiners import MapRefiners, PoseRefinementOptions, refine_pose
+from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugins import (
+    POSE_REFINERS,
+    PluginChoice,
+    PoseRefinement,
+    PoseRefiner,
+    RankingScene,
+    chosen_by_name,
+)
+from megloc_kapture.refinement.references import (
+    Consistency,
+    Displacement,
+    HoldsOut,
+    ReferenceImages,
+    judge_consistency,
+    spread_names,
+)
+from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
+from megloc_kapture.stages.localized_folder import plain_result, pose_of, write_timing
 from megloc_kapture.stages.ranking_scene import KaptureScene, image_inputs
-from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
-from megloc_kapture.stages.stage import PipelineStage, StageWork
-from megloc_kapture.stages.work import HERE, FolderSpec, Work
-from megloc_kapture.values import Pose
+from megloc_kapture.stages.stage import (
+    LOCALIZED,
+    MAP,
+    REFINEMENT_TIMING,
+    UNREFINED_POSES,
+    Layout,
+    PipelineStage,
+    StageWork,
+)
+from megloc_kapture.stages.work import HERE, Digest, FolderSpec, Work, map_inputs, ordered_map
+from megloc_kapture.values import Camera, Options, Pose, RefinementRow, RigidTransform
 
-if TYPE_CHECKING:
-    from megloc_kapture.stages.options import PipelineOptions
+# map images held out at once: of those, what comes behind the last that is needed is thrown away
+_WINDOW = 4
 
 
-@dataclass(frozen=True)
-class _Job:
-    map: FolderSpec
-    query: FolderSpec
-    image: str
-    pose: Pose
-    references: tuple[str, ...]
-    distrusted: tuple[str, ...]
-    refiners: tuple[PoseRefiner, ...]
+class PoseRefinementOptions(Options):
+    """How the poses of localized queries are refined."""
+
+    by: tuple[PluginChoice, ...] = Field(
+        default=(), description="pose refiners, one after another; none: poses stay"
+    )
+    max_references: int = Field(
+        default=30,
+        gt=0,
+        description="map images a refiner may choose from: that look the query's way, the nearest",
+    )
+
+    def idle(self) -> dict[str, str]:
+        return {} if self.refines() else {"max_references": "pose_refinement.by is empty"}
+
+    def with_refiners(self, names: Sequence[str]) -> PoseRefinementOptions:
+        """With these refiners, in this order, each with the options that it has here."""
+        chosen = chosen_by_name(self.by, names)
+        return PoseRefinementOptions.model_validate({**self.model_dump(), "by": chosen})
+
+    def refines(self) -> bool:
+        """Whether anything is done."""
+        return bool(self.by)
+
+    def make_refiners(self) -> list[PoseRefiner]:
+        """The refiners, in order; raises PluginError, MissingWeightsError."""
+        return [load_plugin(POSE_REFINERS, one.name, one.options) for one in self.by]
+
+
+def _map_content(mapping: KaptureFolder, digest: Digest) -> str:
+    """A hash of a whole map: a refiner may look at any image, whatever its references are."""
+    of_image = image_inputs(mapping)
+    images = [[name, of_image(name, digest)] for name in sorted(mapping.read().image_names())]
+    content = json.dumps([map_inputs(mapping, digest), images])
+    return hashlib.sha256(content.encode()).hexdigest()
+
+
+_VERDICTS: TypeAdapter[list[Consistency | None]] = TypeAdapter(list[Consistency | None])
+
+
+class MapRefiners:
+    """The pose refiners of a map: the images they use, and the frames they are trusted in.
+
+    A refiner whose poses are as good as the map is consistent is used in those coordinate frames
+    only that prove to be: a sample of their images is held out. Threads may share it.
+
+    Parameters
+    ----------
+    mapping : kapture with poses, and whatever the refiners need: images, depth maps, points.
+    restrictions : the coordinate frames of the map's images, which are never mixed.
+
+    Raises
+    ------
+    PluginError, MissingWeightsError : there is no such refiner, or it cannot be made.
+    """
+
+    def __init__(
+        self, mapping: KaptureFolder, restrictions: Restrictions, options: PoseRefinementOptions
+    ) -> None:
+        if options.refines() and (unit := unit_of(mapping.root)) != METRES:
+            raise OptionError(
+                f"pose_refinement.by {options.by[0].name}: its limits are in metres, the map is in "
+                f"{unit} of its own; `megloc map --scale` makes a map in metres"
+            )
+        self.refiners = tuple(options.make_refiners())
+        self.map = FolderSpec(mapping)
+        self._mapping, self._restrictions, self._options = mapping, restrictions, options
+        self._verdicts: dict[str, list[Consistency | None]] = {}
+        self._lock = threading.Lock()
+        self.map_content = cache(partial(_map_content, mapping))
+
+    @cached_property
+    def _by_frame(self) -> dict[str, ReferenceImages]:
+        poses = self._mapping.read().poses()
+        images = sorted(poses)
+        return {
+            self._restrictions.frame(images[members[0]]): ReferenceImages(
+                {images[member]: poses[images[member]] for member in members}
+            )
+            for members in self._restrictions.frames(images)
+        }
+
+    def _frame(self, pose: Pose) -> str:
+        """The coordinate frame of a pose, by the map images that it comes from."""
+        return self._restrictions.frame(pose.candidates[0]) if pose.candidates else ""
+
+    def test(self, poses: Iterable[Pose], *, work: Work = HERE) -> None:
+        """Test the frames of these poses that have not been tested.
+
+        Raises DataError: an image or a depth map cannot be read.
+        """
+
+        def inputs(frame: str, digest: Digest) -> object:
+            return [self.map_content(digest), self._by_frame[frame].names]
+
+        with self._lock:
+            frames = sorted({self._frame(pose) for pose in poses} - set(self._verdicts))
+            items = work.items("consistency", frames, inputs)
+            for frame in frames:
+                if frame not in items.done:
+                    verdicts = [
+                        self._judge(refiner, self._by_frame[frame], work)
+                        if isinstance(refiner, HoldsOut) and refiner.require_consistent_map
+                        else None
+                        for refiner in self.refiners
+                    ]
+                    items.add(frame, (), _VERDICTS.dump_python(verdicts))
+                self._verdicts[frame] = _VERDICTS.validate_python(items.done[frame])
+
+    def _judge(self, refiner: HoldsOut, images: ReferenceImages, work: Work) -> Consistency:
+        hold_out, spread = partial(_hold_out, self.map, refiner, images), spread_names(images.names)
+        return judge_consistency(ordered_map(hold_out, spread, work.executor, window=_WINDOW))
+
+    def tested(self) -> list[ConsistencyRow]:
+        """The rows of ``map_consistency.csv``: by refiner, then by frame."""
+        return [
+            _consistency_row(frame, refiner.name, verdict)
+            for number, refiner in enumerate(self.refiners)
+            for frame, verdicts in sorted(self._verdicts.items())
+            if (verdict := verdicts[number]) is not None
+        ]
+
+    def uses(self, pose: Pose) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """References of a pose, and of each refiner why it is distrusted: see :func:`refine_pose`.
+
+        Its frame has been tested.
+        """
+        frame = self._frame(pose)
+        near = self._by_frame[frame].near(
+            pose.cam_from_world, pose.candidates, max_references=self._options.max_references
+        )
+        return tuple(near), tuple(one.reason if one else "" for one in self._verdicts[frame])
+
+    def refine(self, image: str, camera: Camera, pose: Pose, scene: RankingScene) -> Pose:
+        """Refine the pose of one query; raises DataError, PluginError."""
+        if not self.refiners:
+            return pose
+        self.test([pose])
+        return refine_pose(image, camera, pose, *self.uses(pose), self.refiners, scene)
+
+
+def _hold_out(
+    mapping: FolderSpec, refiner: HoldsOut, images: ReferenceImages, image: str
+) -> Displacement | None:
+    return refiner.hold_out(image, images, KaptureScene(mapping.open()))
+
+
+def _consistency_row(frame: str, method: str, found: Consistency) -> ConsistencyRow:
+    median = found.median or Displacement(*[float("nan")] * len(fields(Displacement)))
+    counts = (found.images, found.contradicting)
+    return ConsistencyRow(frame, method, *counts, **vars(median), reason=found.reason)
+
+
+def refine_pose(
+    image: str,
+    camera: Camera,
+    pose: Pose,
+    references: Sequence[str],
+    distrusted: Sequence[str],
+    refiners: Sequence[PoseRefiner],
+    scene: RankingScene,
+) -> Pose:
+    """Refine the pose of one query by one refiner after another.
+
+    Parameters
+    ----------
+    references : map images that may show what the query sees, best first.
+    distrusted : of each refiner, why it must not be used in this map; empty where it may.
+
+    Returns
+    -------
+    The pose that the last accepted refiner gave, with its covariance; what each made of it stands
+    in its ``refinements``.
+
+    Raises
+    ------
+    PluginError : a refiner breaks its protocol.
+    """
+    rows, seconds = [], dict(pose.seconds)
+    for refiner, reason in zip(refiners, distrusted, strict=True):
+        started = time.perf_counter()
+        before = pose.cam_from_world
+        if reason:
+            refined = PoseRefinement(before, reason)
+        else:
+            refined = refiner.refine(image, camera, before, references, scene)
+        rows.append(_row(refiner, image, before, refined))
+        if refined.accepted:
+            after = refined.cam_from_world
+            w, x, y, z = map(float, after.quat_wxyz)  # a plugin may count in another precision
+            t_x, t_y, t_z = map(float, after.translation)
+            after = RigidTransform((w, x, y, z), (t_x, t_y, t_z))
+            pose = replace(pose, cam_from_world=after, covariance=refined.covariance)
+        seconds[refiner.name] = time.perf_counter() - started
+    return replace(pose, refinements=tuple(rows), seconds=seconds)
+
+
+def _row(
+    refiner: PoseRefiner, image: str, before: RigidTransform, refined: PoseRefinement
+) -> RefinementRow:
+    if not isinstance(refined, PoseRefinement):
+        raise PluginError(
+            f"plugin {refiner.name!r} on image {image}: refine returned "
+            f"{type(refined).__name__}, not PoseRefinement"
+        )
+    after = refined.cam_from_world if refined.accepted else before
+    moved_m, turned_deg = movement(before, after)
+    return RefinementRow(
+        image=image,
+        method=refiner.name,
+        reason=refined.reason,
+        moved_m=moved_m,
+        turned_deg=turned_deg,
+        measures=tuple(f"{name}={value:.6g}" for name, value in refined.measures.items()),
+        before=before,
+    )
 
 
 def refine_poses(
@@ -66,7 +302,7 @@ def refine_poses(
     A query that failed, or has a fallback pose, is left as it is. What became of each pose stands
     in ``status.csv``, with measures in ``refinement.csv``. A refiner whose poses are as good as the
     map is consistent is used in those coordinate frames only that prove to be; the measurement
-    stands in ``map_consistency.csv``.
+    stands in ``map_consistency.csv``. Returns counts for the log.
 
     Parameters
     ----------
@@ -76,10 +312,6 @@ def refine_poses(
     restrictions : the coordinate frames of the map's images, which are never mixed.
     timing : where to write seconds per query and refiner.
 
-    Returns
-    -------
-    Counts for the log.
-
     Raises
     ------
     DataError : ``status.csv`` is absent or broken; images or depth maps cannot be read.
@@ -88,7 +320,6 @@ def refine_poses(
     refiners = MapRefiners(map_folder, restrictions, options)
     statuses = read_status(localized.root / STATUS_FILE)
     data = localized.read()
-    query_spec = FolderSpec(query)
     poses = {
         image: Pose(pose, row.num_matches, row.num_inliers, candidates=row.candidates)
         for image, row in statuses.items()
@@ -104,28 +335,20 @@ def refine_poses(
         return [refiners.map_content(digest), *own]
 
     items = work.items("refined", list(poses), inputs)
-    jobs = [
-        _Job(refiners.map, query_spec, image, pose, *uses[image], refiners.refiners)
-        for image, pose in poses.items()
-        if image not in items.done
-    ]
-    found = {image: pose_of(plain) for image, plain in items.done.items()}
-    results = work.map(_refine, jobs, items.label("refining"))
-    for job, refined in zip(jobs, results, strict=True):
-        found[job.image] = refined
-        items.add(job.image, (), plain_result(refined))
-    found = {image: found[image] for image in poses}
+    jobs = [(image, pose, *uses[image]) for image, pose in poses.items() if image not in items.done]
+    kept = {image: pose_of(plain) for image, plain in items.done.items()}
+    refine = partial(_refine, refiners.map, FolderSpec(query), refiners.refiners)
+    results = work.map(refine, jobs, items.label("refining"))
+    for (image, *_), refined in zip(jobs, results, strict=True):
+        kept[image] = refined
+        items.add(image, (), plain_result(refined))
+    found = {image: kept[image] for image in poses}
     _write(output, data, localized, statuses, found)
     tested = refiners.tested()
     if tested:
         write_consistency(output / CONSISTENCY_FILE, tested)
     if timing is not None:
-        rows = (
-            (image, step, f"{seconds:.5f}")
-            for image, refined in found.items()
-            for step, seconds in refined.seconds.items()
-        )
-        write_csv_table(timing, ("image", "step", "seconds"), rows)
+        write_timing(timing, found.items())
     counts: dict[str, float] = {"queries": len(jobs)}
     for refiner in refiners.refiners:
         counts[f"accepted_by_{refiner.name}"] = sum(
@@ -151,15 +374,10 @@ def _write(
         poses[data.record_of(image)] = refined.cam_from_world
     write_sensors(output, replace(data, trajectories=poses))
     link_images(localized.root, output)
-    write_status(
-        output / STATUS_FILE,
-        (
-            status.model_copy(update={"refinement": refinement_text(found[image].refinements)})
-            if image in found
-            else status
-            for image, status in statuses.items()
-        ),
-    )
+    for image, refined in found.items():
+        told = {"refinement": refinement_text(refined.refinements)}
+        statuses[image] = statuses[image].model_copy(update=told)
+    write_status(output / STATUS_FILE, statuses.values())
     clusters = localized.root / CLUSTERS_FILE
     if clusters.is_file():
         shutil.copyfile(clusters, output / CLUSTERS_FILE)
@@ -168,17 +386,15 @@ def _write(
     )
 
 
-def _refine(job: _Job) -> Pose:
-    mapping, query = job.map.open(), job.query.open()
-    return refine_pose(
-        job.image,
-        query.read().camera_of(job.image),
-        job.pose,
-        job.references,
-        job.distrusted,
-        job.refiners,
-        KaptureScene(mapping, query),
-    )
+def _refine(
+    mapping: FolderSpec,
+    query: FolderSpec,
+    refiners: Sequence[PoseRefiner],
+    job: tuple[str, Pose, Sequence[str], Sequence[str]],
+) -> Pose:
+    image, pose, references, distrusted = job
+    scene, camera = KaptureScene(mapping.open(), query.open()), query.open().read().camera_of(image)
+    return refine_pose(image, camera, pose, references, distrusted, refiners, scene)
 
 
 class RefinePoses(PipelineStage):
@@ -187,15 +403,11 @@ class RefinePoses(PipelineStage):
     name = "refine_poses"
     version = 2
     uses = ("pose_refinement",)
-    writes = (LOCALIZED, REFINEMENT_TIMING)
+    inputs = (SIDE_TABLES, Layout.query, MAP, UNREFINED_POSES)
+    outputs = (LOCALIZED, REFINEMENT_TIMING)
 
-    @property
-    def reads(self) -> Sequence[str]:  # type: ignore[override]
-        return (SIDE_TABLES, self.layout.query, MAP, UNREFINED_POSES)
-
-    @classmethod
-    def is_wanted(cls, options: PipelineOptions) -> bool:
-        return options.pose_refinement.refines()
+    def is_wanted(self) -> bool:
+        return self.options.pose_refinement.refines()
 
     def plugins(self) -> Sequence[object]:
         return self.options.pose_refinement.make_refiners()
@@ -203,11 +415,11 @@ class RefinePoses(PipelineStage):
     def run(self, work: StageWork) -> Mapping[str, float]:
         return refine_poses(
             work.folder(MAP),
-            work.folder(self.layout.query),
+            work.folder(self.layout.query()),
             work.folder(UNREFINED_POSES),
             work.out / LOCALIZED,
             self.options.pose_refinement,
-            restrictions=work.restrictions(),
+            restrictions=Restrictions.read(work.path(SIDE_TABLES)),
             work=work,
             timing=work.out / REFINEMENT_TIMING,
         )

@@ -8,10 +8,11 @@ belong to the old pixels.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import astuple, replace
+from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,39 +27,33 @@ from megloc_kapture.io.files import (
     write_json,
     write_json_model,
 )
-from megloc_kapture.io.images import (
-    WRITABLE_SUFFIXES,
-    image_size,
-    write_image,
-)
+from megloc_kapture.io.images import WRITABLE_SUFFIXES, image_size, write_image
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import SEGMENTERS, Segmenter
-from megloc_kapture.preprocessing.frames import (
-    FrameOptions,
-    FramePlan,
-    plan_frame,
-)
+from megloc_kapture.preprocessing.frames import FrameOptions, FramePlan, plan_frame
 from megloc_kapture.preprocessing.masks import UnchangingRegion
 from megloc_kapture.stages.image_masks import (
     JPEG_QUALITY,
     ClassMasks,
     Mask,
-    MaskFiles,
     MaskOptions,
     ProcessedFrame,
     StandingMasks,
     find_unchanging_regions,
     mask_files,
+    read_masks,
 )
-from megloc_kapture.stages.kept_items import Digest, content_of
-from megloc_kapture.stages.layout import MAPPING, PREPROCESSED, QUERY
-from megloc_kapture.stages.local_features import read_image_of
-from megloc_kapture.stages.stage import Hashes, PipelineStage, StageWork
-from megloc_kapture.stages.work import HERE, Work
-
-if TYPE_CHECKING:
-    from megloc_kapture.stages.options import PipelineOptions
+from megloc_kapture.stages.local_features import check_size, read_image_of
+from megloc_kapture.stages.stage import (
+    MAPPING,
+    PREPROCESSED,
+    QUERY,
+    Hashes,
+    PipelineStage,
+    StageWork,
+)
+from megloc_kapture.stages.work import HERE, Digest, Work, content_of
 
 CLASSES, CLASSES_FILE = "classes", "classes.json"
 REPORT_FILE = "preprocessing.json"
@@ -70,58 +65,45 @@ class PreprocessingOptions(FrameOptions):
     masks: MaskOptions = MaskOptions()
 
 
-@dataclass(frozen=True)
-class _Job:
-    image: str
-    source: Path
-    output: Path
-    plan: FramePlan
-    link: bool  # it does not change and has no place in the new kapture yet
-    files: MaskFiles
-    standing: Mapping[str, Mask]  # of its camera, in original pixels
-    classes: ClassMasks | None
-
-
-def _process(job: _Job) -> tuple[list[Path], dict[str, float]]:
+def _process(
+    output: Path,
+    classes: ClassMasks | None,
+    job: tuple[str, Path, FramePlan, bool, Mapping[str, Path], Mapping[str, Mask]],
+) -> tuple[list[Path], dict[str, float]]:
     """Write what becomes of one image and its mask.
 
-    Returns
-    -------
-    The files, links left out; and the share of its pixels masked by each source of masks, and by
-    ``all`` of them, empty where there is none.
+    ``job``: the image and its file; what becomes of it; whether it is linked where it does not
+    change; its mask files, and the masks of its camera in original pixels. Returns the files, links
+    left out; and the share of its pixels masked by each source of masks, and by ``all`` of them,
+    empty where there is none.
     """
+    image, source, plan, link, mask_paths, standing = job
+    sensors, camera = output / "sensors", plan.original
     files: list[Path] = []
 
     def write(path: Path, pixels: NDArray[np.uint8]) -> None:
         write_image(path, pixels, jpeg_quality=JPEG_QUALITY)
         files.append(path)
 
-    sensors, camera = job.output / "sensors", job.plan.original
     frame = ProcessedFrame(
-        job.image,
-        job.plan,
-        lambda: read_image_of(job.source, camera),
-        lambda: {**job.files.read((camera.height, camera.width)), **job.standing},
-        lambda: job.classes,
+        image,
+        plan,
+        lambda: read_image_of(source, camera),
+        lambda: {**read_masks(mask_paths, (camera.height, camera.width)), **standing},
+        lambda: classes,
     )
-    place = sensors / "records_data" / job.image
-    if job.plan.changes_pixels:
-        write(place, frame.written)
+    if plan.changes_pixels:
+        write(sensors / "records_data" / image, frame.written)
     else:
-        size = image_size(job.source)
-        if size != (camera.width, camera.height):
-            raise DataError(
-                f"the image is {size[0]}x{size[1]}, its camera says {camera.width}x{camera.height}",
-                path=job.source,
-            )
-        if job.link:
-            link_file(job.source, place)
+        check_size(image_size(source), camera, source)
+        if link:
+            link_file(source, sensors / "records_data" / image)
     if frame.labels is not None:
-        write(sensors / CLASSES / f"{job.image}.png", frame.labels)
+        write(sensors / CLASSES / f"{image}.png", frame.labels)
     if frame.mask is None:
         return files, {}
     together = frame.mask
-    write(sensors / "masks" / f"{job.image}.png", together.astype(np.uint8) * 255)
+    write(sensors / "masks" / f"{image}.png", together.astype(np.uint8) * 255)
     masks = {**frame.masks, "all": together}
     return files, {source: float((~mask).mean()) for source, mask in masks.items()}
 
@@ -153,27 +135,10 @@ class PreprocessingReport(BaseModel):
     remarks: tuple[str, ...]
 
 
-def camera_reports(data: KaptureData, plans: Mapping[str, FramePlan]) -> dict[str, CameraReport]:
-    """Every camera that took an image, by sensor id."""
-    numbers: dict[str, int] = {}
-    for _, sensor_id in data.records_camera:
-        numbers[sensor_id] = numbers.get(sensor_id, 0) + 1
-    return {
-        sensor_id: CameraReport(
-            images=numbers[sensor_id],
-            original=Sensor.from_camera(plan.original).params,
-            processed=Sensor.from_camera(plan.processed).params,
-        )
-        for sensor_id, plan in plans.items()
-    }
-
-
 def read_report(root: Path) -> PreprocessingReport | None:
     """What was done to a kapture; None where nothing was.
 
-    Raises
-    ------
-    DataError : the report is broken.
+    Raises DataError: the report is broken.
     """
     path = root / "sensors" / REPORT_FILE
     return read_json_model(path, PreprocessingReport) if path.is_file() else None
@@ -186,7 +151,6 @@ def preprocess_images(
     *,
     segmenter: Segmenter | None = None,
     sequences: Sequence[KaptureFolder] = (),
-    root: Path | None = None,
     work: Work = HERE,
 ) -> dict[str, float]:
     """Write a kapture with the images, cameras and masks that the options make of one.
@@ -199,7 +163,6 @@ def preprocess_images(
     ----------
     segmenter : the plugin; made of ``options.masks.segmenter`` unless given.
     sequences : more folders to find the cameras' unchanging regions in; the map's, for queries.
-    root : of the options' relative paths.
     work : its processes write the images, so they must see the same files.
 
     Returns
@@ -221,15 +184,13 @@ def preprocess_images(
     classes = _class_masks(options.masks, segmenter)
     data = folder.read()
     plans = _plans(data, options)
-    user_masks = options.masks.user_masks
-    if user_masks is not None and root is not None:
-        user_masks = root / user_masks
-    files = mask_files(folder, data.image_names(), user_masks)
+    images = data.image_names()
+    files = mask_files(folder, images, options.masks.user_masks)
     regions: dict[str, UnchangingRegion] = {}
     if options.masks.unchanging:
         regions = find_unchanging_regions(folder, sequences, work=work)
     remarks = _remarks(regions, any(one.fallback for one in options.masks.fixed))
-    standing = StandingMasks(options.masks.fixed, regions, root)
+    standing = StandingMasks(options.masks.fixed, regions)
 
     _unlink_folders(output)
     write_sensors(output, _with_cameras(data, plans))
@@ -243,12 +204,12 @@ def preprocess_images(
         return standing.of(sensor_id, image, plans[sensor_id].original)
 
     def inputs(image: str, digest: Digest) -> object:
-        given = [file and digest(file) for file in astuple(files[image])]
+        own = files[image]
+        given = [digest(own[one]) if one in own else None for one in ("own", "user")]
         drawn = [[source, content_of([mask])] for source, mask in standing_of(image).items()]
         plan = plans[data.record_of(image)[1]]
         return [digest(folder.image_path(image)), astuple(plan), given, drawn]
 
-    images = data.image_names()
     items = work.items(f"images of {folder.root.name}", images, inputs)
     todo = [image for image in images if image not in items.done]
     for image in items.done:
@@ -256,43 +217,35 @@ def preprocess_images(
         if not (linked or plans[data.record_of(image)[1]].changes_pixels):
             link_file(folder.image_path(image), output / "sensors" / "records_data" / image)
 
-    def jobs() -> Iterator[_Job]:
+    def jobs() -> Iterator[tuple[str, Path, FramePlan, bool, dict[str, Path], Mapping[str, Mask]]]:
         for image in todo:
             plan = plans[data.record_of(image)[1]]
-            yield _Job(
-                image=image,
-                source=folder.image_path(image),
-                output=output,
-                plan=plan,
-                link=not (linked or plan.changes_pixels),
-                files=files[image],
-                standing=standing_of(image),
-                classes=classes,
-            )
+            link = not (linked or plan.changes_pixels)
+            yield image, folder.image_path(image), plan, link, files[image], standing_of(image)
 
-    results = work.map(
-        _process,
-        jobs(),
-        items.label("pre-processing"),
-        len(todo),
-        plugins=() if classes is None else (classes.segmenter,),
-    )
+    plugins = () if classes is None else (classes.segmenter,)
+    process, label = partial(_process, output, classes), items.label("pre-processing")
+    results = work.map(process, jobs(), label, len(todo), plugins=plugins)
     for image, (written, found) in zip(todo, results, strict=True):
         items.add(image, written, found)
-    shares: dict[str, float] = {}
-    num_images = len(images)
-    num_masked = 0
+    shares: Counter[str] = Counter()
     for image in images:
-        num_masked += bool(items.done[image])
-        for source, share in items.done[image].items():
-            shares[source] = shares.get(source, 0.0) + share
+        shares.update(items.done[image])
     remarks += [f"a fixed mask fits no image: {one.camera}" for one in standing.unused()]
+    taken = Counter(sensor_id for _, sensor_id in data.records_camera)
     report = PreprocessingReport(
-        images=num_images,
+        images=len(images),
         images_changed=sum(plans[s].changes_pixels for _, s in data.records_camera),
-        images_masked=num_masked,
-        cameras=camera_reports(data, plans),
-        masked={source: shares[source] / num_images for source in sorted(shares)},
+        images_masked=sum(bool(items.done[image]) for image in images),
+        cameras={
+            sensor_id: CameraReport(
+                images=taken[sensor_id],
+                original=Sensor.from_camera(plan.original).params,
+                processed=Sensor.from_camera(plan.processed).params,
+            )
+            for sensor_id, plan in plans.items()
+        },
+        masked={source: shares[source] / len(images) for source in sorted(shares)},
         remarks=tuple(remarks),
     )
     write_json_model(output / "sensors" / REPORT_FILE, report)
@@ -364,9 +317,7 @@ def _unlink_folders(output: Path) -> None:
 def _link_records(folder: KaptureFolder, output: Path, plans: Mapping[str, FramePlan]) -> bool:
     """Link all records at once where no image changes; else the depth maps, one by one.
 
-    Returns
-    -------
-    Whether the images are linked.
+    Returns whether the images are linked.
     """
     records = folder.root / "sensors" / "records_data"
     if records.is_dir() and not any(plan.changes_pixels for plan in plans.values()):
@@ -385,12 +336,11 @@ class Preprocess(PipelineStage):
 
     name = "preprocess"
     uses = ("preprocessing",)
-    reads = (MAPPING, QUERY)
-    writes = (PREPROCESSED,)
+    inputs = (MAPPING, QUERY)
+    outputs = (PREPROCESSED,)
 
-    @classmethod
-    def is_wanted(cls, options: PipelineOptions) -> bool:
-        return options.preprocesses()
+    def is_wanted(self) -> bool:
+        return self.options.preprocesses()
 
     def plugins(self) -> Sequence[object]:
         chosen = self.options.preprocessing.masks.segmenter
@@ -407,17 +357,11 @@ class Preprocess(PipelineStage):
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         mapping, *queries = work.folders((MAPPING, QUERY))
-        counts: dict[str, float] = {}
+        options, counts = self.options.preprocessing, dict[str, float]()
         for folder in (mapping, *queries):
-            name = folder.root.name
+            name, out = folder.root.name, work.out / PREPROCESSED / folder.root.name
             # the queries of one camera may be few, or all at night
             others = [] if folder is mapping else [mapping]
-            found = preprocess_images(
-                folder,
-                work.out / PREPROCESSED / name,
-                self.options.preprocessing,
-                sequences=others,
-                work=work,
-            )
+            found = preprocess_images(folder, out, options, sequences=others, work=work)
             counts |= {f"{name}_{key}": count for key, count in found.items()}
         return counts

@@ -1,7 +1,7 @@
-"""Stage: guided pyramid matching of map images, which adds keypoints to both images of a pair.
+"""Stages: guided pyramid matching of map images, and of queries; which add keypoints to images.
 
-What images' variants give lies in a spool until all is there; then the pairs are gone through in
-order, so that the rows of added keypoints do not depend on the workers. Map images whose poses
+What variants of map images give lies in a spool until all is there; then the pairs are gone through
+in order, so that the rows of added keypoints do not depend on the workers. Map images whose poses
 leave them no view in common are not tried.
 """
 
@@ -10,29 +10,28 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import astuple, dataclass, field
-from functools import cache
+from dataclasses import dataclass, field
+from functools import cache, partial
+from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.csv_table import write_csv_table
-from megloc_kapture.io.files import remove, safe_join, write_bytes
+from megloc_kapture.io.files import remove
 from megloc_kapture.io.kapture import (
     FeatureReader,
     ImagePair,
     KaptureFolder,
     MatchesWriter,
+    read_pairs,
 )
 from megloc_kapture.mapping.pairs import views_can_overlap
 from megloc_kapture.matching.guided_pyramid import (
-    GuidedPyramidOptions,
     ImageVariant,
     PairVerifier,
-    VariantMatches,
     pyramid_type,
 )
 from megloc_kapture.matching.pyramid_combination import (
@@ -40,36 +39,48 @@ from megloc_kapture.matching.pyramid_combination import (
     KeypointUnion,
     combine,
 )
-from megloc_kapture.matching.verification import KnownPoseOptions, known_pose_of_variants
-from megloc_kapture.plugins import LocalFeatureExtractor, Matcher
+from megloc_kapture.matching.verification import (
+    KnownPoseOptions,
+    TwoViewOptions,
+    known_pose_of_variants,
+)
+from megloc_kapture.plugins import LocalFeatureExtractor
 from megloc_kapture.stages.guided_pyramid import (
     MatchedVariants,
+    MatchSpool,
+    PyramidFeatures,
     PyramidMethod,
-    RetriedPairs,
-    described,
+    RetriedQuery,
+    Spooled,
     match_image_again,
-)
-from megloc_kapture.stages.kept_items import Digest, feature_inputs
-from megloc_kapture.stages.layout import (
-    FEATURES,
-    LOCAL_FEATURES,
-    MAPPING_MATCHES,
-    MAPPING_PAIRS,
-    MAPPING_PYRAMID,
+    retry_query,
+    tried_row,
+    write_tried,
 )
 from megloc_kapture.stages.local_features import image_inputs, read_frame
+from megloc_kapture.stages.map_points import matched_images
 from megloc_kapture.stages.matches import (
     MATCHING_OPTIONS,
     Features,
     cached_features,
     mapping_pairs,
+    matched_inputs,
 )
-from megloc_kapture.stages.pyramid_queries import COLUMNS, PyramidFeatures, table_path
-from megloc_kapture.stages.stage import PipelineStage, StageWork
-from megloc_kapture.stages.work import HERE, FolderSpec, Work
-
-if TYPE_CHECKING:
-    from megloc_kapture.stages.options import PipelineOptions
+from megloc_kapture.stages.stage import (
+    FEATURES,
+    LOCAL_FEATURES,
+    MAP,
+    MAPPING_MATCHES,
+    MAPPING_PAIRS,
+    MAPPING_PYRAMID,
+    QUERY_MATCHES,
+    QUERY_PAIRS,
+    QUERY_PYRAMID,
+    Layout,
+    PipelineStage,
+    StageWork,
+)
+from megloc_kapture.stages.work import HERE, Digest, FolderSpec, Work, content_of
 
 _Pair = tuple[str, str]
 
@@ -78,13 +89,9 @@ def pyramid_mapping(
     mapping: KaptureFolder,
     pairs: Sequence[ImagePair],
     local_type: str,
-    extractor: LocalFeatureExtractor,
-    matcher: Matcher,
-    verification: KnownPoseOptions,
-    options: GuidedPyramidOptions,
+    method: PyramidMethod,
     output: Path,
     *,
-    mask_margin_px: float = 0.0,
     work: Work = HERE,
 ) -> dict[str, float]:
     """Try mapping pairs with few matches again, each image's variants with the other as it is.
@@ -106,18 +113,15 @@ def pyramid_mapping(
         like those of ``local_type``.
     """
     data, poses = mapping.read(), mapping.read().poses()
-    method = PyramidMethod(extractor, matcher, verification, options)
 
-    def can_gain(first: str, second: str) -> bool:
-        if not (first in poses and second in poses):
+    def can_gain(a: str, b: str) -> bool:
+        if not (a in poses and b in poses):
             return False  # poses are what verifies
-        return views_can_overlap(
-            data.camera_of(first), poses[first], data.camera_of(second), poses[second]
-        )
+        return views_can_overlap(data.camera_of(a), poses[a], data.camera_of(b), poses[b])
 
     # kept in one file, so (a, b) and (b, a) are one pair
     named = sorted({(min(p.query, p.map), max(p.query, p.map)) for p in pairs})
-    stored = mapping.matches(local_type)
+    stored, keypoints = mapping.matches(local_type), mapping.keypoints(local_type)
     counts = {pair: len(stored.read(*pair)[0]) for pair in named}
     hard = [pair for pair in named if method.is_hard(counts[pair]) and can_gain(*pair)]
     hard.sort(key=lambda pair: -counts[pair])
@@ -126,105 +130,86 @@ def pyramid_mapping(
         others[a][0].append(b)
         # turning one image is turning the other: b is turned only where it is scaled
         others[b][1].append(a)
-    spec = FolderSpec(mapping)
-    jobs = [
-        _Job(spec, local_type, method, mask_margin_px, image, *map(tuple, others[image]))
-        for image in sorted(others)
-    ]
 
     @cache
     def side(image: str, digest: Digest) -> list[object]:
-        readers = keypoints, mapping.descriptors(local_type)
-        pose = mapping.read().cam_from_world(image)
-        known = [astuple(data.camera_of(image)), pose and astuple(pose)]
-        return [known, *(feature_inputs(reader, image, digest) for reader in readers)]
+        camera, *read, pose = matched_inputs(mapping, local_type, image, digest, posed=True)
+        return [[camera, pose], *read]
 
     def inputs(image: str, digest: Digest) -> object:
         beside = [[other, side(other, digest)] for names in others[image] for other in names]
-        frame = [mask_margin_px, image_inputs(mapping, image, digest)]
+        frame = [method.mask_margin_px, image_inputs(mapping, image, digest)]
         return [frame, side(image, digest), len(others[image][0]), beside]
 
     features = PyramidFeatures(output, mapping, local_type)
-    keypoints = mapping.keypoints(local_type)
-    added: dict[str, _Added] = defaultdict(_Added)
-    tried, hard_pairs = RetriedPairs(), set(hard)
     spool = MatchSpool(output / ".variants", keypoints, mapping.descriptors(local_type))
-    items = work.items(f"variants of {local_type}", [job.image for job in jobs], inputs)
-    todo = [job for job in jobs if job.image not in items.done]
-    results = work.map(
-        _match_again, todo, items.label("guided pyramid"), plugins=(extractor, matcher)
-    )
-    for job, matched in zip(todo, results, strict=True):
-        file, found = spool.write(job.image, matched.found)
-        told = [found, matched.num_variants, described(matched.skipped), matched.seconds]
-        items.add(job.image, [file], told)
+    images = sorted(others)
+    items = work.items(f"variants of {local_type}", images, inputs)
+    todo = [(image, *others[image]) for image in images if image not in items.done]
+    again = partial(_match_again, FolderSpec(mapping), local_type, method)
+    plugins = method.extractor, method.matcher
+    results = work.map(again, todo, items.label("guided pyramid"), plugins=plugins)
+    for (image, *_), matched in zip(todo, results, strict=True):
+        file, found = spool.write(image, matched.found)
+        told = [found, matched.num_variants, matched.skipped, matched.seconds]
+        items.add(image, [file], told)
+    variants = _AllMatched(spool, keypoints)
+    for image in images:
+        variants.put(image, [*others[image][0], *others[image][1]], *items.done[image])
+    rows, hard_pairs = [], set(hard)
     with closing(MatchesWriter(output, pyramid_type(local_type), orphan=True)) as writer:
-        again = _AllMatched()
-        for job in jobs:
-            again.put(job, *items.done[job.image])
-        tried.seconds = again.seconds
         for pair in named:
             matches, scores = stored.read(*pair)
             if pair in hard_pairs:
-                combined = again.combine(pair, (matches, scores), options, spool, keypoints, added)
-                tried.count(pair, len(matches), combined, *again.told(pair, combined))
+                combined, row = variants.combine(pair, (matches, scores), method)
+                rows.append(row)
                 matches, scores = combined.matches, combined.scores
             writer.write(*pair, matches, scores)
-        for image, own in sorted(added.items()):
-            if own.px is not None:
-                features.write(image, own.px, spool.descriptors(own.descriptors_at))
-        features.write_rest()
+    extended = {image: own for image, own in sorted(variants.added.items()) if own.px is not None}
+    for image, own in extended.items():
+        assert own.px is not None
+        features.write(image, own.px, spool.descriptors(own.descriptors_at))
+    features.write_rest()
     remove(spool.folder)  # a run that is stopped leaves it to the next
-    write_csv_table(table_path(output, local_type), COLUMNS, tried.rows)
     return {
-        "images_extracted_again": len(jobs),
-        "images_extended": sum(own.px is not None for own in added.values()),
+        "images_extracted_again": len(images),
+        "images_extended": len(extended),
         "pairs": len(named),
-        **tried.counts(),
+        **write_tried(output, local_type, rows, variants.seconds),
     }
 
 
-@dataclass(frozen=True)
-class _Job:
-    """An image to extract again, and whom to match its variants with."""
-
-    mapping: FolderSpec
-    local_type: str
-    method: PyramidMethod
-    mask_margin_px: float
-    image: str
-    others: tuple[str, ...]
-    only_scaled: tuple[str, ...]
-
-
-def _match_again(job: _Job) -> MatchedVariants:
-    folder, verification = job.mapping.open(), job.method.verification
-    itself = cached_features(job.mapping, folder, job.local_type, job.image)
+def _match_again(
+    mapping: FolderSpec,
+    local_type: str,
+    method: PyramidMethod,
+    job: tuple[str, Sequence[str], Sequence[str]],
+) -> MatchedVariants:
+    image, others, only_scaled = job
+    folder, verification = mapping.open(), method.verification
+    itself = cached_features(mapping, local_type, image)
 
     def judge(other: str, features: Features) -> PairVerifier:
-        image_from_world = folder.read().cam_from_world(job.image)
+        image_from_world = folder.read().cam_from_world(image)
         other_from_world = folder.read().cam_from_world(other)
         if image_from_world is None or other_from_world is None:
-            raise DataError(f"{job.image} or {other} has no pose, and is to be verified with it")
+            raise DataError(f"{image} or {other} has no pose, and is to be verified with it")
         if not isinstance(verification, KnownPoseOptions):
             raise ValueError("map images are verified with their poses")
+        other_from_image = other_from_world @ image_from_world.inverse()
         return known_pose_of_variants(
-            itself.camera,
-            features.rays,
-            features.slopes,
-            other_from_world @ image_from_world.inverse(),
-            verification,
+            itself.camera, features.rays, features.slopes, other_from_image, verification
         )
 
     return match_image_again(
         itself,
-        *read_frame(folder, job.image, margin_px=job.mask_margin_px),
-        job.others,
-        lambda other: cached_features(job.mapping, folder, job.local_type, other),
+        *read_frame(folder, image, margin_px=method.mask_margin_px),
+        others,
+        partial(cached_features, mapping, local_type),
         judge,
-        job.method,
-        only_scaled=job.only_scaled,
-        name=job.image,
+        method,
+        only_scaled=only_scaled,
+        name=image,
     )
 
 
@@ -236,18 +221,19 @@ class _Added:
     descriptors_at: list[tuple[str, int]] = field(default_factory=list)
 
 
-@dataclass(eq=False)
 class _AllMatched:
-    """What the images' variants found, by image and the other one."""
+    """What the images' variants found, by image and the other one, and what it adds to images."""
 
-    found: dict[_Pair, list[Spooled]] = field(default_factory=dict)
-    num_variants: dict[_Pair, int] = field(default_factory=dict)
-    skipped: dict[str, str] = field(default_factory=dict)
-    seconds: float = 0.0
+    def __init__(self, spool: MatchSpool, keypoints: FeatureReader) -> None:
+        self._spool, self._keypoints = spool, keypoints
+        self._found: dict[_Pair, tuple[list[Spooled], int, str]] = {}
+        self.added: dict[str, _Added] = defaultdict(_Added)
+        self.seconds = 0.0
 
     def put(
         self,
-        job: _Job,
+        image: str,
+        others: Sequence[str],
         found: Sequence[Sequence[Sequence[Any]]],
         num_variants: Sequence[int],
         skipped: str,
@@ -255,180 +241,194 @@ class _AllMatched:
     ) -> None:
         """Keep what the variants of one image came to; ``found`` as :meth:`MatchSpool.write`."""
         self.seconds += seconds
-        self.skipped[job.image] = skipped
-        others = (*job.others, *job.only_scaled)
-        for other, places, count in zip(others, found, num_variants, strict=True):
-            self.found[job.image, other] = [
-                Spooled(ImageVariant(*variant), *rest) for variant, *rest in places
-            ]
-            self.num_variants[job.image, other] = count
-
-    def of_pair(self, pair: _Pair) -> list[tuple[str, Spooled]]:
-        """The variants of both images of a pair that match: whose, and where; in order."""
-        return [
-            (image, place)
-            for image, other in (pair, pair[::-1])
-            for place in self.found.get((image, other), ())
-        ]
+        for other, of_other, count in zip(others, found, num_variants, strict=True):
+            spooled = [Spooled(ImageVariant(*v), count, at) for v, count, at, *_ in of_other]
+            self._found[image, other] = spooled, count, skipped
 
     def combine(
-        self,
-        pair: _Pair,
-        base: tuple[NDArray[np.int64], NDArray[np.float64]],
-        options: GuidedPyramidOptions,
-        spool: MatchSpool,
-        keypoints: FeatureReader,
-        added: dict[str, _Added],
-    ) -> Combined:
-        """The matches of a pair with those of the variants; what they add goes to ``added``."""
-        if options.mode == "off":
+        self, pair: _Pair, base: tuple[NDArray[np.int64], NDArray[Any]], method: PyramidMethod
+    ) -> tuple[Combined, list[str]]:
+        """The matches of a pair with those of the variants of both its images, and its row."""
+        if method.options.mode == "off":
             raise ValueError("only pairs that are tried again are combined")
-        places = self.of_pair(pair)
-        tried = [(pair.index(image), spool.get(image, at)) for image, at in places]
-        first, second = (KeypointUnion(keypoints.read(one), added[one].px) for one in pair)
-        combined = combine(base, tried, options.mode, (first, second))
+        sides: tuple[tuple[str, Literal[0, 1], _Pair], ...]
+        sides = (("image", 0, pair), ("other", 1, pair[::-1]))
+        directed = [(*side, self._found[side[2]]) for side in sides if side[2] in self._found]
+        spooled = [(name, side, at) for name, side, _, (found, *_) in directed for at in found]
+        tried = [(side, self._spool.get(pair[side], at)) for _, side, at in spooled]
+        first, second = (
+            KeypointUnion(self._keypoints.read(one), self.added[one].px) for one in pair
+        )
+        combined = combine(base, tried, method.options.mode, (first, second))
         for image, union, new in zip(pair, (first, second), combined.added, strict=True):
             if len(new):
-                added[image].px = union.added()
-                added[image].descriptors_at += [
-                    (places[number][0], places[number][1].descriptor_at(match, spool.row_bytes))
+                self.added[image].px = union.added()
+                self.added[image].descriptors_at += [
+                    (pair[spooled[number][1]], self._spool.descriptor_at(spooled[number][2], match))
                     for number, match in new.tolist()
                 ]
-        return combined
-
-    def told(self, pair: _Pair, combined: Combined) -> tuple[int, str, str]:
-        """Of a pair the number of variants tried, the best one and those skipped."""
-        tried = sum(self.num_variants.get(one, 0) for one in (pair, pair[::-1]))
         best = ""
         if combined.best is not None:
-            image, place = self.of_pair(pair)[combined.best]
-            best = f"{'image' if image == pair[0] else 'other'} {place.variant}"
-        return tried, best, " | ".join(self._skipped(pair))
-
-    def _skipped(self, pair: _Pair) -> Iterator[str]:
-        for name, directed in (("image", pair), ("other", pair[::-1])):
-            if directed in self.found and self.skipped[directed[0]]:
-                yield f"{name} {self.skipped[directed[0]]}"
+            name, _, at = spooled[combined.best]
+            best = f"{name} {at.variant}"
+        count = sum(count for *_, (_, count, _) in directed)
+        skipped = " | ".join(f"{name} {why}" for name, *_, (_, _, why) in directed if why)
+        return combined, tried_row(pair, len(base[0]), combined, count, best, skipped)
 
 
-@dataclass(frozen=True)
-class Spooled:
-    """Where in the spool the matches of a variant lie."""
+def pyramid_queries(
+    query: KaptureFolder,
+    mapping: KaptureFolder,
+    pairs: Sequence[ImagePair],
+    local_type: str,
+    method: PyramidMethod,
+    output: Path,
+    *,
+    work: Work = HERE,
+) -> dict[str, float]:
+    """Try query pairs with few matches again: the query's variants with the map's keypoints.
 
-    variant: ImageVariant
-    count: int
-    keypoints_at: int
-    rows_at: int
-    scores_at: int
-    descriptors_at: int
+    The map is neither extracted again nor changed. Where it has keypoints of ``T-pyramid`` the
+    variants are matched with those, which begin with those of T.
 
-    def descriptor_at(self, match: int, row_bytes: int) -> int:
-        """Where the descriptor of one of its matches begins."""
-        return self.descriptors_at + match * row_bytes
-
-
-class MatchSpool:
-    """Variants' matches on disk until all are there: a large map's are too many for memory.
-
-    A file per image below ``folder``.
+    Parameters
+    ----------
+    query : images, with the features and the matches of ``local_type``.
+    mapping : images of the map with features of ``local_type``.
+    pairs, output : see :func:`pyramid_mapping`, as what is returned and raised.
     """
+    larger = pyramid_type(local_type)
+    there = all(larger in mapping.types(kind) for kind in ("keypoints", "descriptors"))
+    types = local_type, larger if there else local_type
+    candidates: dict[str, list[str]] = {}
+    both = dict.fromkeys((pair.query, pair.map) for pair in pairs)
+    for image, other in sorted(both, key=itemgetter(0)):
+        candidates.setdefault(image, []).append(other)
+    features, stored = PyramidFeatures(output, query, local_type), query.matches(local_type)
 
-    def __init__(self, folder: Path, keypoints: FeatureReader, descriptors: FeatureReader) -> None:
-        self.folder = folder
-        self._columns = keypoints.config.dsize
-        self._values = descriptors.config.dsize
-        self._descriptor_type = descriptors.config.dtype
-        self.row_bytes = descriptors.config.row_bytes
+    @cache
+    def side(number: int, image: str, digest: Digest) -> list[object]:
+        return matched_inputs((query, mapping)[number], types[number], image, digest)
 
-    def write(
-        self, image: str, found: Sequence[Sequence[VariantMatches]]
-    ) -> tuple[Path, list[list[Any]]]:
-        """Keep the matches of an image's variants with each of the others.
+    def inputs(image: str, digest: Digest) -> object:
+        of_pairs = [
+            [other, side(1, other, digest), content_of(stored.read(image, other))]
+            for other in candidates[image]
+        ]
+        read = image_inputs(query, image, digest)
+        return [method.mask_margin_px, read, side(0, image, digest), of_pairs]
 
-        Returns
-        -------
-        The file, and for ``found`` the fields of :class:`Spooled`, as plain values.
-
-        Raises
-        ------
-        OutputError : the disk is full.
-        """
-        path, content = safe_join(self.folder, f"{image}.variants"), bytearray()
-        told: list[list[Any]] = []
-        for of_other in found:
-            told.append([])
-            for matches in of_other:
-                places = []
-                for part, kind in (
-                    (matches.keypoints_px, np.float32),
-                    (matches.other_rows, np.int64),
-                    (matches.scores, np.float32),
-                    (matches.descriptors, self._descriptor_type),
-                ):
-                    places.append(len(content))
-                    content += np.ascontiguousarray(part, kind).tobytes()
-                told[-1].append([astuple(matches.variant), len(matches), *places])
-        write_bytes(path, bytes(content))
-        return path, told
-
-    def get(self, image: str, place: Spooled) -> VariantMatches:
-        """The matches that were put there, without their descriptors."""
-        return VariantMatches(
-            place.variant,
-            self._read(image, place.keypoints_at, (place.count, self._columns), np.float32),
-            np.zeros((place.count, 0), self._descriptor_type),
-            self._read(image, place.rows_at, (place.count,), np.int64),
-            self._read(image, place.scores_at, (place.count,), np.float32),
-        )
-
-    def descriptors(self, places: list[tuple[str, int]]) -> NDArray[Any]:
-        """Descriptors (N, D) by the image whose variant they are of, and where they begin."""
-        found = np.empty((len(places), self._values), self._descriptor_type)
-        for row, (image, at) in enumerate(places):
-            found[row] = self._read(image, at, (self._values,), self._descriptor_type)
-        return found
-
-    def _read(self, image: str, at: int, shape: tuple[int, ...], kind: DTypeLike) -> NDArray[Any]:
-        path = safe_join(self.folder, f"{image}.variants")
-        count = int(np.prod(shape))
-        return np.fromfile(path, np.dtype(kind), count=count, offset=at).reshape(shape)
+    items = work.items(local_type, list(candidates), inputs)
+    jobs = [job for job in candidates.items() if job[0] not in items.done]
+    features.leave(items.done)
+    retry = partial(_retry, FolderSpec(query), FolderSpec(mapping), types, method)
+    plugins = method.extractor, method.matcher
+    with closing(MatchesWriter(output, larger, orphan=True)) as writer:
+        results = work.map(retry, jobs, items.label("guided pyramid"), plugins=plugins)
+        for (image, _), found in zip(jobs, results, strict=True):
+            files = [writer.write(image, *one) for one in found.matches]
+            files += features.write(image, found.added_px, found.added_descriptors)
+            tried = {"rows": found.rows, "seconds": found.seconds}
+            items.add(image, files, [len(found.added_px) > 0, tried])
+    features.write_rest()
+    done = [items.done[image] for image in candidates]
+    rows = [row for _, tried in done for row in tried["rows"]]
+    counts = write_tried(output, local_type, rows, sum(tried["seconds"] for _, tried in done))
+    return {
+        "images_extracted_again": len({row[0] for row in rows}),
+        "images_extended": sum(extended for extended, _ in done),
+        "pairs": sum(map(len, candidates.values())),
+        **counts,
+    }
 
 
-class PyramidMapping(PipelineStage):
+def _retry(
+    query: FolderSpec,
+    mapping: FolderSpec,
+    types: tuple[str, str],
+    method: PyramidMethod,
+    job: tuple[str, Sequence[str]],
+) -> RetriedQuery:
+    image, candidates = job
+    folder, stored = query.open(), query.open().matches(types[0])
+    return retry_query(
+        cached_features(query, types[0], image),
+        [(other, *stored.read(image, other)) for other in candidates],
+        partial(cached_features, mapping, types[1]),
+        method,
+        lambda: read_frame(folder, image, margin_px=method.mask_margin_px),
+        name=image,
+    )
+
+
+class _PyramidStage(PipelineStage):
+    def _extractors(self) -> list[LocalFeatureExtractor]:
+        return self.options.query_extractors()
+
+    def plugins(self) -> Sequence[object]:
+        extractors = self._extractors()
+        return [*extractors, *(self.options.make_matcher(one.name) for one in extractors)]
+
+    def _methods(
+        self, verification: KnownPoseOptions | TwoViewOptions
+    ) -> Iterator[tuple[str, PyramidMethod]]:
+        """How pairs are tried again, by keypoints type."""
+        options = self.options
+        for extractor in self._extractors():
+            matcher = options.make_matcher(extractor.name)
+            yield (
+                extractor.name,
+                PyramidMethod(
+                    extractor, matcher, verification, options.guided_pyramid, options.mask_margin_px
+                ),
+            )
+
+
+class PyramidMapping(_PyramidStage):
     """Match map images with few matches again, at other scales and turns."""
 
     name = "mapping_pyramid"
     version = 2
     uses = (*MATCHING_OPTIONS, "mapping_verification", "guided_pyramid", "mask_margin_px")
-    writes = (MAPPING_PYRAMID,)
+    inputs = (Layout.mapping, LOCAL_FEATURES, MAPPING_PAIRS, MAPPING_MATCHES)
+    outputs = (MAPPING_PYRAMID,)
 
-    @property
-    def reads(self) -> Sequence[str]:  # type: ignore[override]
-        return (self.layout.mapping, LOCAL_FEATURES, MAPPING_PAIRS, MAPPING_MATCHES)
+    def is_wanted(self) -> bool:
+        return self.options.matches_again() and self.options.triangulates()
 
-    @classmethod
-    def is_wanted(cls, options: PipelineOptions) -> bool:
-        return options.matches_again() and options.triangulates()
-
-    def plugins(self) -> Sequence[object]:
-        extractors = self.options.make_extractors()
-        return [*extractors, *(self.options.make_matcher(one.name) for one in extractors)]
+    def _extractors(self) -> list[LocalFeatureExtractor]:
+        return self.options.make_extractors()
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         counts: dict[str, float] = {}
-        mapping = work.folder(self.layout.mapping, FEATURES, MAPPING_MATCHES)
-        for extractor in self.options.make_extractors():
-            found = pyramid_mapping(
-                mapping,
-                mapping_pairs(work, mapping),
-                extractor.name,
-                extractor,
-                self.options.make_matcher(extractor.name),
-                self.options.mapping_verification,
-                self.options.guided_pyramid,
-                work.out / MAPPING_PYRAMID,
-                mask_margin_px=self.options.mask_margin_px,
-                work=work,
-            )
-            counts |= {f"{extractor.name} {name}": count for name, count in found.items()}
+        mapping = work.folder(self.layout.mapping(), FEATURES, MAPPING_MATCHES)
+        pairs, out = mapping_pairs(work, mapping), work.out / MAPPING_PYRAMID
+        for name, method in self._methods(self.options.mapping_verification):
+            found = pyramid_mapping(mapping, pairs, name, method, out, work=work)
+            counts |= {f"{name} {key}": count for key, count in found.items()}
+        return counts
+
+
+class PyramidQueries(_PyramidStage):
+    """Match queries with few matches again; see :class:`PyramidMapping`."""
+
+    name = "query_pyramid"
+    version = 2
+    uses = (*MATCHING_OPTIONS, "query_verification", "guided_pyramid", "mask_margin_px")
+    inputs = (Layout.mapping, Layout.query, LOCAL_FEATURES, MAP, QUERY_PAIRS, QUERY_MATCHES)
+    outputs = (QUERY_PYRAMID,)
+
+    def is_wanted(self) -> bool:
+        return self.options.matches_again()
+
+    def run(self, work: StageWork) -> Mapping[str, float]:
+        counts: dict[str, float] = {}
+        query = work.folder(self.layout.query(), FEATURES, QUERY_MATCHES)
+        pairs, out = read_pairs(work.path(QUERY_PAIRS)), work.out / QUERY_PYRAMID
+        for name, method in self._methods(self.options.query_verification):
+            mapping = matched_images(work, self, name)
+            described = mapping.descriptors(name)
+            some = [pair for pair in pairs if pair.map in described]
+            found = pyramid_queries(query, mapping, some, name, method, out, work=work)
+            counts |= {f"{name} {key}": count for key, count in found.items()}
         return counts

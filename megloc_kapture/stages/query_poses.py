@@ -30,29 +30,43 @@ from megloc_kapture.localization.cluster_poses import (
     localize_in_clusters,
     poses_of_cameras,
 )
-from megloc_kapture.localization.map_index import MapIndex, QueryView, TypedMatches
+from megloc_kapture.localization.map_index import QueryView, TypedMatches
 from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import POSE_RANKERS, PluginChoice, PoseRanker, RankingScene
-from megloc_kapture.stages.kept_items import Digest, content_of, feature_inputs, map_inputs
-from megloc_kapture.stages.layout import (
+from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
+from megloc_kapture.stages.localized_folder import (
+    plain_result,
+    result_of,
+    unreadable_queries,
+    write_localized,
+)
+from megloc_kapture.stages.matches import iterate_candidates
+from megloc_kapture.stages.ranking_scene import KaptureScene, image_inputs
+from megloc_kapture.stages.rigs import Unit, query_units
+from megloc_kapture.stages.shared_index import index_map, open_index, shared_index, with_noise
+from megloc_kapture.stages.stage import (
     FEATURES,
     LOCAL_FEATURES,
+    LOCAL_TYPES,
     MAP,
     MAPPING,
     QUERY,
     QUERY_PAIRS,
     TIMING,
+    Layout,
+    PipelineStage,
+    StageWork,
 )
-from megloc_kapture.stages.localized_folder import plain_result, result_of, write_localized
-from megloc_kapture.stages.matches import iterate_candidates
-from megloc_kapture.stages.ranking_scene import KaptureScene, image_inputs
-from megloc_kapture.stages.restrictions import UNRESTRICTED, Restrictions
-from megloc_kapture.stages.rigs import Unit, query_units
-from megloc_kapture.stages.shared_index import index_map, open_index, shared_index, with_noise
-from megloc_kapture.stages.stage import LOCAL_TYPES, PipelineStage, StageWork
-from megloc_kapture.stages.unreadable import unreadable_queries
-from megloc_kapture.stages.work import HERE, FolderSpec, Work
+from megloc_kapture.stages.work import (
+    HERE,
+    Digest,
+    FolderSpec,
+    Work,
+    content_of,
+    feature_inputs,
+    map_inputs,
+)
 from megloc_kapture.values import Failure, Options, Pose, RigidTransform
 
 _FIRST_TURN = 5  # candidates; every turn has twice as many as the one before
@@ -93,20 +107,6 @@ class LocalizationOptions(Options):
         return ranker
 
 
-@dataclass(frozen=True)
-class _Job:
-    map: FolderSpec
-    query: FolderSpec
-    matches: FolderSpec
-    indices: tuple[tuple[str, Path], ...]  # by keypoints type
-    unit: Unit
-    candidates: tuple[str, ...]  # of all images of the unit
-    own_candidates: tuple[tuple[str, ...], ...]  # of each
-    frames: tuple[str, ...]  # of the candidates
-    options: LocalizationOptions
-    ranker: PoseRanker
-
-
 def localize_views(
     views: Sequence[QueryView],
     candidates: Sequence[str],
@@ -124,21 +124,19 @@ def localize_views(
     candidates : map images, best first, and ``frames``, the coordinate frame of each.
     centers : of the candidates in the world, (3,) each.
     """
-    none = (0,) * len(views)
-    if not candidates:
-        return ClusterLocalization(Failure("no map image is a candidate"), none)
     matched = {image for view in views for image in view.matched_images()}
     frame_of = dict(zip(candidates, frames, strict=True))
     images = [image for image in candidates if image in matched]
     if not images:
-        return ClusterLocalization(Failure("no map image matches"), none)
+        reason = "no map image matches" if candidates else "no map image is a candidate"
+        return ClusterLocalization(Failure(reason), (0,) * len(views))
     started = time.perf_counter()
     clusters = cluster_candidates(
         images,
         [frame_of[image] for image in images],
         options.clusters,
         centers=centers,
-        indices=_indices_of(views),
+        indices=list({id(typed.index): typed.index for v in views for typed in v.matches}.values()),
     )
     seconds = {"clusters": time.perf_counter() - started}
     found = localize_in_clusters(
@@ -152,8 +150,8 @@ def localize_views(
         min_confidence=options.min_confidence,
         scene=scene,
     )
-    result = replace(found.result, seconds={**seconds, **found.result.seconds})
-    return replace(found, result=result)
+    seconds |= found.result.seconds
+    return replace(found, result=replace(found.result, seconds=seconds))
 
 
 def localize_unit(
@@ -191,9 +189,7 @@ def in_turn(
 ) -> Solved:
     """What ``solve`` makes of the best few candidates where that is sure, else of all.
 
-    Parameters
-    ----------
-    solve : localizes with so many of the candidates, best first.
+    ``solve``: localizes with so many of the candidates, best first.
     """
     sure, few = options.sure_confidence, _FIRST_TURN
     while sure is not None and few < num_candidates:
@@ -205,43 +201,63 @@ def in_turn(
     return solve(num_candidates)
 
 
-def _indices_of(views: Sequence[QueryView]) -> list[MapIndex]:
-    by_identity = {id(typed.index): typed.index for view in views for typed in view.matches}
-    return list(by_identity.values())
+# a unit, the candidates of each of its images, and the frames of these
+_Job = tuple[Unit, Sequence[Sequence[str]], Mapping[str, str]]
 
 
-def _localize(job: _Job) -> list[tuple[str, Pose | Failure]]:
-    started = time.perf_counter()
-    views = [_read_view(job, number) for number in range(len(job.unit))]
-    reading = (time.perf_counter() - started) / len(views)
-    mapping, query = job.map.open(), job.query.open()
-    centers = {
-        image: pose.center()
-        for image in job.candidates
-        if (pose := mapping.read().cam_from_world(image)) is not None
-    }
-    frame_of = dict(zip(job.candidates, job.frames, strict=True))
-    own_candidates = [[image for image in own if image in centers] for own in job.own_candidates]
-    scene = KaptureScene(mapping, query)
+@dataclass(frozen=True)
+class _Localizer:
+    """Localizes units of queries, each with the candidates of its images."""
 
-    def localize(count: int) -> list[Pose | Failure]:
-        first = [own[:count] for own in own_candidates]
-        candidates = interleave(first)
-        return localize_unit(
-            [view.among(own) for view, own in zip(views, first, strict=True)],
-            candidates,
-            [frame_of[image] for image in candidates],
-            job.options,
-            centers=centers,
-            ranker=job.ranker,
-            scene=scene,
-        )
+    map: FolderSpec
+    query: FolderSpec
+    matches: FolderSpec
+    indices: dict[str, Path]  # by keypoints type
+    options: LocalizationOptions
+    ranker: PoseRanker
 
-    results = in_turn(localize, max(map(len, own_candidates), default=0), job.options)
-    return [
-        (image, _for_writing(result, reading))
-        for (image, _), result in zip(job.unit, results, strict=True)
-    ]
+    def __call__(self, job: _Job) -> list[tuple[str, Pose | Failure]]:
+        unit, of_images, frame_of = job
+        started = time.perf_counter()
+        views = [self._read(*one, own) for one, own in zip(unit, of_images, strict=True)]
+        reading = (time.perf_counter() - started) / len(views)
+        mapping, query = self.map.open(), self.query.open()
+        centers = {
+            image: pose.center()
+            for image in interleave(of_images)
+            if (pose := mapping.read().cam_from_world(image)) is not None
+        }
+        own_candidates = [[image for image in own if image in centers] for own in of_images]
+        scene = KaptureScene(mapping, query)
+
+        def localize(count: int) -> list[Pose | Failure]:
+            first = [own[:count] for own in own_candidates]
+            candidates = interleave(first)
+            return localize_unit(
+                [view.among(own) for view, own in zip(views, first, strict=True)],
+                candidates,
+                [frame_of[image] for image in candidates],
+                self.options,
+                centers=centers,
+                ranker=self.ranker,
+                scene=scene,
+            )
+
+        results = in_turn(localize, max(map(len, own_candidates), default=0), self.options)
+        return [
+            (image, _for_writing(result, reading))
+            for (image, _), result in zip(unit, results, strict=True)
+        ]
+
+    def _read(self, image: str, cam_from_rig: RigidTransform, own: Sequence[str]) -> QueryView:
+        query, matches = self.query.open(), self.matches.open()
+        typed = []
+        for local_type, folder in self.indices.items():
+            reader = matches.matches(local_type)
+            found = [(o, *reader.read(image, o)) for o in own if (image, o) in reader]
+            keypoints = query.keypoints(local_type).read(image)
+            typed.append(TypedMatches(_opened(folder), keypoints, found))
+        return QueryView(image, query.read().camera_of(image), tuple(typed), cam_from_rig)
 
 
 def _for_writing(result: Pose | Failure, reading_s: float) -> Pose | Failure:
@@ -252,30 +268,7 @@ def _for_writing(result: Pose | Failure, reading_s: float) -> Pose | Failure:
     return replace(result, inliers=None, inlier_points_px=None, inlier_points_world=None)
 
 
-def _read_view(job: _Job, number: int) -> QueryView:
-    image, cam_from_rig = job.unit[number]
-    query, matches = job.query.open(), job.matches.open()
-    typed = []
-    for local_type, folder in job.indices:
-        reader = matches.matches(local_type)
-        typed.append(
-            TypedMatches(
-                _opened(local_type, folder),
-                query.keypoints(local_type).read(image),
-                [
-                    (other, *reader.read(image, other))
-                    for other in job.own_candidates[number]
-                    if (image, other) in reader
-                ],
-            )
-        )
-    camera = query.read().camera_of(image)
-    return QueryView(image, camera, tuple(typed), cam_from_rig)
-
-
-@lru_cache(maxsize=8)
-def _opened(local_type: str, folder: Path) -> MapIndex:
-    return open_index(folder)
+_opened = lru_cache(maxsize=8)(open_index)
 
 
 def localize_from_matches(
@@ -305,7 +298,6 @@ def localize_from_matches(
     PluginError : there is no such ranker, or it refuses its options.
     """
     ranker = options.make_ranker()
-    map_spec, query_spec, matches_spec = (FolderSpec(f) for f in (map_folder, query, matches))
     candidates = {name: tuple(images) for name, images in iterate_candidates(pairs)}
     units = query_units(query.read(), rigs=options.rigs)
     read = {name: index_map(map_folder, type_in_map(map_folder, name)) for name in local_types}
@@ -329,29 +321,16 @@ def localize_from_matches(
         return found
 
     items = work.items("poses", list(unit_of), inputs)
+    jobs: list[_Job] = []
+    for name, unit in unit_of.items():
+        if name not in items.done:
+            own = [candidates.get(image, ()) for image, _ in unit]
+            jobs.append((unit, own, {one: restrictions.frame(one) for one in chain(*own)}))
+    specs = FolderSpec(map_folder), FolderSpec(query), FolderSpec(matches)
     with shared_index(measured, scratch) as indices:
-        jobs = []
-        for name, unit in unit_of.items():
-            if name in items.done:
-                continue
-            own = tuple(candidates.get(image, ()) for image, _ in unit)
-            together = tuple(interleave(own))
-            jobs.append(
-                _Job(
-                    map=map_spec,
-                    query=query_spec,
-                    matches=matches_spec,
-                    indices=tuple(indices.items()),
-                    unit=unit,
-                    candidates=together,
-                    own_candidates=own,
-                    frames=tuple(restrictions.frame(image) for image in together),
-                    options=options,
-                    ranker=ranker,
-                )
-            )
+        localizer = _Localizer(*specs, indices, options, ranker)
         kept = dict(items.done)
-        fresh = iter(work.map(_localize, jobs, items.label("localizing")))
+        fresh = iter(work.map(localizer, jobs, items.label("localizing")))
         for name in unit_of:
             if name in kept:
                 yield from ((image, result_of(found)) for image, found in kept[name])
@@ -376,23 +355,25 @@ class LocalizeQueries(PipelineStage):
     name = "localization"
     version = 7
     uses = ("localization", "guided_pyramid.mode", *LOCAL_TYPES)
-
-    @property
-    def reads(self) -> Sequence[str]:  # type: ignore[override]
-        images = (MAPPING, QUERY, self.layout.query, SIDE_TABLES)
-        return (*images, LOCAL_FEATURES, MAP, QUERY_PAIRS, *self.layout.query_matches)
-
-    @property
-    def writes(self) -> Sequence[str]:  # type: ignore[override]
-        return (self.layout.poses, TIMING)
+    inputs = (
+        MAPPING,
+        QUERY,
+        Layout.query,
+        SIDE_TABLES,
+        LOCAL_FEATURES,
+        MAP,
+        QUERY_PAIRS,
+        Layout.query_matches,
+    )
+    outputs = (Layout.poses, TIMING)
 
     def plugins(self) -> Sequence[object]:
         return (self.options.localization.make_ranker(),)
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        query = work.folder(self.layout.query, FEATURES, *self.layout.query_matches)
+        query = work.folder(self.layout.query(), FEATURES, *self.layout.query_matches())
         pairs = read_pairs(work.path(QUERY_PAIRS))
-        options = self.options.localization
+        options, tables = self.options.localization, work.path(SIDE_TABLES)
         results = localize_from_matches(
             work.folder(MAP),
             query,
@@ -400,14 +381,14 @@ class LocalizeQueries(PipelineStage):
             pairs,
             self.options.query_types(),
             options,
-            restrictions=work.restrictions(),
+            restrictions=Restrictions.read(tables),
             work=work,
             scratch=work.out,
         )
         return write_localized(
-            work.out / self.layout.poses,
+            work.out / self.layout.poses(),
             work.folder(QUERY),  # as imported: the poses are theirs as well
-            chain(results, unreadable_queries(work.path(SIDE_TABLES))),
+            chain(results, unreadable_queries(tables)),
             fallback=options.fallback,
             first_candidates=first_candidates(pairs, work.folder(MAPPING)),
             timing=work.out / TIMING,
@@ -419,8 +400,5 @@ def first_candidates(
 ) -> dict[str, tuple[str, RigidTransform]]:
     """Query to its best retrieved map image and that image's pose."""
     poses = mapping.read().poses()
-    best = {}
-    for query, images in iterate_candidates(pairs):
-        if images and images[0] in poses:
-            best[query] = (images[0], poses[images[0]])
-    return best
+    best = {query: images[0] for query, images in iterate_candidates(pairs)}
+    return {query: (image, poses[image]) for query, image in best.items() if image in poses}

@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.images import read_depth_map
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.plugins import DepthView
-from megloc_kapture.stages.kept_items import Digest
 from megloc_kapture.stages.local_features import mask_path, read_image_of, read_mask
-from megloc_kapture.stages.rigs import DepthRecord, depth_records
+from megloc_kapture.stages.rigs import DepthRecord, depth_records, read_depth
+from megloc_kapture.stages.work import Digest
 from megloc_kapture.values import Camera, RigidTransform
 
 
@@ -39,11 +38,7 @@ class _Images:
         record = self._depth_records.get(name)
         if record is None:
             return None
-        depth_m = read_depth_map(
-            self.folder.depth_path(record.path),
-            width=record.camera.width,
-            height=record.camera.height,
-        )
+        depth_m = read_depth(self.folder, record)
         return DepthView(record.camera, depth_m, record.image_from_depth)
 
     def points(self, name: str) -> NDArray[np.float64]:
@@ -99,7 +94,8 @@ def depth_of(folder: KaptureFolder, name: str) -> DepthView | None:
 
 
 class KaptureScene:
-    """A :class:`~megloc_kapture.plugins.RankingScene` of a map's folder and its queries.
+    """A :class:`~megloc_kapture.plugins.RankingScene` of a map's folder and its queries; raises
+    DataError where a file cannot be read, or a map image has no pose.
 
     Parameters
     ----------
@@ -120,41 +116,32 @@ class KaptureScene:
         self._map_camera = map_camera or self._map.camera
 
     def query_image(self, name: str) -> NDArray[np.uint8]:
-        """RGB pixels (H, W, 3) of a query image; raises DataError."""
         if self._query is None:
             raise DataError(f"the pixels of query {name} are not known")
         return self._query.image(name)
 
     def query_mask(self, name: str) -> NDArray[np.bool_] | None:
-        """Mask (H, W) of a query image, True = use; None without one."""
         return None if self._query is None else self._query.mask(name)
 
     def query_depth(self, name: str) -> DepthView | None:
-        """Depth that was taken with a query image; None without; raises DataError."""
         return None if self._query is None else self._query.depth(name)
 
     def map_image(self, name: str) -> NDArray[np.uint8]:
-        """RGB pixels (H, W, 3) of a map image; raises DataError."""
         return self._map.image(name)
 
     def map_mask(self, name: str) -> NDArray[np.bool_] | None:
-        """Mask (H, W) of a map image, True = use; None without one."""
         return self._map.mask(name)
 
     def map_depth(self, name: str) -> DepthView | None:
-        """Depth that was taken with a map image; None without; raises DataError."""
         return self._map.depth(name)
 
     def map_points(self, name: str) -> NDArray[np.float64]:
-        """Points of the map that an image observes, in the world, (N, 3); raises DataError."""
         return self._map.points(name)
 
     def map_camera(self, name: str) -> Camera:
-        """Camera of a map image."""
         return self._map_camera(name)
 
     def map_pose(self, name: str) -> RigidTransform:
-        """``cam_from_world`` of a map image; raises DataError when it has none."""
         pose = self._map.folder.read().cam_from_world(name)
         if pose is None:
             raise DataError(f"map image {name} has no pose", path=self._map.folder.root)

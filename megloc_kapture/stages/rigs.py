@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from operator import itemgetter
 
 import numpy as np
+from numpy.typing import NDArray
 
-from megloc_kapture.io.kapture import KaptureData
+from megloc_kapture.io.images import read_depth_map
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder
 from megloc_kapture.values import Camera, Pose, RigidTransform
 
 Unit = tuple[tuple[str, RigidTransform], ...]
@@ -17,21 +20,21 @@ Unit = tuple[tuple[str, RigidTransform], ...]
 def query_units(data: KaptureData, *, rigs: bool) -> list[Unit]:
     """The units of a query folder, sorted by their images; every image is in one.
 
-    Parameters
-    ----------
-    rigs : whether cameras of one rig and one timestamp are localized together. A camera on several
-        rigs goes with the first by name. Without, every image is by itself.
+    ``rigs``: whether cameras of one rig and one timestamp are localized together. A camera on
+    several rigs goes with the first by name. Without, every image is by itself.
     """
     rigs_of = _rigs_of(data) if rigs else {}
-    together: dict[tuple[int, str, str], list[str]] = {}
+    units: list[Unit] = []
+    together: dict[tuple[int, str], list[str]] = {}
     for image in data.image_names():
         timestamp, sensor = data.record_of(image)
-        owner = ("rig", rigs_of[sensor][0]) if sensor in rigs_of else ("sensor", sensor)
-        together.setdefault((timestamp, *owner), []).append(image)
-    units: list[Unit] = []
-    for (_, kind, rig), images in together.items():
-        if kind == "sensor" or len(images) == 1:
-            units += [((image, RigidTransform.identity()),) for image in images]
+        if sensor in rigs_of:
+            together.setdefault((timestamp, rigs_of[sensor][0]), []).append(image)
+        else:
+            units.append(((image, RigidTransform.identity()),))
+    for (_, rig), images in together.items():
+        if len(images) == 1:
+            units.append(((images[0], RigidTransform.identity()),))
         else:
             members = data.rigs[rig]
             units.append(tuple((image, members[data.record_of(image)[1]]) for image in images))
@@ -58,17 +61,15 @@ def poses_through_rig(
     found = {}
     for image in sorted(set(data.records_camera.values()) - set(localized)):
         timestamp, sensor = data.record_of(image)
-        best: tuple[int, str, RigidTransform] | None = None
-        for other_sensor, other in at_time[timestamp]:
-            result = localized.get(other)
-            sensor_from_other = _between(data, rigs_of, sensor, other_sensor)
-            if result is None or sensor_from_other is None:
-                continue
-            key = (-result.num_inliers, other)
-            if best is None or key < best[:2]:
-                best = (*key, sensor_from_other @ result.cam_from_world)
-        if best is not None:
-            found[image] = (best[1], best[2])
+        poses = [
+            (-result.num_inliers, other, sensor_from_other @ result.cam_from_world)
+            for other_sensor, other in at_time[timestamp]
+            if (result := localized.get(other)) is not None
+            and (sensor_from_other := _between(data, rigs_of, sensor, other_sensor)) is not None
+        ]
+        if poses:
+            _, other, pose = min(poses, key=itemgetter(0, 1))
+            found[image] = (other, pose)
     return found
 
 
@@ -110,6 +111,12 @@ def depth_records(data: KaptureData) -> dict[str, DepthRecord]:
             )
             found[image] = DepthRecord(path, data.sensors[sensor].camera(), image_from_depth)
     return found
+
+
+def read_depth(folder: KaptureFolder, record: DepthRecord) -> NDArray[np.float32]:
+    """Depth (H, W) of a record, 0 where nothing is known; raises DataError."""
+    size = {"width": record.camera.width, "height": record.camera.height}
+    return read_depth_map(folder.depth_path(record.path), **size)
 
 
 def _rigs_of(data: KaptureData) -> dict[str, list[str]]:

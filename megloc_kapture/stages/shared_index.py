@@ -42,11 +42,8 @@ def index_map(folder: KaptureFolder, local_type: str) -> MapIndex:
     """Read the points, their uncertainty and the observations of one keypoints type.
 
     A type whose keypoints the map has, but none with a point, has an index without points: nothing
-    of it could be triangulated.
-
-    Raises
-    ------
-    DataError : the map does not know the type, or has covariances of another map's points.
+    of it could be triangulated. Raises DataError: the map does not know the type, or has
+    covariances of another map's points.
     """
     observations = folder.observations().get(local_type)
     if observations is None:
@@ -116,9 +113,7 @@ def _finite_median(parts: Sequence[NDArray[np.float64]]) -> float:
 def write_index(index: MapIndex, folder: Path) -> None:
     """Write an index as files in a folder, which is made where it is missing.
 
-    Raises
-    ------
-    OutputError : cannot be written.
+    Raises OutputError: cannot be written.
     """
     for name in _ARRAYS:
         write_array(folder / f"{name}.npy", getattr(index, name))
@@ -133,9 +128,7 @@ def write_index(index: MapIndex, folder: Path) -> None:
 def open_index(folder: Path) -> MapIndex:
     """Open what :func:`write_index` wrote: arrays are mapped, not read, and cannot be written to.
 
-    Raises
-    ------
-    DataError : a file is missing or is not what was written; names it.
+    Raises DataError: a file is missing or is not what was written; names it.
     """
     arrays = {name: _open_array(folder / f"{name}.npy", *kind) for name, kind in _ARRAYS.items()}
     covariances = None
@@ -169,15 +162,8 @@ def shared_index(
 ) -> Iterator[dict[str, Path]]:
     """Indices by keypoints type as folders for :func:`open_index`; gone after the block.
 
-    Who has one open by then may go on using it.
-
-    Parameters
-    ----------
-    scratch : folder for them meanwhile, the system's unless given.
-
-    Raises
-    ------
-    OutputError : the folder cannot be written to.
+    Who has one open by then may go on using it. ``scratch``: folder for them meanwhile, the
+    system's unless given. Raises OutputError: the folder cannot be written to.
     """
     where = tempfile.gettempdir() if scratch is None else scratch
     try:

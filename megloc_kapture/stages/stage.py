@@ -9,21 +9,103 @@ from __future__ import annotations
 
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, cast
 
-from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.plugin_loading import code_of, is_ours, weights_of
-from megloc_kapture.stages.layout import Layout
-from megloc_kapture.stages.restrictions import Restrictions
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Options
 
 if TYPE_CHECKING:
     from megloc_kapture.stages.options import PipelineOptions
+
+
+# as imported; kapture folders
+MAPPING, QUERY, QUERY_GT, REFERENCE = "mapping", "query", "query_gt", "reference"
+PREPROCESSED = "preprocessed"
+POSED, PHOTOGRAPH_MATCHES = "posed", "matches/photographs"  # of photographs without poses
+LOCAL_FEATURES, GLOBAL_FEATURES = "local_features", "global_features"
+MAPPING_PAIRS, QUERY_PAIRS = "pairs/mapping.txt", "pairs/query.txt"
+QUERY_CANDIDATES = "pairs/query_candidates.txt"  # before they are reranked
+MAPPING_MATCHES, QUERY_MATCHES = "matches/mapping", "matches/query"
+MAPPING_PYRAMID, QUERY_PYRAMID = "pyramid/mapping", "pyramid/query"
+UNREFINED, SPARSE, MAP = "map_unrefined", "map_sparse", "map"
+UNREFINED_POSES, REFINEMENT_TIMING = "localized_unrefined", "timing_refinement.csv"
+LOCALIZED, SUBMISSIONS, EVALUATION = "localized", "submissions", "evaluation"
+TIMING = "timing.csv"
+FEATURES = ""  # features folder of local and global features: the workspace itself
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where, with these options, the images, features and poses are that stages read.
+
+    ``posed``: the map's images are photographs that have got poses.
+    """
+
+    options: PipelineOptions
+    posed: bool = False
+
+    def paths(self, parts: Sequence[LayoutPath]) -> list[str]:
+        """The paths in the workspace that the parts stand for."""
+        found: list[str] = []
+        for part in parts:
+            one = part if isinstance(part, str) else part(self)
+            found += [one] if isinstance(one, str) else one
+        return found
+
+    def mapping(self) -> str:
+        """Kapture folder of the map's images, as everything after pre-processing sees them."""
+        if self.posed:
+            return POSED
+        return f"{PREPROCESSED}/{MAPPING}" if self.options.preprocesses() else MAPPING
+
+    def query(self) -> str:
+        """Kapture folder of the queries' images; see :meth:`mapping`."""
+        return f"{PREPROCESSED}/{QUERY}" if self.options.preprocesses() else QUERY
+
+    def reference(self) -> tuple[str, ...]:
+        """The model that the dataset comes with, where the map has points of it."""
+        return (REFERENCE,) if self.options.uses_given_map() else ()
+
+    def pairing_points(self) -> tuple[str, ...]:
+        """The model that the dataset comes with, where map images are paired by its points."""
+        return (REFERENCE,) if self.options.pairs_by_points() else ()
+
+    def given_map(self) -> tuple[str, ...]:
+        """The map, where it has features of its own that queries are matched with."""
+        return (MAP,) if self.options.uses_given_map() else ()
+
+    def mapping_matches(self) -> tuple[str, ...]:
+        """Features folders with the matches of map images."""
+        if not self.options.triangulates():
+            return ()
+        again = self.options.matches_again()
+        return (MAPPING_MATCHES, MAPPING_PYRAMID) if again else (MAPPING_MATCHES,)
+
+    def query_matches(self) -> tuple[str, ...]:
+        """Features folders with the matches of queries."""
+        again = self.options.matches_again()
+        return (QUERY_MATCHES, QUERY_PYRAMID) if again else (QUERY_MATCHES,)
+
+    def sparse_map(self) -> str:
+        """The map before depth is estimated, where it is."""
+        return MAP if self.options.mvs.mode == "off" else SPARSE
+
+    def candidates(self) -> str:
+        """Pairs of the queries that are matched; some of them are localized with."""
+        return QUERY_CANDIDATES if self.options.reranking.reranks() else QUERY_PAIRS
+
+    def poses(self) -> str:
+        """The localized queries before poses are refined."""
+        return UNREFINED_POSES if self.options.pose_refinement.refines() else LOCALIZED
+
+
+LayoutPath = str | Callable[[Layout], str | tuple[str, ...]]
+"""A path in the workspace, or the method of :class:`Layout` that gives it, or several."""
 
 
 class Hashes(Protocol):
@@ -62,10 +144,6 @@ class StageWork(Work):
     def folders(self, names: Sequence[str], *features: str) -> list[KaptureFolder]:
         """Those of the kapture folders that are there: a map may be made without queries."""
         return [self.folder(name, *features) for name in names if self.path(name).is_dir()]
-
-    def restrictions(self) -> Restrictions:
-        """What the dataset's side tables permit."""
-        return Restrictions.read(self.path(SIDE_TABLES))
 
 
 CODE_OF = "code of "
@@ -121,9 +199,7 @@ class Stage(ABC):
     def run(self, work: StageWork) -> Mapping[str, float]:
         """Write the outputs; returns counts for the log.
 
-        Raises
-        ------
-        MeglocError : the data or the options cannot be used; the workspace stays as it was.
+        Raises MeglocError: the data or the options cannot be used; the workspace stays as it was.
         """
 
 
@@ -139,9 +215,12 @@ class PipelineStage(Stage):
     uses : the keys of the options that determine the output; ``local_features.name`` is the
         names of all choices, when all else about them does not matter. What a stage does not
         declare it cannot read, so that none of it can be forgotten.
+    inputs, outputs : what is read and written, some of it as the options lead to.
     """
 
     uses: ClassVar[tuple[str, ...]] = ()
+    inputs: ClassVar[tuple[LayoutPath, ...]] = ()
+    outputs: ClassVar[tuple[LayoutPath, ...]] = ()
 
     def __init__(self, options: PipelineOptions) -> None:
         self.options: PipelineOptions = cast(
@@ -150,8 +229,15 @@ class PipelineStage(Stage):
         self.layout = Layout(options)
         self._all = options
 
-    @classmethod
-    def is_wanted(cls, options: PipelineOptions) -> bool:
+    @property
+    def reads(self) -> Sequence[str]:  # type: ignore[override]
+        return self.layout.paths(self.inputs)
+
+    @property
+    def writes(self) -> Sequence[str]:  # type: ignore[override]
+        return self.layout.paths(self.outputs)
+
+    def is_wanted(self) -> bool:
         """Whether the options ask for what the stage does."""
         return True
 
@@ -166,6 +252,13 @@ class PipelineStage(Stage):
             file: sha for plugin in self.plugins() for file, sha in weights_of(plugin).items()
         }
         return {**chosen, "weights": weights} if weights else chosen
+
+
+def wanted_stages(
+    kinds: Iterable[type[PipelineStage]], options: PipelineOptions
+) -> list[PipelineStage]:
+    """The stages that the options ask for, in order."""
+    return [stage for kind in kinds if (stage := kind(options)).is_wanted()]
 
 
 class _Declared:

@@ -11,15 +11,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.files import link_images, link_records, safe_join
-from megloc_kapture.io.images import read_depth_map
 from megloc_kapture.io.kapture import (
     KaptureData,
     KaptureFolder,
@@ -30,9 +30,19 @@ from megloc_kapture.io.kapture import (
     write_point_covariances,
     write_points3d,
 )
+from megloc_kapture.io.kapture.points import write_ply
 from megloc_kapture.io.tables import read_depth_rows
-from megloc_kapture.mvs.views import stereo_camera
-from megloc_kapture.stages.rigs import DepthRecord
+from megloc_kapture.mvs.views import (
+    AgreementOptions,
+    agreeing_views,
+    pinhole_matrix,
+    stereo_camera,
+    stereo_view,
+)
+from megloc_kapture.plugins import StereoView
+from megloc_kapture.stages.local_features import read_image_of
+from megloc_kapture.stages.rigs import depth_records, read_depth
+from megloc_kapture.stages.work import HERE, FolderSpec, Work
 from megloc_kapture.values import RigidTransform
 
 FOLDER = "mvs"  # of depth maps below records_data, and of what is beside them below sensors
@@ -58,12 +68,6 @@ def stereo_images(folder: KaptureFolder) -> dict[str, tuple[str, ...]]:
     path = folder.root / DEPTH_FILE
     rows = read_depth_rows(path) if path.is_file() else []
     return {row.image: row.sources for row in sorted(rows, key=lambda r: r.image) if not row.reason}
-
-
-def read_stereo_depth(folder: KaptureFolder, record: DepthRecord) -> NDArray[np.float32]:
-    """Depth (H, W) of a record, 0 where nothing is known; raises DataError."""
-    size = {"width": record.camera.width, "height": record.camera.height}
-    return read_depth_map(folder.depth_path(record.path), **size)
 
 
 def depth_path(image: str) -> str:
@@ -130,48 +134,136 @@ def write_points(
 ) -> int:
     """Write a map's points, unchanged, and behind them those of keypoints that were lifted.
 
-    Parameters
-    ----------
-    lifted : by keypoints type and image.
-
-    Returns
-    -------
-    The number of lifted points.
+    ``lifted``: by keypoints type and image. Returns the number of lifted points.
     """
     points = source.points3d()
     covariances = read_point_covariances(source.root, len(points))
-    parts, uncertain = [points], [np.full((len(points), 6), np.nan)]
-    if covariances is not None:
+    if covariances is None:
+        uncertain = [np.full((len(points), 6), np.nan)]
+    else:
         uncertain = [np.asarray(covariances)]
-    observations = {}
-    total = len(points)
+    xyz, observations, total = [points], {}, len(points)
     for local_type, seen in source.observations().items():
-        new = lifted.get(local_type, {})
-        names = tuple(sorted({*seen.image_names, *new}))
+        new = sorted(lifted.get(local_type, {}).items())
+        names = tuple(sorted({*seen.image_names, *(image for image, _ in new)}))
         row_of = {name: row for row, name in enumerate(names)}
         rows = np.array([row_of[name] for name in seen.image_names], np.int32)
-        point_ids, image_ids, keypoint_ids = (
-            [seen.point_ids],
-            [rows[seen.image_ids] if len(rows) else seen.image_ids],
-            [seen.keypoint_ids],
-        )
-        for image, own in sorted(new.items()):
-            count = len(own.xyz)
-            parts.append(np.concatenate([own.xyz, np.zeros_like(own.xyz)], axis=1))
-            uncertain.append(own.covariances)
-            point_ids.append(total + np.arange(count))
-            image_ids.append(np.full(count, row_of[image], np.int32))
-            keypoint_ids.append(own.keypoint_ids.astype(np.int32))
-            total += count
+        image_ids = [rows[seen.image_ids] if len(rows) else seen.image_ids]
+        image_ids += [np.full(len(own.xyz), row_of[image], np.int32) for image, own in new]
+        keypoint_ids = [own.keypoint_ids.astype(np.int32) for _, own in new]
+        xyz += [np.concatenate([own.xyz, np.zeros_like(own.xyz)], axis=1) for _, own in new]
+        uncertain += [own.covariances for _, own in new]
+        count = sum(map(len, keypoint_ids))
         observations[local_type] = Observations(
             local_type,
             names,
-            np.concatenate(point_ids),
+            np.concatenate([seen.point_ids, total + np.arange(count)]),
             np.concatenate(image_ids),
-            np.concatenate(keypoint_ids),
+            np.concatenate([seen.keypoint_ids, *keypoint_ids]),
         )
-    write_points3d(output, np.concatenate(parts))
+        total += count
+    write_points3d(output, np.concatenate(xyz))
     write_observations(output, observations)
     if covariances is not None or total > len(points):
         write_point_covariances(output, np.concatenate(uncertain))
     return total - len(points)
+
+
+class Cloud(NamedTuple):
+    """Points of depth maps in the world: coordinates (N, 3), colours (N, 3) from 0 to 255, unit
+    normals (N, 3), standard deviations (N,), and the rows of their images (N,), all float64."""
+
+    xyz: NDArray[np.float64]
+    colours: NDArray[np.float64]
+    normals: NDArray[np.float64]
+    sigma_m: NDArray[np.float64]
+    image_ids: NDArray[np.float64]
+
+
+def fused_cloud(
+    densified: KaptureFolder,
+    images: dict[str, tuple[str, ...]],
+    agreement: AgreementOptions,
+    *,
+    max_points: int | None = None,
+    work: Work = HERE,
+) -> Cloud:
+    """The depth maps of images as one cloud.
+
+    A pixel is left out where one of the sources that come before its image, by name, agrees with
+    it: its surface is in the cloud.
+
+    Parameters
+    ----------
+    images : some of :func:`stereo_images`.
+    max_points : about so many pixels are looked at, the same ones each time; None: all.
+
+    Raises
+    ------
+    DataError : something is broken; names the file.
+    """
+    records = depth_records(densified.read())
+    cameras = [records[image].camera for image in images if image in records]
+    total = sum(camera.width * camera.height for camera in cameras)
+    share = 1.0 if max_points is None else min(1.0, max_points / max(total, 1))
+    jobs = [
+        (row, image, [other for other in own if other < image and other in images])
+        for row, (image, own) in enumerate(images.items())
+    ]
+    points = partial(_points, FolderSpec(densified), agreement, share)
+    parts = list(work.map(points, jobs, "cloud"))
+    nothing = Cloud(*(np.zeros(shape) for shape in ((0, 3), (0, 3), (0, 3), (0,), (0,))))
+    return Cloud(*(np.concatenate(column) for column in zip(nothing, *parts, strict=True)))
+
+
+def fuse_depth(
+    densified: KaptureFolder, cloud: Path, agreement: AgreementOptions, *, work: Work = HERE
+) -> int:
+    """Write the depth maps of :mod:`.densifying` as a PLY cloud with normals and deviations.
+
+    Returns number of points. Raises DataError: no densified map, or something broken; names the
+    file.
+    """
+    path = densified.root / DEPTH_FILE
+    if not path.is_file():
+        raise DataError("no densified map: reconstruction/depth.csv is missing", path=path)
+    found = fused_cloud(densified, stereo_images(densified), agreement, work=work)
+    nx, ny, nz = found.normals.T
+    write_ply(cloud, found.xyz, found.colours, nx=nx, ny=ny, nz=nz, deviation=found.sigma_m)
+    return len(found.xyz)
+
+
+def _points(
+    spec: FolderSpec, agreement: AgreementOptions, share: float, job: tuple[int, str, Sequence[str]]
+) -> Cloud:
+    (row, image, earlier), folder = job, spec.open()
+    view, depth = _view_with_depth(folder, image)
+    others = [_view_with_depth(folder, other) for other in earlier]
+    new = (depth > 0) & (agreeing_views(view, depth, others, agreement) == 0)
+    if share < 1:
+        new &= np.random.default_rng(row).random(new.shape) < share
+    rows, columns = np.nonzero(new)
+    pixels = np.stack([columns, rows, np.ones(len(rows))], axis=1)
+    in_camera = pixels @ np.linalg.inv(pinhole_matrix(view.camera)).T * depth[new][:, None]
+    sigma = read_beside(folder.root, image, "sigma")
+    normals = read_beside(folder.root, image, "normals")
+    if sigma is None or normals is None or not sigma.shape == normals.shape[:2] == depth.shape:
+        raise DataError(
+            f"no deviations and normals of {image}, of the size of its depth", path=folder.root
+        )
+    return Cloud(
+        view.cam_from_world.inverse().apply(in_camera),
+        view.image[new].astype(np.float64),
+        normals[new].astype(np.float64) @ view.cam_from_world.rotation_matrix(),
+        sigma[new].astype(np.float64),
+        np.full(len(rows), float(row)),
+    )
+
+
+def _view_with_depth(folder: KaptureFolder, image: str) -> tuple[StereoView, NDArray[np.float32]]:
+    data = folder.read()
+    record = depth_records(data)[image]
+    pixels = read_image_of(folder.image_path(image), data.camera_of(image))
+    longer = max(record.camera.width, record.camera.height)
+    view = stereo_view(pixels, data.camera_of(image), data.poses()[image], None, longer)
+    return view, read_depth(folder, record)

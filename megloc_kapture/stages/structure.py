@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,10 +28,18 @@ from megloc_kapture.io.files import link_images
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.io.tables import read_match_counts
 from megloc_kapture.matching.verification import agree_by_chance
-from megloc_kapture.stages.layout import FEATURES, LOCAL_FEATURES, PHOTOGRAPH_MATCHES, POSED
 from megloc_kapture.stages.matches import MATCHING_OPTIONS, MatchMapping, Verification
 from megloc_kapture.stages.options import PipelineOptions
-from megloc_kapture.stages.stage import LOCAL_TYPES, PipelineStage, StageWork
+from megloc_kapture.stages.stage import (
+    FEATURES,
+    LOCAL_FEATURES,
+    LOCAL_TYPES,
+    PHOTOGRAPH_MATCHES,
+    POSED,
+    Layout,
+    PipelineStage,
+    StageWork,
+)
 from megloc_kapture.stages.triangulation import verified_matches
 from megloc_kapture.values import Options, RigidTransform
 
@@ -60,7 +68,7 @@ class MatchPhotographs(MatchMapping):
 
     name = "photograph_matches"
     uses = (*MATCHING_OPTIONS, "query_verification")
-    writes = (PHOTOGRAPH_MATCHES,)
+    outputs = (PHOTOGRAPH_MATCHES,)
 
     def verification(self) -> Verification:
         return self.options.verify_queries()
@@ -72,28 +80,25 @@ class FindPoses(PipelineStage):
     name = "poses"
     version = 2
     uses = (*LOCAL_TYPES, "query_verification")
-    writes = (POSED, f"{SIDE_TABLES}/{WORLD_FILE}", f"{SIDE_TABLES}/{UNREGISTERED_FILE}")
+    inputs = (Layout.mapping, SIDE_TABLES, LOCAL_FEATURES, PHOTOGRAPH_MATCHES)
+    outputs = (POSED, f"{SIDE_TABLES}/{WORLD_FILE}", f"{SIDE_TABLES}/{UNREGISTERED_FILE}")
 
     def __init__(self, options: PipelineOptions, structure: StructureOptions) -> None:
         super().__init__(options)
         self._structure = structure
 
-    @property
-    def reads(self) -> Sequence[str]:  # type: ignore[override]
-        return (self.layout.mapping, SIDE_TABLES, LOCAL_FEATURES, PHOTOGRAPH_MATCHES)
-
     def settings(self) -> dict[str, Any]:
         return {**super().settings(), "structure": self._structure.model_dump(mode="json")}
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        mapping = work.folder(self.layout.mapping, FEATURES, PHOTOGRAPH_MATCHES)
+        mapping = work.folder(self.layout.mapping(), FEATURES, PHOTOGRAPH_MATCHES)
         data, structure = mapping.read(), self._structure
         models = self._models(work, mapping, data)
         world, model, counts = _scaled(models[0], structure)
         tables = work.out / SIDE_TABLES
         reasons = read_unreadable(work.path(SIDE_TABLES))
-        for image in data.image_names():
-            reasons |= {} if image in model.poses else {image: "no model: too few matches agree"}
+        absent = set(data.image_names()) - model.poses.keys()
+        reasons |= dict.fromkeys(sorted(absent), "no model: too few matches agree")
         for number, other in enumerate(models[1:], start=2):
             reasons |= {
                 image: f"model {number}, of {len(other.poses)} photographs, which does not hang "
@@ -114,34 +119,26 @@ class FindPoses(PipelineStage):
         }
 
     def _models(self, work: StageWork, mapping: KaptureFolder, data: KaptureData) -> list[Model]:
-        local_type = self.options.main_type()
+        local_type, structure = self.options.main_type(), self._structure
         keypoints, images = mapping.keypoints(local_type), data.image_names()
-        photographs = [
-            Photograph(
-                image,
-                data.record_of(image)[1],
-                data.camera_of(image),
-                keypoints.read(image)[:, :2],
-            )
-            for image in images
-        ]
+        photographs = []
+        for image in images:
+            sensor, px = data.record_of(image)[1], keypoints.read(image)[:, :2]
+            photographs.append(Photograph(image, sensor, data.camera_of(image), px))
         counts = read_match_counts(work.path(PHOTOGRAPH_MATCHES), local_type)
         putative = {(pair.image, pair.other): pair.matches for pair in counts}
-        verified = verified_matches(mapping.matches(local_type), images, putative.keys())
-        verification = self.options.query_verification
-        matches = {}
-        for (i, j), rows in verified.items():
+        matches = verified_matches(mapping.matches(local_type), images, putative.keys())
+        for (i, j), rows in list(matches.items()):
             first, second = photographs[i], photographs[j]
-            if not agree_by_chance(
+            if agree_by_chance(
                 first.keypoints_px[rows[:, 0]],
                 first.camera,
                 second.keypoints_px[rows[:, 1]],
                 second.camera,
                 putative[first.name, second.name],
-                verification,
+                self.options.query_verification,
             ):
-                matches[i, j] = rows
-        structure = self._structure
+                del matches[i, j]
         try:
             return reconstruct(
                 photographs,
@@ -171,29 +168,23 @@ def write_posed(output: Path, data: KaptureData, model: Model) -> None:
 def _scaled(model: Model, structure: StructureOptions) -> tuple[World, Model, dict[str, float]]:
     """The model in metres where they are known, its world, and counts for the log.
 
-    Raises
-    ------
-    DataError : what should tell the scale does not.
+    Raises DataError: what should tell the scale does not.
     """
     if structure.distance is not None:
         first, second, metres = structure.distance
         for name in (first, second):
             if name not in model.poses:
                 raise DataError(f"--scale: the map has no photograph {name!r}")
-        centers = [model.poses[name].center() for name in (first, second)]
-        apart = float(np.linalg.norm(np.subtract(*centers)))
+        one, other = (model.poses[name].center() for name in (first, second))
+        apart = float(np.linalg.norm(one - other))
         if apart == 0:
             raise DataError(f"--scale: {first} and {second} were taken at the same place")
-        return (
-            World(unit=METRES),
-            _moved(model, metres / apart),
-            {"metres_per_unit": metres / apart},
-        )
+        scale = metres / apart
+        return World(unit=METRES), _moved(model, scale), {"metres_per_unit": scale}
     if structure.gps is None:
         return World(unit=NO_METRES), model, {}
-    found = align_to_earth(
-        {name: pose.center() for name, pose in model.poses.items()}, structure.gps
-    )
+    centers = {name: pose.center() for name, pose in model.poses.items()}
+    found = align_to_earth(centers, structure.gps)
     counts = {
         "gps_positions": found.num_positions,
         "gps_residual_m": round(found.residual_m, 3),

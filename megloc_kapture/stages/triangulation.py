@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Iterable, Sequence
+from functools import partial
 from itertools import product
 from pathlib import Path
 
@@ -16,7 +16,6 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.io.colmap import MapImage, TriangulatedPoints, TriangulationOptions, triangulate
 from megloc_kapture.io.files import hard_link, link_images
 from megloc_kapture.io.kapture import (
-    FeatureReader,
     FeatureWriter,
     ImagePair,
     KaptureFolder,
@@ -69,60 +68,55 @@ def triangulate_map(
     """
     types = tuple(dict.fromkeys([local_types] if isinstance(local_types, str) else local_types))
     data = mapping.read()
-    poses = data.poses()
-    images = sorted(poses)
+    images = sorted(data.poses())
     if not images:
         raise DataError("no mapping image has a pose", path=mapping.root)
     asked = None if pairs is None else {tuple(sorted((pair.query, pair.map))) for pair in pairs}
-    num_pairs = 0
-    points = [np.zeros((0, 3))]
-    errors_px = [np.zeros(0)]
-    observations = {}
-    by_type: dict[str, float] = {}
     of_type = {name: _matched_pairs(matches.matches(name), images, asked) for name in types}
     for name in types:
         mapping.keypoints(name)  # refused before any work
     specs = FolderSpec(mapping), FolderSpec(matches)
-    for type_name, matched in of_type.items():
-        part = _Part(*specs, type_name, tuple(images), matched, options, num_threads, output)
-        found = _triangulate(part, work)
-        observations[type_name] = Observations(
-            keypoints_type=type_name,
+    xyz, errors_px = np.zeros((0, 3)), np.zeros(0)
+    observations = {}
+    by_type: dict[str, float] = {}
+    for name, matched in of_type.items():
+        parts = _unconnected(len(images), matched)
+        threads = 1 if len(parts) > 1 and work.executor is not None else num_threads
+        part = partial(_triangulate_part, specs, name, options, threads, output.absolute())
+        found = _triangulate(part, images, matched, parts, work, f"triangulation of {name}")
+        observations[name] = Observations(
+            keypoints_type=name,
             image_names=tuple(images),
-            point_ids=found.point_ids + sum(map(len, points)),
+            point_ids=found.point_ids + len(xyz),
             image_ids=found.image_ids.astype(np.int32),
             keypoint_ids=found.keypoint_ids.astype(np.int32),
         )
-        num_pairs += len(matched)
-        points.append(found.xyz)
-        errors_px.append(found.errors_px)
-        by_type[f"points_{type_name}"] = len(found.xyz)
-        by_type[f"observations_{type_name}"] = len(found.point_ids)
+        xyz = np.concatenate([xyz, found.xyz])
+        errors_px = np.concatenate([errors_px, found.errors_px])
+        by_type[f"points_{name}"] = len(found.xyz)
+        by_type[f"observations_{name}"] = len(found.point_ids)
     write_sensors(output, data)
     link_images(mapping.root, output)
     # with a pyramid's type the one it begins with: queries are matched with that at first
-    for type_name in {*types, *map(base_type, types)}.intersection(mapping.types("keypoints")):
-        copy_features(mapping, output, type_name)
-    xyz, errors = np.concatenate(points), np.concatenate(errors_px)
+    there = mapping.types("keypoints")
+    copy_features(mapping, output, {*types, *map(base_type, types)}.intersection(there))
     # kapture keeps a colour per point; black says that nobody looked it up
     write_points3d(output, np.concatenate([xyz, np.zeros_like(xyz)], axis=1))
     write_observations(output, observations)
     num_observations = sum(map(len, observations.values()))
     return {
         "images": len(images),
-        "pairs": num_pairs,
+        "pairs": sum(map(len, of_type.values())),
         "points": len(xyz),
         "observations": num_observations,
         **(by_type if len(types) > 1 else {}),
         "mean_track_length": round(num_observations / max(len(xyz), 1), 3),
-        "mean_reprojection_error_px": round(float(errors.mean()), 4) if len(xyz) else 0.0,
+        "mean_reprojection_error_px": round(float(errors_px.mean()), 4) if len(xyz) else 0.0,
     }
 
 
 def verified_matches(
-    reader: MatchesReader,
-    images: Sequence[str],
-    asked: Collection[tuple[str, ...]] | None = None,
+    reader: MatchesReader, images: Sequence[str], asked: Collection[tuple[str, ...]] | None = None
 ) -> dict[tuple[int, int], NDArray[np.int64]]:
     """Matches by pairs of rows of ``images``; of the pairs asked for alone (first name first)."""
     return _read(reader, images, _matched_pairs(reader, images, asked))
@@ -148,36 +142,28 @@ def _matched_pairs(
     return np.array(pairs, np.int64).reshape(-1, 2)
 
 
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """Images of a map, and those pairs (P, 2) of them that match."""
-
-    mapping: FolderSpec
-    matches: FolderSpec
-    local_type: str
-    images: tuple[str, ...]
-    pairs: NDArray[np.int64]
-    options: TriangulationOptions
-    num_threads: int
-    scratch: Path
+_Part = tuple[list[str], NDArray[np.int64]]  # images, and pairs (P, 2) of them that match
 
 
-def _triangulate(whole: _Part, work: Work) -> TriangulatedPoints:
+def _triangulate(
+    triangulate_part: Callable[[_Part], TriangulatedPoints],
+    images: list[str],
+    pairs: NDArray[np.int64],
+    members: Sequence[NDArray[np.int64]],
+    work: Work,
+    label: str,
+) -> TriangulatedPoints:
     """Points of the images, part by part where no match connects them."""
-    members = _unconnected(len(whole.images), whole.pairs)
     if len(members) == 1:
-        return _triangulate_part(whole)
+        return triangulate_part((images, pairs))
     parts = [
-        replace(
-            whole,
-            images=tuple(whole.images[row] for row in rows.tolist()),
-            pairs=np.searchsorted(rows, whole.pairs[np.isin(whole.pairs[:, 0], rows)]),
-            num_threads=whole.num_threads if work.executor is None else 1,
-            scratch=whole.scratch.absolute(),
+        (
+            [images[row] for row in rows.tolist()],
+            np.searchsorted(rows, pairs[np.isin(pairs[:, 0], rows)]),
         )
         for rows in members
     ]
-    found = list(work.map(_triangulate_part, parts, f"triangulation of {whole.local_type}"))
+    found = list(work.map(triangulate_part, parts, label))
     before = np.cumsum([0, *(len(one.xyz) for one in found)]).tolist()
     return TriangulatedPoints(
         xyz=np.concatenate([one.xyz for one in found]),
@@ -192,17 +178,24 @@ def _triangulate(whole: _Part, work: Work) -> TriangulatedPoints:
     )
 
 
-def _triangulate_part(part: _Part) -> TriangulatedPoints:
-    mapping, reader = part.mapping.open(), part.matches.open().matches(part.local_type)
-    data, keypoints = mapping.read(), mapping.keypoints(part.local_type)
+def _triangulate_part(
+    specs: tuple[FolderSpec, FolderSpec],
+    local_type: str,
+    options: TriangulationOptions,
+    num_threads: int,
+    scratch: Path,
+    part: _Part,
+) -> TriangulatedPoints:
+    names, pairs = part
+    mapping, reader = specs[0].open(), specs[1].open().matches(local_type)
+    data, keypoints = mapping.read(), mapping.keypoints(local_type)
     images = [
         MapImage(image, data.camera_of(image), pose, keypoints.read(image)[:, :2])
-        for image in part.images
+        for image in names
         if (pose := data.cam_from_world(image)) is not None  # all have one
     ]
-    verified = _read(reader, part.images, part.pairs)
-    threads, scratch = part.num_threads, part.scratch
-    return triangulate(images, verified, part.options, num_threads=threads, scratch=scratch)
+    verified = _read(reader, names, pairs)
+    return triangulate(images, verified, options, num_threads=num_threads, scratch=scratch)
 
 
 def _unconnected(num_images: int, pairs: NDArray[np.int64]) -> list[NDArray[np.int64]]:
@@ -221,69 +214,62 @@ def _unconnected(num_images: int, pairs: NDArray[np.int64]) -> list[NDArray[np.i
     return [np.sort(np.concatenate(group)) for group in groups]
 
 
-_COPIED: tuple[ArrayKind, ...] = ("keypoints", "descriptors", "global_features")
+_READ = {
+    "keypoints": KaptureFolder.keypoints,
+    "descriptors": KaptureFolder.descriptors,
+    "global_features": KaptureFolder.global_features,
+}
+_KINDS: tuple[ArrayKind, ...] = ("keypoints", "descriptors", "global_features")
 _VOCABULARY_FILES = ("vlad.json", "vocabulary.npy")
 
 
 def copy_features(
-    source: KaptureFolder, output: Path, local_type: str, *, link_own: bool = False
+    source: KaptureFolder,
+    output: Path,
+    local_types: Iterable[str] | None = None,
+    *,
+    link_own: bool = False,
 ) -> None:
-    """Put the map images' features of ``source`` into the kapture at ``output``.
+    """Put the map images' features of ``source`` into the kapture at ``output``; what is there
+    stays.
 
-    Files of features folders are hard links where the file system has them: a map then stands
-    alone and takes no space twice. The kapture's own features, which come first as everywhere, are
-    somebody's data and copied, unless ``link_own`` says that they are ours; what comes out of a
-    tar is copied.
+    Files of features folders are hard links where the file system has them: a map then stands alone
+    and takes no space twice. The kapture's own features, which come first as everywhere, are
+    somebody's data and copied, unless ``link_own`` says that they are ours; what comes out of a tar
+    is copied. ``local_types``: all types of local features unless given; of global features all are
+    copied.
     """
-    own = source.with_features(())
-    for kind in _COPIED:
-        types = source.types(kind) if kind == "global_features" else [local_type]
-        for type_name in types:
-            if type_name in source.types(kind):
-                _copy_type(source, own, output, kind, type_name, link_own=link_own)
+    wanted = None if local_types is None else set(local_types)
+    for kind in _KINDS:
+        for name in source.types(kind):
+            if kind == "global_features" or wanted is None or name in wanted:
+                _copy_type(source, output, kind, name, link_own=link_own)
 
 
 def _copy_type(
-    source: KaptureFolder,
-    own: KaptureFolder,
-    output: Path,
-    kind: ArrayKind,
-    type_name: str,
-    *,
-    link_own: bool,
+    source: KaptureFolder, output: Path, kind: ArrayKind, type_name: str, *, link_own: bool
 ) -> None:
-    place = output / "reconstruction" / kind / type_name
-    images = source.read().image_names()
-    kept = set(_reader(own, kind, type_name).names) if type_name in own.types(kind) else set()
+    copies, suffix = output / "reconstruction" / kind / type_name, SUFFIX[kind]
+    images, own = source.read().image_names(), source.with_features(())
+    kept = set(_READ[kind](own, type_name).names) if type_name in own.types(kind) else set()
     parent = "global_features" if kind == "global_features" else "local_features"
     beside = [source.root / "reconstruction" / kind / type_name]
     for image in sorted(kept) if link_own else ():
-        file = beside[0] / f"{image}{SUFFIX[kind]}"
-        if file.is_file():
-            hard_link(file, place / f"{image}{SUFFIX[kind]}")
+        if (file := beside[0] / f"{image}{suffix}").is_file():
+            hard_link(file, copies / f"{image}{suffix}")
     for features_dir in source.features_dirs:
         found = features_dir / parent / type_name / kind
         beside.append(found.parent)
         for image in images:
-            file, copy = (folder / f"{image}{SUFFIX[kind]}" for folder in (found, place))
+            file, copy = found / f"{image}{suffix}", copies / f"{image}{suffix}"
             if image not in kept and file.is_file() and not copy.exists():  # the first has it
                 hard_link(file, copy)
     if kind == "global_features":
         for folder, name in product(beside, _VOCABULARY_FILES):
-            if (folder / name).is_file() and not (place / name).exists():
-                hard_link(folder / name, place / name)
-    reader = _reader(source, kind, type_name)
+            if (folder / name).is_file() and not (copies / name).exists():
+                hard_link(folder / name, copies / name)
+    reader = _READ[kind](source, type_name)
     with FeatureWriter(output, kind, type_name, reader.config) as writer:
         for image in images:
             if image not in writer and image in reader:
                 writer.write(image, reader.read(image))
-
-
-def _reader(folder: KaptureFolder, kind: ArrayKind, type_name: str) -> FeatureReader:
-    if kind == "keypoints":
-        return folder.keypoints(type_name)
-    return (
-        folder.descriptors(type_name)
-        if kind == "descriptors"
-        else folder.global_features(type_name)
-    )

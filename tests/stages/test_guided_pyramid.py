@@ -18,6 +18,7 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.io.colmap import TriangulationOptions
 from megloc_kapture.io.csv_table import read_csv_table
+from megloc_kapture.io.dataset_tables import table_path
 from megloc_kapture.io.images import read_image_rgb, write_image
 from megloc_kapture.io.kapture import (
     ImagePair,
@@ -30,14 +31,13 @@ from megloc_kapture.matching.guided_pyramid import GuidedPyramidOptions, ImageVa
 from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
 from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
 from megloc_kapture.pipeline.executors import single_threaded
-from megloc_kapture.stages.guided_pyramid import PyramidMethod, retry_query
+from megloc_kapture.stages.guided_pyramid import COLUMNS, PyramidMethod, retry_query
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.matches import Features, match_pairs
-from megloc_kapture.stages.pyramid_mapping import pyramid_mapping
-from megloc_kapture.stages.pyramid_queries import COLUMNS, pyramid_queries, table_path
+from megloc_kapture.stages.pyramid_mapping import pyramid_mapping, pyramid_queries
 from megloc_kapture.stages.query_poses import LocalizationOptions, localize_from_matches
 from megloc_kapture.stages.triangulation import triangulate_map
-from megloc_kapture.stages.work import Work
+from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, ImageFeatures, LocalFeatures, Pose, RigidTransform
 
 MAP_IMAGES = ("left/1.png", "right/2.png", "right/3.png")
@@ -115,25 +115,37 @@ class Scene:
             for image in MAP_IMAGES
         ]
 
-    def retry_queries(self, name: str, output: Path, **more: Any) -> dict[str, float]:
-        given = {
-            "extractor": Upright(), "matcher": NearestNeighbours(), "options": ALL,
-            "mapping": self.mapping(), **more,
-        }  # fmt: skip
+    def retry_queries(
+        self,
+        name: str,
+        output: Path,
+        *,
+        mapping: KaptureFolder | None = None,
+        work: Work = HERE,
+        **more: Any,
+    ) -> dict[str, float]:
         with single_threaded():
             return pyramid_queries(
-                self.query(name), given.pop("mapping"), self.query_pairs(name), "upright",
-                given.pop("extractor"), given.pop("matcher"), TwoViewOptions(),
-                given.pop("options"), output, **given,
+                self.query(name), mapping or self.mapping(), self.query_pairs(name), "upright",
+                method(**more), output, work=work,
             )  # fmt: skip
 
-    def retry_mapping(self, output: Path, **more: Any) -> dict[str, float]:
-        given = {"extractor": Upright(), "options": ALL, **more}
+    def retry_mapping(self, output: Path, *, work: Work = HERE, **more: Any) -> dict[str, float]:
+        how = method(verification=KnownPoseOptions(), **more)
         with single_threaded():
             return pyramid_mapping(
-                self.mapping(), self.mapping_pairs(), "upright", given.pop("extractor"),
-                NearestNeighbours(), KnownPoseOptions(), given.pop("options"), output, **given,
-            )  # fmt: skip
+                self.mapping(), self.mapping_pairs(), "upright", how, output, work=work
+            )
+
+
+def method(
+    extractor: Any = None, matcher: Any = None, options: GuidedPyramidOptions = ALL, **more: Any
+) -> PyramidMethod:
+    """How pairs are tried again: by upright features, unless another extractor is given."""
+    verification = more.pop("verification", TwoViewOptions())
+    return PyramidMethod(
+        extractor or Upright(), matcher or NearestNeighbours(), verification, options, **more
+    )
 
 
 def write_images(
@@ -390,8 +402,8 @@ def test_easy_pairs_are_never_extracted_again(scene: Scene, tmp_path: Path) -> N
     options = GuidedPyramidOptions(mode="all", min_matches=40)
     pairs = [pair for pair in scene.query_pairs("easy") if pair.map != "right/3.png"]
     counts = pyramid_queries(
-        scene.query("easy"), scene.mapping(), pairs, "upright", Forbidden(), NearestNeighbours(),
-        TwoViewOptions(), options, tmp_path / "out",
+        scene.query("easy"), scene.mapping(), pairs, "upright",
+        method(Forbidden(), options=options), tmp_path / "out",
     )  # fmt: skip
     assert counts["pairs"] == 4 and counts["pairs_tried"] == 0
     assert counts["seconds_per_tried_pair"] == 0 and list(rows(tmp_path / "out")) == []
@@ -435,8 +447,8 @@ def test_the_mask_goes_with_the_image(scene: Scene, tmp_path: Path) -> None:
     query = KaptureFolder(root, features_dirs=scene.query("turned").features_dirs)
     with single_threaded():
         pyramid_queries(
-            query, scene.mapping(), scene.query_pairs("turned"), "upright", Upright(),
-            NearestNeighbours(), TwoViewOptions(), ALL, tmp_path / "out", mask_margin_px=10.0,
+            query, scene.mapping(), scene.query_pairs("turned"), "upright",
+            method(mask_margin_px=10.0), tmp_path / "out",
         )  # fmt: skip
     larger = KaptureFolder(root, features_dirs=[tmp_path / "out"]).keypoints("upright-pyramid")
     for image in query.read().image_names():
@@ -458,8 +470,8 @@ def test_pairs_without_a_pose_are_not_tried(scene: Scene, tmp_path: Path) -> Non
     )
     mapping = KaptureFolder(root, features_dirs=scene.mapping().features_dirs)
     counts = pyramid_mapping(
-        mapping, scene.mapping_pairs(), "upright", Forbidden(), NearestNeighbours(),
-        KnownPoseOptions(), ALL, tmp_path / "out",
+        mapping, scene.mapping_pairs(), "upright",
+        method(Forbidden(), verification=KnownPoseOptions()), tmp_path / "out",
     )  # fmt: skip
     assert counts["pairs"] == 3 and counts["pairs_tried"] == 0
 
@@ -468,8 +480,7 @@ def test_matches_that_are_missing_are_named(scene: Scene, tmp_path: Path) -> Non
     pairs = [ImagePair("query/a.png", "left/0.png", 1.0)]
     with pytest.raises(DataError, match=r"no matches .* 'query/a.png' and 'left/0.png'"):
         pyramid_queries(
-            scene.query("easy"), scene.mapping(), pairs, "upright", Upright(),
-            NearestNeighbours(), TwoViewOptions(), ALL, tmp_path / "out",
+            scene.query("easy"), scene.mapping(), pairs, "upright", method(), tmp_path / "out"
         )  # fmt: skip
 
 
@@ -488,7 +499,7 @@ def test_one_query_alone_gives_what_the_stage_gives(scene: Scene) -> None:
     with single_threaded():
         found = retry_query(
             features(query, image), base, lambda name: features(mapping, name),
-            PyramidMethod(Upright(), NearestNeighbours(), TwoViewOptions(), ALL),
+            method(),
             lambda: (read_image_rgb(query.image_path(image)), None),
         )  # fmt: skip
     stored = KaptureFolder(query.root, features_dirs=[scene.root / "turned_all"])
@@ -516,9 +527,9 @@ def test_one_query_whose_pairs_are_easy_is_never_read(scene: Scene) -> None:
     )
     rows = np.stack([np.arange(100)] * 2, axis=1)
     for options in (ALL, GuidedPyramidOptions(min_matches=1000)):
-        method = PyramidMethod(Forbidden(), NearestNeighbours(), TwoViewOptions(), options)
-        found = retry_query(own, [("left/1.png", rows, np.ones(100))], never, method, never)
-        assert len(found.added_px) == len(found.added_descriptors) == len(found.tried.rows) == 0
+        how = method(Forbidden(), options=options)
+        found = retry_query(own, [("left/1.png", rows, np.ones(100))], never, how, never)
+        assert len(found.added_px) == len(found.added_descriptors) == len(found.rows) == 0
         assert [(other, len(matches)) for other, matches, _ in found.matches] == [
             ("left/1.png", 100)
         ]

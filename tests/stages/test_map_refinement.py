@@ -192,10 +192,7 @@ def test_depth_maps_that_are_not_there_count_as_none(tmp_path: Path) -> None:
 
 def test_nothing_is_lost_where_nothing_is_asked_for(wall: Wall, tmp_path: Path) -> None:
     counts = refine_map(wall.folder(), tmp_path / "out", OFF)
-    assert counts == {
-        "points": 66,
-        "observations": sum(map(len, contents(wall.root).values())),
-    }
+    assert counts == {"points": 66, "observations": sum(map(len, contents(wall.root).values()))}
     assert contents(tmp_path / "out") == contents(wall.root)
     assert KaptureFolder(tmp_path / "out").read().poses() == wall.folder().read().poses()
 

@@ -12,12 +12,7 @@ import pytest
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import bearing_rays
-from megloc_kapture.io.kapture import (
-    FeatureConfig,
-    FeatureWriter,
-    ImagePair,
-    KaptureFolder,
-)
+from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, ImagePair, KaptureFolder
 from megloc_kapture.io.tables import read_match_counts
 from megloc_kapture.matching.nearest_neighbours import NearestNeighbours, match_nearest
 from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions

@@ -129,9 +129,7 @@ def run(
 ) -> tuple[KaptureFolder, PreprocessingReport]:
     """Pre-process; keyword arguments that are no options go to the stage."""
     stage = {
-        name: options.pop(name)
-        for name in ("segmenter", "sequences", "root", "work")
-        if name in options
+        name: options.pop(name) for name in ("segmenter", "sequences", "work") if name in options
     }
     chosen = PreprocessingOptions(masks=MaskOptions(**masks or {}), **options)
     preprocess_images(folder, output, chosen, **stage)
@@ -391,10 +389,10 @@ def test_drawn_masks_of_a_pattern_of_images(street: KaptureFolder, tmp_path: Pat
     drawn[:, 200:] = 0
     write_image(tmp_path / "drawn" / "side.png", drawn)
     fixed = (
-        FixedMask(camera="side/[01].jpg", file=Path("side.png")),
+        FixedMask(camera="side/[01].jpg", file=tmp_path / "drawn" / "side.png"),
         FixedMask(camera="rear", bottom_share=0.5),
     )
-    new, report = run(street, tmp_path / "new", {"fixed": fixed}, root=tmp_path / "drawn")
+    new, report = run(street, tmp_path / "new", {"fixed": fixed})
     np.testing.assert_array_equal(mask_of(new, "side/0.jpg"), drawn > 0)
     assert mask_of(new, "side/2.jpg") is None and mask_of(new, "front/0.png") is None
     assert report.remarks == ("a fixed mask fits no image: rear",)

@@ -19,8 +19,8 @@ from megloc_kapture.io.kapture import (
 )
 from megloc_kapture.io.kapture.features import FeatureReader, feature_folder
 from megloc_kapture.matching.guided_pyramid import ImageVariant, VariantMatches
+from megloc_kapture.stages.guided_pyramid import PyramidFeatures
 from megloc_kapture.stages.pyramid_mapping import MatchSpool, Spooled
-from megloc_kapture.stages.pyramid_queries import PyramidFeatures
 from megloc_kapture.values import Camera
 
 KEYPOINTS = FeatureConfig("toy", np.dtype("float32"), 3)
@@ -84,7 +84,7 @@ def test_what_is_spooled_comes_back(tmp_path: Path) -> None:
         np.testing.assert_array_equal(found.other_rows, matches.other_rows)
         np.testing.assert_array_equal(found.scores, matches.scores)
     asked = [(2, 4), (0, 1), (2, 0)]
-    at = [places[number].descriptor_at(match, spool.row_bytes) for number, match in asked]
+    at = [spool.descriptor_at(places[number], match) for number, match in asked]
     found = spool.descriptors([("a/1.png", one) for one in at])
     expected = [many[number].descriptors[match] for number, match in asked]
     np.testing.assert_array_equal(found, expected)

@@ -68,14 +68,14 @@ def depth_blocks(context: ResultContext) -> tuple[Block, ...]:
 
 def _pictured(folder: KaptureFolder, row: DepthRow, unit: str) -> Pictures:
     """The panels of an image; raises DataError where it or its depth cannot be read."""
-    from megloc_kapture.stages.rigs import depth_records
-    from megloc_kapture.stages.stereo_depth import read_beside, read_stereo_depth
+    from megloc_kapture.stages.rigs import depth_records, read_depth
+    from megloc_kapture.stages.stereo_depth import read_beside
 
     record = depth_records(folder.read()).get(row.image)
     if record is None:
         raise DataError(f"no depth record of {row.image}", path=folder.root)
     pixels = read_image_rgb(folder.image_path(row.image))
-    depth = subsampled(read_stereo_depth(folder, record))
+    depth = subsampled(read_depth(folder, record))
     known = depth > 0
     low, high = np.quantile(depth[known], _SPAN) if known.any() else (0.0, 0.0)
     # of inverse depth, so that what is near keeps its shades

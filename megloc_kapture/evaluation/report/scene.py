@@ -314,8 +314,7 @@ def _dense_points(
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8], list[str]]:
     """Points (N, 3) of depth by stereo with their colours (N, 3) and images; none without any."""
     from megloc_kapture.mvs.views import AgreementOptions  # loads more than others wait for
-    from megloc_kapture.stages.fusion import fused_cloud
-    from megloc_kapture.stages.stereo_depth import stereo_images
+    from megloc_kapture.stages.stereo_depth import fused_cloud, stereo_images
 
     nothing = np.zeros((0, 3)), np.zeros((0, 3), np.uint8), list[str]()
     if mapping is None:
