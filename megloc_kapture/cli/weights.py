@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,9 +10,9 @@ from typing import Annotated
 
 import tyro
 
-from megloc_kapture.cli.common import Common, Force, Output
-from megloc_kapture.cli.console import Console
-from megloc_kapture.errors import MeglocError, OptionError, OutputError
+from megloc_kapture.cli.common import Common, Console, Force, Output
+from megloc_kapture.errors import MeglocError, OptionError, OutputError, missing_extra
+from megloc_kapture.evaluation.provenance import installed_version
 from megloc_kapture.io.weights import (
     MissingWeightsError,
     WeightsFile,
@@ -27,8 +28,7 @@ from megloc_kapture.io.weights import (
 )
 from megloc_kapture.io.weights.fetch import fetch
 from megloc_kapture.io.weights.registry import PublishedFile, Weights, lookup, registry
-from megloc_kapture.pipeline.missing_weights import check_weights
-from megloc_kapture.pipeline.presets import options_of_preset
+from megloc_kapture.pipeline.presets import check_weights, options_of_preset
 
 WRONG_FILES = 2
 
@@ -281,3 +281,65 @@ def _aligned(rows: Sequence[Sequence[str]]) -> Iterator[str]:
     for row in rows:
         cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
         yield "  ".join(cells).rstrip()
+
+
+_PACKAGES = (
+    "megloc-kapture",
+    "kapture",
+    "numpy",
+    "scipy",
+    "opencv-python-headless",
+    "pycolmap",
+    "poselib",
+    "torch",
+    "numba",
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Doctor(Common):
+    """Check the environment: versions, known-bad combinations, GPU, weights."""
+
+    def run(self) -> int:
+        """Print what there is; exit status 2 when something is wrong."""
+        console = self.console()
+        for package in _PACKAGES:
+            console.result(f"{package:24s}{installed_version(package) or 'not installed'}")
+        console.result(f"{'GPU':24s}{gpu()}")
+        console.result(f"{'weights':24s}{summary()}")
+        problems = find_problems()
+        for problem in problems:
+            console.result(f"problem: {problem}")
+        if problems:
+            raise MeglocError(f"{len(problems)} problems found, see above")
+        console.result("no problem found")
+        return 0
+
+
+def gpu() -> str:
+    """Name of the GPU that torch sees."""
+    try:
+        import torch
+    except ModuleNotFoundError as error:
+        return f"unknown: {missing_extra(error) or error}"
+
+    return torch.cuda.get_device_name(0) if torch.cuda.is_available() else "none"
+
+
+def find_problems() -> list[str]:
+    """Known-bad combinations of installed packages, each with its remedy."""
+    problems = []
+    torch, vision = installed_version("torch"), installed_version("torchvision")
+    if vision and torch and "+cpu" in torch:
+        problems.append(
+            f"torchvision {vision} beside torch {torch}: its CPU builds fail to import and break "
+            "transformers too; pip uninstall torchvision"
+        )
+    if installed_version("opencv-python") and installed_version("opencv-python-headless"):
+        problems.append(
+            "opencv-python beside opencv-python-headless: both write the folder cv2; uninstall "
+            "both and install opencv-python-headless"
+        )
+    if importlib.util.find_spec("cv2") is None:
+        problems.append("cv2 cannot be imported; pip install opencv-python-headless")
+    return problems

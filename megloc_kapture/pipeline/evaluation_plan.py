@@ -16,7 +16,7 @@ from megloc_kapture.evaluation.results import context_of
 from megloc_kapture.io.dataset_tables import SIDE_TABLES, Protocol
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.datasets import DatasetChoice, with_model
-from megloc_kapture.pipeline.missing_weights import check_weights
+from megloc_kapture.pipeline.presets import check_weights
 from megloc_kapture.pipeline.run import Run
 from megloc_kapture.pipeline.submission import write_submission
 from megloc_kapture.plugin_loading import load_plugin

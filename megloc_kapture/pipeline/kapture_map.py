@@ -285,9 +285,7 @@ class KaptureMap:
             taken = sorted({at for start in starts for at in range(start, start + run)})
             # half a pixel of another origin is far within what a map may err by
             sample = observed_keypoints(
-                self.folder,
-                keypoints.index,
-                (images[at] for at in taken if at < len(images)),
+                self.folder, keypoints.index, (images[at] for at in taken if at < len(images))
             )
             found = map_fault(sample, keypoints.index.xyz)
             if found is not None:
@@ -408,8 +406,5 @@ def _find_origin(folder: KaptureFolder, local_type: str, index: MapIndex) -> Pix
     sample = observed_keypoints(folder, index, images[::step])
     known: Origin | None = "corner" if _is_ours(folder, local_type) else None
     return find_pixel_origin(
-        sample,
-        index.xyz,
-        cameras=[data.camera_of(image) for image in images],
-        keypoints_at=known,
+        sample, index.xyz, cameras=[data.camera_of(image) for image in images], keypoints_at=known
     )

@@ -19,21 +19,22 @@ from megloc_kapture.localization.cluster_poses import Clock, interleave
 from megloc_kapture.localization.query_views import ImageMatches, QueryView, TypedMatches
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap
-from megloc_kapture.pipeline.kapture_queries import KaptureQueries, Unit
 from megloc_kapture.pipeline.local_types import local_types_of
 from megloc_kapture.pipeline.map_retrieval import MapRetrieval
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.queries import Preprocessor, Query, QueryImage, QueryImages
+from megloc_kapture.pipeline.queries import (
+    KaptureQueries,
+    Preprocessor,
+    Query,
+    QueryImage,
+    QueryImages,
+    Unit,
+)
 from megloc_kapture.stages.devices import Precision, unheeded
 from megloc_kapture.stages.map_refiners import MapRefiners
 from megloc_kapture.stages.matches import FeatureCache, Features, VerifiedMatches
 from megloc_kapture.stages.options import PipelineOptions
-from megloc_kapture.stages.query_poses import (
-    Solved,
-    in_turn,
-    localize_unit,
-    localize_views,
-)
+from megloc_kapture.stages.query_poses import Solved, in_turn, localize_unit, localize_views
 from megloc_kapture.stages.ranking_scene import KaptureScene
 from megloc_kapture.stages.reranking import counted, rerank
 from megloc_kapture.stages.unreadable import unreadable_image

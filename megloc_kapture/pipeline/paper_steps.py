@@ -275,10 +275,7 @@ _STEPS = (
         lambda o, facts: "" if facts.query_depth else "the queries have no depth",
     ),
     _Step(
-        "poses refined by rendering",
-        "pose_refinement.by",
-        _refines_by("rendering"),
-        _no_map_depth,
+        "poses refined by rendering", "pose_refinement.by", _refines_by("rendering"), _no_map_depth
     ),
     _Step(
         "rendering by a neural field (NeRF-W)",

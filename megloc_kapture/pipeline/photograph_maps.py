@@ -28,9 +28,8 @@ from megloc_kapture.io.dataset_tables import (
     write_unreadable,
 )
 from megloc_kapture.io.kapture import KaptureFolder, write_sensors
-from megloc_kapture.pipeline.missing_weights import check_weights
 from megloc_kapture.pipeline.photographs import Photographs
-from megloc_kapture.pipeline.presets import PRESETS, options_of_preset
+from megloc_kapture.pipeline.presets import PRESETS, check_weights, options_of_preset
 from megloc_kapture.stages.global_features import ExtractGlobalFeatures
 from megloc_kapture.stages.image_pairs import PairMapping
 from megloc_kapture.stages.layout import MAP, MAPPING, QUERY

@@ -15,8 +15,7 @@ from megloc_kapture.io.kapture import KaptureData, Sensor, writable_name
 from megloc_kapture.io.paths import check_relative
 from megloc_kapture.io.photos import UNREAD_SUFFIXES, read_photo, turned_upright
 from megloc_kapture.io.video import VIDEO_SUFFIXES, extract_frames
-from megloc_kapture.pipeline.kapture_queries import Unit
-from megloc_kapture.pipeline.queries import Query
+from megloc_kapture.pipeline.queries import Query, Unit
 from megloc_kapture.values import Camera, RigidTransform
 
 FRAMES_EVERY = 30

@@ -16,9 +16,9 @@ from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.output_folders import staged_output
 from megloc_kapture.io.tables import CONSISTENCY_FILE, write_consistency
 from megloc_kapture.localization.shared_camera import solve_with_shared_camera
-from megloc_kapture.pipeline.kapture_queries import KaptureQueries
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.photographs import Photographs
+from megloc_kapture.pipeline.queries import KaptureQueries
 from megloc_kapture.stages.layout import LOCALIZED
 from megloc_kapture.stages.localized_folder import query_status, write_localized
 from megloc_kapture.stages.unreadable import unreadable_image

@@ -34,9 +34,16 @@ from megloc_kapture.pipeline.executors import available_cores
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.queries import Query as ImageQuery
 from megloc_kapture.service import pages
-from megloc_kapture.service.answers import Answer, Refused, answer_of, read_camera
 from megloc_kapture.service.limits import Busy, Limits, Rates, Turns, client_of
-from megloc_kapture.service.photographs import Photograph, TooManyPixels, UnknownFormat
+from megloc_kapture.service.photographs import (
+    Answer,
+    Photograph,
+    Refused,
+    TooManyPixels,
+    UnknownFormat,
+    answer_of,
+    read_camera,
+)
 from megloc_kapture.values import Camera
 
 _PATH = re.compile(r"(^|[\s'\"(=])/\w[^\s]*/")

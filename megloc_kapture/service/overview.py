@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,3 +63,9 @@ def _sample(rows: NDArray[np.float64], most: int) -> NDArray[np.float64]:
 
 def _rounded(values: NDArray[np.float64], digits: int = 5) -> list[float]:
     return [float(f"{value:.{digits}g}") for value in values.ravel().tolist()]
+
+
+@cache
+def read(name: str) -> str:
+    """A page of this folder."""
+    return Path(__file__).with_name(name).read_text(encoding="utf-8")

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import tyro
 
-from megloc_kapture.cli.examples import EXAMPLES
+from megloc_kapture.cli.arguments import EXAMPLES
 from megloc_kapture.cli.main import COMMANDS, _parser
 from megloc_kapture.pipeline.presets import options_of_preset
 

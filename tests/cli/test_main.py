@@ -16,7 +16,7 @@ import pytest
 
 from megloc_kapture import plugin_loading
 from megloc_kapture.cli.arguments import summary
-from megloc_kapture.cli.console import Console
+from megloc_kapture.cli.common import Console
 from megloc_kapture.cli.main import COMMANDS, command_class
 
 BAD_ARGUMENTS = {
@@ -169,7 +169,7 @@ def test_doctor_finds_no_problem_here(megloc: Any) -> None:
 def test_progress_says_how_many_how_fast_and_how_long(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("megloc_kapture.cli.console._LINE_EVERY_S", 0.0)
+    monkeypatch.setattr("megloc_kapture.cli.common._LINE_EVERY_S", 0.0)
     assert list(Console().track("abc", 3, "features, 4 of 7 kept")) == ["a", "b", "c"]
     lines = capsys.readouterr().err.splitlines()
     for number, line in enumerate(lines, start=1):
@@ -234,7 +234,7 @@ def test_a_signal_ends_a_run_whatever_it_meets(number: str, told: str, meeting: 
     script = f"""
 import ctypes, signal, sys, time
 from megloc_kapture.cli import main
-from megloc_kapture.cli.doctor import Doctor
+from megloc_kapture.cli.weights import Doctor
 from megloc_kapture.errors import MeglocError
 def run(self):
 {meeting}

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 import megloc_kapture
-from megloc_kapture.cli.options import shown
+from megloc_kapture.cli.info import shown
 from megloc_kapture.pipeline.presets import PRESETS, options_of, options_of_preset
 from megloc_kapture.stages.options import PipelineOptions
 
