@@ -80,8 +80,11 @@ class MapKeypoints:
         return all(image in self._descriptors for image in images if image in self._keypoints)
 
     def extractor(self) -> PluginChoice | None:
-        """The extractor plugin that makes this type of features; None where there is none."""
-        return extractor_of(self.folder, self.name)
+        """The extractor plugin of the type, by its name or that in its file; None without one."""
+        names = [self.name, base_type(self.name)]
+        if self.name in self.folder.types("keypoints"):
+            names.append(self._keypoints.config.name)
+        return next((found for name in names if (found := _extractor_named(name))), None)
 
     def check(self, images: Collection[str]) -> None:
         """Compare the sizes of the images' feature files; reads none of them.
@@ -167,9 +170,8 @@ class KaptureMap:
             indices = _read_indices(folder, keypoints_types)
         origins = _find_origins(folder, indices)
         if pixel_origin != "auto":
-            given: Origin = pixel_origin
             origins = {
-                name: replace(found, intrinsics=given, reason=AS_ASKED)
+                name: replace(found, intrinsics=pixel_origin, reason=AS_ASKED)
                 for name, found in origins.items()
             }
         keypoints = {n: MapKeypoints(folder, n, indices[n], origins[n]) for n in indices}
@@ -181,16 +183,10 @@ class KaptureMap:
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickled it is its folders' names; another process opens it again."""
         asked = self.pixel_origin.intrinsics if self.pixel_origin.reason == AS_ASKED else "auto"
-        folder = self.folder
-        linked = tuple(path.absolute() for path in folder.allow_links_below)
-        features = tuple(path.absolute() for path in folder.features_dirs)
-        return _opened_again, (
-            folder.root.absolute(),
-            tuple(self.keypoints),
-            features,
-            asked,
-            linked,
-        )
+        linked = tuple(path.absolute() for path in self.folder.allow_links_below)
+        features = tuple(path.absolute() for path in self.folder.features_dirs)
+        root = self.folder.root.absolute()
+        return _opened_again, (root, tuple(self.keypoints), features, asked, linked)
 
     @property
     def pixel_origin(self) -> PixelOrigin:
@@ -208,9 +204,9 @@ class KaptureMap:
             return self.keypoints[name]
         index = index_map(self.folder, name)
         origin = self.pixel_origin
-        if not _is_ours(self.folder, name):
-            return MapKeypoints(self.folder, name, index, origin)
-        return MapKeypoints(self.folder, name, index, replace(origin, keypoints="corner"))
+        if _is_ours(self.folder, name):
+            origin = replace(origin, keypoints="corner")
+        return MapKeypoints(self.folder, name, index, origin)
 
     @cached_property
     def unit(self) -> str:
@@ -309,14 +305,6 @@ def check_lengths(keypoints: FeatureReader, descriptors: FeatureReader, image: s
         raise DataError(
             f"{found} descriptors for {expected} keypoints", path=descriptors.where(image)
         )
-
-
-def extractor_of(folder: KaptureFolder, local_type: str) -> PluginChoice | None:
-    """The extractor plugin of a keypoints type: by the folder's name, or the name in its file."""
-    names = [local_type, base_type(local_type)]
-    if local_type in folder.types("keypoints"):
-        names.append(folder.keypoints(local_type).config.name)
-    return next((found for name in names if (found := _extractor_named(name))), None)
 
 
 def _extractor_named(name: str) -> PluginChoice | None:

@@ -277,10 +277,7 @@ class Localizer:
         What orders candidates by their matches, and guided pyramids, need all matches at first;
         else no more candidates are matched than are taken.
         """
-        asked = [
-            self._asked(image, cam_from_rig)
-            for image, (_, cam_from_rig) in zip(images, unit, strict=True)
-        ]
+        asked = [self._asked(image, at) for image, (_, at) in zip(images, unit, strict=True)]
         whole = self.options.reranking.reranks() or self.options.matches_again()
         matched = [self._match(one, len(one.ranked) if whole else 0) for one in asked]
 
@@ -364,10 +361,10 @@ class Localizer:
         image = self._preprocessor.of(query)
         features = [local.of_query(image) for local in self.types]
         found = self._retrieval.rank(image, features, self._permitted(query))
-        if not self.options.reranking.reranks():
-            return found
-        matched = [local.match(f, found) for local, f in zip(self.types, features, strict=True)]
-        return [found[at] for at in self._kept(matched)]
+        if self.options.reranking.reranks():
+            matched = [one.match(own, found) for one, own in zip(self.types, features, strict=True)]
+            found = [found[at] for at in self._kept(matched)]
+        return found
 
     def _permitted(self, query: Query) -> list[str]:
         if query.prior is None:

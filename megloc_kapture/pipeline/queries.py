@@ -1,4 +1,4 @@
-"""Queries of the localizer: images, or features that somebody else extracted, pre-processed."""
+"""Queries of the localizer: images or given features, pre-processed; those of kapture folders."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from megloc_kapture.datasets.kapture_folders import check_image
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.files import link_images
 from megloc_kapture.io.images import read_image_rgb
-from megloc_kapture.io.kapture import FeatureReader, KaptureData, KaptureFolder
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder
 from megloc_kapture.io.photos import turned_upright
 from megloc_kapture.localization.focal_length import estimate_remark
 from megloc_kapture.matching.guided_pyramid import equivalent_types
@@ -130,6 +130,7 @@ class Preprocessor:
 
     def __init__(self, options: PipelineOptions) -> None:
         self._options = options
+        self.mask_margin_px = options.mask_margin_px
         masks = options.preprocessing.masks
         if masks != MaskOptions(segmenter=masks.segmenter, dynamic=masks.dynamic):
             raise OptionError(
@@ -157,11 +158,6 @@ class Preprocessor:
             return None
         segmenter = load_plugin(SEGMENTERS, masks.segmenter.name, masks.segmenter.options)
         return ClassMasks.of(segmenter, masks.dynamic)
-
-    @property
-    def mask_margin_px(self) -> float:
-        """Features nearer than this to a masked pixel are left out."""
-        return self._options.mask_margin_px
 
 
 class QueryImage:
@@ -204,11 +200,7 @@ class QueryImage:
     def mask(self) -> NDArray[np.bool_] | None:
         """Its mask bool (H, W), True = use: its own, dynamic classes, what the original shows.
 
-        None where all of it is used.
-
-        Raises
-        ------
-        DataError : the mask cannot be read, or is not of the camera's size.
+        None where all of it is used. Raises DataError.
         """
         return self._frame.mask
 
@@ -276,11 +268,10 @@ class KaptureQueries:
         self.names = self._data.image_names()
         self.unreadable: dict[str, str] = {}
         self.faults: dict[str, str] = {}
-        stored = kapture_map.stored_types()
-        self._stored = stored
+        self._stored = stored = kapture_map.stored_types()
         wanted = {other for name in stored for other in equivalent_types(name)}
         brought = set(folder.types("keypoints")).intersection(folder.types("descriptors"))
-        self._local: dict[str, tuple[FeatureReader, FeatureReader]] = {
+        self._local = {
             name: (folder.keypoints(name), folder.descriptors(name))
             for name in sorted(wanted & brought)
         }
@@ -316,7 +307,7 @@ class KaptureQueries:
         if not self.names:
             raise DataError("there are no query images", path=self._folder.root)
         self._check_widths()
-        first: DataError | None = None
+        errors = []
         for name in self.names:
             if any(name in keypoints for keypoints, _ in self._local.values()):
                 continue
@@ -324,10 +315,10 @@ class KaptureQueries:
                 check_image(self._folder, name)
             except DataError as error:
                 self.unreadable[name] = error.message
-                first = first or error
+                errors.append(error)
         self.names = [name for name in self.names if name not in self.unreadable]
-        if first is not None and not self.names:
-            raise first
+        if not self.names:
+            raise errors[0]
 
     def data(self) -> KaptureData:
         """Sensors, rigs and records."""
@@ -364,12 +355,8 @@ class KaptureQueries:
         ]
 
     def units(self, *, rigs: bool) -> list[tuple[str, ...]]:
-        """Names of the images that are localized together.
-
-        Parameters
-        ----------
-        rigs : whether cameras of one rig and one moment are; else every image by itself.
-        """
+        """Names of the images that are localized together: with ``rigs`` those of one rig and
+        moment, else every image by itself."""
         return [tuple(image for image, _ in unit) for unit in self._units(rigs=rigs)]
 
     def read_units(self, *, rigs: bool) -> Iterator[Unit]:
@@ -400,16 +387,11 @@ class KaptureQueries:
             name=name,
             features=features,
             global_features=of_image,
-            prior=self._prior(name),
+            prior=self._priors[name] if name in self._map.restrictions.priors else None,
             candidates=candidates,
             mask=mask_path(self._folder, name),
             depth=partial(depth_of, self._folder, name) if self._data.records_depth else None,
         )
-
-    def _prior(self, name: str) -> tuple[str, ...] | None:
-        if name not in self._map.restrictions.priors:
-            return None
-        return self._priors[name]
 
     @cached_property
     def _priors(self) -> dict[str, tuple[str, ...]]:

@@ -12,7 +12,7 @@ from pydantic import Field, ValidationError, field_validator
 
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.dataset_tables import SIDE_TABLES, Protocol, read_protocol
-from megloc_kapture.pipeline.datasets import TWIN_PREFIX, DatasetChoice, choose_dataset, has_model
+from megloc_kapture.pipeline.datasets import TWIN_PREFIX, DatasetChoice, choose_dataset, with_model
 from megloc_kapture.pipeline.paper_steps import DatasetFacts, LayeredOptions, PaperStep, paper_steps
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, PRESETS, options_of_preset
 from megloc_kapture.pipeline.submission import place_of
@@ -220,7 +220,9 @@ def choose_run(
         find_root=find_root,
     )
     source.check()
-    facts = DatasetFacts(source.has_map_depth(), source.has_query_depth(), has_model(source))
+    facts = DatasetFacts(
+        source.has_map_depth(), source.has_query_depth(), with_model(source) is not None
+    )
     of_file = benchmark.changes(preset, query_depth=facts.query_depth)
     layers = LayeredOptions(
         preset,
