@@ -5,11 +5,12 @@ from __future__ import annotations
 import logging
 import sys
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
@@ -29,6 +30,7 @@ from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera
 
 if TYPE_CHECKING:
+    from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
     from megloc_kapture.pipeline.workspace import Workspace
 
 Input = Annotated[Path, tyro.conf.arg(aliases=["-i"])]
@@ -223,6 +225,21 @@ class Reading(Linked):
         return KaptureFolder(
             root,
             features_dirs=existing(self.features_dir),
+            allow_links_below=existing(self.allow_links_below),
+        )
+
+    def opening(
+        self, path: Path, keypoints_types: tuple[str, ...], pixel_origin: PixelOriginChoice
+    ) -> Callable[..., KaptureMap]:
+        """What opens a map with these flags; raises DataError for a folder that is not there."""
+        from megloc_kapture.pipeline.kapture_map import KaptureMap
+
+        return partial(
+            KaptureMap.open,
+            path,
+            keypoints_types=keypoints_types,
+            features_dirs=existing(self.features_dir),
+            pixel_origin=pixel_origin,
             allow_links_below=existing(self.allow_links_below),
         )
 

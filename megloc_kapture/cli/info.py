@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from megloc_kapture.cli.common import Common, Console, Reading, existing, opened_map
+from megloc_kapture.cli.common import Common, Console, Reading, opened_map
 from megloc_kapture.cli.maps import report_lines
 from megloc_kapture.errors import MeglocError, OptionError
 from megloc_kapture.features.vlad import VladOptions
@@ -74,20 +74,12 @@ class Info(Reading, Common):
 
     def _describe_map(self, console: Console, root: Path) -> None:
         try:
-            opened = KaptureMap.open(
-                root,
-                keypoints_types=self.keypoints_type,
-                features_dirs=existing(self.features_dir),
-                pixel_origin=self.pixel_origin,
-                allow_links_below=existing(self.allow_links_below),
-            )
+            opened = self.opening(root, self.keypoints_type, self.pixel_origin)()
         except MeglocError as error:
             line(console, "localizing", f"not possible: {error}")
             return
-        text = (
-            "metres" if opened.unit == METRES else f"none: {opened.unit} of its own, no scale known"
-        )
-        line(console, "unit", text)
+        unknown = f"none: {opened.unit} of its own, no scale known"
+        line(console, "unit", "metres" if opened.unit == METRES else unknown)
         if fault := opened.fault():
             line(console, "FAULT", fault)
         for local_type, keypoints in opened.keypoints.items():
@@ -97,11 +89,7 @@ class Info(Reading, Common):
             line(console, "localizing with", local_type)
             line(console, "pixel origin", f"{origin.intrinsics}: {origin.reason}")
             line(console, "", f"median reprojection error by origin: {errors}")
-            line(
-                console,
-                "map descriptors",
-                describe_descriptors(opened, keypoints, None if found is None else found.name),
-            )
+            line(console, "map descriptors", describe_descriptors(opened, keypoints, found))
             line(console, "query features", describe_extraction(local_type, found))
         describe_retrieval(console, opened)
 
@@ -120,17 +108,13 @@ def describe_content(console: Console, folder: KaptureFolder) -> None:
     for kind in ("keypoints", "descriptors", "global_features"):
         for name in folder.types(kind):
             reader = getattr(folder, kind)(name)
-            config = reader.config
-            line(
-                console,
-                kind.replace("_", " "),
-                f"{name}: {len(reader.names)} images, {config.dtype.name} x {config.dsize}",
-            )
+            stored = f"{reader.config.dtype.name} x {reader.config.dsize}"
+            text = f"{name}: {len(reader.names)} images, {stored}"
+            line(console, kind.replace("_", " "), text)
     for name in folder.types("matches"):
         line(console, "matches", f"{name}: {len(folder.matches(name).pairs)} pairs")
     if folder.has_points():
-        points = len(folder.points3d())
-        line(console, "points", str(points))
+        line(console, "points", str(len(folder.points3d())))
         for name, seen in sorted(folder.observations().items()):
             line(console, "observations", f"{name}: {len(seen.point_ids)}")
         describe_refinement(console, folder)
@@ -163,7 +147,9 @@ def describe_extraction(local_type: str, extractor: PluginChoice | None) -> str:
     return f"extracted by plugin {extractor.name}, or given in kapture"
 
 
-def describe_descriptors(opened: KaptureMap, keypoints: MapKeypoints, extractor: str | None) -> str:
+def describe_descriptors(
+    opened: KaptureMap, keypoints: MapKeypoints, extractor: PluginChoice | None
+) -> str:
     """What is known of a map's descriptors, in words."""
     if keypoints.has_descriptors(opened.images):
         return "there"
@@ -171,7 +157,7 @@ def describe_descriptors(opened: KaptureMap, keypoints: MapKeypoints, extractor:
         return "missing, and no extractor for the type is installed: localizing is not possible"
     if not opened.has_images():
         return "missing, and no images to extract them from: localizing is not possible"
-    return f"missing; will be extracted again by plugin {extractor}"
+    return f"missing; will be extracted again by plugin {extractor.name}"
 
 
 def describe_retrieval(console: Console, opened: KaptureMap) -> None:
@@ -185,8 +171,7 @@ def describe_retrieval(console: Console, opened: KaptureMap) -> None:
     types = local_types_of(opened, options, FeatureCache())
     retrieval = MapRetrieval(opened, options, types, Preprocessor(options))
     line(console, "retrieval", retrieval.describe_candidates(()))
-    brought = opened.global_types()
-    if brought:
+    if brought := opened.global_types():
         text = retrieval.describe_candidates(brought)
         line(console, "", f"where queries bring {', '.join(brought)}: {text}")
 

@@ -22,7 +22,6 @@ from megloc_kapture.cli.common import (
     Reading,
     Texts,
     camera_of_text,
-    existing,
     opened_map,
 )
 from megloc_kapture.errors import DataError, OptionError
@@ -82,13 +81,8 @@ class Localize(Reading, Deciding, Common):
         console = self.console()
         self._check_queries()
         workers = available_cores() if self.workers is None else self.workers
-        kapture_map = KaptureMap.open(
-            opened_map(self.input, console),
-            keypoints_types=self.keypoints_type,
-            features_dirs=existing(self.features_dir),
-            pixel_origin=self.pixel_origin,
-            allow_links_below=existing(self.allow_links_below),
-        )
+        path = opened_map(self.input, console)
+        kapture_map = self.opening(path, self.keypoints_type, self.pixel_origin)()
         _check_consistent(kapture_map, self.input, force=self.force)
         options = _options_of(self)
         folder: KaptureFolder | Photographs
@@ -171,7 +165,7 @@ class Serve(Reading, Deciding, Common):
     def run(self) -> int:
         """Run it."""
         from megloc_kapture.cli.main import INTERRUPTED, TERMINATED, Terminated
-        from megloc_kapture.service.server import ServedMap, bind, serve
+        from megloc_kapture.service.server import bind, serve
 
         console = self.console()
         if self.workers < 1:
@@ -181,15 +175,9 @@ class Serve(Reading, Deciding, Common):
         token = None if self.token_file is None else _read_token(self.token_file)
         options = _options_of(self)
         with bind(self.host, self.port) as bound:
-            served = ServedMap(
-                opened_map(self.map, console),
-                options,
-                self.keypoints_type,
-                existing(self.features_dir),
-                self.pixel_origin,
-                existing(self.allow_links_below),
-            )
-            kapture_map = served.open()
+            path = opened_map(self.map, console)
+            opening = self.opening(path, self.keypoints_type, self.pixel_origin)
+            kapture_map = opening()
             _check_consistent(kapture_map, self.map, force=self.force)
             typed = assigned(self.assignments())
             types = local_types_of(kapture_map, options, FeatureCache())
@@ -204,8 +192,9 @@ class Serve(Reading, Deciding, Common):
 
             try:
                 serve(
-                    served,
+                    opening,
                     kapture_map,
+                    options,
                     bound,
                     limits=limits,
                     workers=self.workers,

@@ -77,10 +77,9 @@ class Fetch(Common):
         console = self.console()
         names = self.names
         if self.preset is not None:
-            missing = _missing(self.preset)
-            if not (missing or names):
+            names = tuple(dict.fromkeys((*names, *_missing(self.preset))))
+            if not names:
                 console.result(f"{self.preset}: no weights are missing")
-            names = tuple(dict.fromkeys((*names, *missing)))
         elif not names:
             raise OptionError(f"say which weights to fetch: {', '.join(registry())}")
         wanted, refused = [], []

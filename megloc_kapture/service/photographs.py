@@ -1,4 +1,4 @@
-"""Photographs that strangers send: measured before anything of them is decoded.
+"""Photographs that strangers send, measured before anything of them is decoded; and the answers.
 
 What a decoder would do is bounded by the header: pixels, and the scans of a progressive JPEG, each
 of which goes over all of them. pillow reads headers too, at a microsecond a segment in Python, of
@@ -266,3 +266,22 @@ def _finite(value: Any) -> Any:
     rows = value if isinstance(value, list) else [[value]]
     known = value is not None and all(math.isfinite(x) for row in rows for x in row)
     return value if known else None
+
+
+def camera_of(photograph: Photograph, camera: str | None) -> tuple[Camera, int]:
+    """The camera, and how the pixels are to be turned before (1: not); raises DataError."""
+    if not camera:
+        found = photograph.exif()
+        if found is None:
+            raise DataError(
+                "the camera is missing, and the image has no EXIF with a focal length: send "
+                "`camera`, JSON with model, width, height and params as COLMAP defines them"
+            )
+        return found.upright_camera, found.orientation
+    given = read_camera(camera)
+    if (given.width, given.height) != (photograph.width, photograph.height):
+        raise DataError(
+            f"the image is {photograph.width}x{photograph.height} as it is stored, its camera says "
+            f"{given.width}x{given.height}"
+        )
+    return given, 1

@@ -11,7 +11,7 @@ import pytest
 
 from megloc_kapture.cli.main import main
 from megloc_kapture.pipeline.kapture_map import KaptureMap
-from megloc_kapture.service.overview import map_overview
+from megloc_kapture.service.server import map_overview
 
 FEW = ("--set", "local_features.options.max_keypoints=700", "--executor", "inline")
 
