@@ -111,6 +111,13 @@ def assigned_pairs(flag: str, texts: Sequence[str], takes: str) -> Iterator[tupl
         yield name, value
 
 
+def refuse_given(of: str, **flags: object) -> None:
+    """Raise OptionError where one of these flags, which are of others, is given."""
+    for name, value in flags.items():
+        if value is not None:
+            raise OptionError(f"--{name.replace('_', '-')} changes nothing: it is of {of}")
+
+
 def opened_map(path: Path, console: Console) -> Path:
     """The kapture folder of a map, or of a workspace; a COLMAP model's is made in the user's cache,
     and said."""

@@ -193,8 +193,8 @@ class Check(Common):
         from megloc_kapture.evaluation.check.reading import read_reference
         from megloc_kapture.evaluation.check.submission import check_submission
         from megloc_kapture.io.dataset_tables import PROTOCOL_FILE, SIDE_TABLES
-        from megloc_kapture.pipeline.datasets import TWIN_PREFIX
-        from megloc_kapture.pipeline.submission import check_dataset, check_known
+        from megloc_kapture.pipeline.datasets import TWIN_PREFIX, check_known
+        from megloc_kapture.pipeline.submission import check_dataset
 
         console = self.console()
         check_known(self.dataset)

@@ -23,6 +23,7 @@ from megloc_kapture.cli.common import (
     Texts,
     camera_of_text,
     opened_map,
+    refuse_given,
 )
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.dataset_tables import METRES
@@ -133,9 +134,7 @@ class Localize(Reading, Deciding, Common):
         if (self.query is None) == (not self.images):
             raise OptionError("give the queries: either --query, a kapture folder, or --images")
         if self.query is not None:
-            for name, given in (("--camera", self.camera), ("--every", self.every)):
-                if given is not None:
-                    raise OptionError(f"{name} changes nothing: it is of --images")
+            refuse_given("--images", camera=self.camera, every=self.every)
 
 
 @dataclass(frozen=True, kw_only=True)

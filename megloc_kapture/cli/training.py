@@ -21,6 +21,7 @@ from megloc_kapture.cli.common import (
     Working,
     assigned_pairs,
     camera_of_text,
+    refuse_given,
 )
 from megloc_kapture.errors import DataError, OptionError, OutputError
 from megloc_kapture.io.images import WRITABLE_SUFFIXES
@@ -207,18 +208,14 @@ class Render(Linked, Working):
             raise OptionError("say what to render: --pose and --camera, --along or --between")
         many = self.along or self.between
         if many is None:
-            for name in ("max_side", "workers", "scheduler"):
-                if getattr(self, name) is not None:
-                    flag = "--" + name.replace("_", "-")
-                    raise OptionError(f"{flag} changes nothing: it is of --along and --between")
+            others = {"workers": self.workers, "scheduler": self.scheduler}
+            refuse_given("--along and --between", max_side=self.max_side, **others)
             self._render_one()
             console.result(f"rendered: {self.output}")
             return 0
         if self.max_side is not None and self.max_side < 1:
             raise OptionError(f"--max-side {self.max_side} is not positive")
-        for name in ("camera", "depth"):
-            if getattr(self, name) is not None:
-                raise OptionError(f"--{name} changes nothing: it is of --pose")
+        refuse_given("--pose", camera=self.camera, depth=self.depth)
         data = self.kapture(many).read()
         if not data.poses():
             raise DataError("no image here has a pose", path=many)

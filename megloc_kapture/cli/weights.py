@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -259,20 +260,16 @@ def _state(weights: Weights) -> str:
 
 
 def _row(weights: Weights) -> tuple[str, ...]:
-    file = next((f for f in weights.files if _is_there(weights, f)), weights.files[0])
+    there: list[PublishedFile | None] = []
+    with suppress(MeglocError):
+        there = [describe(weights.name, path).published for path in files_of(weights)]
+    file = next((one for one in weights.files if one in there), weights.files[0])
     size = "?" if file.size is None else f"{file.size / 1e6:.2f} MB"
     name = f"{weights.name} *" if weights.unverified else weights.name
     licence = weights.licence if weights.commercial else f"{weights.licence} (!)"
     known = "known" if file.sha256 else "not known"
     names = " | ".join(f.name for f in weights.files)
     return name, weights.purpose, names, size, licence, _state(weights), known
-
-
-def _is_there(weights: Weights, file: PublishedFile) -> bool:
-    try:
-        return any(describe(weights.name, path).published == file for path in files_of(weights))
-    except MeglocError:
-        return False
 
 
 def _aligned(rows: Sequence[Sequence[str]]) -> Iterator[str]:

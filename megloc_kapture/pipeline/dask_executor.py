@@ -21,7 +21,6 @@ from concurrent.futures import wait as wait_for
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +29,7 @@ from distributed.client import ClosedClientError
 from distributed.comm.core import CommClosedError
 
 from megloc_kapture.errors import MeglocError, OptionError
+from megloc_kapture.evaluation.provenance import installed_version
 from megloc_kapture.io.files import clear_leftovers, owned_name
 from megloc_kapture.io.weights import describe, files_of, sha256_of, share_weights
 from megloc_kapture.io.weights.registry import registry
@@ -279,12 +279,9 @@ class _Preparation(WorkerPlugin):
 
 
 def _packages() -> dict[str, str]:
-    """Versions of what computes; empty for one that is not there."""
+    """Versions of what computes; "none" of what is not there."""
     found = {"Python": platform.python_version(), "machine": f"{sys.platform} {platform.machine()}"}
-    for name in _PACKAGES:
-        with suppress(metadata.PackageNotFoundError):
-            found[name] = metadata.version(name)
-    return {name: found.get(name, "none") for name in ("Python", "machine", *_PACKAGES)}
+    return found | {name: installed_version(name) or "none" for name in _PACKAGES}
 
 
 def _weights() -> dict[str, str]:

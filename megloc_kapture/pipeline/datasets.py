@@ -23,7 +23,7 @@ from megloc_kapture.datasets.kapture_folders import (
 )
 from megloc_kapture.datasets.official import OfficialDataset, write_official
 from megloc_kapture.errors import OptionError, PluginError, suggestion
-from megloc_kapture.evaluation.protocols import TWIN_PREFIX
+from megloc_kapture.evaluation.protocols import TWIN_PREFIX as TWIN_PREFIX
 from megloc_kapture.io.dataset_tables import SIDE_TABLES, Protocol
 from megloc_kapture.io.files import write_bytes
 from megloc_kapture.io.kapture import KaptureFolder
@@ -157,6 +157,12 @@ def dataset_names() -> list[str]:
     return [KAPTURE, *official, SYNTHETIC, *(f"{TWIN_PREFIX}{name}" for name in official)]
 
 
+def check_known(dataset: str) -> None:
+    """Refuse a dataset that nobody knows; raises OptionError with those that are known."""
+    if dataset not in dataset_names():
+        raise OptionError(f"unknown dataset {dataset!r}; {suggestion(dataset, dataset_names())}")
+
+
 def choose_dataset(
     name: str,
     root: Path | None,
@@ -177,8 +183,7 @@ def choose_dataset(
     OptionError : unknown name, no root where one is needed (says where the data is published), or
         an option the dataset does not have.
     """
-    if name not in dataset_names():
-        raise OptionError(f"unknown dataset {name!r}; {suggestion(name, dataset_names())}")
+    check_known(name)
     layout = name.removeprefix(TWIN_PREFIX)
     adapter: DatasetAdapter | None = None
     if layout not in (KAPTURE, SYNTHETIC):
@@ -258,17 +263,3 @@ def twin_of(layout: str, **options: Any) -> RenderedDataset:
         raise OptionError(f"nothing renders {layout!r}; known: {', '.join(known)}")
     twin: RenderedDataset = load_plugin(RENDERED_DATASETS, layout, options)
     return twin
-
-
-__all__ = [
-    "KAPTURE",
-    "SUMMARY_FILE",
-    "SYNTHETIC",
-    "TWIN_PREFIX",
-    "DatasetChoice",
-    "ProtocolChange",
-    "choose_dataset",
-    "dataset_names",
-    "summary_text",
-    "twin_of",
-]

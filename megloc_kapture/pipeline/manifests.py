@@ -12,6 +12,7 @@ import hashlib
 import json
 import os
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from stat import S_ISREG
 from typing import Any
@@ -22,8 +23,6 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.io.file_states import FileState, state_if_unchanged, state_of
 from megloc_kapture.io.files import output_error, read_content, read_json_model, write_bytes
 from megloc_kapture.values import Options
-
-_CHUNK_BYTES = 1 << 20
 
 
 class Manifest(Options):
@@ -58,8 +57,6 @@ def fingerprint(
 
 def read_manifest(path: Path) -> Manifest | None:
     """The manifest, None where there is none that can be read: then the stage has to run."""
-    if not path.is_file():
-        return None
     try:
         return read_json_model(path, Manifest)
     except DataError:
@@ -76,14 +73,11 @@ class FileHashes:
     def __init__(self, path: Path, written: Mapping[str, FileState] | None = None) -> None:
         """``path`` is where they are remembered; ``written`` are files whose state is known."""
         self._written = written or {}
-        self._known: dict[str, list[Any]] = {}
         self._seen: dict[str, list[Any]] = {}
-        if path.is_file():
-            try:
-                content = json.loads(path.read_text(encoding="utf-8"))
-                self._known = content if isinstance(content, dict) else {}
-            except (OSError, ValueError):
-                self._known = {}
+        content = None
+        with suppress(OSError, ValueError):
+            content = json.loads(path.read_text(encoding="utf-8"))
+        self._known: dict[str, list[Any]] = content if isinstance(content, dict) else {}
 
     def of_file(self, path: Path) -> str:
         """Hash of one file's content; raises DataError when it cannot be read."""
@@ -100,14 +94,12 @@ class FileHashes:
             if isinstance(known, list) and known[:4] == state and len(known) == 5:
                 self._seen[key] = known
                 return str(known[4])
-            digest = hashlib.sha256()
             with open(path, "rb") as file:
-                while chunk := file.read(_CHUNK_BYTES):
-                    digest.update(chunk)
+                sha256 = hashlib.file_digest(file, "sha256").hexdigest()
         except OSError as error:
             raise DataError(f"cannot be read: {error.strerror}", path=path) from error
-        self._seen[key] = [*state, digest.hexdigest()]
-        return digest.hexdigest()
+        self._seen[key] = [*state, sha256]
+        return sha256
 
     def of_files(self, root: Path, files: Iterable[Path]) -> str:
         """One hash of many files: their names relative to ``root`` and their contents."""

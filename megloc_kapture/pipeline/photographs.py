@@ -123,9 +123,8 @@ class Photographs:
         sensor_ids: dict[tuple[str, Camera], str] = {}
         for timestamp, name in enumerate(self.names):
             image = self._images[name]
-            sensor_id = sensor_ids.setdefault(
-                (image.make, image.camera), f"camera{len(sensor_ids)}"
-            )
+            key = image.make, image.camera
+            sensor_id = sensor_ids.setdefault(key, f"camera{len(sensor_ids)}")
             title = image.make.replace(",", " ")
             data.sensors[sensor_id] = Sensor.from_camera(image.camera, name=title)
             data.records_camera[timestamp, sensor_id] = name

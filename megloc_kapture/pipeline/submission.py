@@ -12,7 +12,7 @@ from types import MappingProxyType
 from typing import Any
 
 from megloc_kapture.datasets.kapture_folders import MAPPING, QUERY
-from megloc_kapture.errors import DataError, OptionError, suggestion
+from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.evaluation.pose_files import (
     RelativePose,
     format_mlad_file,
@@ -38,7 +38,13 @@ from megloc_kapture.io.files import write_bytes, write_json
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder
 from megloc_kapture.io.paths import safe_join
 from megloc_kapture.io.tables import STATUS_FILE, QueryStatus, read_status
-from megloc_kapture.pipeline.datasets import KAPTURE, SYNTHETIC, TWIN_PREFIX, dataset_names
+from megloc_kapture.pipeline.datasets import (
+    KAPTURE,
+    SYNTHETIC,
+    TWIN_PREFIX,
+    check_known,
+    dataset_names,
+)
 from megloc_kapture.pipeline.manifests import read_manifest
 from megloc_kapture.stages import rigs
 from megloc_kapture.values import Pose, RigidTransform
@@ -90,12 +96,6 @@ def check_dataset(dataset: str, protocol: Protocol, *, tables: Path | None) -> N
             f"dataset {dataset} is asked for, and {(tables or Path()) / PROTOCOL_FILE} is of "
             f"dataset {protocol.dataset}"
         )
-
-
-def check_known(dataset: str) -> None:
-    """Refuse a dataset that nobody knows; raises OptionError with those that are known."""
-    if dataset not in dataset_names():
-        raise OptionError(f"unknown dataset {dataset!r}; {suggestion(dataset, dataset_names())}")
 
 
 def place_of(folder: Path, stem: str, protocol: Protocol) -> Path:
