@@ -46,7 +46,7 @@ class Options(BaseModel):
     def idle(self) -> dict[str, str]:
         """Options that change nothing while the others are as they are: name to the reason.
 
-        Who sets one of them meant something else: it is refused (pipeline/assignments.py).
+        Who sets one of them meant something else: it is refused (pipeline/presets.py).
         """
         return {}
 

@@ -1,4 +1,4 @@
-"""Errors of the command line itself, in one line like every other."""
+"""Help and errors of the command line: examples behind every page, errors in one line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``megloc info``: what is in a kapture folder, and what is missing to localize in it."""
+"""``megloc info`` and ``options``: what a kapture folder has, and which options there are."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``megloc weights``: what each network needs, where it is published, what its licence allows."""
+"""``megloc weights`` and ``doctor``: weights of networks and their licences; the environment."""
 
 from __future__ import annotations
 

@@ -32,37 +32,26 @@ _BESIDE = frozenset({"import", "submission", "evaluation"})
 
 @dataclass(frozen=True)
 class Variant:
-    """A run without one step.
-
-    Attributes
-    ----------
-    name : of the step, in words; ``slug`` is its folder below ``ablation/``.
-    """
+    """A run without one step, which is named in words."""
 
     name: str
     options: PipelineOptions
 
     @property
     def slug(self) -> str:
-        """The name of its folder."""
+        """Its folder below ``ablation/``."""
         return "without_" + self.name.replace(" ", "_")
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a run came to.
-
-    Attributes
-    ----------
-    recall : text of each threshold to recall, 0 to 1.
-    seconds : of all its stages, from import and evaluation apart.
-    """
+    """What a run came to."""
 
     name: str
-    recall: dict[str, float]
+    recall: dict[str, float]  # 0 to 1, by the text of the threshold
     median_position_m: float
     median_angle_deg: float
-    seconds: float
+    seconds: float  # of all its stages, from import and evaluation apart
 
 
 def variants(options: PipelineOptions) -> list[Variant]:

@@ -225,22 +225,13 @@ def _single_threaded(function: Callable[..., Any], /, *args: Any, **kwargs: Any)
 
 @dataclass
 class _Preparation(WorkerPlugin):
-    """Makes a worker like the process that has the run, or refuses it.
+    """Makes a worker like the process that has the run, or refuses it."""
 
-    Attributes
-    ----------
-    packages : versions, of Python too.
-    weights : sha256 of the files of networks that this process has.
-    folder : current folder, which relative paths start from.
-    token : file in the shared folder.
-    elsewhere : the workers were there before, and stay.
-    """
-
-    packages: dict[str, str]
-    weights: dict[str, str]
-    folder: Path
-    token: Path
-    elsewhere: bool
+    packages: dict[str, str]  # versions, of Python too
+    weights: dict[str, str]  # sha256 of the files of networks that this process has
+    folder: Path  # the current one, which relative paths start from
+    token: Path  # a file in the shared folder
+    elsewhere: bool  # the workers were there before, and stay
     name = "megloc"
 
     @classmethod

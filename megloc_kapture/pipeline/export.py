@@ -86,17 +86,11 @@ class Scene:
 
 @dataclass(frozen=True)
 class GeoOrigin:
-    """Where on WGS84 the world's origin lies; its axes are East, North and Up there.
+    """Where on WGS84 the world's origin lies; its axes are East, North and Up there."""
 
-    Parameters
-    ----------
-    latitude_deg, longitude_deg : geodetic.
-    height_m : above the ellipsoid.
-    """
-
-    latitude_deg: float
+    latitude_deg: float  # geodetic
     longitude_deg: float
-    height_m: float = 0.0
+    height_m: float = 0.0  # above the ellipsoid
 
 
 def export_colmap(scene: Scene, output: Path) -> None:

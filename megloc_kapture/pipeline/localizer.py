@@ -44,21 +44,9 @@ from megloc_kapture.values import Camera, Device, Failure, Pose, RigidTransform
 _ALONE = RigidTransform.identity()
 # the options that localizing uses; the others are of maps that are made
 LOCALIZING = (
-    "device",
-    "precision",
-    "preprocessing",
-    "local_features",
-    "mask_margin_px",
-    "global_features",
-    "fusion",
-    "query_pairs",
-    "reranking",
-    "matching",
-    "verification",
-    "query_verification",
-    "guided_pyramid",
-    "localization",
-    "pose_refinement",
+    *("device", "precision", "preprocessing", "local_features", "mask_margin_px"),
+    *("global_features", "fusion", "query_pairs", "reranking", "matching", "verification"),
+    *("query_verification", "guided_pyramid", "localization", "pose_refinement"),
 )
 
 

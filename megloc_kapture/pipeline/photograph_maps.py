@@ -48,20 +48,9 @@ from megloc_kapture.values import Options
 GPS = "gps"
 # the options that making a map of photographs uses
 MAPPING_OPTIONS = (
-    "device",
-    "precision",
-    "preprocessing",
-    "local_features",
-    "mask_margin_px",
-    "global_features",
-    "fusion",
-    "mapping_pairs",
-    "matching",
-    "mapping_verification",
-    "query_verification",
-    "guided_pyramid",
-    "triangulation",
-    "refinement",
+    *("device", "precision", "preprocessing", "local_features", "mask_margin_px"),
+    *("global_features", "fusion", "mapping_pairs", "matching", "mapping_verification"),
+    *("query_verification", "guided_pyramid", "triangulation", "refinement"),
 )
 _WITHOUT_POSES: tuple[type[PipelineStage], ...] = (
     Preprocess,

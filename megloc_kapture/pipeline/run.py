@@ -1,4 +1,4 @@
-"""``benchmarks/<dataset>.toml``: a dataset's options, protocol and published figures."""
+"""A run of ``megloc eval``: its benchmark file, dataset, preset, options and workspace."""
 
 from __future__ import annotations
 
@@ -41,13 +41,7 @@ class PublishedResult(Options):
 
 
 class PresetOptions(Options):
-    """What a dataset wants different of one preset alone, after what it wants of all of them.
-
-    Parameters
-    ----------
-    import_options : the adapter's.
-    options : changes to the preset.
-    """
+    """What a dataset wants different of one preset alone, after what it wants of all of them."""
 
     import_options: dict[str, Any] = Field(default_factory=dict)
     options: dict[str, Any] = Field(default_factory=dict)
@@ -142,13 +136,7 @@ def read_benchmark(path: Path) -> BenchmarkFile:
 
 @dataclass(frozen=True)
 class RunChoice:
-    """A dataset, its benchmark file and the options, chosen together; nothing is written yet.
-
-    Attributes
-    ----------
-    layers : the options by who chose them: preset, benchmark file, user.
-    facts : what of the dataset decides which steps of the paper it permits.
-    """
+    """A dataset, its benchmark file and the options, chosen together; nothing is written yet."""
 
     source: DatasetChoice
     benchmark: BenchmarkFile
@@ -235,13 +223,7 @@ def choose_run(
 
 @dataclass(frozen=True)
 class Run:
-    """What a run is of.
-
-    Attributes
-    ----------
-    benchmark : what it wants different in the dataset's protocol.
-    steps : of the paper, for the report.
-    """
+    """What a run is of; ``benchmark`` changes the protocol, ``steps`` are the paper's."""
 
     source: DatasetChoice
     preset: str

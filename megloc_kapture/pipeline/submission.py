@@ -1,4 +1,4 @@
-"""What is handed in: the pose files of a localized kapture, by its challenge's rules."""
+"""Pose files of a localized kapture, by its challenge's rules, and the folder that keeps them."""
 
 from __future__ import annotations
 

@@ -22,12 +22,7 @@ JOURNAL = ".items"  # of a stage's items that are done, in the folder that it wr
 
 
 class Workspace:
-    """Paths of a workspace (docs/architecture.md, Contract 3).
-
-    Raises
-    ------
-    OutputError : the folder has something in it that is not a workspace's.
-    """
+    """Paths of a workspace (docs/architecture.md); raises OutputError for a folder of others."""
 
     def __init__(self, root: Path, *, force: bool = False) -> None:
         self.root = Path(root).absolute()

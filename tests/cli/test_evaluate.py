@@ -1,4 +1,4 @@
-"""``megloc evaluate``: one result, several, runs of one method, and results without truth."""
+"""``megloc evaluate``, ``submit`` and ``check`` as their users meet them."""
 
 from __future__ import annotations
 

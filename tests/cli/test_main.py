@@ -1,4 +1,4 @@
-"""The command as such: help, errors of the command line, tracebacks, pipes."""
+"""The command as such: help, examples, options, errors of the command line, tracebacks, pipes."""
 
 from __future__ import annotations
 

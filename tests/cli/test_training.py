@@ -1,4 +1,4 @@
-"""``megloc train``: its flags, its files, and what it refuses."""
+"""``megloc train``, ``train-field`` and ``render``: flags, files, and what they refuse."""
 
 from __future__ import annotations
 
