@@ -17,8 +17,7 @@ from mapped_scene import Query, Scene, errors, hypotheses
 from megloc_twins.indoor_rooms import MODULE_M
 from scenes import megloc
 
-from megloc_kapture.pipeline.benchmarks import find_benchmark
-from megloc_kapture.pipeline.datasets import TWIN_PREFIX
+from megloc_kapture.pipeline.run import find_benchmark
 from megloc_kapture.plugins import PoseHypothesis
 from megloc_kapture.stages.query_poses import LocalizationOptions
 
@@ -54,7 +53,7 @@ class InLocRooms:
     @cached_property
     def localization(self) -> LocalizationOptions:
         """How InLoc's benchmark file localizes."""
-        benchmark = find_benchmark(DATASET, TWIN_PREFIX)
+        benchmark = find_benchmark(DATASET)
         return LocalizationOptions.model_validate(benchmark.options["localization"])
 
     def run(self, workspace: Path, seed: int) -> Path:

@@ -9,9 +9,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from concurrent.futures import Executor
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -259,12 +258,19 @@ def open_map(
     return Map(opened, options)
 
 
-def _open(
-    workers: int, scheduler: str | None, root: Path
-) -> AbstractContextManager[Executor | None]:
-    if scheduler is None:
-        return open_executor("processes", workers)
-    return open_executor("dask", None if workers == 1 else workers, scheduler, root)
+@contextmanager
+def _working_in(
+    workspace: Path | str, workers: int, scheduler: str | None
+) -> Iterator[tuple[Workspace, Work]]:
+    """A workspace, held meanwhile, and what to work with."""
+    opened = Workspace(Path(workspace))
+    executor = (
+        open_executor("processes", workers)
+        if scheduler is None
+        else open_executor("dask", None if workers == 1 else workers, scheduler, opened.root)
+    )
+    with opened.lock(), single_threaded(), executor as running:
+        yield opened, Work(running, num_threads=workers)
 
 
 def build_map(
@@ -347,9 +353,8 @@ def _made(
     workers: int,
     scheduler: str | None,
 ) -> Map:
-    opened = Workspace(place)
-    with opened.lock(), single_threaded(), _open(workers, scheduler, opened.root) as executor:
-        run_plan(stages, opened, Work(executor, num_threads=workers))
+    with _working_in(place, workers, scheduler) as (opened, work):
+        run_plan(stages, opened, work)
     return Map(KaptureMap.open(opened.path(MAP)), options)
 
 
@@ -426,8 +431,8 @@ def run(
     choice = choose_run(
         dataset, None if root is None else Path(root), preset=preset, assignments=set or {}
     )
-    opened = Workspace(Path(workspace or Path("runs") / f"{dataset}-{choice.preset}"))
-    with opened.lock(), single_threaded(), _open(workers, scheduler, opened.root) as executor:
+    place = workspace or Path("runs") / f"{dataset}-{choice.preset}"
+    with _working_in(place, workers, scheduler) as (opened, work):
         chosen = choice.run_in(opened)
-        run_plan(plan_evaluation(chosen), opened, Work(executor, num_threads=workers))
+        run_plan(plan_evaluation(chosen), opened, work)
     return FinishedRun(opened.root, chosen.submission_below(opened.root), choice.options)

@@ -71,8 +71,7 @@ _EXTRAS = {
     "h5py": "megadepth",
     "rerun": "rerun",
     **dict.fromkeys(
-        ("fastapi", "prometheus_client", "python_multipart", "starlette", "uvicorn"),
-        "serve",
+        ("fastapi", "prometheus_client", "python_multipart", "starlette", "uvicorn"), "serve"
     ),
 }
 

@@ -18,13 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from megloc_kapture.values import (
-    Camera,
-    ImageFeatures,
-    LocalFeatures,
-    Options,
-    RigidTransform,
-)
+from megloc_kapture.values import Camera, ImageFeatures, LocalFeatures, Options, RigidTransform
 
 LOCAL_FEATURES = "megloc_kapture.local_features"
 MATCHERS = "megloc_kapture.matchers"

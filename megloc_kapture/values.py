@@ -46,7 +46,7 @@ class Options(BaseModel):
     def idle(self) -> dict[str, str]:
         """Options that change nothing while the others are as they are: name to the reason.
 
-        Who sets one of them meant something else: it is refused (pipeline/assignments.py).
+        Who sets one of them meant something else: it is refused (pipeline/presets.py).
         """
         return {}
 
@@ -148,35 +148,22 @@ class RigidTransform:
         cls, rotation: NDArray[np.float64], translation: NDArray[np.float64]
     ) -> RigidTransform:
         """From a rotation matrix (3, 3) and a translation (3,)."""
-        m = np.asarray(rotation, dtype=np.float64)
+        (a, b, c), (d, e, f), (g, h, i) = np.asarray(rotation, dtype=np.float64)
         # the symmetric 4x4 matrix whose largest eigenvector is the quaternion: stable everywhere
         k = np.array(
             [
-                [m[0, 0] + m[1, 1] + m[2, 2], 0.0, 0.0, 0.0],
-                [m[2, 1] - m[1, 2], m[0, 0] - m[1, 1] - m[2, 2], 0.0, 0.0],
-                [
-                    m[0, 2] - m[2, 0],
-                    m[0, 1] + m[1, 0],
-                    m[1, 1] - m[0, 0] - m[2, 2],
-                    0.0,
-                ],
-                [
-                    m[1, 0] - m[0, 1],
-                    m[0, 2] + m[2, 0],
-                    m[1, 2] + m[2, 1],
-                    m[2, 2] - m[0, 0] - m[1, 1],
-                ],
+                [a + e + i, 0.0, 0.0, 0.0],
+                [h - f, a - e - i, 0.0, 0.0],
+                [c - g, b + d, e - a - i, 0.0],
+                [d - b, c + g, f + h, i - a - e],
             ]
         )
         _, vectors = np.linalg.eigh(k / 3.0)  # reads the lower triangle
         quat = vectors[:, -1]
         quat = quat if quat[0] >= 0 else -quat
-        quat = quat / np.linalg.norm(quat)
-        t = np.asarray(translation, dtype=np.float64).reshape(3)
-        return cls(
-            (float(quat[0]), float(quat[1]), float(quat[2]), float(quat[3])),
-            (float(t[0]), float(t[1]), float(t[2])),
-        )
+        qw, qx, qy, qz = (quat / np.linalg.norm(quat)).tolist()
+        tx, ty, tz = np.asarray(translation, dtype=np.float64).reshape(3).tolist()
+        return cls((qw, qx, qy, qz), (tx, ty, tz))
 
     def rotation_matrix(self) -> NDArray[np.float64]:
         """Rotation as (3, 3) float64."""

@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 
 import megloc_kapture
+from megloc_kapture.cli.info import shown
 from megloc_kapture.cli.main import main
-from megloc_kapture.cli.options import shown
 from megloc_kapture.features.vlad import VladOptions
 from megloc_kapture.pipeline.presets import options_of
 from megloc_kapture.stages.options import PipelineOptions

@@ -1,31 +1,97 @@
-"""Flags that commands share, named as kapture's tools name theirs."""
+"""Flags that commands share, named as kapture's tools name theirs; and what a person sees."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import logging
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from datetime import timedelta
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import tyro
 
-from megloc_kapture.cli.console import Console, configure_logging
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.dataset_tables import PROTOCOL_FILE, SIDE_TABLES
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.pipeline.executors import ExecutorKind, open_executor
+from megloc_kapture.io.output_folders import staged_output
+from megloc_kapture.pipeline.executors import (
+    ExecutorKind,
+    available_cores,
+    open_executor,
+    single_threaded,
+)
+from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera
 
 if TYPE_CHECKING:
-    from megloc_kapture.pipeline.kapture_map import KaptureMap
-    from megloc_kapture.pipeline.local_types import LocalType
-    from megloc_kapture.stages.options import PipelineOptions
+    from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
+    from megloc_kapture.pipeline.workspace import Workspace
 
 Input = Annotated[Path, tyro.conf.arg(aliases=["-i"])]
+Inputs = Annotated[tuple[Path, ...], tyro.conf.arg(aliases=["-i"]), tyro.conf.UseAppendAction]
 Output = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 Force = Annotated[bool, tyro.conf.arg(aliases=["-f"])]
+Folders = Annotated[tuple[Path, ...], tyro.conf.UseAppendAction]
+Texts = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
+
+Item = TypeVar("Item")
+
+_LINE_EVERY_S = 10.0
+
+
+class Console:
+    """Progress bars on a terminal, plain lines elsewhere; results go to standard output."""
+
+    def __init__(self, *, quiet: bool = False) -> None:
+        self.quiet = quiet
+        self.terminal = sys.stderr.isatty()
+
+    def say(self, text: str) -> None:
+        """A line about what goes on; to standard error, so that results can be piped."""
+        if not self.quiet:
+            print(text, file=sys.stderr, flush=True)
+
+    def result(self, text: str) -> None:
+        """A line of the result."""
+        print(text, flush=True)
+
+    def counts(self, counts: Mapping[str, float]) -> None:
+        """A line of the result for each count."""
+        for what, value in counts.items():
+            self.result(f"{what.replace('_', ' '):44s}{value:>8g}")
+
+    def track(self, items: Iterable[Item], total: int, label: str) -> Iterator[Item]:
+        """Yield the items and show how far it is."""
+        if self.quiet:
+            yield from items
+        elif self.terminal:
+            from rich.console import Console as RichConsole
+            from rich.progress import Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+            class Rate(TaskProgressColumn):
+                def render(self, task: Any) -> Any:
+                    return self.render_speed(task.finished_speed or task.speed)
+
+            bar, of = Progress.get_default_columns()[1], TextColumn("{task.completed}/{task.total}")
+            columns = (TextColumn("{task.description}"), bar, of, Rate(), TimeRemainingColumn())
+            with Progress(*columns, console=RichConsole(stderr=True), transient=True) as progress:
+                yield from progress.track(items, total=total, description=f"  {label}")
+        else:
+            started = shown = time.monotonic()
+            for number, item in enumerate(items, start=1):
+                yield item
+                now = time.monotonic()
+                if now - shown > _LINE_EVERY_S and number < total:
+                    shown = now
+                    rate = number / (now - started)
+                    left = timedelta(seconds=round((total - number) / rate))
+                    self.say(f"  {label}: {number} of {total}, {rate:.2g}/s, {left} left")
 
 
 def existing(folders: Sequence[Path]) -> tuple[Path, ...]:
@@ -36,13 +102,28 @@ def existing(folders: Sequence[Path]) -> tuple[Path, ...]:
     return tuple(folders)
 
 
+def assigned_pairs(flag: str, texts: Sequence[str], takes: str) -> Iterator[tuple[str, str]]:
+    """Both sides of each ``A=B``, by the last sign; raises OptionError where one is empty."""
+    for text in texts:
+        name, _, value = text.rpartition("=")
+        if not (name and value):
+            raise OptionError(f"{flag} takes {takes}, got {text!r}")
+        yield name, value
+
+
+def refuse_given(of: str, **flags: object) -> None:
+    """Raise OptionError where one of these flags, which are of others, is given."""
+    for name, value in flags.items():
+        if value is not None:
+            raise OptionError(f"--{name.replace('_', '-')} changes nothing: it is of {of}")
+
+
 def opened_map(path: Path, console: Console) -> Path:
     """The kapture folder of a map, or of a workspace; a COLMAP model's is made in the user's cache,
     and said."""
     # commands that open no map do not wait for all stages
     from megloc_kapture.datasets.colmap_map import is_colmap
     from megloc_kapture.pipeline.colmap_maps import kapture_of
-    from megloc_kapture.stages.work import Work
 
     if not is_colmap(path):
         return kapture_of(path)
@@ -65,47 +146,10 @@ def camera_of_text(text: str) -> Camera:
         ) from error
 
 
-def check_consistent(kapture_map: KaptureMap, path: Path, *, force: bool) -> None:
-    """Raise DataError for a map that contradicts itself, unless it is to be used all the same."""
-    if not force and (fault := kapture_map.fault()):
-        raise DataError(
-            f"{fault}; the poses would be wrong (--force localizes all the same)", path=path
-        )
-
-
-def idle_for_types(
-    typed: Mapping[str, Any], types: Sequence[LocalType], options: PipelineOptions
-) -> dict[str, str]:
-    """Options that change nothing for a map of these keypoints types, and why.
-
-    Parameters
-    ----------
-    typed : nested tables of ``--set``.
-    """
-    idle = {}
-    if "guided_pyramid" in typed and options.matches_again():
-        obstacles = [local.pyramid_obstacle for local in types]
-        if all(obstacles):
-            idle["guided_pyramid"] = obstacles[0]
-    used = {local.choice.name for local in types if local.choice is not None}
-    unused = [one.name for one in options.local_features if one.name not in used]
-    if unused:
-        brought = ", ".join(local.name for local in types)
-        idle["local_features"] = f"the map is of {brought}; nothing in it is of {unused[0]}"
-    return idle
-
-
-def refuse_idle(typed: Mapping[str, Any], idle: Mapping[str, str]) -> None:
-    """Raise OptionError where an option that was typed changes nothing."""
-    for name in typed:
-        if name in idle:
-            raise OptionError(f"--set {name} changes nothing: {idle[name]}")
-
-
 def side_tables_beside(result: Path) -> Path | None:
     """The workspace's side tables, where a result lies in a workspace."""
-    place = result.resolve().parent / SIDE_TABLES
-    return place if (place / PROTOCOL_FILE).is_file() else None
+    folder = result.resolve().parent / SIDE_TABLES
+    return folder if (folder / PROTOCOL_FILE).is_file() else None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,12 +167,16 @@ class Common:
 
     def console(self) -> Console:
         """The console these flags ask for."""
-        configure_logging("debug" if self.debug else self.verbose)
+        level = "debug" if self.debug else self.verbose
+        # to standard error
+        logging.basicConfig(
+            level=getattr(logging, level.upper()), format="%(levelname)s %(name)s: %(message)s"
+        )
         return Console(quiet=self.quiet)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Working:
+class Working(Common):
     """Flags of commands with per-image or per-pair work."""
 
     executor: ExecutorKind = "processes"
@@ -142,12 +190,31 @@ class Working:
         """The executor that these flags ask for; a cluster must see the output's folder."""
         return open_executor(self.executor, self.workers, self.scheduler, output)
 
+    @contextmanager
+    def working(self, output: Path) -> Iterator[Work]:
+        """What to work with, by these flags; all workers must see the folder of the output."""
+        folder = output if output.is_dir() else output.absolute().parent
+        with single_threaded(), self.open_executor(folder) as executor:
+            yield Work(executor, self.console().track)
+
+    @contextmanager
+    def staged(self, output: Path, kind: str, *, force: bool) -> Iterator[tuple[Path, Work]]:
+        """A folder to write into, which ends as the output, and what to work with."""
+        with staged_output(output, kind=kind, force=force) as out, self.working(out) as work:
+            yield out, work
+
+    @contextmanager
+    def working_in(self, workspace: Workspace) -> Iterator[Work]:
+        """What to work with in a workspace, which is held meanwhile."""
+        with workspace.lock(), single_threaded(), self.open_executor(workspace.root) as executor:
+            yield Work(executor, self.console().track, self.workers or available_cores())
+
 
 @dataclass(frozen=True, kw_only=True)
 class Linked:
     """Flags of commands that read kapture folders, which may consist of links."""
 
-    allow_links_below: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = ()
+    allow_links_below: Folders = ()
     """Folder that links in the kapture folders may lead to, as those of kapture-localization's
     proxy folders do; may be repeated."""
 
@@ -160,7 +227,7 @@ class Linked:
 class Reading(Linked):
     """Flags of commands that read features of kapture folders."""
 
-    features_dir: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = ()
+    features_dir: Folders = ()
     """Features folder beside the kapture folders; may be repeated."""
 
     def kapture(self, root: Path) -> KaptureFolder:
@@ -168,6 +235,21 @@ class Reading(Linked):
         return KaptureFolder(
             root,
             features_dirs=existing(self.features_dir),
+            allow_links_below=existing(self.allow_links_below),
+        )
+
+    def opening(
+        self, path: Path, keypoints_types: tuple[str, ...], pixel_origin: PixelOriginChoice
+    ) -> Callable[..., KaptureMap]:
+        """What opens a map with these flags; raises DataError for a folder that is not there."""
+        from megloc_kapture.pipeline.kapture_map import KaptureMap
+
+        return partial(
+            KaptureMap.open,
+            path,
+            keypoints_types=keypoints_types,
+            features_dirs=existing(self.features_dir),
+            pixel_origin=pixel_origin,
             allow_links_below=existing(self.allow_links_below),
         )
 
@@ -200,7 +282,7 @@ class Choosing(Computing):
 
     preset: str | None = None
     """A set of options by name: classic, modern, modern-large, megloc."""
-    set: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
+    set: Texts = ()
     """Change an option: key.key=value; may be repeated."""
 
     def assignments(self) -> tuple[str, ...]:

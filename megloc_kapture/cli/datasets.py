@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import tyro
 
-from megloc_kapture.cli.common import Common, Force, Output, Working
-from megloc_kapture.cli.console import Console
+from megloc_kapture.cli.common import Common, Console, Force, Output, Texts, Working
 from megloc_kapture.datasets.colmap_map import find_colmap
 from megloc_kapture.datasets.kapture_folders import QUERY
 from megloc_kapture.datasets.megadepth import MegaDepthOptions, import_megadepth
@@ -57,7 +56,7 @@ class Import(Common):
     metres."""
     allow_missing: bool = False
     """Import what is there of a partial download."""
-    set: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
+    set: Texts = ()
     """An option of the dataset: key=value (version=1.0, reference_model=true); may be repeated."""
     query_prefix: str = ""
     """Put the queries into a folder of this name, where they share names with the map."""
@@ -90,8 +89,7 @@ class Import(Common):
             unreadable = set_aside_unreadable(out / QUERY, out / SIDE_TABLES, work)
             summary = out / SUMMARY_FILE
             text = summary.read_text(encoding="utf-8") if summary.is_file() else ""
-        for what, value in counts.items():
-            console.result(f"{what.replace('_', ' '):44s}{value:>8g}")
+        console.counts(counts)
         for name, reason in unreadable.items():
             console.say(f"warning: query {name} cannot be used and will fail: {reason}")
         if text:
@@ -110,8 +108,7 @@ class Import(Common):
                 write_unit(out, self.unit)
         for what, found in (("images", source.images), ("database", source.database)):
             console.say(f"{what}: {found or 'none'}")
-        for what, value in counts.items():
-            console.result(f"{what.replace('_', ' '):44s}{value:>8g}")
+        console.counts(counts)
         return 0
 
     def _import_megadepth(self, console: Console) -> int:
@@ -120,21 +117,17 @@ class Import(Common):
         with staged_output(self.output, kind=MEGADEPTH, force=self.force) as out:
             work = Work(track=console.track)
             counts = import_megadepth(self.root, out, options, work=work)
-        for what, value in counts.items():
-            console.result(f"{what.replace('_', ' '):44s}{value:>8g}")
+        console.counts(counts)
         return 0
 
     def _refuse_unused(self, what: str, flags: dict[str, object]) -> None:
-        of_datasets = {
-            "--query-prefix": self.query_prefix,
-            "--allow-missing": self.allow_missing,
-        }
+        of_datasets = {"--query-prefix": self.query_prefix, "--allow-missing": self.allow_missing}
         if given := [flag for flag, value in (flags | of_datasets).items() if value]:
             raise OptionError(f"{given[0]} changes nothing of {what}")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Synth(Working, Common):
+class Synth(Working):
     """Render a dataset: the synthetic world as kapture, or a small twin in an official layout."""
 
     dataset: tyro.conf.Positional[str] = SYNTHETIC
@@ -143,7 +136,7 @@ class Synth(Working, Common):
     """Where to."""
     seed: int = 0
     """Another seed is another world."""
-    set: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
+    set: Texts = ()
     """An option of the world: key=value; may be repeated."""
     force: Force = False
     """Write into a folder that has other things in it."""
@@ -158,7 +151,6 @@ class Synth(Working, Common):
             self.open_executor(out) as executor,
         ):
             counts = twin.write(out, Work(executor, console.track))
-        for what, value in counts.items():
-            console.result(f"{what.replace('_', ' '):44s}{value:>8g}")
+        console.counts(counts)
         console.result(f"rendered: {self.output}")
         return 0

@@ -1,16 +1,26 @@
-"""``megloc evaluate``: recall tables and reports of localized kapture and pose files."""
+"""Commands of results: recall and reports, what is handed in, and whether that is right."""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from megloc_kapture.cli.common import Common, Force, existing
-from megloc_kapture.cli.stages import Inputs
-from megloc_kapture.errors import OptionError
+from megloc_kapture.cli.common import (
+    Common,
+    Console,
+    Force,
+    Input,
+    Inputs,
+    Output,
+    existing,
+    side_tables_beside,
+)
+from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.output_folders import staged_output
 
 EVALUATION = "evaluation"
@@ -92,3 +102,135 @@ class Evaluate(Common):
         if self.seeds and self.gt is None:
             raise OptionError("--seeds needs true poses (--gt)")
         existing([path for path in (self.side_tables, self.map) if path is not None])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Submit(Common):
+    """Write the pose file of a localized kapture folder, and its provenance beside it."""
+
+    dataset: tyro.conf.Positional[str]
+    """Dataset whose rules hold: aachen, robotcar, 4seasons, inloc, kapture, synthetic or a twin."""
+    input: Input
+    """Localized kapture folder."""
+    output: Output
+    """Pose file; for 4seasons the folder that gets one per relocalization file."""
+    side_tables: Path | None = None
+    """The megloc/ folder of the imported dataset; found beside the result by itself."""
+    from_rig: bool = False
+    """Queries without a pose get one through the rig, from another camera of their moment."""
+    force: Force = False
+    """Overwrite the pose file."""
+
+    def run(self) -> int:
+        """Run it."""
+        from megloc_kapture.io.dataset_tables import Protocol, read_protocol
+        from megloc_kapture.pipeline.submission import (
+            check_dataset,
+            workspace_provenance,
+            write_submission,
+        )
+
+        console = self.console()
+        if self.side_tables is not None and not self.side_tables.is_dir():
+            raise DataError("no such folder", path=self.side_tables)
+        tables = self.side_tables or side_tables_beside(self.input)
+        rules = Protocol() if tables is None else read_protocol(tables)
+        check_dataset(self.dataset, rules, tables=tables)
+        self._check_output(folder=rules.pose_file == "mlad")
+        counts = write_submission(
+            self.input,
+            self.output,
+            tables=None if tables is None else tables.resolve(),
+            provenance={"dataset": self.dataset, **workspace_provenance(self.input)},
+            from_rig=self.from_rig,
+        )
+        console.result(f"{summary(counts)}: {self.output}")
+        return 0
+
+    def _check_output(self, *, folder: bool) -> None:
+        place = self.output
+        if place.is_dir() != folder and place.exists():
+            kind = "folder, one file per relocalization file" if folder else "file"
+            raise OptionError(f"{place} exists and is not what is to be written, a {kind}")
+        if place.exists() and not self.force and (not folder or any(place.iterdir())):
+            raise OptionError(f"{place} exists; -f overwrites it")
+
+
+def summary(counts: Mapping[str, int]) -> str:
+    """What has been written, in one line."""
+    text = f"{counts['poses']} poses of {counts['scored']} queries"
+    if counts["scored"] != counts["queries"] and not counts["dummies"]:
+        text += f" that are scored ({counts['queries']} in all)"
+    parts = [
+        f"{counts['missing']} missing" if counts["missing"] else "",
+        "dummies in their place" if counts["dummies"] else "",
+        f"{counts['fallbacks']} of the poses guessed" if counts["fallbacks"] else "",
+        f"{counts['from_rig']} from the rig" if counts["from_rig"] else "",
+    ]
+    return ", ".join([text, *filter(None, parts)])
+
+
+# a wrong file is the user's to mend, as wrong data are
+PROBLEMS_FOUND = 2
+_RUNS = Path("runs")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check(Common):
+    """Check a pose file, ours or foreign, against the rules of its challenge and the map."""
+
+    dataset: tyro.conf.Positional[str]
+    """Dataset whose rules hold: aachen, robotcar, 4seasons, inloc, kapture, synthetic or a twin."""
+    file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
+    """Pose file; for 4seasons also the folder of all of them."""
+    data: Path | None = None
+    """Imported dataset or workspace to compare with; runs/DATASET-* where there is just one."""
+    json: bool = False
+    """Print everything that was found as JSON."""
+
+    def run(self) -> int:
+        """Run it; returns 2 where there are problems."""
+        from megloc_kapture.evaluation.check.reading import read_reference
+        from megloc_kapture.evaluation.check.submission import check_submission
+        from megloc_kapture.io.dataset_tables import PROTOCOL_FILE, SIDE_TABLES
+        from megloc_kapture.pipeline.datasets import TWIN_PREFIX, check_known
+        from megloc_kapture.pipeline.submission import check_dataset
+
+        console = self.console()
+        check_known(self.dataset)
+        if not self.file.exists():
+            raise DataError("no such file", path=self.file)
+        data = self.data or self._workspace(console)
+        reference = None if data is None else read_reference(data)
+        if reference is not None and data is not None:
+            tables = data / SIDE_TABLES
+            known = (tables / PROTOCOL_FILE).is_file()
+            check_dataset(self.dataset, reference.protocol, tables=tables if known else None)
+        report = check_submission(
+            self.file, dataset=self.dataset.removeprefix(TWIN_PREFIX), reference=reference
+        )
+        if self.json:
+            console.result(json.dumps(report.to_json(), indent=2, ensure_ascii=False))
+        else:
+            for line in report.lines():
+                console.result(line)
+        return PROBLEMS_FOUND if report.has_problems else 0
+
+    def _workspace(self, console: Console) -> Path | None:
+        from megloc_kapture.pipeline.datasets import dataset_names
+
+        # runs/synthetic-aachen-classic is no run of dataset synthetic
+        longer = tuple(f"{n}-" for n in dataset_names() if n.startswith(f"{self.dataset}-"))
+        found = [
+            path
+            for path in sorted(_RUNS.glob(f"{self.dataset}-*"))
+            if (path / "mapping" / "sensors" / "sensors.txt").is_file()
+            and not path.name.startswith(longer or "/")
+        ]
+        if len(found) == 1:
+            console.say(f"compared with {found[0]}")
+            return found[0]
+        if found:
+            names = ", ".join(map(str, found))
+            console.say(f"compared with none of {names}: choose with --data")
+        return None

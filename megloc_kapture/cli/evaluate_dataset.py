@@ -3,52 +3,33 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from megloc_kapture.cli.common import Common, Deciding, Force, Working
-from megloc_kapture.cli.console import Console
+from megloc_kapture.cli.common import Console, Deciding, Force, Working
 from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.report.renderers import REPORT_HTML
-from megloc_kapture.evaluation.report.reports import (
-    AGREEMENT_TEXT,
-    RECALL_JSON,
-    RECALL_TEXT,
-)
+from megloc_kapture.evaluation.report.reports import AGREEMENT_TEXT, RECALL_JSON, RECALL_TEXT
 from megloc_kapture.io.tables import STATUS_FILE, read_status
-from megloc_kapture.pipeline.ablation import (
-    fresh_copy,
-    outcome,
-    outcomes_text,
-    variants,
-    write_outcomes,
-)
-from megloc_kapture.pipeline.benchmarks import BenchmarkFile
-from megloc_kapture.pipeline.datasets import (
-    DatasetChoice,
-)
+from megloc_kapture.pipeline.ablation import ablate, outcomes_text, write_outcomes
+from megloc_kapture.pipeline.datasets import DatasetChoice
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
-from megloc_kapture.pipeline.executors import available_cores, single_threaded
-from megloc_kapture.pipeline.paper_steps import (
-    steps_text,
-)
-from megloc_kapture.pipeline.plan import all_kept, describe, run_plan
-from megloc_kapture.pipeline.run import RunChoice, choose_run
-from megloc_kapture.pipeline.submissions_folder import FOLDER, keep_submission
+from megloc_kapture.pipeline.paper_steps import steps_text
+from megloc_kapture.pipeline.plan import all_kept, run_plan
+from megloc_kapture.pipeline.run import BenchmarkFile, choose_run
+from megloc_kapture.pipeline.submission import FOLDER, keep_submission
 from megloc_kapture.pipeline.workspace import Workspace
-from megloc_kapture.stages.stage import EVALUATION, LOCALIZED, Stage
-from megloc_kapture.stages.work import Work
+from megloc_kapture.stages.stage import EVALUATION, LOCALIZED
 
 BELOW_RECALL = 3
 
 
 @dataclass(frozen=True, kw_only=True)
-class Eval(Deciding, Working, Common):
+class Eval(Deciding, Working):
     """Run all stages on a dataset; what is done and still true is kept."""
 
     dataset: tyro.conf.Positional[str] = "synthetic-aachen"
@@ -108,18 +89,12 @@ class Eval(Deciding, Working, Common):
             pairs = tuple((t.position_m, t.angle_deg) for t in parsed)
             wanted = choice.benchmark.model_copy(update={"thresholds": pairs})
             choice = replace(choice, benchmark=wanted)
-        self._check_judging(choice.source)
-        self._check_ablation(choice.source)
+        self._check_truth(choice.source)
         place = self.workspace or Path("runs") / f"{self.dataset}-{choice.preset}"
         submissions = self.submissions or (None if self.workspace else Path(FOLDER))
         workspace = Workspace(place, force=self.force)
-        with (
-            workspace.lock(),
-            single_threaded(),
-            self.open_executor(workspace.root) as executor,
-        ):
+        with self.working_in(workspace) as work:
             run = choice.run_in(workspace)
-            work = Work(executor, console.track, self.workers or available_cores())
             stages = plan_evaluation(run)
             reports = run_plan(
                 stages,
@@ -129,11 +104,13 @@ class Eval(Deciding, Working, Common):
                 last=self.until,
                 dry_run=self.dry_run,
                 verify=self.verify,
-                on_start=console.say,
-                on_report=lambda report: console.say(describe(report)),
+                say=console.say,
             )
             if self.ablate and not self.dry_run:
-                self._ablate(console, choice, work, workspace, stages)
+                outcomes = ablate(choice, workspace, stages, work, console.say)
+                path = write_outcomes(workspace, outcomes)
+                console.result(outcomes_text(outcomes))
+                console.result(f"ablation   {shown(path)}")
         if self.dry_run:
             return 0
         if all_kept(reports):
@@ -147,50 +124,15 @@ class Eval(Deciding, Working, Common):
             console.result(f"report     {shown(report)}")
         return status
 
-    def _ablate(
-        self,
-        console: Console,
-        choice: RunChoice,
-        work: Work,
-        whole: Workspace,
-        stages: Sequence[Stage],
-    ) -> None:
-        outcomes = [outcome("all steps", whole, stages)]
-        for variant in variants(choice.options):
-            console.say(f"ablation: without {variant.name}")
-            workspace = fresh_copy(whole, variant.slug)
-            changed = choice.with_options(variant.options).run_in(workspace)
-            with workspace.lock():
-                planned = plan_evaluation(changed)
-                run_plan(
-                    planned,
-                    workspace,
-                    work,
-                    on_start=console.say,
-                    on_report=lambda report: console.say(describe(report)),
-                )
-            outcomes.append(outcome(f"without {variant.name}", workspace, planned))
-        path = write_outcomes(whole, outcomes)
-        console.result(outcomes_text(outcomes))
-        console.result(f"ablation   {shown(path)}")
-
-    def _check_ablation(self, choice: DatasetChoice) -> None:
-        if not self.ablate:
-            return
-        if self.until not in (None, "evaluation"):
-            raise OptionError(f"--ablate needs stage evaluation; --until {self.until} skips it")
-        if not choice.has_truth():
-            raise OptionError(f"--ablate needs true poses: {choice.root}/query_gt is missing")
-
-    def _check_judging(self, choice: DatasetChoice) -> None:
-        if self.fail_below is None:
-            return
-        if not 0.0 <= self.fail_below <= 1.0:
+    def _check_truth(self, choice: DatasetChoice) -> None:
+        """Raise OptionError for what needs true poses, where they are not measured against."""
+        if self.fail_below is not None and not 0.0 <= self.fail_below <= 1.0:
             raise OptionError(f"--fail-below is a share between 0 and 1, got {self.fail_below:g}")
-        if self.until not in (None, "evaluation"):
-            raise OptionError(f"--fail-below needs stage evaluation; --until {self.until} skips it")
-        if not choice.has_truth():
-            raise OptionError(f"--fail-below needs true poses: {choice.root}/query_gt is missing")
+        for flag, given in (("fail-below", self.fail_below is not None), ("ablate", self.ablate)):
+            if given and self.until not in (None, "evaluation"):
+                raise OptionError(f"--{flag} needs stage evaluation; --until {self.until} skips it")
+            if given and not choice.has_truth():
+                raise OptionError(f"--{flag} needs true poses: {choice.root}/query_gt is missing")
 
     def _hand_in(self, console: Console, pose_file: Path, submissions: Path | None) -> None:
         """Say where the pose file is, and put it among the others where that is wanted."""
@@ -208,23 +150,20 @@ class Eval(Deciding, Working, Common):
         statuses = read_status(workspace.path(LOCALIZED) / STATUS_FILE)
         if statuses and all(status.status == "failed" for status in statuses.values()):
             console.say("warning: no query was localized; reasons are in localized/status.csv")
-        if (evaluation / RECALL_TEXT).is_file():
-            console.result((evaluation / RECALL_TEXT).read_text(encoding="utf-8"))
-        elif (evaluation / AGREEMENT_TEXT).is_file():
-            console.result((evaluation / AGREEMENT_TEXT).read_text(encoding="utf-8"))
+        for text in (RECALL_TEXT, AGREEMENT_TEXT):
+            if (evaluation / text).is_file():
+                console.result((evaluation / text).read_text(encoding="utf-8"))
+                break
         for text in published_results(benchmark):
             console.result(text)
-        if self.fail_below is not None:
-            return self._judge(console, evaluation)
-        return 0
-
-    def _judge(self, console: Console, evaluation: Path) -> int:
+        if self.fail_below is None:
+            return 0
         rows = json.loads((evaluation / RECALL_JSON).read_text(encoding="utf-8"))["rows"]
         recall = next(row for row in rows if row["name"] == "all")["recall"][-1]["recall"]
-        if self.fail_below is not None and recall < self.fail_below:
-            console.say(f"recall {recall:.3f} is below {self.fail_below:.3f}")
-            return BELOW_RECALL
-        return 0
+        if recall >= self.fail_below:
+            return 0
+        console.say(f"recall {recall:.3f} is below {self.fail_below:.3f}")
+        return BELOW_RECALL
 
 
 def published_results(benchmark: BenchmarkFile) -> list[str]:

@@ -1,19 +1,22 @@
-"""``megloc info``: what is in a kapture folder, and what is missing to localize in it."""
+"""``megloc info`` and ``options``: what a kapture folder has, and which options there are."""
 
 from __future__ import annotations
 
+import json
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
+from difflib import get_close_matches
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
 
-from megloc_kapture.cli.common import Common, Reading, existing, opened_map
-from megloc_kapture.cli.console import Console
-from megloc_kapture.cli.refine_map import report_lines
-from megloc_kapture.errors import MeglocError
+from megloc_kapture.cli.common import Common, Console, Reading, opened_map
+from megloc_kapture.cli.maps import report_lines
+from megloc_kapture.errors import MeglocError, OptionError
+from megloc_kapture.features.vlad import VladOptions
 from megloc_kapture.io.dataset_tables import METRES
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.kapture.points import read_point_covariances
@@ -21,11 +24,22 @@ from megloc_kapture.mapping.uncertainty import point_deviations
 from megloc_kapture.pipeline.kapture_map import KaptureMap, MapKeypoints, PixelOriginChoice
 from megloc_kapture.pipeline.local_types import local_types_of
 from megloc_kapture.pipeline.map_retrieval import MapRetrieval
-from megloc_kapture.pipeline.presets import DEFAULT_PRESET, options_of_preset
+from megloc_kapture.pipeline.presets import DEFAULT_PRESET, Option, options_of, options_of_preset
 from megloc_kapture.pipeline.queries import Preprocessor
-from megloc_kapture.plugin_loading import load_plugin
-from megloc_kapture.plugins import LOCAL_FEATURES, PluginChoice
+from megloc_kapture.plugin_loading import load_plugin, plugin_class, plugin_names
+from megloc_kapture.plugins import (
+    DATASETS,
+    GLOBAL_FEATURES,
+    LOCAL_FEATURES,
+    MATCHERS,
+    POSE_RANKERS,
+    POSE_REFINERS,
+    SEGMENTERS,
+    PluginChoice,
+)
+from megloc_kapture.stages.global_features import VLAD
 from megloc_kapture.stages.matches import FeatureCache
+from megloc_kapture.values import Options
 
 _COLUMN = 18
 _QUANTILES = (0.1, 0.5, 0.9)
@@ -60,20 +74,12 @@ class Info(Reading, Common):
 
     def _describe_map(self, console: Console, root: Path) -> None:
         try:
-            opened = KaptureMap.open(
-                root,
-                keypoints_types=self.keypoints_type,
-                features_dirs=existing(self.features_dir),
-                pixel_origin=self.pixel_origin,
-                allow_links_below=existing(self.allow_links_below),
-            )
+            opened = self.opening(root, self.keypoints_type, self.pixel_origin)()
         except MeglocError as error:
             line(console, "localizing", f"not possible: {error}")
             return
-        text = (
-            "metres" if opened.unit == METRES else f"none: {opened.unit} of its own, no scale known"
-        )
-        line(console, "unit", text)
+        unknown = f"none: {opened.unit} of its own, no scale known"
+        line(console, "unit", "metres" if opened.unit == METRES else unknown)
         if fault := opened.fault():
             line(console, "FAULT", fault)
         for local_type, keypoints in opened.keypoints.items():
@@ -83,11 +89,7 @@ class Info(Reading, Common):
             line(console, "localizing with", local_type)
             line(console, "pixel origin", f"{origin.intrinsics}: {origin.reason}")
             line(console, "", f"median reprojection error by origin: {errors}")
-            line(
-                console,
-                "map descriptors",
-                describe_descriptors(opened, keypoints, None if found is None else found.name),
-            )
+            line(console, "map descriptors", describe_descriptors(opened, keypoints, found))
             line(console, "query features", describe_extraction(local_type, found))
         describe_retrieval(console, opened)
 
@@ -106,17 +108,13 @@ def describe_content(console: Console, folder: KaptureFolder) -> None:
     for kind in ("keypoints", "descriptors", "global_features"):
         for name in folder.types(kind):
             reader = getattr(folder, kind)(name)
-            config = reader.config
-            line(
-                console,
-                kind.replace("_", " "),
-                f"{name}: {len(reader.names)} images, {config.dtype.name} x {config.dsize}",
-            )
+            stored = f"{reader.config.dtype.name} x {reader.config.dsize}"
+            text = f"{name}: {len(reader.names)} images, {stored}"
+            line(console, kind.replace("_", " "), text)
     for name in folder.types("matches"):
         line(console, "matches", f"{name}: {len(folder.matches(name).pairs)} pairs")
     if folder.has_points():
-        points = len(folder.points3d())
-        line(console, "points", str(points))
+        line(console, "points", str(len(folder.points3d())))
         for name, seen in sorted(folder.observations().items()):
             line(console, "observations", f"{name}: {len(seen.point_ids)}")
         describe_refinement(console, folder)
@@ -149,7 +147,9 @@ def describe_extraction(local_type: str, extractor: PluginChoice | None) -> str:
     return f"extracted by plugin {extractor.name}, or given in kapture"
 
 
-def describe_descriptors(opened: KaptureMap, keypoints: MapKeypoints, extractor: str | None) -> str:
+def describe_descriptors(
+    opened: KaptureMap, keypoints: MapKeypoints, extractor: PluginChoice | None
+) -> str:
     """What is known of a map's descriptors, in words."""
     if keypoints.has_descriptors(opened.images):
         return "there"
@@ -157,7 +157,7 @@ def describe_descriptors(opened: KaptureMap, keypoints: MapKeypoints, extractor:
         return "missing, and no extractor for the type is installed: localizing is not possible"
     if not opened.has_images():
         return "missing, and no images to extract them from: localizing is not possible"
-    return f"missing; will be extracted again by plugin {extractor}"
+    return f"missing; will be extracted again by plugin {extractor.name}"
 
 
 def describe_retrieval(console: Console, opened: KaptureMap) -> None:
@@ -171,8 +171,7 @@ def describe_retrieval(console: Console, opened: KaptureMap) -> None:
     types = local_types_of(opened, options, FeatureCache())
     retrieval = MapRetrieval(opened, options, types, Preprocessor(options))
     line(console, "retrieval", retrieval.describe_candidates(()))
-    brought = opened.global_types()
-    if brought:
+    if brought := opened.global_types():
         text = retrieval.describe_candidates(brought)
         line(console, "", f"where queries bring {', '.join(brought)}: {text}")
 
@@ -180,3 +179,71 @@ def describe_retrieval(console: Console, opened: KaptureMap) -> None:
 def line(console: Console, name: str, text: str) -> None:
     """One line of the description."""
     console.result(f"{name:{_COLUMN}s}{text}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class OptionsCommand(Common):
+    """List the options that --set takes, with value, type and meaning."""
+
+    key: tyro.conf.Positional[str] = ""
+    """Those of a step (localization.pose), one of them, or those of a plugin (aliked)."""
+    preset: str = DEFAULT_PRESET
+    """Show the values of this preset."""
+
+    def run(self) -> int:
+        """Run it."""
+        console = self.console()
+        every = list(options_of(options_of_preset(self.preset)))
+        found = [one for one in every if _is_below(one.key, self.key)]
+        if not found:
+            found = list(_options_of_plugins(self.key))
+        if not found:
+            steps = {one.key.rpartition(".")[0] for one in every} - {""}
+            known = sorted({*(one.key for one in every), *steps, *_plugins()})
+            near = get_close_matches(self.key, known, n=3)
+            hint = f"did you mean {' or '.join(near)}? " if near else ""
+            raise OptionError(
+                f"no option, step or plugin {self.key!r}; {hint}`megloc options` lists all options"
+            )
+        for one in found:
+            console.result(f"{one.key} = {shown(one.value)}")
+            console.result(f"    {one.kind}{f'; {one.meaning}' if one.meaning else ''}")
+        return 0
+
+
+def shown(value: Any) -> str:
+    """A value as ``--set`` takes it."""
+    if isinstance(value, PluginChoice) and not value.options:
+        return value.name
+    if isinstance(value, Options):
+        return json.dumps(value.model_dump(mode="json", exclude_defaults=True))
+    if isinstance(value, tuple | list):
+        return f"[{', '.join(shown(one) for one in value)}]"
+    if value is None or isinstance(value, bool):
+        return str(value).lower()
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _is_below(key: str, asked: str) -> bool:
+    return not asked or key == asked or key.startswith(f"{asked}.")
+
+
+def _plugins() -> dict[str, list[str]]:
+    """The groups of each plugin that may have options."""
+    found: dict[str, list[str]] = {VLAD: []}
+    for group in (
+        *(LOCAL_FEATURES, GLOBAL_FEATURES, MATCHERS, POSE_RANKERS, POSE_REFINERS),
+        *(SEGMENTERS, DATASETS),
+    ):
+        for name in plugin_names(group):
+            found.setdefault(name, []).append(group)
+    return found
+
+
+def _options_of_plugins(name: str) -> Iterator[Option]:
+    if name == VLAD:
+        yield from options_of(VladOptions(), f"{name}: options.")
+    for group in _plugins().get(name, ()):
+        model = getattr(plugin_class(group, name), "Options", None)
+        if model is not None:
+            yield from options_of(model(), f"{name}: options.")

@@ -1,10 +1,12 @@
-"""``megloc localize``: queries into any kapture map; the map stays as it is."""
+"""``megloc localize`` and ``megloc serve``: queries into any kapture map, which stays as it is."""
 
 from __future__ import annotations
 
+import logging
+import sys
 import time
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,27 +20,31 @@ from megloc_kapture.cli.common import (
     Input,
     Output,
     Reading,
+    Texts,
     camera_of_text,
-    check_consistent,
-    existing,
-    idle_for_types,
     opened_map,
-    refuse_idle,
+    refuse_given,
 )
-from megloc_kapture.errors import OptionError
+from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.dataset_tables import METRES
+from megloc_kapture.io.files import read_text
 from megloc_kapture.io.kapture import KaptureFolder, read_pairs
 from megloc_kapture.io.output_folders import staged_output
 from megloc_kapture.io.tables import STATUS_FILE
 from megloc_kapture.pipeline.executors import available_cores
 from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
-from megloc_kapture.pipeline.kapture_queries import KaptureQueries
+from megloc_kapture.pipeline.local_types import LocalType, local_types_of
 from megloc_kapture.pipeline.localizer import LOCALIZING, Localizer
 from megloc_kapture.pipeline.photographs import Photographs
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, assigned, options_of_preset
+from megloc_kapture.pipeline.queries import KaptureQueries
 from megloc_kapture.pipeline.results import Results
-from megloc_kapture.stages.matches import iterate_candidates
+from megloc_kapture.service.limits import Limits
+from megloc_kapture.stages.matches import FeatureCache, iterate_candidates
+from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.stage import LOCALIZED
+
+_MIN_TOKEN_LENGTH = 16
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +67,7 @@ class Localize(Reading, Deciding, Common):
     """Kapture folder with the queries' poses, and status.csv."""
     pairs: Path | None = None
     """Candidates of each query, instead of retrieval."""
-    keypoints_type: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
+    keypoints_type: Texts = ()
     """Keypoints type to localize with; may be repeated; all that have points unless given."""
     pixel_origin: PixelOriginChoice = "auto"
     """Where the map's intrinsics put the pixel origin; auto finds it out."""
@@ -76,17 +82,10 @@ class Localize(Reading, Deciding, Common):
         console = self.console()
         self._check_queries()
         workers = available_cores() if self.workers is None else self.workers
-        kapture_map = KaptureMap.open(
-            opened_map(self.input, console),
-            keypoints_types=self.keypoints_type,
-            features_dirs=existing(self.features_dir),
-            pixel_origin=self.pixel_origin,
-            allow_links_below=existing(self.allow_links_below),
-        )
-        check_consistent(kapture_map, self.input, force=self.force)
-        options = options_of_preset(
-            self.preset or DEFAULT_PRESET, assignments=self.assignments(), used=LOCALIZING
-        )
+        path = opened_map(self.input, console)
+        kapture_map = self.opening(path, self.keypoints_type, self.pixel_origin)()
+        _check_consistent(kapture_map, self.input, force=self.force)
+        options = _options_of(self)
         folder: KaptureFolder | Photographs
         if self.query is None:
             camera = None if self.camera is None else camera_of_text(self.camera)
@@ -98,7 +97,9 @@ class Localize(Reading, Deciding, Common):
         localizer = Localizer(kapture_map, options=options)
         results = Results(localizer, folder, workers=workers, candidates=given, track=console.track)
         queries = results.queries
-        check_acted_on(assigned(self.assignments()), localizer, queries, pairs=given is not None)
+        typed = assigned(self.assignments())
+        idle = _idle_for_queries(typed, localizer, queries, pairs=given is not None)
+        _refuse_idle(typed, localizer.types, localizer.options, idle)
         with staged_output(self.output, kind=LOCALIZED, force=self.force) as out:
             started = time.perf_counter()
             named = list(results.items())
@@ -107,7 +108,7 @@ class Localize(Reading, Deciding, Common):
         how = "as given"
         if given is None:
             how = localizer.describe_retrieval(queries.types_of_all())
-        console.say(f"localizing with {', '.join(local.name for local in localizer.types)}")
+        console.say(f"localizing with {_names(localizer.types)}")
         console.say(f"candidates: {how}")
         console.say(f"pixel origin: {kapture_map.pixel_origin.intrinsics}")
         remarks = Counter(remark for _, result in named for remark in result.remarks)
@@ -133,36 +134,123 @@ class Localize(Reading, Deciding, Common):
         if (self.query is None) == (not self.images):
             raise OptionError("give the queries: either --query, a kapture folder, or --images")
         if self.query is not None:
-            for name, given in (("--camera", self.camera), ("--every", self.every)):
-                if given is not None:
-                    raise OptionError(f"{name} changes nothing: it is of --images")
+            refuse_given("--images", camera=self.camera, every=self.every)
 
 
-def check_acted_on(
+@dataclass(frozen=True, kw_only=True)
+class Serve(Reading, Deciding, Common):
+    """Localize images that come by HTTP in a kapture map; with a page for photographs."""
+
+    map: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MAP")]
+    """Kapture map: keypoints, points3d and observations; or a COLMAP model. Read only."""
+    host: str = "127.0.0.1"
+    """Address to listen at; 0.0.0.0: every one of this machine."""
+    port: int = 8000
+    """Port to listen at; 0: a free one."""
+    workers: int = 1
+    """Processes that share the map's index; every limit is of each of them."""
+    limits: Limits = Limits()
+    token_file: Path | None = None
+    """File with a token that clients have to send, 16 characters or more; none unless given."""
+    proxy: str = ""
+    """Address of a reverse proxy, whose X-Forwarded-For says who the client is."""
+    keypoints_type: Texts = ()
+    """Keypoints type to localize with; may be repeated; all that have points unless given."""
+    pixel_origin: PixelOriginChoice = "auto"
+    """Where the map's intrinsics put the pixel origin; auto finds it out."""
+    force: Force = False
+    """Localize in a map that contradicts itself."""
+
+    def run(self) -> int:
+        """Run it."""
+        from megloc_kapture.cli.main import INTERRUPTED, TERMINATED, Terminated
+        from megloc_kapture.service.server import bind, serve
+
+        console = self.console()
+        if self.workers < 1:
+            raise OptionError(f"{self.workers} workers cannot work; give 1 or more")
+        threads = self.limits.threads or max(1, available_cores() // self.workers)
+        limits = self.limits.model_copy(update={"threads": threads})
+        token = None if self.token_file is None else _read_token(self.token_file)
+        options = _options_of(self)
+        with bind(self.host, self.port) as bound:
+            path = opened_map(self.map, console)
+            opening = self.opening(path, self.keypoints_type, self.pixel_origin)
+            kapture_map = opening()
+            _check_consistent(kapture_map, self.map, force=self.force)
+            typed = assigned(self.assignments())
+            types = local_types_of(kapture_map, options, FeatureCache())
+            _refuse_idle(typed, types, options, _idle_for_images(typed, options))
+
+            def ready() -> None:
+                host = f"[{self.host}]" if ":" in self.host else self.host
+                where = f"http://{host}:{bound.getsockname()[1]}/"
+                console.result(f"{len(kapture_map.images)} map images, served at {where}")
+                if token is None and self.host not in ("127.0.0.1", "::1", "localhost"):
+                    console.say("warning: without --token-file everybody may ask")
+
+            try:
+                serve(
+                    opening,
+                    kapture_map,
+                    options,
+                    bound,
+                    limits=limits,
+                    workers=self.workers,
+                    proxy=self.proxy,
+                    token=token,
+                    log_requests=logging.getLogger().isEnabledFor(logging.INFO),
+                    ready=ready,
+                )
+            except (KeyboardInterrupt, Terminated) as end:
+                console.say("stopped")
+                sys.exit(TERMINATED if isinstance(end, Terminated) else INTERRUPTED)
+        return 0
+
+
+def _read_token(path: Path) -> str:
+    """The token in a file: one line of printable ASCII; raises DataError."""
+    token = read_text(path, max_bytes=10_000).strip()
+    if len(token) < _MIN_TOKEN_LENGTH or not token.isascii() or not token.isprintable():
+        raise DataError(
+            f"a token is one line of {_MIN_TOKEN_LENGTH} or more printable characters", path=path
+        )
+    return token
+
+
+def _options_of(command: Deciding) -> PipelineOptions:
+    return options_of_preset(
+        command.preset or DEFAULT_PRESET, assignments=command.assignments(), used=LOCALIZING
+    )
+
+
+def _check_consistent(kapture_map: KaptureMap, path: Path, *, force: bool) -> None:
+    """Raise DataError for a map that contradicts itself, unless it is to be used all the same."""
+    if not force and (fault := kapture_map.fault()):
+        raise DataError(
+            f"{fault}; the poses would be wrong (--force localizes all the same)", path=path
+        )
+
+
+def _idle_for_queries(
     typed: Mapping[str, Any],
     localizer: Localizer,
     queries: KaptureQueries | Photographs,
     *,
     pairs: bool,
-) -> None:
-    """Refuse options that were typed and change nothing for this map and these queries.
+) -> dict[str, str]:
+    """Options that change nothing for a map and these queries, and why.
 
     Parameters
     ----------
     typed : nested tables of ``--set``.
     pairs : whether the candidates are given.
-
-    Raises
-    ------
-    OptionError : names the option, and why it changes nothing.
     """
-    idle = idle_for_types(typed, localizer.types, localizer.options)
-    brought = ", ".join(local.name for local in localizer.types)
+    idle = {}
     if all(queries.lacking(local.name) is None for local in localizer.types):
-        idle |= dict.fromkeys(
-            ("preprocessing", "mask_margin_px"),
-            f"the queries bring their local features ({brought}), nothing is extracted",
-        )
+        reason = f"the queries bring their local features ({_names(localizer.types)})"
+        reason += ", nothing is extracted"
+        idle = dict.fromkeys(("preprocessing", "mask_margin_px"), reason)
     shared = queries.types_of_all()
     if pairs:
         names = ("query_pairs", "global_features", "fusion")
@@ -175,4 +263,42 @@ def check_acted_on(
             idle["localization"] = "rigs: the queries have none"
         elif localization.get("fallback") == "rig":
             idle["localization"] = "fallback = rig: the queries have none"
-    refuse_idle(typed, idle)
+    return idle
+
+
+def _idle_for_images(typed: Mapping[str, Any], options: PipelineOptions) -> dict[str, str]:
+    """Options that change nothing for single images without depth, and why."""
+    idle = {}
+    localization = typed.get("localization", {})
+    if localization.get("rigs") or localization.get("fallback") == "rig":
+        idle["localization"] = "images come one by one, not on a rig"
+    if any(one.name == "icp" for one in options.pose_refinement.by):
+        idle["pose_refinement"] = "icp needs depth maps, and images come without"
+    return idle
+
+
+def _refuse_idle(
+    typed: Mapping[str, Any],
+    types: Sequence[LocalType],
+    options: PipelineOptions,
+    of_queries: Mapping[str, str],
+) -> None:
+    """Raise OptionError where an option that was typed changes nothing for these keypoints types,
+    or for the queries."""
+    idle = {}
+    if "guided_pyramid" in typed and options.matches_again():
+        obstacles = [local.pyramid_obstacle for local in types]
+        if all(obstacles):
+            idle["guided_pyramid"] = obstacles[0]
+    used = {local.choice.name for local in types if local.choice is not None}
+    unused = [one.name for one in options.local_features if one.name not in used]
+    if unused:
+        idle["local_features"] = f"the map is of {_names(types)}; nothing in it is of {unused[0]}"
+    idle |= of_queries
+    for name in typed:
+        if name in idle:
+            raise OptionError(f"--set {name} changes nothing: {idle[name]}")
+
+
+def _names(types: Sequence[LocalType]) -> str:
+    return ", ".join(local.name for local in types)

@@ -43,117 +43,59 @@ class Command(Protocol):
         ...
 
 
-# module and class, and the first line of its help: only the command that runs is imported
+# name, module and class, first line of the help: only the command that runs is imported
+_TABLE = """
+eval evaluate_dataset:Eval Run all stages on a dataset; what is done and still true is kept.
+import datasets:Import Bring a dataset into DIR/{mapping,query,query_gt,megloc}, or a COLMAP model \
+into a map.
+synth datasets:Synth Render a dataset: the synthetic world as kapture, or a small twin in an \
+official layout.
+preprocess preprocess:Preprocess Resize, undistort and mask the images of a kapture; poses stay, \
+cameras follow.
+extract-local stages:ExtractLocal Extract local features of all images of kapture folders.
+extract-global retrieval:ExtractGlobal Describe every image by one vector: VLAD trained on the \
+map, or image networks.
+pairs-mapping retrieval:PairsMapping Choose which images of a map are matched with each other.
+pairs-query retrieval:PairsQuery Choose the map images each query is matched with.
+match stages:Match Match and verify image pairs; with known poses within a map, else by a two-view \
+model.
+triangulate stages:Triangulate Triangulate verified matches of images with known poses into a \
+kapture map.
+refine-map maps:RefineMap Take points and observations out of a map that its images, or depth \
+maps, contradict.
+densify maps:Densify Estimate depth of a map's images that have none, by multi-view stereo.
+refine-poses maps:RefinePoses Refine the poses of localized queries; a pose that gets no better \
+stays, and says why.
+map maps:MapPhotographs Make a map of photographs without poses; what is done and still true is \
+kept.
+localize localize:Localize Localize photographs, or the images of a kapture folder, in a kapture \
+map.
+serve localize:Serve Localize images that come by HTTP in a kapture map; with a page for \
+photographs.
+submit evaluate:Submit Write the pose file of a localized kapture folder, and its provenance \
+beside it.
+check evaluate:Check Check a pose file, ours or foreign, against the rules of its challenge and \
+the map.
+evaluate evaluate:Evaluate Compare localized queries (kapture folders or pose files) with their \
+true poses, and two or more results with each other.
+export export:Export Write a map, localized queries or both for COLMAP, nerfstudio, evo and \
+viewers.
+view export:View Write a page that shows a map in 3D, and the queries of a result in it; it needs \
+no network.
+train training:Train Train SuperGlue, or a detector's descriptors, on kapture folders with depth \
+and on photographs.
+train-field training:TrainField Train a neural field (NeRF-W) on the images of a map, to render \
+views and refine poses.
+render training:Render Render a view of a neural field, views of a result, or views that no camera \
+took.
+weights weights:WeightsCommand List, fetch, add, convert and check the weights of networks.
+info info:Info Say what is in a kapture folder, and what a map allows.
+options info:OptionsCommand List the options that --set takes, with value, type and meaning.
+doctor weights:Doctor Check the environment: versions, known-bad combinations, GPU, weights.
+"""
 COMMANDS: dict[str, tuple[str, str]] = {
-    "eval": (
-        "evaluate_dataset:Eval",
-        "Run all stages on a dataset; what is done and still true is kept.",
-    ),
-    "import": (
-        "datasets:Import",
-        "Bring a dataset into DIR/{mapping,query,query_gt,megloc}, or a COLMAP model into a map.",
-    ),
-    "synth": (
-        "datasets:Synth",
-        "Render a dataset: the synthetic world as kapture, or a small twin in an official layout.",
-    ),
-    "preprocess": (
-        "preprocess:Preprocess",
-        "Resize, undistort and mask the images of a kapture; poses stay, cameras follow.",
-    ),
-    "extract-local": (
-        "stages:ExtractLocal",
-        "Extract local features of all images of kapture folders.",
-    ),
-    "extract-global": (
-        "retrieval:ExtractGlobal",
-        "Describe every image by one vector: VLAD trained on the map, or image networks.",
-    ),
-    "pairs-mapping": (
-        "retrieval:PairsMapping",
-        "Choose which images of a map are matched with each other.",
-    ),
-    "pairs-query": ("retrieval:PairsQuery", "Choose the map images each query is matched with."),
-    "match": (
-        "stages:Match",
-        "Match and verify image pairs; with known poses within a map, else by a two-view model.",
-    ),
-    "triangulate": (
-        "stages:Triangulate",
-        "Triangulate verified matches of images with known poses into a kapture map.",
-    ),
-    "refine-map": (
-        "refine_map:RefineMap",
-        "Take points and observations out of a map that its images, or depth maps, contradict.",
-    ),
-    "densify": (
-        "densify:Densify",
-        "Estimate depth of a map's images that have none, by multi-view stereo.",
-    ),
-    "refine-poses": (
-        "refine_poses:RefinePoses",
-        "Refine the poses of localized queries; a pose that gets no better stays, and says why.",
-    ),
-    "map": (
-        "map_photographs:MapPhotographs",
-        "Make a map of photographs without poses; what is done and still true is kept.",
-    ),
-    "localize": (
-        "localize:Localize",
-        "Localize photographs, or the images of a kapture folder, in a kapture map.",
-    ),
-    "serve": (
-        "serve:Serve",
-        "Localize images that come by HTTP in a kapture map; with a page for photographs.",
-    ),
-    "submit": (
-        "submit:Submit",
-        "Write the pose file of a localized kapture folder, and its provenance beside it.",
-    ),
-    "check": (
-        "check:Check",
-        "Check a pose file, ours or foreign, against the rules of its challenge and the map.",
-    ),
-    "evaluate": (
-        "evaluate:Evaluate",
-        "Compare localized queries (kapture folders or pose files) with their true poses, and two "
-        "or more results with each other.",
-    ),
-    "export": (
-        "export:Export",
-        "Write a map, localized queries or both for COLMAP, nerfstudio, evo and viewers.",
-    ),
-    "view": (
-        "view:View",
-        "Write a page that shows a map in 3D, and the queries of a result in it; it needs no "
-        "network.",
-    ),
-    "train": (
-        "train:Train",
-        "Train SuperGlue, or a detector's descriptors, on kapture folders with depth and on "
-        "photographs.",
-    ),
-    "train-field": (
-        "field:TrainField",
-        "Train a neural field (NeRF-W) on the images of a map, to render views and refine poses.",
-    ),
-    "render": (
-        "field:Render",
-        "Render a view of a neural field, views of a result, or views that no camera took.",
-    ),
-    "weights": (
-        "weights:WeightsCommand",
-        "List, fetch, add, convert and check the weights of networks.",
-    ),
-    "info": ("info:Info", "Say what is in a kapture folder, and what a map allows."),
-    "options": (
-        "options:OptionsCommand",
-        "List the options that --set takes, with value, type and meaning.",
-    ),
-    "doctor": (
-        "doctor:Doctor",
-        "Check the environment: versions, known-bad combinations, GPU, weights.",
-    ),
+    name: (place, text)
+    for name, place, text in (line.split(" ", 2) for line in _TABLE.strip().splitlines())
 }
 
 
@@ -163,7 +105,7 @@ def command_class(name: str) -> type[Any]:
         module, _, kind = COMMANDS[name][0].partition(":")
         found: type[Any] = getattr(import_module(f"megloc_kapture.cli.{module}"), kind)
         return found
-    from megloc_kapture.cli.outside_stages import stage_command
+    from megloc_kapture.cli.stages import stage_command
 
     return stage_command(name.replace("-", "_"))
 

@@ -2,28 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import tyro
 from pydantic import ValidationError
 
 from megloc_kapture.cli.common import (
-    Common,
     Computing,
+    Folders,
     Force,
     Input,
     Linked,
     Output,
+    Texts,
     Working,
+    assigned_pairs,
     existing,
 )
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.files import first_problem
-from megloc_kapture.io.output_folders import replace_directory, staged_output
-from megloc_kapture.pipeline.executors import single_threaded
+from megloc_kapture.io.output_folders import replace_directory
 from megloc_kapture.pipeline.presets import assigned
 from megloc_kapture.stages.devices import placed
 from megloc_kapture.stages.preprocessing import (
@@ -33,7 +33,6 @@ from megloc_kapture.stages.preprocessing import (
     preprocess_images,
     read_report,
 )
-from megloc_kapture.stages.work import Work
 
 PREPROCESSED = "preprocessed"
 
@@ -47,11 +46,9 @@ _SOURCES = {
     "all": "together",
 }
 
-Several = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
-
 
 @dataclass(frozen=True, kw_only=True)
-class Preprocess(Linked, Computing, Working, Common):
+class Preprocess(Linked, Computing, Working):
     """Resize, undistort and mask the images of a kapture; poses stay, cameras follow."""
 
     input: Input
@@ -66,19 +63,19 @@ class Preprocess(Linked, Computing, Working, Common):
     """Segmenter plugin whose dynamic classes (people, vehicles) are masked."""
     dynamic: tuple[str, ...] = ()
     """Classes to mask; the segmenter's own choice unless given."""
-    bottom_share: Several = ()
+    bottom_share: Texts = ()
     """Mask the bottom of a camera's images: CAMERA=0.2, a sensor id or a pattern of image names."""
-    polygon: Several = ()
+    polygon: Texts = ()
     """Mask a polygon: CAMERA="x,y x,y x,y", corners in shares of width and height."""
-    mask_file: Several = ()
+    mask_file: Texts = ()
     """Mask what is 0 in an image of the camera's size: CAMERA=FILE."""
     unchanging: bool = False
     """Mask the region at the bottom that never changes (the car's bonnet), found per camera."""
-    sequence: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = ()
+    sequence: Folders = ()
     """Kapture folder whose images of the same cameras help to find it; may be repeated."""
     user_masks: Path | None = None
     """Folder of masks IMAGE.png, 0 where the image is ignored."""
-    set: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
+    set: Texts = ()
     """Change another option: key=value (upscale, multiple_of, blank_pixels); may be repeated."""
     force: Force = False
     """Write into a folder that has other things in it."""
@@ -89,14 +86,8 @@ class Preprocess(Linked, Computing, Working, Common):
         options = self.options()
         source = self.kapture(self.input)
         sequences = [self.kapture(path) for path in existing(self.sequence)]
-        with (
-            single_threaded(),
-            staged_output(self.output, kind=PREPROCESSED, force=self.force) as out,
-            self.open_executor(out) as executor,
-        ):
-            preprocess_images(
-                source, out, options, sequences=sequences, work=Work(executor, console.track)
-            )
+        with self.staged(self.output, PREPROCESSED, force=self.force) as (out, work):
+            preprocess_images(source, out, options, sequences=sequences, work=work)
             report = read_report(out)
             # masks and images of an earlier run would be taken for this one's
             if (self.output / "sensors" / REPORT_FILE).is_file():
@@ -133,11 +124,12 @@ class Preprocess(Linked, Computing, Working, Common):
         return placed(options, self.device or "auto", self.precision or "full")
 
     def _fixed_masks(self) -> Iterator[dict[str, Any]]:
-        for camera, value in _assignments("--bottom-share", self.bottom_share):
+        takes = "CAMERA=VALUE"
+        for camera, value in assigned_pairs("--bottom-share", self.bottom_share, takes):
             yield {"camera": camera, "bottom_share": value}
-        for camera, value in _assignments("--polygon", self.polygon):
+        for camera, value in assigned_pairs("--polygon", self.polygon, takes):
             yield {"camera": camera, "polygon": [corner.split(",") for corner in value.split()]}
-        for camera, value in _assignments("--mask-file", self.mask_file):
+        for camera, value in assigned_pairs("--mask-file", self.mask_file, takes):
             yield {"camera": camera, "file": value}
 
 
@@ -162,11 +154,3 @@ def report_lines(report: PreprocessingReport) -> list[str]:
             if source in report.masked
         ]
     return lines
-
-
-def _assignments(flag: str, texts: Sequence[str]) -> Iterator[tuple[str, str]]:
-    for text in texts:
-        camera, equals, value = text.rpartition("=")
-        if not (camera and equals and value):
-            raise OptionError(f"{flag} takes CAMERA=VALUE, got {text!r}")
-        yield camera, value

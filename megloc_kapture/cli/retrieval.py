@@ -5,18 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-import tyro
-
-from megloc_kapture.cli.common import Force, Input, Output, Reading
-from megloc_kapture.cli.stage_command import (
-    StageCommand,
-    only_type,
-    restrictions_beside,
-)
+from megloc_kapture.cli.common import Folders, Force, Input, Output, Reading
+from megloc_kapture.cli.stages import FEATURES, StageCommand, only_type, restrictions_beside
 from megloc_kapture.errors import OptionError
-from megloc_kapture.io.kapture import ImagePair, KaptureFolder, write_pairs
+from megloc_kapture.io.kapture import KaptureFolder, write_pairs
 from megloc_kapture.retrieval.fusion import FusionMethod
 from megloc_kapture.stages.candidates import Retrieval
 from megloc_kapture.stages.global_features import extract_global_features, extract_vlad, vlad_type
@@ -39,7 +33,7 @@ class ExtractGlobal(Reading, StageCommand):
 
     input: Input
     """Kapture folder of the map; VLAD is trained on its descriptors."""
-    query: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = ()
+    query: Folders = ()
     """Kapture folder of queries to describe as well; may be repeated."""
     output: Output
     """Features folder: global_features/T/global_features."""
@@ -56,21 +50,15 @@ class ExtractGlobal(Reading, StageCommand):
         choices = self.options(self.named("global_features", self.features)).global_features
         folders = [self.kapture(folder) for folder in (self.input, *self.query)]
         extractors = {one.name: one.make() for one in choices if not one.is_vlad}
-        with self.features_folder(self.output, force=self.force) as (out, work):
+        with self.staged(self.output, FEATURES, force=self.force) as (out, work):
             for choice in choices:
                 if choice.is_vlad:
                     options = choice.vlad_options()
-                    local_type = only_type(
-                        folders[0], "descriptors", self.local_type or options.local_type
-                    )
+                    asked = self.local_type or options.local_type
+                    local_type = only_type(folders[0], "descriptors", asked)
                     type_name = vlad_type(local_type)
                     counts = extract_vlad(
-                        folders[0],
-                        folders,
-                        local_type,
-                        out,
-                        options.of_vlad(),
-                        work=work,
+                        folders[0], folders, local_type, out, options.of_vlad(), work=work
                     )
                 else:
                     extractor = extractors[choice.name]
@@ -105,11 +93,9 @@ class PairsMapping(Reading, StageCommand):
 
     def run(self) -> int:
         """Run it."""
+        console = self.console()
         mapping = self.kapture(self.input)
-        changes: dict[str, object] = {"by": self.by}
-        if self.topk is not None:
-            changes["top_k"] = self.topk
-        chosen = self.options({"mapping_pairs": changes})
+        chosen = self.options({"mapping_pairs": _changes(self.by, self.topk)})
         options = chosen.mapping_pairs
         covisible = self.covisibility_map
         if covisible is not None and not options.needs_points():
@@ -126,8 +112,9 @@ class PairsMapping(Reading, StageCommand):
                 covisible=None if covisible is None else self.kapture(covisible),
                 work=work,
             )
-        _write_pairs(self.output, pairs, force=self.force)
-        self.console().say(f"{len(pairs)} pairs")
+        _refuse_existing(self.output, force=self.force)
+        write_pairs(self.output, pairs)
+        console.say(f"{len(pairs)} pairs")
         return 0
 
 
@@ -172,12 +159,10 @@ class PairsQuery(Reading, StageCommand):
         mapping = self.kapture(self.input)
         query = self.kapture(self.query)
         mapping.check_features_apart(query)
-        changes: dict[str, object] = {"by": "exhaustive" if self.exhaustive else "retrieval"}
-        if self.topk is not None:
-            changes["top_k"] = self.topk
+        by = "exhaustive" if self.exhaustive else "retrieval"
         matching = ("local_features", "matching", "verification", "query_verification")
         also = () if self.rerank is None else matching
-        options = self.options({"query_pairs": changes}, also=also)
+        options = self.options({"query_pairs": _changes(by, self.topk)}, also=also)
         of_types = (chosen.matching for chosen in options.local_features)
         self.check_computes((options.matching, *of_types))
         retrieval = None
@@ -193,45 +178,34 @@ class PairsQuery(Reading, StageCommand):
                 work=work,
             )
         if self.rerank is not None and self.matches_dir is not None:
-            pairs = self._rerank(mapping, query, pairs, self.rerank, self.matches_dir, options)
-        _write_pairs(self.output, pairs, force=self.force)
+            local_types = self._types_of_both(mapping, query)
+            verification = options.verify_queries()
+            with self.staged(self.matches_dir, FEATURES, force=self.force) as (out, work):
+                for name in local_types:
+                    matcher = options.make_matcher(name)
+                    match_pairs(query, mapping, pairs, name, matcher, verification, out, work=work)
+                matched = query.with_features([*query.features_dirs, out])
+                how = RerankingOptions(by=self.rerank_by, keep=self.rerank)
+                pairs = reranked(pairs, matched, out, local_types, how)
+        _refuse_existing(self.output, force=self.force)
+        write_pairs(self.output, pairs)
         console.say(f"{len(pairs)} pairs")
         return 0
 
-    def _rerank(
-        self,
-        mapping: KaptureFolder,
-        query: KaptureFolder,
-        pairs: Sequence[ImagePair],
-        keep: int,
-        matches_dir: Path,
-        options: PipelineOptions,
-    ) -> list[ImagePair]:
+    def _types_of_both(self, mapping: KaptureFolder, query: KaptureFolder) -> list[str]:
+        """The local features to rerank by; raises OptionError."""
         both = set(mapping.types("descriptors")) & set(query.types("descriptors"))
-        local_types = [
-            only_type(mapping, "descriptors", asked)
-            for asked in self.local_features or sorted(both)
-        ]
-        if not local_types:
+        asked = self.local_features or sorted(both)
+        if not asked:
             raise OptionError(
                 f"{query.root}: no local features that the map has as well; give their folder "
                 "with --features-dir"
             )
-        with self.features_folder(matches_dir, force=self.force) as (out, work):
-            for local_type in local_types:
-                match_pairs(
-                    query,
-                    mapping,
-                    pairs,
-                    local_type,
-                    options.make_matcher(local_type),
-                    options.verify_queries(),
-                    out,
-                    work=work,
-                )
-            matched = query.with_features([*query.features_dirs, out])
-            how = RerankingOptions(by=self.rerank_by, keep=keep)
-            return reranked(pairs, matched, out, local_types, how)
+        return [only_type(mapping, "descriptors", one) for one in asked]
+
+
+def _changes(by: object, topk: int | None) -> dict[str, object]:
+    return {"by": by} | ({} if topk is None else {"top_k": topk})
 
 
 def _retrieval(
@@ -246,11 +220,6 @@ def _retrieval(
     if fusion is not None:
         how = how.model_copy(update={"method": fusion})
     return Retrieval(types, fusion=how)
-
-
-def _write_pairs(path: Path, pairs: Sequence[ImagePair], *, force: bool) -> None:
-    _refuse_existing(path, force=force)
-    write_pairs(path, pairs)
 
 
 def _refuse_existing(path: Path, *, force: bool) -> None:

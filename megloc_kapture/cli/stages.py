@@ -1,28 +1,101 @@
-"""Commands of local features, matches and maps; each writes what any kapture tool can read."""
+"""Commands of single stages: features, matches and points, and the stages of other packages.
+
+What our own write, any kapture tool can read; a stage of another package runs in a workspace.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, make_dataclass
+from inspect import getdoc
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, ClassVar
 
 import tyro
 
-from megloc_kapture.cli.common import Force, Input, Linked, Output, Reading
-from megloc_kapture.cli.stage_command import StageCommand, only_type
+from megloc_kapture.cli.common import (
+    Choosing,
+    Force,
+    Input,
+    Inputs,
+    Linked,
+    Output,
+    Reading,
+    Texts,
+    Working,
+    side_tables_beside,
+)
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs
 from megloc_kapture.pipeline.executors import available_cores
-from megloc_kapture.plugin_loading import load_plugin
-from megloc_kapture.plugins import MATCHERS
+from megloc_kapture.pipeline.plan import run_plan
+from megloc_kapture.pipeline.presets import DEFAULT_PRESET, assigned, options_of_preset
+from megloc_kapture.pipeline.workspace import Workspace
+from megloc_kapture.plugin_loading import load_plugin, plugin_class
+from megloc_kapture.plugins import MATCHERS, STAGES, chosen_by_name
+from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.matches import match_pairs
+from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.triangulation import triangulate_map
 
-MAP = "map"
+FEATURES, MAP = "features", "map"
 
-Inputs = Annotated[tuple[Path, ...], tyro.conf.arg(aliases=["-i"]), tyro.conf.UseAppendAction]
+
+@dataclass(frozen=True, kw_only=True)
+class StageCommand(Choosing, Working):
+    uses: ClassVar[tuple[str, ...]] = ()
+    """The options that the command acts on, by their first key; --set takes no others."""
+
+    def options(
+        self, changes: dict[str, object] | None = None, *, also: Sequence[str] = ()
+    ) -> PipelineOptions:
+        """The preset's options, with what the flags change.
+
+        Parameters
+        ----------
+        also : options that are acted on beside :attr:`uses`, because of other flags.
+
+        Raises
+        ------
+        OptionError : see ``options_of_preset``; or a device is given and no network is used.
+        """
+        used = (*self.uses, *also)
+        options = options_of_preset(
+            self.preset or DEFAULT_PRESET,
+            changes=[changes or {}, assigned(self.placement())],
+            assignments=self.set,
+            used=used,
+        )
+        self.check_computes(tuple(getattr(options, name) for name in used))
+        return options
+
+    def named(self, key: str, names: Sequence[str]) -> dict[str, object]:
+        """Changes that choose plugins by their names, with the settings that the preset has of
+        them; none without names."""
+        preset = getattr(options_of_preset(self.preset or DEFAULT_PRESET), key)
+        return {key: chosen_by_name(preset, names)} if names else {}
+
+
+def only_type(folder: KaptureFolder, kind: str, asked: str | None) -> str:
+    """The type of a kind that is meant: the one asked for, or the only one; raises OptionError."""
+    types = folder.types(kind)  # type: ignore[arg-type]
+    there = ", ".join(types)
+    if asked in types or (asked is None and len(types) == 1):
+        return asked or types[0]
+    if asked is not None:
+        reason = f"no {kind} of type {asked!r}; there are: {there or 'none'}"
+    elif types:
+        reason = f"several types of {kind}, name one: {there}"
+    else:
+        reason = f"no {kind}; give their folder with --features-dir"
+    raise OptionError(f"{folder.root}: {reason}")
+
+
+def restrictions_beside(folder: Path) -> Restrictions:
+    """Of the dataset whose tables lie beside a kapture folder; none where there are none."""
+    tables = side_tables_beside(folder)
+    return UNRESTRICTED if tables is None else Restrictions.read(tables)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,30 +121,22 @@ class ExtractLocal(Linked, StageCommand):
         folders = [self.kapture(path) for path in self.input]
         options = self.options(self.named("local_features", self.features))
         extractors = options.make_extractors()
-        with self.features_folder(self.output, force=self.force) as (out, work):
+        with self.staged(self.output, FEATURES, force=self.force) as (out, work):
             for extractor in extractors:
                 counts = extract_local_features(
-                    folders,
-                    extractor,
-                    out,
-                    mask_margin_px=options.mask_margin_px,
-                    work=work,
+                    folders, extractor, out, mask_margin_px=options.mask_margin_px, work=work
                 )
-                console.say(
-                    f"{extractor.name}: {counts['keypoints']} keypoints, {counts['images']} images"
-                    + (
-                        f"; masks of {counts['images_with_mask']} images removed "
+                told = [f"{counts['keypoints']} keypoints, {counts['images']} images"]
+                if "images_with_mask" in counts:
+                    told.append(
+                        f"masks of {counts['images_with_mask']} images removed "
                         f"{counts['keypoints_masked']}"
-                        if "images_with_mask" in counts
-                        else ""
                     )
-                    + (
-                        f"; {counts['images_reduced']} images were reduced meanwhile "
-                        "(max_megapixels)"
-                        if "images_reduced" in counts
-                        else ""
+                if "images_reduced" in counts:
+                    told.append(
+                        f"{counts['images_reduced']} images were reduced meanwhile (max_megapixels)"
                     )
-                )
+                console.say(f"{extractor.name}: {'; '.join(told)}")
         return 0
 
 
@@ -110,21 +175,12 @@ class Match(Reading, StageCommand):
         matcher = load_plugin(MATCHERS, chosen.name, chosen.options)
         first, verification = mapping, options.verify_mapping()
         if self.query is not None:
-            first = self.kapture(self.query)
+            first, verification = self.kapture(self.query), options.verify_queries()
             mapping.check_features_apart(first)
-            verification = options.verify_queries()
-        pairs = read_pairs(self.pairs)
-        _check_images_of(pairs, first, mapping, self.pairs)
-        with self.features_folder(self.output, force=self.force) as (out, work):
+        pairs = _read_pairs_of(self.pairs, first, mapping)
+        with self.staged(self.output, FEATURES, force=self.force) as (out, work):
             counts = match_pairs(
-                first,
-                mapping,
-                pairs,
-                local_type,
-                matcher,
-                verification,
-                out,
-                work=work,
+                first, mapping, pairs, local_type, matcher, verification, out, work=work
             )
         console.say(f"{counts['matches']} matches in {counts['pairs_with_matches']} pairs")
         return 0
@@ -152,9 +208,7 @@ class Triangulate(Reading, StageCommand):
         console = self.console()
         mapping = self.kapture(self.input)
         local_types = [only_type(mapping, "matches", asked) for asked in self.features or (None,)]
-        pairs = None if self.pairs is None else read_pairs(self.pairs)
-        if pairs is not None and self.pairs is not None:
-            _check_images_of(pairs, mapping, mapping, self.pairs)
+        pairs = None if self.pairs is None else _read_pairs_of(self.pairs, mapping, mapping)
         with self.staged(self.output, MAP, force=self.force) as (out, work):
             counts = triangulate_map(
                 mapping,
@@ -173,13 +227,42 @@ class Triangulate(Reading, StageCommand):
         return 0
 
 
-def _check_images_of(
-    pairs: Sequence[ImagePair], first: KaptureFolder, second: KaptureFolder, path: Path
-) -> None:
-    known_first = set(first.read().image_names())
-    known_second = set(second.read().image_names())
+def _read_pairs_of(path: Path, first: KaptureFolder, second: KaptureFolder) -> list[ImagePair]:
+    """The pairs of a file, which must be of images of the two folders; raises DataError."""
+    pairs = read_pairs(path)
+    known_first, known_second = (set(one.read().image_names()) for one in (first, second))
     for pair in pairs:
         if pair.query not in known_first:
             raise DataError(f"no image {pair.query} in {first.root}", path=path)
         if pair.map not in known_second:
             raise DataError(f"no image {pair.map} in {second.root}", path=path)
+    return pairs
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutsideStage(Working):
+    stage: ClassVar[str]
+
+    workspace: Annotated[Path, tyro.conf.arg(aliases=["-w"])]
+    """Workspace of megloc eval that has what the stage reads."""
+    set: Texts = ()
+    """Change an option of the stage: key=value; may be repeated."""
+
+    def run(self) -> int:
+        """Run it."""
+        console = self.console()
+        stage = load_plugin(STAGES, self.stage, assigned(self.set))
+        if not (self.workspace / "stages").is_dir():
+            raise OptionError(f"{self.workspace} is no workspace of megloc eval")
+        workspace = Workspace(self.workspace)
+        with self.working_in(workspace) as work:
+            run_plan([stage], workspace, work, say=console.say)
+        return 0
+
+
+def stage_command(name: str) -> type[Any]:
+    """The command of a registered stage; raises PluginError where it cannot be loaded."""
+    command = make_dataclass(name, [], bases=(OutsideStage,), frozen=True, kw_only=True)
+    command.stage = name  # type: ignore[attr-defined]
+    command.__doc__ = getdoc(plugin_class(STAGES, name)) or f"Run the stage {name}."
+    return command

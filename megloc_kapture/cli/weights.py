@@ -1,17 +1,19 @@
-"""``megloc weights``: what each network needs, where it is published, what its licence allows."""
+"""``megloc weights`` and ``doctor``: weights of networks and their licences; the environment."""
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from megloc_kapture.cli.common import Common, Force, Output
-from megloc_kapture.cli.console import Console
-from megloc_kapture.errors import MeglocError, OptionError, OutputError
+from megloc_kapture.cli.common import Common, Console, Force, Output
+from megloc_kapture.errors import MeglocError, OptionError, OutputError, missing_extra
+from megloc_kapture.evaluation.provenance import installed_version
 from megloc_kapture.io.weights import (
     MissingWeightsError,
     WeightsFile,
@@ -27,8 +29,7 @@ from megloc_kapture.io.weights import (
 )
 from megloc_kapture.io.weights.fetch import fetch
 from megloc_kapture.io.weights.registry import PublishedFile, Weights, lookup, registry
-from megloc_kapture.pipeline.missing_weights import check_weights
-from megloc_kapture.pipeline.presets import options_of_preset
+from megloc_kapture.pipeline.presets import check_weights, options_of_preset
 
 WRONG_FILES = 2
 
@@ -77,10 +78,9 @@ class Fetch(Common):
         console = self.console()
         names = self.names
         if self.preset is not None:
-            missing = _missing(self.preset)
-            if not (missing or names):
+            names = tuple(dict.fromkeys((*names, *_missing(self.preset))))
+            if not names:
                 console.result(f"{self.preset}: no weights are missing")
-            names = tuple(dict.fromkeys((*names, *missing)))
         elif not names:
             raise OptionError(f"say which weights to fetch: {', '.join(registry())}")
         wanted, refused = [], []
@@ -260,7 +260,10 @@ def _state(weights: Weights) -> str:
 
 
 def _row(weights: Weights) -> tuple[str, ...]:
-    file = next((f for f in weights.files if _is_there(weights, f)), weights.files[0])
+    there: list[PublishedFile | None] = []
+    with suppress(MeglocError):
+        there = [describe(weights.name, path).published for path in files_of(weights)]
+    file = next((one for one in weights.files if one in there), weights.files[0])
     size = "?" if file.size is None else f"{file.size / 1e6:.2f} MB"
     name = f"{weights.name} *" if weights.unverified else weights.name
     licence = weights.licence if weights.commercial else f"{weights.licence} (!)"
@@ -269,15 +272,70 @@ def _row(weights: Weights) -> tuple[str, ...]:
     return name, weights.purpose, names, size, licence, _state(weights), known
 
 
-def _is_there(weights: Weights, file: PublishedFile) -> bool:
-    try:
-        return any(describe(weights.name, path).published == file for path in files_of(weights))
-    except MeglocError:
-        return False
-
-
 def _aligned(rows: Sequence[Sequence[str]]) -> Iterator[str]:
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
         yield "  ".join(cells).rstrip()
+
+
+_PACKAGES = (
+    "megloc-kapture",
+    "kapture",
+    "numpy",
+    "scipy",
+    "opencv-python-headless",
+    "pycolmap",
+    "poselib",
+    "torch",
+    "numba",
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Doctor(Common):
+    """Check the environment: versions, known-bad combinations, GPU, weights."""
+
+    def run(self) -> int:
+        """Print what there is; exit status 2 when something is wrong."""
+        console = self.console()
+        for package in _PACKAGES:
+            console.result(f"{package:24s}{installed_version(package) or 'not installed'}")
+        console.result(f"{'GPU':24s}{gpu()}")
+        console.result(f"{'weights':24s}{summary()}")
+        problems = find_problems()
+        for problem in problems:
+            console.result(f"problem: {problem}")
+        if problems:
+            raise MeglocError(f"{len(problems)} problems found, see above")
+        console.result("no problem found")
+        return 0
+
+
+def gpu() -> str:
+    """Name of the GPU that torch sees."""
+    try:
+        import torch
+    except ModuleNotFoundError as error:
+        return f"unknown: {missing_extra(error) or error}"
+
+    return torch.cuda.get_device_name(0) if torch.cuda.is_available() else "none"
+
+
+def find_problems() -> list[str]:
+    """Known-bad combinations of installed packages, each with its remedy."""
+    problems = []
+    torch, vision = installed_version("torch"), installed_version("torchvision")
+    if vision and torch and "+cpu" in torch:
+        problems.append(
+            f"torchvision {vision} beside torch {torch}: its CPU builds fail to import and break "
+            "transformers too; pip uninstall torchvision"
+        )
+    if installed_version("opencv-python") and installed_version("opencv-python-headless"):
+        problems.append(
+            "opencv-python beside opencv-python-headless: both write the folder cv2; uninstall "
+            "both and install opencv-python-headless"
+        )
+    if importlib.util.find_spec("cv2") is None:
+        problems.append("cv2 cannot be imported; pip install opencv-python-headless")
+    return problems

@@ -8,15 +8,20 @@ import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.report.reports import RECALL_JSON
 from megloc_kapture.io.csv_table import write_csv_table
 from megloc_kapture.io.files import hard_link, output_error
+from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
 from megloc_kapture.pipeline.manifests import read_manifest
+from megloc_kapture.pipeline.plan import run_plan
+from megloc_kapture.pipeline.run import RunChoice
 from megloc_kapture.pipeline.workspace import LOCK, PARTIAL, Workspace
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.stage import EVALUATION, Stage
+from megloc_kapture.stages.work import Work
 
 ABLATION, TABLE = "ablation", "ablation/ablation.csv"
 
@@ -26,115 +31,107 @@ _BESIDE = frozenset({"import", "submission", "evaluation"})
 
 @dataclass(frozen=True)
 class Variant:
-    """A run without one step.
-
-    Attributes
-    ----------
-    name : of the step, in words; ``slug`` is its folder below ``ablation/``.
-    """
+    """A run without one step, which is named in words."""
 
     name: str
     options: PipelineOptions
 
     @property
     def slug(self) -> str:
-        """The name of its folder."""
+        """Its folder below ``ablation/``."""
         return "without_" + self.name.replace(" ", "_")
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a run came to.
-
-    Attributes
-    ----------
-    recall : text of each threshold to recall, 0 to 1.
-    seconds : of all its stages, from import and evaluation apart.
-    """
+    """What a run came to."""
 
     name: str
-    recall: dict[str, float]
+    recall: dict[str, float]  # 0 to 1, by the text of the threshold
     median_position_m: float
     median_angle_deg: float
-    seconds: float
+    seconds: float  # of all its stages, from import and evaluation apart
 
 
 def variants(options: PipelineOptions) -> list[Variant]:
     """The runs without one of the steps that these options have, in the pipeline's order."""
-    found = []
-    for name, has, without in _STEPS:
-        if has(options):
-            found.append(Variant(name, without(options)))
-    for position, chosen in enumerate(options.pose_refinement.by):
-        by = options.pose_refinement.by
-        rest = {"by": by[:position] + by[position + 1 :]}
-        changed = options.pose_refinement.model_copy(update=rest)
-        found.append(Variant(chosen.name, _with(options, pose_refinement=changed)))
-    return found
-
-
-def _with(options: PipelineOptions, **changes: object) -> PipelineOptions:
-    return options.model_copy(update=changes)
-
-
-def _plain_ranking(options: PipelineOptions) -> PipelineOptions:
-    rank = options.localization.rank.model_copy(update={"name": "inliers", "options": {}})
-    return _with(options, localization=options.localization.model_copy(update={"rank": rank}))
-
-
-def _one_cluster(options: PipelineOptions) -> PipelineOptions:
-    clusters = options.localization.clusters.model_copy(update={"by": "none"})
-    return _with(
-        options, localization=options.localization.model_copy(update={"clusters": clusters})
-    )
-
-
-def _unranked(options: PipelineOptions) -> PipelineOptions:
-    # as many images, the first that retrieval finds
-    pairs = options.query_pairs.model_copy(update={"top_k": options.reranking.keep})
-    reranking = options.reranking.model_copy(update={"by": "none"})
-    return _with(options, query_pairs=pairs, reranking=reranking)
-
-
-def _nothing_rejected(options: PipelineOptions) -> PipelineOptions:
+    no_masks = type(options.preprocessing.masks)()
     depth = options.refinement.depth.model_copy(update={"max_sigmas": None})
-    kind = type(options.refinement)
-    return _with(options, refinement=kind(depth=depth, ply=options.refinement.ply))
-
-
-_STEPS: tuple[
-    tuple[str, Callable[[PipelineOptions], bool], Callable[[PipelineOptions], PipelineOptions]], ...
-] = (
-    (
-        "masks",
-        lambda o: o.preprocessing.masks != type(o.preprocessing.masks)(),
-        lambda o: _with(
-            o,
-            preprocessing=o.preprocessing.model_copy(
-                update={"masks": type(o.preprocessing.masks)()}
-            ),
+    nothing_rejected = type(options.refinement)(depth=depth, ply=options.refinement.ply)
+    # as many images, the first that retrieval finds
+    unranked = _changed(options, "query_pairs", top_k=options.reranking.keep)
+    localization = options.localization
+    steps: list[tuple[str, bool, PipelineOptions]] = [
+        (
+            "masks",
+            options.preprocessing.masks != no_masks,
+            _changed(options, "preprocessing", masks=no_masks),
         ),
-    ),
-    (
-        "second local features",
-        lambda o: len(o.local_features) > 1,
-        lambda o: _with(o, local_features=o.local_features[:1]),
-    ),
-    (
-        "fusion",
-        lambda o: len(o.global_features) > 1,
-        lambda o: _with(o, global_features=o.global_features[:1]),
-    ),
-    ("map refinement", lambda o: o != _nothing_rejected(o), _nothing_rejected),
-    ("reranking", lambda o: o.reranking.reranks(), _unranked),
-    (
-        "guided pyramid",
-        lambda o: o.matches_again(),
-        lambda o: _with(o, guided_pyramid=o.guided_pyramid.model_copy(update={"mode": "off"})),
-    ),
-    ("clusters", lambda o: o.localization.clusters.by != "none", _one_cluster),
-    ("pose ranking", lambda o: o.localization.rank.name != "inliers", _plain_ranking),
-)
+        (
+            "second local features",
+            len(options.local_features) > 1,
+            _changed(options, local_features=options.local_features[:1]),
+        ),
+        (
+            "fusion",
+            len(options.global_features) > 1,
+            _changed(options, global_features=options.global_features[:1]),
+        ),
+        (
+            "map refinement",
+            options.refinement != nothing_rejected,
+            _changed(options, refinement=nothing_rejected),
+        ),
+        ("reranking", options.reranking.reranks(), _changed(unranked, "reranking", by="none")),
+        (
+            "guided pyramid",
+            options.matches_again(),
+            _changed(options, "guided_pyramid", mode="off"),
+        ),
+        (
+            "clusters",
+            localization.clusters.by != "none",
+            _changed(options, "localization.clusters", by="none"),
+        ),
+        (
+            "pose ranking",
+            localization.rank.name != "inliers",
+            _changed(options, "localization.rank", name="inliers", options={}),
+        ),
+    ]
+    refiners = options.pose_refinement.by
+    for at, chosen in enumerate(refiners):
+        without = _changed(options, "pose_refinement", by=refiners[:at] + refiners[at + 1 :])
+        steps.append((chosen.name, True, without))
+    return [Variant(name, without) for name, has, without in steps if has]
+
+
+def _changed(model: Any, path: str = "", **values: object) -> Any:
+    """A model with other values in the model at a path in it."""
+    if path:
+        name, _, below = path.partition(".")
+        values = {name: _changed(getattr(model, name), below, **values)}
+    return model.model_copy(update=values)
+
+
+def ablate(
+    choice: RunChoice,
+    whole: Workspace,
+    stages: Sequence[Stage],
+    work: Work,
+    say: Callable[[str], None] = lambda text: None,
+) -> list[Outcome]:
+    """Run again without each of the steps in turn; what the whole run and these came to."""
+    outcomes = [outcome("all steps", whole, stages)]
+    for variant in variants(choice.options):
+        say(f"ablation: without {variant.name}")
+        workspace = fresh_copy(whole, variant.slug)
+        changed = choice.with_options(variant.options).run_in(workspace)
+        with workspace.lock():
+            planned = plan_evaluation(changed)
+            run_plan(planned, workspace, work, say=say)
+        outcomes.append(outcome(f"without {variant.name}", workspace, planned))
+    return outcomes
 
 
 def fresh_copy(source: Workspace, slug: str) -> Workspace:
@@ -172,19 +169,17 @@ def outcome(name: str, workspace: Workspace, stages: Sequence[Stage]) -> Outcome
     path = workspace.path(EVALUATION) / RECALL_JSON
     rows = json.loads(path.read_text(encoding="utf-8"))["rows"]
     row = next(row for row in rows if row["name"] == "all")
+    # JSON knows no infinity: a median over queries without a pose is written as null
+    medians = (row["median_position_m"], row["median_angle_deg"])
+    position_m, angle_deg = (float("inf" if value is None else value) for value in medians)
     manifests = [read_manifest(workspace.manifest_path(s.name)) for s in stages]
     return Outcome(
         name=name,
         recall={str(Threshold(**at["threshold"])): float(at["recall"]) for at in row["recall"]},
-        median_position_m=_number(row["median_position_m"]),
-        median_angle_deg=_number(row["median_angle_deg"]),
+        median_position_m=position_m,
+        median_angle_deg=angle_deg,
         seconds=sum(m.seconds for m in manifests if m is not None and m.stage not in _BESIDE),
     )
-
-
-def _number(value: float | None) -> float:
-    """JSON knows no infinity: a median over queries without a pose is written as null."""
-    return float("inf") if value is None else float(value)
 
 
 def write_outcomes(workspace: Workspace, outcomes: Sequence[Outcome]) -> Path:
@@ -210,10 +205,7 @@ def outcomes_text(outcomes: Sequence[Outcome]) -> str:
     """The table as text: recall in percent, medians over all queries, seconds of the stages."""
     thresholds = list(outcomes[0].recall)
     width = max(len(one.name) for one in outcomes)
-    lines = [
-        f"recall (%) at {' / '.join(thresholds)}; median error; seconds of all stages",
-        "",
-    ]
+    lines = [f"recall (%) at {' / '.join(thresholds)}; median error; seconds of all stages", ""]
     for one in outcomes:
         recall = " / ".join(f"{100 * value:5.1f}" for value in one.recall.values())
         lines.append(

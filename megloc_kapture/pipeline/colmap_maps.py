@@ -93,8 +93,7 @@ def import_colmap(source: ColmapFolders, output: Path, *, work: Work = HERE) -> 
     read.link_images(output)
     folder = KaptureFolder(output)
     seen = sum(len(found) for found in folder.observations().values())
-    counts = {"images": len(read.names), "points": len(folder.points3d()), "observations": seen}
-    return dict(counts)
+    return {"images": len(read.names), "points": len(folder.points3d()), "observations": seen}
 
 
 def kapture_of(path: Path | str, *, work: Work = HERE) -> Path:

@@ -21,7 +21,6 @@ from concurrent.futures import wait as wait_for
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +29,7 @@ from distributed.client import ClosedClientError
 from distributed.comm.core import CommClosedError
 
 from megloc_kapture.errors import MeglocError, OptionError
+from megloc_kapture.evaluation.provenance import installed_version
 from megloc_kapture.io.files import clear_leftovers, owned_name
 from megloc_kapture.io.weights import describe, files_of, sha256_of, share_weights
 from megloc_kapture.io.weights.registry import registry
@@ -225,22 +225,13 @@ def _single_threaded(function: Callable[..., Any], /, *args: Any, **kwargs: Any)
 
 @dataclass
 class _Preparation(WorkerPlugin):
-    """Makes a worker like the process that has the run, or refuses it.
+    """Makes a worker like the process that has the run, or refuses it."""
 
-    Attributes
-    ----------
-    packages : versions, of Python too.
-    weights : sha256 of the files of networks that this process has.
-    folder : current folder, which relative paths start from.
-    token : file in the shared folder.
-    elsewhere : the workers were there before, and stay.
-    """
-
-    packages: dict[str, str]
-    weights: dict[str, str]
-    folder: Path
-    token: Path
-    elsewhere: bool
+    packages: dict[str, str]  # versions, of Python too
+    weights: dict[str, str]  # sha256 of the files of networks that this process has
+    folder: Path  # the current one, which relative paths start from
+    token: Path  # a file in the shared folder
+    elsewhere: bool  # the workers were there before, and stay
     name = "megloc"
 
     @classmethod
@@ -279,12 +270,9 @@ class _Preparation(WorkerPlugin):
 
 
 def _packages() -> dict[str, str]:
-    """Versions of what computes; empty for one that is not there."""
+    """Versions of what computes; "none" of what is not there."""
     found = {"Python": platform.python_version(), "machine": f"{sys.platform} {platform.machine()}"}
-    for name in _PACKAGES:
-        with suppress(metadata.PackageNotFoundError):
-            found[name] = metadata.version(name)
-    return {name: found.get(name, "none") for name in ("Python", "machine", *_PACKAGES)}
+    return found | {name: installed_version(name) or "none" for name in _PACKAGES}
 
 
 def _weights() -> dict[str, str]:

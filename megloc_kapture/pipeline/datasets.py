@@ -23,13 +23,12 @@ from megloc_kapture.datasets.kapture_folders import (
 )
 from megloc_kapture.datasets.official import OfficialDataset, write_official
 from megloc_kapture.errors import OptionError, PluginError, suggestion
-from megloc_kapture.evaluation.protocols import TWIN_PREFIX
+from megloc_kapture.evaluation.protocols import TWIN_PREFIX as TWIN_PREFIX
 from megloc_kapture.io.dataset_tables import SIDE_TABLES, Protocol
 from megloc_kapture.io.files import write_bytes
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.plugin_loading import load_plugin, plugin_names
 from megloc_kapture.plugins import DATASETS, RENDERED_DATASETS, DatasetAdapter, RenderedDataset
-from megloc_kapture.stages.work import Work
 
 KAPTURE, SYNTHETIC = "kapture", "synthetic"
 DATA_VARIABLE = "MEGLOC_DATA"
@@ -60,12 +59,8 @@ class DatasetChoice:
 
     def check(self) -> None:
         """Raise DataError when the folder cannot be the dataset's, before anything is written."""
-        if self.root is None:
-            return
-        if self.adapter is None:
-            check_root(self.root)
-        else:
-            self.adapter.check(self.root)
+        if self.root is not None:
+            (check_root if self.adapter is None else self.adapter.check)(self.root)
 
     def has_truth(self) -> bool:
         """Whether true poses may lie beside the dataset; an adapter may know of more."""
@@ -76,9 +71,7 @@ class DatasetChoice:
     def has_query_depth(self) -> bool:
         """Whether the queries come with depth maps; those of official datasets have none.
 
-        Raises
-        ------
-        DataError : the queries' folder is broken.
+        Raises DataError where the queries' folder is broken.
         """
         if self.root is None or self.adapter is not None:
             return False
@@ -87,9 +80,7 @@ class DatasetChoice:
     def has_map_depth(self) -> bool:
         """Whether the map's images come with depth maps, as far as options and folders tell.
 
-        Raises
-        ------
-        DataError : the map's folder is broken.
+        Raises DataError where the map's folder is broken.
         """
         if self.adapter is not None:
             return bool(getattr(getattr(self.adapter, "options", None), "depth", False))
@@ -142,12 +133,6 @@ class DatasetChoice:
             "queries_with_truth": 0 if truth is None else len(truth.poses()),
         }
 
-    def render_to(self, output: Path, work: Work) -> Mapping[str, float]:
-        """Write the rendered dataset; only where there is no root."""
-        if self.twin is None:
-            raise ValueError(f"dataset {self.name} is given, not rendered")
-        return self.twin.write(output, work)
-
     def render_options(self) -> dict[str, Any]:
         """What determines the rendered dataset."""
         if self.twin is None:
@@ -172,6 +157,12 @@ def dataset_names() -> list[str]:
     return [KAPTURE, *official, SYNTHETIC, *(f"{TWIN_PREFIX}{name}" for name in official)]
 
 
+def check_known(dataset: str) -> None:
+    """Refuse a dataset that nobody knows; raises OptionError with those that are known."""
+    if dataset not in dataset_names():
+        raise OptionError(f"unknown dataset {dataset!r}; {suggestion(dataset, dataset_names())}")
+
+
 def choose_dataset(
     name: str,
     root: Path | None,
@@ -192,8 +183,7 @@ def choose_dataset(
     OptionError : unknown name, no root where one is needed (says where the data is published), or
         an option the dataset does not have.
     """
-    if name not in dataset_names():
-        raise OptionError(f"unknown dataset {name!r}; {suggestion(name, dataset_names())}")
+    check_known(name)
     layout = name.removeprefix(TWIN_PREFIX)
     adapter: DatasetAdapter | None = None
     if layout not in (KAPTURE, SYNTHETIC):
@@ -212,54 +202,34 @@ def choose_dataset(
     return choice
 
 
-def with_model(choice: DatasetChoice, *, features: bool) -> DatasetChoice:
-    """The dataset, imported with the model that it comes with.
+def with_model(choice: DatasetChoice, *, features: bool = False) -> DatasetChoice | None:
+    """The dataset, imported with the model of points that it comes with; None where it has none.
 
     Parameters
     ----------
     features : of a twin, draw the model's features too, which localizing in it needs.
-
-    Raises
-    ------
-    OptionError : it comes with none.
     """
-    adapter = None if choice.adapter is None else _adapter_with_model(choice)
-    if adapter is None:
-        raise OptionError(f"dataset {choice.name} comes with no model")
-    twin = choice.twin
-    if twin is not None and features:
-        layout = choice.name.removeprefix(TWIN_PREFIX)
-        twin = twin_of(layout, **{**twin.options.model_dump(), "model_features": True})
-    options = {**choice.import_options, "reference_model": True}
-    return replace(choice, adapter=adapter, import_options=options, twin=twin)
-
-
-def has_model(choice: DatasetChoice) -> bool:
-    """Whether the dataset comes with a model of points."""
-    return choice.adapter is not None and _adapter_with_model(choice) is not None
-
-
-def _adapter_with_model(choice: DatasetChoice) -> DatasetAdapter | None:
-    """The adapter that imports the dataset's model too; None where it knows of none."""
+    if choice.adapter is None:
+        return None
+    layout = choice.name.removeprefix(TWIN_PREFIX)
     options = {**choice.import_options, "reference_model": True}
     try:
-        adapter: DatasetAdapter = load_plugin(
-            DATASETS, choice.name.removeprefix(TWIN_PREFIX), options
-        )
+        adapter: DatasetAdapter = load_plugin(DATASETS, layout, options)
     except PluginError:
         return None
-    return adapter
+    twin = choice.twin
+    if twin is not None and features:
+        twin = twin_of(layout, **{**twin.options.model_dump(), "model_features": True})
+    return replace(choice, adapter=adapter, import_options=options, twin=twin)
 
 
 def _root_in_environment(name: str, adapter: DatasetAdapter | None) -> Path:
     folder = os.environ.get(DATA_VARIABLE)
     names: Sequence[str] = (name,) if adapter is None else (name, *adapter.card.folders)
-    tried = []
-    if folder:
-        tried = [Path(folder) / own for own in names]
-        for place in tried:
-            if place.is_dir():
-                return place
+    tried = [Path(folder) / own for own in names] if folder else []
+    for place in tried:
+        if place.is_dir():
+            return place
     looked = f"; {DATA_VARIABLE} has none of {', '.join(p.name for p in tried)}" if tried else ""
     if adapter is None:
         raise OptionError(
@@ -293,17 +263,3 @@ def twin_of(layout: str, **options: Any) -> RenderedDataset:
         raise OptionError(f"nothing renders {layout!r}; known: {', '.join(known)}")
     twin: RenderedDataset = load_plugin(RENDERED_DATASETS, layout, options)
     return twin
-
-
-__all__ = [
-    "KAPTURE",
-    "SUMMARY_FILE",
-    "SYNTHETIC",
-    "TWIN_PREFIX",
-    "DatasetChoice",
-    "ProtocolChange",
-    "choose_dataset",
-    "dataset_names",
-    "summary_text",
-    "twin_of",
-]

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from typing import Any
 
-from megloc_kapture.cli.refine_map import RefineMap
+from megloc_kapture.cli.maps import RefineMap
 from megloc_kapture.datasets.kapture_folders import import_mapping, mapping_files
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.evaluation.evaluate import evaluate, results_without_truth
@@ -17,7 +18,7 @@ from megloc_kapture.evaluation.results import context_of
 from megloc_kapture.io.dataset_tables import SIDE_TABLES, Protocol
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.datasets import DatasetChoice, with_model
-from megloc_kapture.pipeline.missing_weights import check_weights
+from megloc_kapture.pipeline.presets import check_weights
 from megloc_kapture.pipeline.run import Run
 from megloc_kapture.pipeline.submission import write_submission
 from megloc_kapture.plugin_loading import load_plugin
@@ -136,9 +137,8 @@ def _insert(stages: list[Stage], stage: Stage) -> None:
 
 
 def _with_model(run: Run, given: bool) -> DatasetChoice:
-    try:
-        return with_model(run.source, features=given)
-    except OptionError as error:
+    found = with_model(run.source, features=given)
+    if found is None:
         wanted = (
             f"map = {run.options.map} localizes in that model (megloc localize takes any kapture "
             "map)"
@@ -146,7 +146,8 @@ def _with_model(run: Run, given: bool) -> DatasetChoice:
             else "mapping_pairs by covisibility or overlap need its points; "
             '--set \'mapping_pairs.by=["poses", "retrieval"]\' does without them'
         )
-        raise OptionError(f"{error}: {wanted}") from error
+        raise OptionError(f"dataset {run.dataset} comes with no model: {wanted}")
+    return found
 
 
 class _RunStage(Stage):
@@ -167,7 +168,10 @@ class Render(_RunStage):
         return self._run.source.render_options()
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        return self._run.source.render_to(work.out / WORLD, work)
+        twin = self._run.source.twin
+        if twin is None:
+            raise ValueError(f"dataset {self._run.dataset} is given, not rendered")
+        return twin.write(work.out / WORLD, work)
 
 
 class Import(_RunStage):
@@ -188,8 +192,7 @@ class Import(_RunStage):
         return {**self._run.source.settings(), "protocol": protocol}
 
     def plugins(self) -> Sequence[object]:
-        adapter = self._run.source.adapter
-        return () if adapter is None else (adapter,)
+        return [one for one in (self._run.source.adapter,) if one is not None]
 
     def external(self, hashes: Hashes) -> Mapping[str, str]:
         source = self._run.source
@@ -238,11 +241,8 @@ class Submit(_RunStage):
 
     name = "submission"
     version = 3
+    reads = (SIDE_TABLES, LOCALIZED)
     writes = (SUBMISSIONS,)
-
-    @property
-    def reads(self) -> Sequence[str]:  # type: ignore[override]
-        return (SIDE_TABLES, LOCALIZED)
 
     def settings(self) -> dict[str, Any]:
         return self._run.provenance()
@@ -272,23 +272,24 @@ class Evaluate(_RunStage):
         label = f"{self._run.dataset}, {self._run.preset}"
         map_poses = work.folder(MAPPING).read().poses()
         provenance = self.settings() | {"versions": package_versions()}
-        output = work.out / EVALUATION
-        # two runs give the same bytes, so seconds stand in manifests and timing.csv alone
-        contexts = [replace(context_of(localized), seconds={})]
+        report = partial(
+            write_report,
+            work.out / EVALUATION,
+            map_poses=map_poses,
+            provenance=provenance,
+            # two runs give the same bytes, so seconds stand in manifests and timing.csv alone
+            contexts=[replace(context_of(localized), seconds={})],
+        )
         if not truth.is_dir():
             found = results_without_truth(
                 [localized], benchmark_of(tables), map_poses=map_poses, labels=[label]
             )
-            write_report(
-                output, found, map_poses=map_poses, provenance=provenance, contexts=contexts
-            )
+            report(found)
             return {"queries_with_truth": 0}
         evaluation = evaluate(
             localized, truth, side_tables=tables, label=label, mapping=work.path(MAPPING)
         )
-        write_report(
-            output, evaluation, map_poses=map_poses, provenance=provenance, contexts=contexts
-        )
+        report(evaluation)
         row = evaluation.row()
         recall = {f"recall at {at.threshold}": round(at.recall, 4) for at in row.recall}
         return {"queries_with_truth": len(evaluation.queries), **recall}

@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from multiprocessing import forkserver, resource_tracker
 from multiprocessing.connection import wait
 from multiprocessing.util import Finalize, get_temp_dir
@@ -193,17 +193,22 @@ def _start_worker(shared: Path) -> None:
 
 
 @contextmanager
-def deaf_to(*signals: signal.Signals) -> Iterator[None]:
-    """This process ignores signals in the block: what it ends must not be disturbed."""
+def _handled_by(handler: Any, *signals: signal.Signals) -> Iterator[None]:
+    """Another handler of signals in the block; only the main thread may have one."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = {one: signal.signal(one, signal.SIG_IGN) for one in signals}
+    before = {one: signal.signal(one, handler) for one in signals}
     try:
         yield
     finally:
-        for one, handler in before.items():
-            signal.signal(one, handler)
+        for one, former in before.items():
+            signal.signal(one, former)
+
+
+def deaf_to(*signals: signal.Signals) -> AbstractContextManager[None]:
+    """This process ignores signals in the block: what it ends must not be disturbed."""
+    return _handled_by(signal.SIG_IGN, *signals)
 
 
 @contextmanager
@@ -213,45 +218,32 @@ def starting_processes() -> Iterator[None]:
     A terminal sends Ctrl-C to every process; the run itself ends its workers. On this process
     Ctrl-C and SIGTERM have their effect at the end of the block.
     """
-    with _signals_held():
-        # where it is started later, it lets the signals through again
-        resource_tracker.ensure_running()
-        # blocked, for that is inherited: were it ignored meanwhile, one would be lost
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        try:
-            yield
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-@contextmanager
-def _signals_held() -> Iterator[None]:
-    """Ctrl-C and SIGTERM have their effect at the end of the block."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
     met: list[int] = []
-    held = (signal.SIGINT, signal.SIGTERM)
-    before = {one: signal.signal(one, lambda number, _: met.append(number)) for one in held}
     try:
-        yield
+        with _handled_by(lambda number, _: met.append(number), signal.SIGINT, signal.SIGTERM):
+            # where it is started later, it lets the signals through again
+            resource_tracker.ensure_running()
+            # blocked, for that is inherited: were it ignored meanwhile, one would be lost
+            before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+            try:
+                yield
+            finally:
+                signal.pthread_sigmask(signal.SIG_SETMASK, before)
     finally:
-        for one, handler in before.items():
-            signal.signal(one, handler)
         for number in met[:1]:
             signal.raise_signal(number)
 
 
 def end_with_parent() -> None:
     """End this process when its parent has gone: a worker waits for work that will not come."""
-    threading.Thread(target=_wait_for_parent, daemon=True).start()
 
+    def wait_for_parent() -> None:
+        parent = multiprocessing.parent_process()
+        if parent is not None:
+            wait([parent.sentinel])
+            os._exit(1)
 
-def _wait_for_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        wait([parent.sentinel])
-        os._exit(1)
+    threading.Thread(target=wait_for_parent, daemon=True).start()
 
 
 def _name_as_ours() -> None:
@@ -314,13 +306,16 @@ def open_executor(
     context.set_forkserver_preload(["megloc_kapture.stages.query_poses"])
     pool: _WatchedPool | None = None
     try:
-        with _writing_temporary(), starting_processes():
-            _name_as_ours()
-            forkserver.ensure_running()
-            temporary = Path(get_temp_dir())  # ends with the run
-            pool = _WatchedPool(
-                count, mp_context=context, initializer=_start_worker, initargs=(temporary,)
-            )
+        try:
+            with starting_processes():
+                _name_as_ours()
+                forkserver.ensure_running()
+                temporary = Path(get_temp_dir())  # ends with the run
+                pool = _WatchedPool(
+                    count, mp_context=context, initializer=_start_worker, initargs=(temporary,)
+                )
+        except OSError as error:
+            raise output_error(tempfile.gettempdir(), error) from error
         yield pool
     except BaseException as error:
         if pool is not None:
@@ -335,14 +330,6 @@ def open_executor(
     finally:
         if pool is not None:
             pool.shutdown(wait=True, cancel_futures=True)
-
-
-@contextmanager
-def _writing_temporary() -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise output_error(tempfile.gettempdir(), error) from error
 
 
 class _WatchedPool(ProcessPoolExecutor):

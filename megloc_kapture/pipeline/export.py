@@ -1,21 +1,266 @@
-"""A map and localized queries, as other tools read them."""
+"""A map and localized queries in the formats of other tools.
+
+colmap      a model, as COLMAP writes it
+nerfstudio  ``transforms.json`` and ``sparse_pc.ply``
+tum         ``timestamp tx ty tz qx qy qz qw``, as evo reads it
+kitti       twelve numbers, ``world_from_cam`` row by row, as evo reads it
+ply         points and camera frusta, which every viewer of meshes opens
+geojson     camera centres as points of WGS84 (RFC 7946)
+
+Trajectories hold ``world_from_cam`` in the camera axes of COLMAP and kapture: x right, y down, z
+ahead. nerfstudio's are OpenGL's: x right, y up, z back.
+"""
 
 from __future__ import annotations
 
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, OptionError, OutputError, suggestion
+from megloc_kapture.evaluation.report.scene import corner_rays
+from megloc_kapture.geometry.cameras import principal_point_px
+from megloc_kapture.geometry.poses import earth_from_enu, geodetic
+from megloc_kapture.io.colmap import MapImage, write_model
 from megloc_kapture.io.dataset_tables import read_world, tables_of
+from megloc_kapture.io.files import write_bytes
 from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.kapture.points import write_ply
 from megloc_kapture.io.output_folders import staged_output
-from megloc_kapture.pipeline import export_formats as formats
 from megloc_kapture.pipeline.colmap_maps import kapture_of
-from megloc_kapture.pipeline.export_formats import GeoOrigin, PosedImage, Scene
 from megloc_kapture.pipeline.kapture_map import KaptureMap
+from megloc_kapture.values import ONE_FOCAL_MODELS, Camera, RigidTransform
+
+_MAP_COLOUR, _QUERY_COLOUR = (120, 120, 120), (220, 50, 32)
+# fx fy cx cy and distortion, by COLMAP's order of parameters
+_NERFSTUDIO: dict[str, tuple[str, tuple[str, ...]]] = {
+    "SIMPLE_PINHOLE": ("OPENCV", ()),
+    "PINHOLE": ("OPENCV", ()),
+    "SIMPLE_RADIAL": ("OPENCV", ("k1",)),
+    "RADIAL": ("OPENCV", ("k1", "k2")),
+    "OPENCV": ("OPENCV", ("k1", "k2", "p1", "p2")),
+    "OPENCV_FISHEYE": ("OPENCV_FISHEYE", ("k1", "k2", "k3", "k4")),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class PosedImage:
+    """An image with its pose.
+
+    Attributes
+    ----------
+    path : its file; None where there is none.
+    camera : in COLMAP's convention.
+    timestamp, sensor : of its record in kapture.
+    is_query : localized, not of the map.
+    keypoints_px : (K, 2); empty where nothing is observed.
+    rows, points : int (M,), rows of keypoints and of the scene's points that they observe.
+    """
+
+    name: str
+    path: Path | None
+    camera: Camera
+    cam_from_world: RigidTransform
+    timestamp: int
+    sensor: str
+    is_query: bool
+    keypoints_px: NDArray[np.floating]
+    rows: NDArray[np.integer]
+    points: NDArray[np.integer]
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What is exported: images, and points float64 (N, 6) as X Y Z R G B."""
+
+    images: Sequence[PosedImage]
+    points: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class GeoOrigin:
+    """Where on WGS84 the world's origin lies; its axes are East, North and Up there."""
+
+    latitude_deg: float  # geodetic
+    longitude_deg: float
+    height_m: float = 0.0  # above the ellipsoid
+
+
+def export_colmap(scene: Scene, output: Path) -> None:
+    """Write a model: cameras, rigs, frames, images, points3D, in COLMAP's binary format.
+
+    Every camera is a rig of its own. Queries bring no observations.
+
+    Raises
+    ------
+    DataError : map and queries share a name.
+    """
+    names = [image.name for image in scene.images]
+    if len(set(names)) != len(names):
+        twice = min(name for name in names if names.count(name) > 1)
+        raise DataError(f"map and queries both have an image {twice!r}; COLMAP knows one")
+    images = [MapImage(i.name, i.camera, i.cam_from_world, i.keypoints_px) for i in scene.images]
+    observed = [(image.rows, image.points) for image in scene.images]
+    write_model(output, images, observed, scene.points[:, :3], scene.points[:, 3:])
+
+
+def export_nerfstudio(scene: Scene, output: Path, *, beside: Path | None = None) -> None:
+    """Write ``transforms.json``, with intrinsics per frame, and ``sparse_pc.ply``.
+
+    Parameters
+    ----------
+    beside : folder that the images' paths are relative to, where it is not ``output``.
+
+    Raises
+    ------
+    DataError : an image without a file, or a camera model that nerfstudio has not.
+    """
+    frames = []
+    for image in scene.images:
+        if image.path is None or not image.path.is_file():
+            raise DataError(f"nerfstudio needs the file of {image.name!r}", path=image.path)
+        world_from_cam = image.cam_from_world.inverse().matrix()
+        file = os.path.relpath(image.path.resolve(), (beside or output).resolve())
+        frames.append(
+            {
+                "file_path": Path(file).as_posix(),
+                **_nerfstudio_camera(image.camera),
+                "transform_matrix": (world_from_cam @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist(),
+            }
+        )
+    content: dict[str, Any] = {"frames": frames}
+    if len(scene.points):
+        write_ply(output / "sparse_pc.ply", scene.points[:, :3], scene.points[:, 3:])
+        content["ply_file_path"] = "sparse_pc.ply"
+    write_bytes(output / "transforms.json", (json.dumps(content, indent=1) + "\n").encode())
+
+
+def export_tum(scene: Scene, output: Path) -> None:
+    """Write a TUM trajectory, timestamps as kapture has them.
+
+    Raises
+    ------
+    DataError : images of two cameras have one timestamp, which such a file cannot tell apart.
+    """
+    rows = []
+    for image in sorted(scene.images, key=lambda one: one.timestamp):
+        world_from_cam = image.cam_from_world.inverse()
+        w, *vector = world_from_cam.quat_wxyz
+        numbers = (*world_from_cam.translation, *vector, w)
+        rows.append((image.timestamp, " ".join(f"{value:.17g}" for value in numbers)))
+    stamps = [stamp for stamp, _ in rows]
+    if len(set(stamps)) != len(stamps):
+        raise DataError(
+            "several images have one timestamp; choose one camera with --sensor: "
+            f"{', '.join(sorted({image.sensor for image in scene.images}))}"
+        )
+    write_bytes(output, "".join(f"{stamp} {row}\n" for stamp, row in rows).encode())
+
+
+def export_kitti(scene: Scene, output: Path) -> None:
+    """Write a KITTI trajectory in the order of the names, which ``OUTPUT.names.txt`` has."""
+    images = sorted(scene.images, key=lambda image: image.name)
+    lines = [
+        " ".join(f"{value:.17g}" for value in image.cam_from_world.inverse().matrix()[:3].ravel())
+        for image in images
+    ]
+    write_bytes(output, "".join(f"{line}\n" for line in lines).encode())
+    names = "".join(f"{image.name}\n" for image in images)
+    write_bytes(output.with_name(f"{output.name}.names.txt"), names.encode())
+
+
+def export_ply(scene: Scene, output: Path) -> None:
+    """Write the points, and every camera as five vertices and eight edges.
+
+    A frustum is as deep as a twentieth of what the cameras see in the median.
+    """
+    depths = [
+        float(np.median(image.cam_from_world.apply(scene.points[image.points, :3])[:, 2]))
+        for image in scene.images
+        if len(image.points)
+    ]
+    centres = np.array([image.cam_from_world.center() for image in scene.images]).reshape(-1, 3)
+    extent = float(np.ptp(centres, axis=0).max()) if len(centres) > 1 else 1.0
+    depth = 0.05 * (float(np.median(depths)) if depths else extent or 1.0)
+    vertices, colours = [scene.points[:, :3]], [scene.points[:, 3:]]
+    edges: list[tuple[int, int]] = []
+    for image in scene.images:
+        first = sum(len(part) for part in vertices)
+        vertices.append(frustum(image.camera, image.cam_from_world, depth))
+        colours.append(np.tile(_QUERY_COLOUR if image.is_query else _MAP_COLOUR, (5, 1)))
+        edges += [(first, first + k) for k in (1, 2, 3, 4)]
+        edges += [(first + k, first + k % 4 + 1) for k in (1, 2, 3, 4)]
+    write_ply(output, np.concatenate(vertices), np.concatenate(colours), edges=edges)
+
+
+def export_geojson(scene: Scene, output: Path, origin: GeoOrigin) -> None:
+    """Write the camera centres as points, with name, heading and role.
+
+    Raises
+    ------
+    DataError : the origin is no place on earth.
+    """
+    if not (-90 <= origin.latitude_deg <= 90 and -180 <= origin.longitude_deg <= 180):
+        raise DataError(f"{origin.latitude_deg}, {origin.longitude_deg} is no latitude, longitude")
+    earth_from_world = earth_from_enu(origin.latitude_deg, origin.longitude_deg, origin.height_m)
+    features = []
+    for image in scene.images:
+        world_from_cam = image.cam_from_world.inverse()
+        east, north, _ = world_from_cam.rotation_matrix()[:, 2]
+        position = (earth_from_world @ world_from_cam).translation
+        latitude, longitude, height = geodetic(np.array(position))
+        features.append(
+            {
+                "type": "Feature",
+                "geometry": {"type": "Point", "coordinates": [longitude, latitude, height]},
+                "properties": {
+                    "name": image.name,
+                    "role": "query" if image.is_query else "map",
+                    "heading_deg": math.degrees(math.atan2(east, north)) % 360.0,
+                },
+            }
+        )
+    content = {"type": "FeatureCollection", "features": features}
+    write_bytes(output, (json.dumps(content, indent=1) + "\n").encode())
+
+
+def frustum(camera: Camera, cam_from_world: RigidTransform, depth: float) -> NDArray[np.float64]:
+    """Centre and corners (5, 3) of what a camera sees up to a depth, in the world; see
+    :func:`~megloc_kapture.evaluation.report.scene.corner_rays`."""
+    rays = np.concatenate([np.zeros((1, 3)), depth * corner_rays(camera)])
+    return cam_from_world.inverse().apply(rays)
+
+
+def _nerfstudio_camera(camera: Camera) -> Mapping[str, Any]:
+    if camera.model not in _NERFSTUDIO:
+        raise DataError(
+            f"nerfstudio has no camera model {camera.model}; undistort first "
+            "(`megloc preprocess --set undistort=true`)"
+        )
+    model, names = _NERFSTUDIO[camera.model]
+    cx, cy = principal_point_px(camera)
+    fx, fy = camera.params[0], camera.params[0 if camera.model in ONE_FOCAL_MODELS else 1]
+    distortion = camera.params[len(camera.params) - len(names) :]
+    return {
+        **{
+            "camera_model": model,
+            "w": camera.width,
+            "h": camera.height,
+            "fl_x": fx,
+            "fl_y": fy,
+            "cx": cx,
+            "cy": cy,
+        },
+        **dict(zip(names, distortion, strict=True)),
+    }
+
 
 ExportFormat = Literal["colmap", "nerfstudio", "tum", "kitti", "ply", "geojson"]
 _KIND = "export"
@@ -73,18 +318,20 @@ def export(
     if name in ("colmap", "nerfstudio"):
         with staged_output(output, kind=_KIND, force=force) as out:
             if name == "colmap":
-                formats.export_colmap(scene, out)
+                export_colmap(scene, out)
             else:
-                formats.export_nerfstudio(scene, out, beside=output)
+                export_nerfstudio(scene, out, beside=output)
         return len(scene.images)
     if output.exists() and not force:
         raise OutputError(f"{output}: is there already; --force overwrites it")
     if origin is not None:
-        formats.export_geojson(scene, output, origin)
+        export_geojson(scene, output, origin)
+    elif name == "tum":
+        export_tum(scene, output)
+    elif name == "kitti":
+        export_kitti(scene, output)
     else:
-        {"tum": formats.export_tum, "kitti": formats.export_kitti, "ply": formats.export_ply}[name](
-            scene, output
-        )
+        export_ply(scene, output)
     return len(scene.images)
 
 

@@ -22,7 +22,7 @@ from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.plugin_loading import plugin_names
 from megloc_kapture.plugins import LOCAL_FEATURES, PluginChoice
 from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
-from megloc_kapture.stages.preprocessing import REPORT_FILE
+from megloc_kapture.stages.map_refinement import REPORT_FILE
 from megloc_kapture.stages.shared_index import index_map, observed_keypoints, with_noise
 from megloc_kapture.values import Camera, RigidTransform
 
@@ -79,8 +79,11 @@ class MapKeypoints:
         return all(image in self._descriptors for image in images if image in self._keypoints)
 
     def extractor(self) -> PluginChoice | None:
-        """The extractor plugin that makes this type of features; None where there is none."""
-        return extractor_of(self.folder, self.name)
+        """The extractor plugin of the type, by its name or that in its file; None without one."""
+        names = [self.name, base_type(self.name)]
+        if self.name in self.folder.types("keypoints"):
+            names.append(self._keypoints.config.name)
+        return next((found for name in names if (found := _extractor_named(name))), None)
 
     def check(self, images: Collection[str]) -> None:
         """Compare the sizes of the images' feature files; reads none of them.
@@ -166,9 +169,8 @@ class KaptureMap:
             indices = _read_indices(folder, keypoints_types)
         origins = _find_origins(folder, indices)
         if pixel_origin != "auto":
-            given: Origin = pixel_origin
             origins = {
-                name: replace(found, intrinsics=given, reason=AS_ASKED)
+                name: replace(found, intrinsics=pixel_origin, reason=AS_ASKED)
                 for name, found in origins.items()
             }
         keypoints = {n: MapKeypoints(folder, n, indices[n], origins[n]) for n in indices}
@@ -180,16 +182,10 @@ class KaptureMap:
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickled it is its folders' names; another process opens it again."""
         asked = self.pixel_origin.intrinsics if self.pixel_origin.reason == AS_ASKED else "auto"
-        folder = self.folder
-        linked = tuple(path.absolute() for path in folder.allow_links_below)
-        features = tuple(path.absolute() for path in folder.features_dirs)
-        return _opened_again, (
-            folder.root.absolute(),
-            tuple(self.keypoints),
-            features,
-            asked,
-            linked,
-        )
+        linked = tuple(path.absolute() for path in self.folder.allow_links_below)
+        features = tuple(path.absolute() for path in self.folder.features_dirs)
+        root = self.folder.root.absolute()
+        return _opened_again, (root, tuple(self.keypoints), features, asked, linked)
 
     @property
     def pixel_origin(self) -> PixelOrigin:
@@ -207,9 +203,9 @@ class KaptureMap:
             return self.keypoints[name]
         index = index_map(self.folder, name)
         origin = self.pixel_origin
-        if not _is_ours(self.folder, name):
-            return MapKeypoints(self.folder, name, index, origin)
-        return MapKeypoints(self.folder, name, index, replace(origin, keypoints="corner"))
+        if _is_ours(self.folder, name):
+            origin = replace(origin, keypoints="corner")
+        return MapKeypoints(self.folder, name, index, origin)
 
     @cached_property
     def unit(self) -> str:
@@ -284,9 +280,7 @@ class KaptureMap:
             taken = sorted({at for start in starts for at in range(start, start + run)})
             # half a pixel of another origin is far within what a map may err by
             sample = observed_keypoints(
-                self.folder,
-                keypoints.index,
-                (images[at] for at in taken if at < len(images)),
+                self.folder, keypoints.index, (images[at] for at in taken if at < len(images))
             )
             found = map_fault(sample, keypoints.index.xyz)
             if found is not None:
@@ -310,14 +304,6 @@ def check_lengths(keypoints: FeatureReader, descriptors: FeatureReader, image: s
         raise DataError(
             f"{found} descriptors for {expected} keypoints", path=descriptors.where(image)
         )
-
-
-def extractor_of(folder: KaptureFolder, local_type: str) -> PluginChoice | None:
-    """The extractor plugin of a keypoints type: by the folder's name, or the name in its file."""
-    names = [local_type, base_type(local_type)]
-    if local_type in folder.types("keypoints"):
-        names.append(folder.keypoints(local_type).config.name)
-    return next((found for name in names if (found := _extractor_named(name))), None)
 
 
 def _extractor_named(name: str) -> PluginChoice | None:
@@ -407,8 +393,5 @@ def _find_origin(folder: KaptureFolder, local_type: str, index: MapIndex) -> Pix
     sample = observed_keypoints(folder, index, images[::step])
     known: Origin | None = "corner" if _is_ours(folder, local_type) else None
     return find_pixel_origin(
-        sample,
-        index.xyz,
-        cameras=[data.camera_of(image) for image in images],
-        keypoints_at=known,
+        sample, index.xyz, cameras=[data.camera_of(image) for image in images], keypoints_at=known
     )

@@ -167,8 +167,7 @@ class LocalType:
         few = any(len(found) < options.guided_pyramid.min_matches for _, found, _ in matches)
         if not options.matches_again() or not few:
             return query.keypoints_px, list(matches), ""
-        reason = self.pyramid_obstacle or ("" if image.query.has_image() else "no image")
-        if reason:
+        if reason := self.pyramid_obstacle or ("" if image.query.has_image() else "no image"):
             return query.keypoints_px, list(matches), f"guided pyramid matching: {reason}"
         method = PyramidMethod(
             self.extractor, self.matcher, options.query_verification, options.guided_pyramid
@@ -199,9 +198,8 @@ class LocalType:
 
     def _load(self, keypoints: MapKeypoints, image: str) -> Features:
         stored = keypoints.keypoints_px(image)
-        descriptors = (
-            self.descriptors(image) if keypoints is self.first else keypoints.descriptors(image)
-        )
+        source = self if keypoints is self.first else keypoints
+        descriptors = source.descriptors(image)
         if len(stored) != len(descriptors):
             raise DataError(
                 f"{image} has {len(stored)} keypoints and {len(descriptors)} descriptors of type "
@@ -256,13 +254,12 @@ def _rank(local_type: str, choices: Sequence[LocalFeaturesChoice]) -> int:
     """
     base = base_type(local_type)
     fitting = [rank for rank, one in enumerate(choices) if base.startswith(one.name)]
-    by_weights = [
-        rank
-        for rank in fitting
-        if str(choices[rank].options.get("weights", "")).removesuffix(".pth") == base
-    ]
-    exact = [rank for rank in fitting if choices[rank].name == base]
-    return next(iter((*by_weights, *exact, *fitting)), len(choices))
+
+    def distance(rank: int) -> int:
+        weights = str(choices[rank].options.get("weights", "")).removesuffix(".pth")
+        return 0 if weights == base else 1 if choices[rank].name == base else 2
+
+    return min(fitting, key=distance, default=len(choices))
 
 
 def extract_again(

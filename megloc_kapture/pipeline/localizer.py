@@ -19,11 +19,17 @@ from megloc_kapture.localization.cluster_poses import Clock, interleave
 from megloc_kapture.localization.map_index import ImageMatches, QueryView, TypedMatches
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap
-from megloc_kapture.pipeline.kapture_queries import KaptureQueries, Unit
 from megloc_kapture.pipeline.local_types import local_types_of
 from megloc_kapture.pipeline.map_retrieval import MapRetrieval
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.queries import Preprocessor, Query, QueryImage, QueryImages
+from megloc_kapture.pipeline.queries import (
+    KaptureQueries,
+    Preprocessor,
+    Query,
+    QueryImage,
+    QueryImages,
+    Unit,
+)
 from megloc_kapture.stages.devices import Precision, unheeded
 from megloc_kapture.stages.image_pairs import counted, rerank
 from megloc_kapture.stages.localized_folder import unreadable_image
@@ -43,21 +49,9 @@ from megloc_kapture.values import Camera, Device, Failure, Pose, RigidTransform
 _ALONE = RigidTransform.identity()
 # the options that localizing uses; the others are of maps that are made
 LOCALIZING = (
-    "device",
-    "precision",
-    "preprocessing",
-    "local_features",
-    "mask_margin_px",
-    "global_features",
-    "fusion",
-    "query_pairs",
-    "reranking",
-    "matching",
-    "verification",
-    "query_verification",
-    "guided_pyramid",
-    "localization",
-    "pose_refinement",
+    *("device", "precision", "preprocessing", "local_features", "mask_margin_px"),
+    *("global_features", "fusion", "query_pairs", "reranking", "matching", "verification"),
+    *("query_verification", "guided_pyramid", "localization", "pose_refinement"),
 )
 
 
@@ -276,10 +270,7 @@ class Localizer:
         What orders candidates by their matches, and guided pyramids, need all matches at first;
         else no more candidates are matched than are taken.
         """
-        asked = [
-            self._asked(image, cam_from_rig)
-            for image, (_, cam_from_rig) in zip(images, unit, strict=True)
-        ]
+        asked = [self._asked(image, at) for image, (_, at) in zip(images, unit, strict=True)]
         whole = self.options.reranking.reranks() or self.options.matches_again()
         matched = [self._match(one, len(one.ranked) if whole else 0) for one in asked]
 
@@ -363,10 +354,10 @@ class Localizer:
         image = self._preprocessor.of(query)
         features = [local.of_query(image) for local in self.types]
         found = self._retrieval.rank(image, features, self._permitted(query))
-        if not self.options.reranking.reranks():
-            return found
-        matched = [local.match(f, found) for local, f in zip(self.types, features, strict=True)]
-        return [found[at] for at in self._kept(matched)]
+        if self.options.reranking.reranks():
+            matched = [one.match(own, found) for one, own in zip(self.types, features, strict=True)]
+            found = [found[at] for at in self._kept(matched)]
+        return found
 
     def _permitted(self, query: Query) -> list[str]:
         if query.prior is None:

@@ -64,6 +64,11 @@ class _Compared:
     stored: bool
     lacks_weights: bool = False
 
+    @property
+    def is_vlad(self) -> bool:
+        """Whether VLAD makes the query's."""
+        return self.choice is not None and self.choice.is_vlad
+
 
 class MapRetrieval:
     """Ranks a map's images for queries.
@@ -141,13 +146,10 @@ class MapRetrieval:
 
     def describe(self, global_types: Collection[str]) -> str:
         """How queries that bring these global features are compared, for people."""
-        words = []
-        for one in self._compared(global_types):
-            if one.choice is not None and one.choice.is_vlad:
-                words.append("VLAD over the map's descriptors")
-            else:
-                words.append(f"global features {one.name}")
-        return ", ".join(words)
+        return ", ".join(
+            "VLAD over the map's descriptors" if one.is_vlad else f"global features {one.name}"
+            for one in self._compared(global_types)
+        )
 
     def describe_candidates(self, brought: Collection[str]) -> str:
         """The map images that queries which bring these features are matched with, for people."""
@@ -156,9 +158,9 @@ class MapRetrieval:
         if count <= top_k:
             ranked = f"ranked by {how}" if self.is_at_hand(brought) else "not ranked"
             return f"all {count} map images, {ranked}"
-        lacking = [one.name for one in self._compared(brought) if one.lacks_weights]
-        if lacking:
-            return f"not possible: the weights that make {lacking[0]} are missing"
+        for one in self._compared(brought):
+            if one.lacks_weights:
+                return f"not possible: the weights that make {one.name} are missing"
         return f"the {top_k} of {count} map images that are most similar by {how}"
 
     def _compared(self, brought: Collection[str]) -> Sequence[_Compared]:
@@ -171,7 +173,7 @@ class MapRetrieval:
                     _Compared(name, None, weight_of.get(name, 1.0), stored=True)
                     for name in named or shared
                 ]
-            usable = [one for one in self._wanted if one.stored or self._trains_vlad(one)]
+            usable = [one for one in self._wanted if one.stored or one.is_vlad]
             return usable or self.known or self._wanted
 
     @cached_property
@@ -206,9 +208,8 @@ class MapRetrieval:
         if name in there:
             return self._made_by(choice, name, choice.weight, stored=True)
         for other in there:
-            published = _PUBLISHED.get(other)
-            if published is not None and published.name == choice.name:
-                return self._made_by(published, other, choice.weight, stored=True)
+            if other in _PUBLISHED and _PUBLISHED[other].name == choice.name:
+                return self._made_by(_PUBLISHED[other], other, choice.weight, stored=True)
         return self._made_by(choice, name, choice.weight, stored=False)
 
     def _made_by(
@@ -232,9 +233,6 @@ class MapRetrieval:
         # not the map's own, which were made with other options
         name = vlad_type(local_type or base_type(self._types[0].name))
         return name if name not in self._map.global_types() else f"{name}, trained anew"
-
-    def _trains_vlad(self, one: _Compared) -> bool:
-        return one.choice is not None and one.choice.is_vlad
 
     def _of_query(
         self, one: _Compared, image: QueryImage, features: Sequence[Features]

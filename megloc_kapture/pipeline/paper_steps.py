@@ -18,48 +18,30 @@ _LIFTED = "the points are lifted from the map's depth: map images are not matche
 
 @dataclass(frozen=True)
 class PaperStep:
-    """A step of the paper in a run.
-
-    Attributes
-    ----------
-    why : who turned it on or off, or what it needs that is not there.
-    """
+    """A step of the paper in a run."""
 
     name: str
     on: bool
-    why: str
+    why: str  # who turned it on or off, or what it needs that is not there
 
 
 @dataclass(frozen=True)
 class DatasetFacts:
-    """What of a dataset decides which steps it permits.
+    """What a dataset comes with, which decides which steps it permits."""
 
-    Attributes
-    ----------
-    map_depth, query_depth : whether map images and queries come with depth maps.
-    model : whether it comes with points of its own.
-    """
-
-    map_depth: bool
+    map_depth: bool  # depth maps of the map images
     query_depth: bool
-    model: bool
+    model: bool  # points of its own
 
 
 @dataclass(frozen=True)
 class LayeredOptions:
-    """A run's options as they came about.
+    """A run's options as they came about."""
 
-    Attributes
-    ----------
-    preset : the name, and ``of_preset`` the options of it alone.
-    of_dataset : with what the dataset's file changes.
-    chosen : with what the user typed: those of the run.
-    """
-
-    preset: str
-    of_preset: PipelineOptions
-    of_dataset: PipelineOptions
-    chosen: PipelineOptions
+    preset: str  # its name
+    of_preset: PipelineOptions  # of it alone
+    of_dataset: PipelineOptions  # with what the dataset's file changes
+    chosen: PipelineOptions  # with what the user typed: those of the run
 
 
 @dataclass(frozen=True)
@@ -275,10 +257,7 @@ _STEPS = (
         lambda o, facts: "" if facts.query_depth else "the queries have no depth",
     ),
     _Step(
-        "poses refined by rendering",
-        "pose_refinement.by",
-        _refines_by("rendering"),
-        _no_map_depth,
+        "poses refined by rendering", "pose_refinement.by", _refines_by("rendering"), _no_map_depth
     ),
     _Step(
         "rendering by a neural field (NeRF-W)",

@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from megloc_kapture.cli.refine_map import RefineMap
+from megloc_kapture.cli.maps import RefineMap
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.colmap_mapping import MIN_IMAGES, Mapper
 from megloc_kapture.io.dataset_tables import (
@@ -29,9 +29,8 @@ from megloc_kapture.io.dataset_tables import (
     write_unreadable,
 )
 from megloc_kapture.io.kapture import KaptureFolder, write_sensors
-from megloc_kapture.pipeline.missing_weights import check_weights
 from megloc_kapture.pipeline.photographs import Photographs
-from megloc_kapture.pipeline.presets import PRESETS, options_of_preset
+from megloc_kapture.pipeline.presets import PRESETS, check_weights, options_of_preset
 from megloc_kapture.stages.global_features import ExtractGlobalFeatures
 from megloc_kapture.stages.image_pairs import PairMapping
 from megloc_kapture.stages.local_features import ExtractLocalFeatures
@@ -57,20 +56,9 @@ from megloc_kapture.values import Options
 GPS = "gps"
 # the options that making a map of photographs uses
 MAPPING_OPTIONS = (
-    "device",
-    "precision",
-    "preprocessing",
-    "local_features",
-    "mask_margin_px",
-    "global_features",
-    "fusion",
-    "mapping_pairs",
-    "matching",
-    "mapping_verification",
-    "query_verification",
-    "guided_pyramid",
-    "triangulation",
-    "refinement",
+    *("device", "precision", "preprocessing", "local_features", "mask_margin_px"),
+    *("global_features", "fusion", "mapping_pairs", "matching", "mapping_verification"),
+    *("query_verification", "guided_pyramid", "triangulation", "refinement"),
 )
 _WITHOUT_POSES: tuple[type[PipelineStage], ...] = (
     Preprocess,

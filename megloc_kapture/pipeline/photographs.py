@@ -21,8 +21,7 @@ from megloc_kapture.io.images import (
     write_image,
 )
 from megloc_kapture.io.kapture import KaptureData, Sensor, writable_name
-from megloc_kapture.pipeline.kapture_queries import Unit
-from megloc_kapture.pipeline.queries import Query
+from megloc_kapture.pipeline.queries import Query, Unit
 from megloc_kapture.values import Camera, RigidTransform
 
 FRAMES_EVERY = 30
@@ -130,9 +129,8 @@ class Photographs:
         sensor_ids: dict[tuple[str, Camera], str] = {}
         for timestamp, name in enumerate(self.names):
             image = self._images[name]
-            sensor_id = sensor_ids.setdefault(
-                (image.make, image.camera), f"camera{len(sensor_ids)}"
-            )
+            key = image.make, image.camera
+            sensor_id = sensor_ids.setdefault(key, f"camera{len(sensor_ids)}")
             title = image.make.replace(",", " ")
             data.sensors[sensor_id] = Sensor.from_camera(image.camera, name=title)
             data.records_camera[timestamp, sensor_id] = name

@@ -15,13 +15,21 @@ from typing import Any, Literal
 from megloc_kapture.errors import OptionError, suggestion
 from megloc_kapture.evaluation.provenance import package_versions
 from megloc_kapture.io.files import clear_temporary, hard_link, write_bytes, write_json_model
-from megloc_kapture.pipeline.manifests import FileHashes, Manifest, fingerprint, read_manifest
+from megloc_kapture.pipeline.manifests import (
+    FileHashes,
+    Manifest,
+    changed_file,
+    fingerprint,
+    read_manifest,
+    remember_files,
+    written_files,
+)
 from megloc_kapture.pipeline.workspace import HASHES, JOURNAL, Workspace
-from megloc_kapture.pipeline.written_files import changed_file, remember_files, written_files
 from megloc_kapture.stages.stage import CODE_OF, Stage, StageWork, is_below
 from megloc_kapture.stages.work import HERE, Digest, KeptItems, Work
 
 State = Literal["run", "kept", "pending", "skipped"]
+_NOT_DONE = "not done yet"
 
 
 @dataclass(frozen=True)
@@ -33,11 +41,7 @@ class StageReport:
     seconds: float
     counts: Mapping[str, float]
     why: str
-    kept_items: str = ""
-    """How many of its items were taken over from runs before."""
-
-
-_NOT_DONE = "not done yet"
+    kept_items: str = ""  # how many of its items were taken over from runs before
 
 
 def run_plan(
@@ -49,8 +53,7 @@ def run_plan(
     last: str | None = None,
     dry_run: bool = False,
     verify: bool = False,
-    on_start: Callable[[str], None] = lambda text: None,
-    on_report: Callable[[StageReport], None] = lambda report: None,
+    say: Callable[[str], None] = lambda text: None,
 ) -> list[StageReport]:
     """Run the stages that have to be run.
 
@@ -62,7 +65,7 @@ def run_plan(
         not, is run again in any case.
     last : stages behind it are left out.
     dry_run : say what would run, run nothing.
-    on_start : told in one line which stage starts, and why it has to run.
+    say : told in one line which stage starts, and why it has to run; and what it came to.
     verify : compare the content of all files that stages wrote with what it was then; otherwise
         their sizes and times alone.
 
@@ -74,54 +77,95 @@ def run_plan(
     for name in (first, last):
         if name is not None and name not in names:
             raise OptionError(f"no stage {name!r}; {suggestion(name, names, listed='stages: ')}")
-    fingerprints: dict[str, str] = {}
-    reports = []
     start = names.index(first) if first else 0
     stop = names.index(last) + 1 if last else len(names)
     if stop <= start:
         raise OptionError(f"--until {last} stands before --from {first}")
     asked = _with_followers(stages, first) if first else {}
-    _check_done(stages[:start], workspace, first)
+    for name in names[:start]:
+        if read_manifest(workspace.manifest_path(name)) is None:
+            raise OptionError(
+                f"--from {first} needs stage {name}, which has not run; leave --from out"
+            )
     external = _external(stages, workspace)
     if not dry_run:
         # whatever stops this run, the next one has to do what was asked for
         for name in asked:
             workspace.manifest_path(name).unlink(missing_ok=True)
             workspace.forget_items(name)
+    outputs: dict[str, str] = {}  # fingerprints of what each stage wrote
+    reports = []
     for number, stage in enumerate(stages[:stop]):
-        inputs = {name: fingerprints[name] for name in _before(stages, stage)}
-        settings, code = stage.settings(), stage.code()
-        inputs |= _there(stages, stage, workspace) | external[stage.name] | code
-        mark = fingerprint(stage.name, stage.version, settings, inputs)
-        manifest = read_manifest(workspace.manifest_path(stage.name))
-        if number < start and manifest is not None:
-            why = changed_file(workspace.files_path(stage.name), workspace.root, verify=verify)
+        inputs = {name: outputs[name] for name in _before(stages, stage)}
+        inputs |= _there(stages, stage, workspace) | external[stage.name] | stage.code()
+        made = read_manifest(workspace.manifest_path(stage.name))
+        due = _Due(stage, stage.settings(), inputs, made)
+        files = workspace.files_path(stage.name)
+        why = "" if number < start else asked.get(stage.name) or due.why(workspace)
+        why = why or changed_file(files, workspace.root, verify=verify)
+        if made is not None and number < start:
             # what follows is made of something else than the stage wrote, and has to know that
-            fingerprints[stage.name] = f"{manifest.output}{', changed' if why else ''}"
-            report = StageReport(stage.name, "skipped", manifest.seconds, manifest.counts, why)
-            reports.append(report)
-            on_report(report)
-            continue
-        same = manifest is not None and manifest.fingerprint == mark
-        fingerprints[stage.name] = manifest.output if manifest is not None and same else mark
-        why = asked.get(stage.name) or _why(stage, manifest, mark, settings, inputs, workspace)
-        why = why or changed_file(workspace.files_path(stage.name), workspace.root, verify=verify)
-        if not why and manifest is not None:
-            report = StageReport(stage.name, "kept", manifest.seconds, manifest.counts, "")
+            outputs[stage.name] = f"{made.output}{', changed' if why else ''}"
+            report = StageReport(stage.name, "skipped", made.seconds, made.counts, why)
+        elif made is not None and not why:
+            outputs[stage.name] = made.output
+            report = StageReport(stage.name, "kept", made.seconds, made.counts, "")
         elif dry_run:
+            same = made is not None and made.fingerprint == due.mark
+            outputs[stage.name] = made.output if made is not None and same else due.mark
             report = StageReport(stage.name, "pending", 0.0, {}, why)
         else:
             said = "starting" if why == _NOT_DONE else why
-            on_start(f"{stage.name}, stage {number + 1} of {stop}: {said}")
-            former = [] if manifest is None else _former_outputs(stage, manifest)
-            own = fingerprint(stage.name, stage.version, settings, code)
-            report, made = _run(
-                stage, workspace, work, mark, own, settings, inputs, why, former, verify=verify
-            )
-            fingerprints[stage.name] = made.output
+            say(f"{stage.name}, stage {number + 1} of {stop}: {said}")
+            manifest, taken = _run(due, workspace, work, verify=verify)
+            outputs[stage.name] = manifest.output
+            report = StageReport(stage.name, "run", manifest.seconds, manifest.counts, why, taken)
         reports.append(report)
-        on_report(report)
+        say(describe(report))
     return reports
+
+
+@dataclass(frozen=True)
+class _Due:
+    """A stage, what its output depends on now, and the manifest of what it made before."""
+
+    stage: Stage
+    settings: Mapping[str, Any]
+    inputs: Mapping[str, str]
+    made: Manifest | None
+
+    @property
+    def mark(self) -> str:
+        """The fingerprint of what it would make."""
+        return fingerprint(self.stage.name, self.stage.version, self.settings, self.inputs)
+
+    def former_outputs(self) -> list[str]:
+        """What it wrote and does not write now: options may give an output another name."""
+        before = () if self.made is None else self.made.outputs
+        return sorted(set(before) - set(self.stage.writes))
+
+    def why(self, workspace: Workspace) -> str:
+        """Why it has to run; empty when it need not."""
+        made = self.made
+        if made is None:
+            return _NOT_DONE
+        gone = [output for output in made.outputs if not workspace.path(output).exists()]
+        if gone:
+            return f"{gone[0]} is gone"
+        if before := self.former_outputs():
+            return f"{before[0]} is written no more"
+        if made.fingerprint == self.mark:
+            return ""
+        if made.version != self.stage.version:
+            return "a newer version of the stage"
+        changed = _differences(made.inputs, self.inputs)
+        # another plugin has another code; that it was chosen tells more
+        read = [name for name in changed if not name.startswith(CODE_OF)]
+        settings = json.loads(json.dumps(self.settings))  # knows no tuples
+        options = _differences(made.options, settings)
+        if options and not read:
+            return f"options changed: {', '.join(options[:3])}"
+        return f"{(read or changed)[0]} changed"
 
 
 def _before(stages: Sequence[Stage], stage: Stage) -> list[str]:
@@ -171,48 +215,6 @@ def _with_followers(stages: Sequence[Stage], first: str) -> dict[str, str]:
     return found
 
 
-def _check_done(stages: Iterable[Stage], workspace: Workspace, first: str | None) -> None:
-    for stage in stages:
-        if read_manifest(workspace.manifest_path(stage.name)) is None:
-            raise OptionError(
-                f"--from {first} needs stage {stage.name}, which has not run; leave --from out"
-            )
-
-
-def _why(
-    stage: Stage,
-    manifest: Manifest | None,
-    mark: str,
-    settings: Mapping[str, Any],
-    inputs: Mapping[str, str],
-    workspace: Workspace,
-) -> str:
-    """Why a stage has to run; empty when it need not."""
-    if manifest is None:
-        return _NOT_DONE
-    gone = [output for output in manifest.outputs if not workspace.path(output).exists()]
-    if gone:
-        return f"{gone[0]} is gone"
-    if before := _former_outputs(stage, manifest):
-        return f"{before[0]} is written no more"
-    if manifest.fingerprint == mark:
-        return ""
-    if manifest.version != stage.version:
-        return "a newer version of the stage"
-    changed = _differences(manifest.inputs, inputs)
-    # another plugin has another code; that it was chosen tells more
-    read = [name for name in changed if not name.startswith(CODE_OF)]
-    options = _differences(manifest.options, json.loads(json.dumps(settings)))  # knows no tuples
-    if options and not read:
-        return f"options changed: {', '.join(options[:3])}"
-    return f"{(read or changed)[0]} changed"
-
-
-def _former_outputs(stage: Stage, manifest: Manifest) -> list[str]:
-    """What a stage wrote and does not write now: options may give an output another name."""
-    return sorted(set(manifest.outputs) - set(stage.writes))
-
-
 def _take_over(stage: Stage, workspace: Workspace) -> None:
     """Let no other stage count as done that wrote, under other options, what this one writes."""
     for path in workspace.manifest_paths():
@@ -232,19 +234,10 @@ def _differences(old: Any, new: Any, prefix: str = "") -> list[str]:
     return [] if old == new else [prefix]
 
 
-def _run(
-    stage: Stage,
-    workspace: Workspace,
-    work: Work,
-    mark: str,
-    own: str,  # what of the mark is not read
-    settings: Mapping[str, Any],
-    inputs: Mapping[str, str],
-    why: str,
-    former_outputs: Sequence[str],
-    *,
-    verify: bool,
-) -> tuple[StageReport, Manifest]:
+def _run(due: _Due, workspace: Workspace, work: Work, *, verify: bool) -> tuple[Manifest, str]:
+    """Run a stage; its manifest, and how many of its items were taken over."""
+    stage = due.stage
+    own = fingerprint(stage.name, stage.version, due.settings, stage.code())  # but what is read
     started = datetime.now(UTC).isoformat(timespec="seconds")
     clock = time.perf_counter()
     with workspace.staging(stage.name) as folder:
@@ -265,26 +258,24 @@ def _run(
         else:
             workspace.items_path(stage.name).unlink(missing_ok=True)
         workspace.publish(folder, tuple(stage.writes))
-        workspace.remove(former_outputs)
+        workspace.remove(due.former_outputs())
     files = workspace.files_path(stage.name)
     content = remember_files(files, workspace.root, written, kept.states)
-    seconds = time.perf_counter() - clock
     manifest = Manifest(
         stage=stage.name,
         version=stage.version,
-        options=dict(settings),
-        inputs=dict(inputs),
-        fingerprint=mark,
+        options=dict(due.settings),
+        inputs=dict(due.inputs),
+        fingerprint=due.mark,
         content=content,
         outputs=written,
         counts=counts,
-        seconds=round(seconds, 3),
+        seconds=round(time.perf_counter() - clock, 3),
         started=started,
         versions=package_versions(),
     )
     write_json_model(workspace.manifest_path(stage.name), manifest)
-    taken = f"{kept.num_kept} of {kept.num_items} kept" if kept.num_kept else ""
-    return StageReport(stage.name, "run", seconds, counts, why, taken), manifest
+    return manifest, f"{kept.num_kept} of {kept.num_items} kept" if kept.num_kept else ""
 
 
 def _digest(workspace: Workspace) -> Digest:

@@ -4,17 +4,26 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
 from megloc_kapture.errors import OptionError, suggestion
+from megloc_kapture.io.weights import MissingWeightsError, all_missing
 from megloc_kapture.mapping.uncertainty import UncertaintyOptions
 from megloc_kapture.matching.guided_pyramid import GuidedPyramidOptions
-from megloc_kapture.pipeline.assignments import check_assigned
-from megloc_kapture.plugins import PluginChoice
+from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugins import (
+    LOCAL_FEATURES,
+    MATCHERS,
+    POSE_RANKERS,
+    POSE_REFINERS,
+    SEGMENTERS,
+    PluginChoice,
+)
 from megloc_kapture.stages.candidates import QueryPairsOptions
 from megloc_kapture.stages.global_features import GlobalFeaturesChoice
 from megloc_kapture.stages.image_pairs import MappingPairsOptions, RerankingOptions
@@ -150,7 +159,8 @@ def assigned(assignments: Sequence[str] | Mapping[str, Any]) -> dict[str, Any]:
     OptionError : a text that is none.
     """
     tree: dict[str, Any] = {}
-    for key, value in _typed(assignments):
+    pairs = assignments.items() if isinstance(assignments, Mapping) else map(_typed, assignments)
+    for key, value in pairs:
         nested: Any = value
         for part in reversed(key.split(".")):
             nested = {part: nested}
@@ -158,15 +168,18 @@ def assigned(assignments: Sequence[str] | Mapping[str, Any]) -> dict[str, Any]:
     return tree
 
 
-def _typed(assignments: Sequence[str] | Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    if isinstance(assignments, Mapping):
-        yield from assignments.items()
-        return
-    for assignment in assignments:
-        key, equals, text = assignment.partition("=")
-        if not equals or not key:
-            raise OptionError(f"--set takes key=value, got {assignment!r}")
-        yield key.strip(), _value(text.strip())
+def _typed(assignment: str) -> tuple[str, Any]:
+    """Key and value of ``key=value``: a TOML value, or the text itself where it is none."""
+    key, equals, text = assignment.partition("=")
+    if not equals or not key:
+        raise OptionError(f"--set takes key=value, got {assignment!r}")
+    key, text = key.strip(), text.strip()
+    if text.lower() in ("none", "null") and text != "none":  # which is a choice of some options
+        return key, None
+    try:
+        return key, tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return key, text
 
 
 def _known(path: str, root: type[Options]) -> str:
@@ -202,9 +215,8 @@ def options_of(options: Options, prefix: str = "") -> Iterator[Option]:
         if isinstance(value, Options) and not isinstance(value, PluginChoice):
             yield from options_of(value, f"{prefix}{name}.")
         else:
-            yield Option(
-                f"{prefix}{name}", value, _type_name(field.annotation), field.description or ""
-            )
+            kind, meaning = _type_name(field.annotation), field.description or ""
+            yield Option(f"{prefix}{name}", value, kind, meaning)
 
 
 def _type_name(annotation: Any) -> str:
@@ -255,11 +267,91 @@ def _merged_choices(
     return merged
 
 
-def _value(text: str) -> Any:
-    """A TOML value, or the text itself where it is none (``--set verification=none``)."""
-    if text.lower() in ("none", "null") and text != "none":
-        return None
-    try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        return text
+def check_assigned(
+    options: Options, assigned: Mapping[str, Any], *, used: Collection[str] | None = None
+) -> None:
+    """Refuse options that were typed and change nothing.
+
+    Parameters
+    ----------
+    options : with all changes.
+    assigned : nested tables of what was typed.
+    used : options that the command acts on; None: all.
+
+    Raises
+    ------
+    OptionError : an option that the command does not use, or that another option makes idle.
+    """
+    for name in assigned:
+        if used is not None and name not in used:
+            raise OptionError(
+                f"--set {name}: nothing here uses it; used are: {', '.join(sorted(used))}"
+            )
+    for path, reason in _idle(options, assigned):
+        raise OptionError(f"--set {path} changes nothing: {reason}")
+
+
+def _idle(
+    model: Options, assigned: Mapping[str, Any], above: str = ""
+) -> Iterator[tuple[str, str]]:
+    """Paths of assigned options that change nothing, and why."""
+    idle = model.idle()
+    for name, value in assigned.items():
+        inner = getattr(model, name, None)
+        if name in idle:
+            yield above + name, idle[name]
+        elif isinstance(inner, Options) and isinstance(value, Mapping):
+            yield from _idle(inner, value, f"{above}{name}.")
+        elif isinstance(inner, tuple) and isinstance(value, Mapping):
+            yield from _idle_in_list(inner, value, f"{above}{name}.")
+
+
+def _idle_in_list(
+    choices: Sequence[Any], assigned: Mapping[str, Any], above: str
+) -> Iterator[tuple[str, str]]:
+    """The same in a list of plugins, of which the only one, or those that are named, change."""
+    for name, value in assigned.items():
+        named = [one for one in choices if getattr(one, "name", None) == name]
+        if named and isinstance(value, Mapping):
+            for one in named:
+                yield from _idle_in_list([one], value, f"{above}{name}.")
+        elif name == "weight" and len(choices) == 1:
+            yield above + name, "it is the share among several, and there is one"
+
+
+def check_weights(options: PipelineOptions) -> None:
+    """Make every plugin that a run uses once.
+
+    Raises
+    ------
+    MissingWeightsError : names each checkpoint that is not there, and how to get it.
+    PluginError : a plugin is not there, or refuses its options.
+    """
+    missing = []
+    for make in _makers(options):
+        try:
+            make()
+        except MissingWeightsError as error:
+            missing.append(error)
+    if missing:
+        raise all_missing(missing)
+
+
+def _makers(options: PipelineOptions) -> Iterator[Callable[[], object]]:
+    chosen: list[tuple[str, PluginChoice]] = []
+    if (segmenter := options.preprocessing.masks.segmenter) is not None:
+        chosen.append((SEGMENTERS, segmenter))
+    features: list[tuple[PluginChoice, PluginChoice]] = []  # extractor and matcher
+    if options.makes_points():
+        features += [
+            (local, local.matching or options.matching) for local in options.local_features
+        ]
+    if options.uses_given_map():
+        features.append((options.given_features, options.matching))
+    chosen += [(LOCAL_FEATURES, extractor) for extractor, _ in features]
+    chosen += [(MATCHERS, matcher) for _, matcher in features]
+    chosen.append((POSE_RANKERS, options.localization.rank))
+    chosen += [(POSE_REFINERS, one) for one in options.pose_refinement.by]
+    for group, one in chosen:
+        yield partial(load_plugin, group, one.name, one.options)
+    yield from (one.make for one in options.global_features if not one.is_vlad)

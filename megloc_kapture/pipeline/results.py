@@ -16,9 +16,9 @@ from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.output_folders import staged_output
 from megloc_kapture.io.tables import CONSISTENCY_FILE, write_consistency
 from megloc_kapture.localization.focal_length import solve_with_shared_camera
-from megloc_kapture.pipeline.kapture_queries import KaptureQueries
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.photographs import Photographs
+from megloc_kapture.pipeline.queries import KaptureQueries
 from megloc_kapture.stages.localized_folder import query_status, unreadable_image, write_localized
 from megloc_kapture.stages.stage import LOCALIZED
 from megloc_kapture.stages.work import Track, untracked
@@ -71,7 +71,7 @@ class Results(Mapping[str, Pose | Failure]):
         # what is wrong is found before the first query
         localizer.map.check()
         self.queries.check()
-        _check_extractors(localizer, self.queries)
+        self._check_extractors()
         self._candidates = candidates
         self._rigs = localizer.options.localization.rigs
         self._units = self.queries.units(rigs=self._rigs)
@@ -127,8 +127,7 @@ class Results(Mapping[str, Pose | Failure]):
         self.queries.write_images(output)
         if (unit := self.localizer.map.unit) != METRES:
             write_unit(output, unit)
-        tested = self.localizer.refiners.tested()
-        if tested:
+        if tested := self.localizer.refiners.tested():
             write_consistency(output / CONSISTENCY_FILE, tested)
         return counts
 
@@ -168,6 +167,21 @@ class Results(Mapping[str, Pose | Failure]):
         folder = self.localizer.map.folder
         write_view(path, folder, self, truth, cameras=cameras, rendered=rendered)
 
+    def _check_extractors(self) -> None:
+        """Make the extractors that queries without features need.
+
+        Raises DataError where there is none for a type, with the first image that needs it;
+        PluginError, MissingWeightsError where it cannot be made.
+        """
+        for local in self.localizer.types:
+            lacking = self.queries.lacking(local.name)
+            if lacking is None:
+                continue
+            try:
+                _ = local.extractor
+            except DataError as error:
+                raise DataError(f"image {lacking!r}: {error.message}", path=error.path) from error
+
     def _localized(self, workers: int, track: Track) -> Iterator[tuple[str, Pose | Failure]]:
         with ThreadPoolExecutor(workers) as executor:
             units = self.queries.read_units(rigs=self._rigs)
@@ -179,9 +193,8 @@ class Results(Mapping[str, Pose | Failure]):
             for names, found in zip(self._units, tracked, strict=True):
                 for name, result in zip(names, found, strict=True):
                     if isinstance(result, Failure) and name in self.queries.faults:
-                        yield name, replace(result, reason=self.queries.faults[name])
-                    else:
-                        yield name, result
+                        result = replace(result, reason=self.queries.faults[name])
+                    yield name, result
 
     def _with_shared_cameras(self, results: list[Pose | Failure]) -> list[Pose | Failure]:
         """Results of photographs, each by itself; those of one camera are solved with one."""
@@ -203,32 +216,14 @@ class Results(Mapping[str, Pose | Failure]):
         for name, result in self.items():
             if result or name in self.queries.faults or name in self.queries.unreadable:
                 continue
-            if self._candidates is None:
-                try:
-                    ranked: Sequence[str] = self.localizer.ranked(self.queries.query(name))
-                except DataError:
-                    continue  # it could not be decoded either when it was localized
-            else:
+            ranked: Sequence[str] = ()
+            if self._candidates is not None:
                 ranked = self._candidates.get(name, ())
+            else:
+                # one that cannot be decoded could not be either when it was localized
+                with contextlib.suppress(DataError):
+                    ranked = self.localizer.ranked(self.queries.query(name))
             first = next((image for image in ranked if image in poses), None)
             if first is not None:
                 best[name] = (first, poses[first])
         return best
-
-
-def _check_extractors(localizer: Localizer, queries: KaptureQueries | Photographs) -> None:
-    """Make the extractors that queries without features need.
-
-    Raises
-    ------
-    DataError : there is no extractor for a type; names the first image that needs it.
-    PluginError, MissingWeightsError : it cannot be made.
-    """
-    for local in localizer.types:
-        lacking = queries.lacking(local.name)
-        if lacking is None:
-            continue
-        try:
-            _ = local.extractor
-        except DataError as error:
-            raise DataError(f"image {lacking!r}: {error.message}", path=error.path) from error

@@ -1,14 +1,18 @@
-"""What is handed in: the pose files of a localized kapture, by its challenge's rules."""
+"""Pose files of a localized kapture, by its challenge's rules, and the folder that keeps them."""
 
 from __future__ import annotations
 
+import json
+import os
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain, count
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from megloc_kapture.datasets.kapture_folders import MAPPING, QUERY
-from megloc_kapture.errors import DataError, OptionError, suggestion
+from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.evaluation.pose_files import (
     RelativePose,
     format_mlad_file,
@@ -16,7 +20,7 @@ from megloc_kapture.evaluation.pose_files import (
     relative_pose,
     timestamp_of,
 )
-from megloc_kapture.evaluation.provenance import write_provenance
+from megloc_kapture.evaluation.provenance import provenance_path, write_provenance
 from megloc_kapture.io.dataset_tables import (
     PROTOCOL_FILE,
     RELOCALIZATION_FILE,
@@ -30,17 +34,25 @@ from megloc_kapture.io.dataset_tables import (
     read_unreadable,
     read_world,
 )
-from megloc_kapture.io.files import safe_join, write_bytes
+from megloc_kapture.io.files import safe_join, write_bytes, write_json
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder
 from megloc_kapture.io.tables import STATUS_FILE, QueryStatus, read_status
-from megloc_kapture.pipeline.datasets import KAPTURE, SYNTHETIC, TWIN_PREFIX, dataset_names
+from megloc_kapture.pipeline.datasets import (
+    KAPTURE,
+    SYNTHETIC,
+    TWIN_PREFIX,
+    check_known,
+    dataset_names,
+)
 from megloc_kapture.pipeline.manifests import read_manifest
 from megloc_kapture.stages import rigs
 from megloc_kapture.values import Pose, RigidTransform
 
-_IMPORT_MANIFEST = "stages/import.json"
 # a row of MLAD for a query without a pose; kapture's own exporter writes the same
 _DUMMY = RigidTransform.identity()
+
+
+_Content = tuple[Mapping[str, str], Sequence[str], Sequence[str]]
 
 
 @dataclass(frozen=True)
@@ -52,15 +64,6 @@ class _Result:
     guesses: Collection[str]
     from_rig: Collection[str]
     confidences: Mapping[str, float]
-
-
-@dataclass(frozen=True)
-class _Content:
-    """Texts by file name ("" where it is one file), images of the rows with a pose, the rest."""
-
-    files: Mapping[str, str]
-    posed: Sequence[str]
-    missing: Sequence[str]
 
 
 def check_dataset(dataset: str, protocol: Protocol, *, tables: Path | None) -> None:
@@ -92,12 +95,6 @@ def check_dataset(dataset: str, protocol: Protocol, *, tables: Path | None) -> N
             f"dataset {dataset} is asked for, and {(tables or Path()) / PROTOCOL_FILE} is of "
             f"dataset {protocol.dataset}"
         )
-
-
-def check_known(dataset: str) -> None:
-    """Refuse a dataset that nobody knows; raises OptionError with those that are known."""
-    if dataset not in dataset_names():
-        raise OptionError(f"unknown dataset {dataset!r}; {suggestion(dataset, dataset_names())}")
 
 
 def place_of(folder: Path, stem: str, protocol: Protocol) -> Path:
@@ -145,30 +142,30 @@ def write_submission(
     result = _read_result(localized, beside, from_rig=from_rig)
     unreadable = {} if tables is None else read_unreadable(tables)
     if rules.pose_file == "mlad" and tables is not None:
-        content = _mlad(result, tables)
-        for name, text in content.files.items():
+        texts, posed, missing = _mlad(result, tables)
+        for name, text in texts.items():
             write_bytes(safe_join(place, name), text.encode("ascii"))
     else:
-        content = _ltvl(result, tables, rules, unreadable)
-        write_bytes(place, content.files[""].encode("utf-8"))
+        texts, posed, missing = _ltvl(result, tables, rules, unreadable)
+        write_bytes(place, texts[""].encode("utf-8"))
     counts = {
         "queries": len(result.data.records_camera) + len(unreadable),
-        "scored": len(content.posed) + len(content.missing),
-        "poses": len(content.posed),
-        "missing": len(content.missing),
-        "fallbacks": sum(image in result.guesses for image in content.posed),
-        "from_rig": sum(image in result.from_rig for image in content.posed),
-        "dummies": len(content.missing) if rules.pose_file == "mlad" else 0,
+        "scored": len(posed) + len(missing),
+        "poses": len(posed),
+        "missing": len(missing),
+        "fallbacks": sum(image in result.guesses for image in posed),
+        "from_rig": sum(image in result.from_rig for image in posed),
+        "dummies": len(missing) if rules.pose_file == "mlad" else 0,
     }
-    posed = set(content.posed)
+    known = set(posed)
     entries = {
         **provenance,
         "weights": dict(weights or {}),
-        "confidence": {i: c for i, c in sorted(result.confidences.items()) if i in posed},
+        "confidence": {i: c for i, c in sorted(result.confidences.items()) if i in known},
         "dataset_fingerprint": _dataset_fingerprint(beside),
-        "dummies" if rules.pose_file == "mlad" else "missing": content.missing,
+        "dummies" if rules.pose_file == "mlad" else "missing": missing,
     }
-    files = None if rules.pose_file == "ltvl" else list(content.files)
+    files = None if rules.pose_file == "ltvl" else list(texts)
     write_provenance(place, entries, counts=counts, files=files)
     return counts
 
@@ -176,29 +173,21 @@ def write_submission(
 def poses_through_rig(
     data: KaptureData,
     poses: Mapping[str, RigidTransform],
-    statuses: Mapping[str, QueryStatus] | None = None,
+    statuses: Mapping[str, QueryStatus] = MappingProxyType({}),
 ) -> dict[str, RigidTransform]:
     """Poses of images that have none of their own, through the rig, from another of the moment.
 
     A pose that is only a guess (a fallback) is none of its own, and gives none to others. Of
-    several siblings the one with the most inliers counts.
-
-    Parameters
-    ----------
-    data : sensors, rigs and records of the images.
-    poses : ``cam_from_world`` by image.
-    statuses : rows of ``status.csv``; without, all poses are taken for localized.
+    several siblings the one with the most inliers counts; without status a pose is localized.
     """
-    known = statuses or {}
     localized = {}
     for image, pose in poses.items():
-        status = known.get(image)
+        status = statuses.get(image)
         if status is None:
             localized[image] = Pose(pose, 0, 0)
         elif status.status == "localized":
             localized[image] = Pose(pose, status.num_matches, status.num_inliers)
-    found = rigs.poses_through_rig(data, localized)
-    return {image: pose for image, (_, pose) in found.items()}
+    return {image: pose for image, (_, pose) in rigs.poses_through_rig(data, localized).items()}
 
 
 def _read_result(localized: Path, beside: Path | None, *, from_rig: bool) -> _Result:
@@ -240,6 +229,7 @@ def _read_result(localized: Path, beside: Path | None, *, from_rig: bool) -> _Re
 def _ltvl(
     result: _Result, tables: Path | None, rules: Protocol, unreadable: Collection[str]
 ) -> _Content:
+    """What :func:`_mlad` gives, of one file without a name."""
     names = {} if tables is None else read_names(tables)
     world = World() if tables is None else read_world(tables)
     images = list(names)
@@ -250,10 +240,11 @@ def _ltvl(
     posed = [image for image in images if image in result.poses]
     official = {image: world.pose_in_official(result.poses[image]) for image in posed}
     text = format_pose_file(official, names=names or rules.pose_file_names)
-    return _Content({"": text}, posed, [image for image in images if image not in result.poses])
+    return {"": text}, posed, [image for image in images if image not in result.poses]
 
 
 def _mlad(result: _Result, tables: Path) -> _Content:
+    """Texts by file name, the images of their rows that have a pose, and the other rows."""
     pairs = read_relocalization(tables)
     if not pairs:
         raise DataError(
@@ -275,14 +266,12 @@ def _mlad(result: _Result, tables: Path) -> _Content:
             pose = relative_pose(query, reference, scale=scale)
         row = RelativePose(timestamp_of(pair.reference), timestamp_of(pair.query), pose)
         rows.setdefault(pair.file, []).append(row)
-    return _Content({name: format_mlad_file(own) for name, own in rows.items()}, posed, missing)
+    return {name: format_mlad_file(own) for name, own in rows.items()}, posed, missing
 
 
 def _dataset_fingerprint(workspace: Path | None) -> str | None:
     """Fingerprint of the imported dataset; None where it was not imported by a run."""
-    if workspace is None:
-        return None
-    manifest = read_manifest(workspace / _IMPORT_MANIFEST)
+    manifest = None if workspace is None else read_manifest(workspace / "stages" / "import.json")
     return None if manifest is None else manifest.fingerprint
 
 
@@ -301,3 +290,93 @@ def workspace_provenance(localized: Path) -> dict[str, Any]:
         options = handed_in.options
         found |= {key: options[key] for key in ("preset", "options") if key in options}
     return found
+
+
+FOLDER = "submissions"
+
+
+def keep_submission(place: Path, folder: Path) -> Path:
+    """Copy a submission and its provenance into a folder, beside those of other runs.
+
+    The same bytes are left as they are. Where another result bears the name already, it stays,
+    and the new one gets a number: ``Aachen_eval_METHOD-2.txt``.
+
+    Parameters
+    ----------
+    place : the pose file, or the folder of a challenge that takes several; its provenance lies
+        beside it.
+    folder : where to; made where it is missing.
+
+    Returns
+    -------
+    Where the copy stands.
+
+    Raises
+    ------
+    DataError : the submission or its provenance is missing or cannot be read.
+    OutputError : the copy cannot be written.
+    """
+    content = _content(place)
+    beside = _read(provenance_path(place))
+    # only a file's name has a type: that of a folder may hold a dot
+    end = place.suffix if place.is_file() else ""
+    stem = place.name.removesuffix(end)
+    numbered = (folder / f"{stem}-{number}{end}" for number in count(2))
+    places = chain([folder / place.name], numbered)
+    kept = next(other for other in places if _is_free(other, content))
+    there = _content(kept) if os.path.lexists(kept) else {}
+    for name in content.keys() - there.keys():
+        write_bytes(kept / name if name else kept, content[name])
+    # last: with its provenance a submission is whole
+    if there != content or not os.path.lexists(provenance_path(kept)):
+        _write_provenance(place, beside, kept)
+    return kept
+
+
+def _content(place: Path) -> dict[str, bytes]:
+    """Bytes by name below ``place``; the name is "" where it is a file itself."""
+    if not place.is_dir():
+        return {"": _read(place)}
+    try:
+        files = sorted(place.iterdir())
+    except OSError as error:
+        raise DataError(f"cannot read: {error.strerror or error}", path=place) from error
+    return {file.name: _read(file) for file in files}
+
+
+def _is_free(place: Path, content: dict[str, bytes]) -> bool:
+    """Whether nothing stands there but the same, or that part of it which a killed run wrote."""
+    if not os.path.lexists(place):
+        return True
+    try:
+        there = _content(place)
+    except DataError:  # a folder in it, a dangling link: whatever it is, it is not this
+        return False
+    if os.path.lexists(provenance_path(place)):
+        return there == content
+    return there.items() <= content.items()
+
+
+def _read(path: Path) -> bytes:
+    if not path.is_file():
+        raise DataError("no such file; --from submission writes it again", path=path)
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise DataError(f"cannot read: {error.strerror or error}", path=path) from error
+
+
+def _write_provenance(place: Path, beside: bytes, kept: Path) -> None:
+    if kept.name == place.name or place.is_dir():
+        write_bytes(provenance_path(kept), beside)
+        return
+    # it names the file it belongs to
+    try:
+        told = json.loads(beside)
+        told["files"] = {kept.name: told["files"][place.name]}
+    except (ValueError, KeyError, TypeError) as error:
+        raise DataError(
+            f"not the provenance of {place.name}; --from submission writes it again",
+            path=provenance_path(place),
+        ) from error
+    write_json(provenance_path(kept), told)

@@ -22,12 +22,7 @@ JOURNAL = ".items"  # of a stage's items that are done, in the folder that it wr
 
 
 class Workspace:
-    """Paths of a workspace (docs/architecture.md, Contract 3).
-
-    Raises
-    ------
-    OutputError : the folder has something in it that is not a workspace's.
-    """
+    """Paths of a workspace (docs/architecture.md); raises OutputError for a folder of others."""
 
     def __init__(self, root: Path, *, force: bool = False) -> None:
         self.root = Path(root).absolute()
@@ -70,8 +65,8 @@ class Workspace:
 
     def manifest_paths(self) -> list[Path]:
         """The manifests that there are."""
-        folder = self.root / "stages"
-        return sorted(path for path in folder.glob("*.json") if path.name[0] != ".")
+        found = (self.root / "stages").glob("*.json")
+        return sorted(path for path in found if path.name[0] != ".")
 
     def folder(self, name: str, *features: str) -> KaptureFolder:
         """A kapture folder of the workspace, with features folders of the workspace."""
@@ -91,11 +86,9 @@ class Workspace:
         except OSError as error:
             raise output_error(path, error) from error
         try:
-            try:
+            held = False
+            with contextlib.suppress(OSError):
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                held = False
-            else:
                 # a run that has just taken its unused workspace away holds nothing any more
                 held = _is_still(handle, path)
             if not held:
@@ -123,7 +116,6 @@ class Workspace:
                     remove(left)
 
     def _release_if_unused(self) -> None:
-        stages = self.root / "stages"
         with contextlib.suppress(OSError):
             gone = not (self.root / LOCK).exists()  # what is there has come after the deletion
             kept = self._published or self.manifest_paths() or any((self.root / PARTIAL).glob("*"))
@@ -131,7 +123,7 @@ class Workspace:
                 return
             for path in (self.path(HASHES), self.root / LOCK):
                 path.unlink(missing_ok=True)
-            for folder in (stages, self.root / PARTIAL):
+            for folder in (self.root / "stages", self.root / PARTIAL):
                 with contextlib.suppress(OSError):
                     folder.rmdir()
             self._claim.undo()

@@ -14,7 +14,8 @@ import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, suppress
-from functools import partial
+from functools import cache, partial
+from pathlib import Path
 from typing import Annotated, Any
 
 import prometheus_client as prometheus
@@ -33,11 +34,16 @@ from megloc_kapture.io.images import turned_upright
 from megloc_kapture.pipeline.executors import available_cores
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.queries import Query as ImageQuery
-from megloc_kapture.service import pages
-from megloc_kapture.service.answers import Answer, Refused, answer_of, read_camera
 from megloc_kapture.service.limits import Busy, Limits, Rates, Turns, client_of
-from megloc_kapture.service.photographs import Photograph, TooManyPixels, UnknownFormat
-from megloc_kapture.values import Camera
+from megloc_kapture.service.photographs import (
+    Answer,
+    Photograph,
+    Refused,
+    TooManyPixels,
+    UnknownFormat,
+    answer_of,
+    camera_of,
+)
 
 _PATH = re.compile(r"(^|[\s'\"(=])/\w[^\s]*/")
 _DISCARD_S = 2.0
@@ -167,7 +173,7 @@ class Service:
         try:
             max_pixels = self.limits.max_megapixels * 1e6
             photograph = Photograph.of(content, max_pixels=max_pixels)
-            chosen, orientation = _camera_of(photograph, camera)
+            chosen, orientation = camera_of(photograph, camera)
             pixels = turned_upright(photograph.decode(), orientation)
             # a JPEG is pre-processed as a JPEG
             query = ImageQuery(chosen, pixels, f"image{photograph.suffix}")
@@ -253,7 +259,7 @@ def make_app(service: Service, overview: bytes) -> ASGIApp:
 
     Parameters
     ----------
-    overview : the map from above as JSON; see :mod:`megloc_kapture.service.overview`.
+    overview : the map from above as JSON; see :mod:`megloc_kapture.service.server`.
     """
 
     @asynccontextmanager
@@ -305,11 +311,11 @@ def make_app(service: Service, overview: bytes) -> ASGIApp:
 
     @app.get("/", include_in_schema=False)
     async def page() -> HTMLResponse:
-        return HTMLResponse(pages.read("localize.html"))
+        return HTMLResponse(_page("localize.html"))
 
     @app.get("/docs", include_in_schema=False)
     async def docs() -> HTMLResponse:
-        return HTMLResponse(pages.read("docs.html"))
+        return HTMLResponse(_page("docs.html"))
 
     @app.exception_handler(HTTPException)
     async def refuse(_: Request, error: HTTPException) -> Response:
@@ -387,6 +393,12 @@ class _Envelope:
         return False
 
 
+@cache
+def _page(name: str) -> str:
+    """A page of this folder: one file that needs nothing else."""
+    return Path(__file__).with_name(name).read_text(encoding="utf-8")
+
+
 class _FormInMemory(MultiPartParser):
     spool_max_size = 1 << 40  # nothing of a client's goes to a disk
 
@@ -417,22 +429,3 @@ async def _image_of(request: Request, body: bytes) -> tuple[bytes, str | None]:
 async def _disconnected(request: Request) -> None:
     while (await request.receive())["type"] != "http.disconnect":
         pass
-
-
-def _camera_of(photograph: Photograph, camera: str | None) -> tuple[Camera, int]:
-    """The camera, and how the pixels are to be turned before (1: not); raises DataError."""
-    if not camera:
-        found = photograph.exif()
-        if found is None:
-            raise DataError(
-                "the camera is missing, and the image has no EXIF with a focal length: send "
-                "`camera`, JSON with model, width, height and params as COLMAP defines them"
-            )
-        return found.upright_camera, found.orientation
-    given = read_camera(camera)
-    if (given.width, given.height) != (photograph.width, photograph.height):
-        raise DataError(
-            f"the image is {photograph.width}x{photograph.height} as it is stored, its camera says "
-            f"{given.width}x{given.height}"
-        )
-    return given, 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import logging
 import os
 import signal
@@ -12,7 +13,6 @@ import tempfile
 from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,18 +20,19 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 import uvicorn
+from numpy.typing import NDArray
 from uvicorn.config import STARTUP_FAILURE
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.supervisors import Multiprocess
 
 from megloc_kapture.errors import MeglocError, OptionError
+from megloc_kapture.geometry.poses import camera_centers, invert_quats, rotate, stack_poses
 from megloc_kapture.io.files import clear_leftovers, owned_name
 from megloc_kapture.pipeline.executors import end_with_parent, single_threaded
-from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
+from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.service.app import Service, make_app
 from megloc_kapture.service.limits import Limits, client_of
-from megloc_kapture.service.overview import map_overview
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.shared_index import open_index, shared_index
 from megloc_kapture.values import Camera
@@ -41,38 +42,6 @@ if TYPE_CHECKING:
 
 _MAX_CONNECTIONS, _MAX_CONNECTIONS_OF_CLIENT = 512, 64
 _HEADERS_LIMIT_S = 10.0
-
-
-@dataclass(frozen=True)
-class ServedMap:
-    """Where a map is and how it is localized in; worker processes open it by this.
-
-    Parameters
-    ----------
-    path, keypoints_types, features_dirs, pixel_origin, allow_links_below : of
-        :meth:`~megloc_kapture.pipeline.kapture_map.KaptureMap.open`.
-    options : of localizing.
-    """
-
-    path: Path
-    options: PipelineOptions
-    keypoints_types: tuple[str, ...] = ()
-    features_dirs: tuple[Path, ...] = ()
-    pixel_origin: PixelOriginChoice = "auto"
-    allow_links_below: tuple[Path, ...] = ()
-
-    def open(self, indices: Mapping[str, Path] | None = None) -> KaptureMap:
-        """Open the map; ``indices`` are folders of :func:`shared_index`. Raises DataError."""
-        return KaptureMap.open(
-            self.path,
-            keypoints_types=self.keypoints_types,
-            features_dirs=self.features_dirs,
-            pixel_origin=self.pixel_origin,
-            allow_links_below=self.allow_links_below,
-            indices=None
-            if indices is None
-            else {name: open_index(folder) for name, folder in indices.items()},
-        )
 
 
 def prepared_localizer(kapture_map: KaptureMap, options: PipelineOptions) -> Localizer:
@@ -113,8 +82,9 @@ def bind(host: str, port: int) -> socket.socket:
 
 
 def serve(
-    served: ServedMap,
+    opening: Callable[..., KaptureMap],
     kapture_map: KaptureMap,
+    options: PipelineOptions,
     bound: socket.socket,
     *,
     limits: Limits,
@@ -128,7 +98,10 @@ def serve(
 
     Parameters
     ----------
-    kapture_map : ``served``, opened.
+    opening : :meth:`~megloc_kapture.pipeline.kapture_map.KaptureMap.open` with its arguments, but
+        for ``indices``: so worker processes open the map.
+    kapture_map : the map, opened.
+    options : of localizing.
     bound : of :func:`bind`.
     workers : processes; each has ``limits`` of its own.
     proxy : address of a reverse proxy, whose X-Forwarded-For is believed; "" without one.
@@ -139,7 +112,7 @@ def serve(
     MeglocError : the map cannot be localized in.
     """
     logging.getLogger("uvicorn").setLevel(logging.ERROR)  # a client's mistakes are no news
-    localizer = prepared_localizer(kapture_map, served.options)
+    localizer = prepared_localizer(kapture_map, options)
     overview = map_overview(kapture_map)
     configure = partial(_config, limits=limits, proxy=proxy, log_requests=log_requests)
     if workers == 1:
@@ -155,7 +128,7 @@ def serve(
         tempfile.TemporaryDirectory(prefix=f".{owned_name()}") as counters,
     ):
         os.environ["PROMETHEUS_MULTIPROC_DIR"] = counters
-        factory = partial(_app_of_worker, served, folders, limits, token, overview)
+        factory = partial(_app_of_worker, opening, options, folders, limits, token, overview)
         config = configure(factory, factory=True, workers=workers, timeout_worker_healthcheck=60)
         del localizer, kapture_map, indices  # the workers have theirs
         _Workers(config, [bound], ready).run()
@@ -181,7 +154,8 @@ def _config(
 
 
 def _app_of_worker(
-    served: ServedMap,
+    opening: Callable[..., KaptureMap],
+    options: PipelineOptions,
     folders: Mapping[str, Path],
     limits: Limits,
     token: str | None,
@@ -191,7 +165,8 @@ def _app_of_worker(
     logging.getLogger("uvicorn").setLevel(logging.ERROR)
     cv2.setNumThreads(1)
     try:
-        localizer = prepared_localizer(served.open(folders), served.options)
+        indices = {name: open_index(folder) for name, folder in folders.items()}
+        localizer = prepared_localizer(opening(indices=indices), options)
     except MeglocError as error:
         print(f"megloc: {error}", file=sys.stderr)
         sys.exit(STARTUP_FAILURE)
@@ -281,3 +256,56 @@ class _Connection(H11Protocol):
         if self._cut is not None:
             self._cut.cancel()
             self._cut = None
+
+
+_MAX_POINTS, _MAX_CAMERAS = 15_000, 3_000
+
+
+def map_overview(kapture_map: KaptureMap) -> bytes:
+    """JSON: ``right`` and ``up``, unit vectors of the world, and an ``origin`` in it; on these
+    ``points`` [x, y, ...] and ``cameras`` [x, y, direction x, direction y, ...]; how many
+    ``images`` there are, and the ``unit`` of the world, ``m`` or ``units``.
+
+    Of many points and cameras a sample.
+    """
+    # matplotlib comes with it, and worker processes are given what it makes
+    from megloc_kapture.evaluation.report.map_view import top_view
+
+    names = kapture_map.images
+    quats, translations = stack_poses([kapture_map.poses[name] for name in names])
+    centers = camera_centers(quats, translations)
+    origin = centers.mean(axis=0)
+    view = top_view(quats, centers)
+    forward = rotate(invert_quats(quats), np.array([0.0, 0.0, 1.0]))
+    cameras = np.hstack([view.project(centers - origin), view.project(forward)])
+    points = _trimmed(np.concatenate([k.index.xyz for k in kapture_map.keypoints.values()]))
+    content = {
+        "images": len(names),
+        "unit": kapture_map.unit,
+        "right": _rounded(view.right, 9),
+        "up": _rounded(view.up, 9),
+        "origin": origin.tolist(),
+        "cameras": _rounded(_sample(cameras, _MAX_CAMERAS)),
+        "points": _rounded(view.project(_sample(points, _MAX_POINTS) - origin)),
+    }
+    return json.dumps(content, separators=(",", ":")).encode()
+
+
+def _trimmed(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Without the outermost, which would make the rest a dot."""
+    points = points[np.isfinite(points).all(axis=1)]
+    if len(points) < 100:
+        return points
+    low, high = np.percentile(points, [1.0, 99.0], axis=0)
+    margin = 0.5 * (high - low)
+    return points[((points >= low - margin) & (points <= high + margin)).all(axis=1)]
+
+
+def _sample(rows: NDArray[np.float64], most: int) -> NDArray[np.float64]:
+    if len(rows) <= most:
+        return rows
+    return rows[np.sort(np.random.default_rng(0).choice(len(rows), most, replace=False))]
+
+
+def _rounded(values: NDArray[np.float64], digits: int = 5) -> list[float]:
+    return [float(f"{value:.{digits}g}") for value in values.ravel().tolist()]

@@ -1,18 +1,26 @@
-"""``megloc evaluate``: one result, several, runs of one method, and results without truth."""
+"""``megloc evaluate``, ``submit`` and ``check`` as their users meet them."""
 
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from megloc_kapture.evaluation.pose_files import write_pose_file
+from megloc_kapture.evaluation.pose_files import read_pose_file, write_pose_file
 from megloc_kapture.evaluation.protocols import protocol_of
-from megloc_kapture.io.dataset_tables import ImageGroup, write_groups, write_protocol
-from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
+from megloc_kapture.io.dataset_tables import (
+    ImageGroup,
+    Protocol,
+    RelocalizationPair,
+    write_groups,
+    write_protocol,
+    write_relocalization,
+)
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.io.tables import QueryStatus, write_status
 from megloc_kapture.values import Camera, RigidTransform
 
@@ -204,3 +212,181 @@ def test_what_cannot_be_done_is_said_in_one_line(
     before = sorted(runs.rglob("*"))
     megloc("evaluate", *(argument.format(runs) for argument in arguments)).refused(said)
     assert sorted(runs.rglob("*")) == before
+
+
+@pytest.fixture
+def imported(scene: Path, tmp_path: Path) -> Path:
+    """An imported scene and a result in it: the true poses of all but one query."""
+    root = tmp_path / "imported"
+    for part in ("mapping", "query"):
+        write_sensors(root / part, KaptureFolder(scene / part).read())
+    truth = KaptureFolder(scene / "query_gt").read()
+    images = truth.image_names()
+    truth.trajectories.pop(truth.record_of(images[0]))
+    write_sensors(root / "localized", truth)
+    failed = {"status": "failed", "reason": "no matches"}
+    rows = [
+        QueryStatus(image=images[0], **failed),
+        QueryStatus(image=images[1], fallback="retrieval", **failed),
+        *(QueryStatus(image=image, status="localized") for image in images[2:]),
+    ]
+    write_status(root / "localized" / "status.csv", rows)
+    write_protocol(root / "megloc", Protocol(dataset="aachen", pose_file_names="basename"))
+    return root
+
+
+def test_what_is_told(megloc: Any, imported: Path, tmp_path: Path) -> None:
+    place = tmp_path / "poses.txt"
+    done = megloc("submit", "aachen", "-i", imported / "localized", "-o", place)
+    assert (done.status, done.err) == (0, "")
+    assert done.out == f"3 poses of 4 queries, 1 missing, 1 of the poses guessed: {place}\n"
+    assert len(read_pose_file(place)) == 3
+    beside = json.loads(place.with_name("poses.txt.json").read_text())
+    assert beside["dataset"] == "aachen" and beside["counts"]["missing"] == 1
+    megloc("submit", "aachen", "-i", imported / "localized", "-o", place).refused("exists; -f")
+    again = megloc("submit", "synthetic-aachen", "-i", imported / "localized", "-o", place, "-f")
+    assert again.status == 0
+
+
+def test_side_tables_of_elsewhere(megloc: Any, imported: Path, tmp_path: Path) -> None:
+    result = tmp_path / "elsewhere" / "result"
+    shutil.copytree(imported / "localized", result, symlinks=True)
+    command = ["submit", "aachen", "-i", result, "-o", tmp_path / "poses.txt"]
+    megloc(*command).refused("rules of aachen stand in the megloc/ folder", "--side-tables")
+    done = megloc(*command, "--side-tables", imported / "megloc")
+    assert done.out.startswith("3 poses of 4 queries")
+    megloc(*command, "--side-tables", tmp_path / "nowhere").refused("nowhere: no such folder")
+    assert megloc("submit", "kapture", *command[2:], "-f").out.startswith("3 poses of 4 queries")
+
+
+def test_what_submit_refuses(megloc: Any, imported: Path, tmp_path: Path) -> None:
+    result, place = imported / "localized", tmp_path / "poses.txt"
+    megloc("submit", "robotcar", "-i", result, "-o", place).refused(
+        "dataset robotcar is asked for", "protocol.json is of dataset aachen"
+    )
+    megloc("submit", "cambridge", "-i", result, "-o", place).refused(
+        "unknown dataset 'cambridge'; known: kapture"
+    )
+    megloc("submit", "aachen", "-i", result, "-o", place, "--from-rig").refused("rigs.txt")
+    megloc("submit", "aachen", "-i", result, "-o", tmp_path).refused("is not what is to be written")
+    assert not place.exists()
+
+
+def test_mlad_goes_to_a_folder(megloc: Any, imported: Path, tmp_path: Path) -> None:
+    write_protocol(imported / "megloc", Protocol(dataset="4seasons", pose_file="mlad"))
+    mapping = KaptureFolder(imported / "mapping").read()
+    for part in ("mapping", "query", "localized"):
+        data = KaptureFolder(imported / part).read()
+        data.records_camera = {
+            key: f"{int(name.removesuffix('.jpg')) + 1}.png"
+            for key, name in data.records_camera.items()
+        }
+        write_sensors(imported / part, data)
+    (imported / "localized" / "status.csv").unlink()
+    reference = KaptureFolder(imported / "mapping").read().image_names()[0]
+    queries = KaptureFolder(imported / "query").read().image_names()
+    assert len(mapping.records_camera) == 7
+    pairs = [RelocalizationPair("a_to_b.txt", reference, query) for query in queries]
+    write_relocalization(imported / "megloc", pairs)
+    place = tmp_path / "submission"
+    command = ["submit", "4seasons", "-i", imported / "localized", "-o", place]
+    done = megloc(*command)
+    assert done.out == f"3 poses of 4 queries, 1 missing, dummies in their place: {place}\n"
+    assert sorted(path.name for path in tmp_path.glob("submission*")) == [
+        "submission",
+        "submission.json",
+    ]
+    assert [path.name for path in place.iterdir()] == ["a_to_b.txt"]
+    megloc(*command).refused("exists; -f")
+    assert megloc(*command, "-f").status == 0
+    (tmp_path / "file").write_text("")
+    megloc(*command[:-1], tmp_path / "file").refused("a folder, one file per relocalization file")
+
+
+@pytest.fixture
+def poses(scene: Path) -> dict[str, RigidTransform]:
+    return KaptureFolder(scene / "query_gt").read().poses()
+
+
+@pytest.fixture
+def aachen(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The one workspace of dataset aachen below runs/, with the scene's map."""
+    monkeypatch.chdir(tmp_path)
+    root = tmp_path / "runs" / "aachen-classic"
+    for part in ("mapping", "query"):
+        write_sensors(root / part, KaptureFolder(scene / part).read())
+    write_protocol(root / "megloc", Protocol(dataset="aachen", pose_file_names="basename"))
+    return root
+
+
+def test_a_right_file(
+    megloc: Any, aachen: Path, poses: dict[str, RigidTransform], tmp_path: Path
+) -> None:
+    place = tmp_path / "poses.txt"
+    write_pose_file(place, poses)
+    done = megloc("check", "aachen", place)
+    assert (done.status, done.out) == (0, "4 poses of 4 queries: no problem found\n")
+    assert done.err == "compared with runs/aachen-classic\n"
+    assert megloc("check", "aachen", place, "-q").err == ""
+    assert megloc("check", "synthetic-aachen", place, "--data", aachen).status == 0
+
+
+def test_a_wrong_file(
+    megloc: Any, aachen: Path, poses: dict[str, RigidTransform], tmp_path: Path
+) -> None:
+    place = tmp_path / "poses.txt"
+    write_pose_file(place, {name: pose.inverse() for name, pose in poses.items()})
+    with place.open("a") as file:
+        file.write("stranger.jpg 1 0 0\n0001.png 1 1 0 0 0 0 0\n")
+    done = megloc("check", "aachen", place)
+    assert (done.status, "compared" in done.err) == (2, True)
+    first, *others, outcome = done.out.splitlines()
+    assert "0001.png should be 0001.jpg" in others[0]
+    assert first.startswith("error: poses.txt: the poses are inverted: they are world_from_cam")
+    assert any("poses.txt:5: 4 columns instead of 8" in line for line in others)
+    assert any("stranger.jpg is no name of the list" in line for line in others)
+    assert "quaternion of length 1.41421, not 1" in done.out
+    assert outcome.startswith("5 poses of 4 queries: ") and "problems found" in outcome
+    done = megloc("check", "aachen", place, "--json")
+    content = json.loads(done.out)
+    assert done.status == 2 and content["ok"] is False
+    assert content["findings"][0]["kind"] == "inverted"
+
+
+def test_without_data_the_file_alone_is_checked(
+    megloc: Any, aachen: Path, poses: dict[str, RigidTransform], tmp_path: Path
+) -> None:
+    place = tmp_path / "poses.txt"
+    write_pose_file(place, poses)
+    done = megloc("check", "inloc", place)
+    assert done.status == 2 and "not ending in .JPG" in done.out
+    assert "the poses are not checked" in done.out
+    done = megloc("check", "kapture", place)
+    assert done.status == 0 and done.out.endswith("4 poses: no problem found\n")
+    # a twin's run is none of the rendered world
+    write_sensors(
+        tmp_path / "runs" / "synthetic-aachen-classic" / "mapping",
+        KaptureFolder(aachen / "mapping").read(),
+    )
+    assert "compared" not in megloc("check", "synthetic", place).err
+    (aachen.parent / "aachen-megloc").mkdir()
+    (aachen / "mapping").rename(aachen.parent / "aachen-megloc" / "mapping")
+    write_sensors(aachen / "mapping", KaptureFolder(aachen / "query").read())
+    done = megloc("check", "aachen", place)
+    assert done.err.startswith("compared with none of runs/aachen-classic, runs/aachen-megloc")
+
+
+def test_what_check_refuses(
+    megloc: Any, aachen: Path, poses: dict[str, RigidTransform], tmp_path: Path
+) -> None:
+    place = tmp_path / "poses.txt"
+    megloc("check", "aachen", place).refused(r"poses\.txt: no such file")
+    write_pose_file(place, poses)
+    megloc("check", "aahcen", place).refused("unknown dataset 'aahcen'")
+    megloc("check", "robotcar", place, "--data", aachen).refused("is of dataset aachen")
+    megloc("check", "aachen", place, "--data", tmp_path).refused("no imported dataset")
+    (aachen / "megloc" / "protocol.json").unlink()
+    megloc("check", "aachen", place, "-q").refused("rules of aachen", "--data")
+    megloc("check", "aachen", tmp_path, "--data", aachen, "-q").refused("rules of aachen")
+    place.write_bytes(b"\xff\xfe")
+    megloc("check", "kapture", place, "-q").refused(r"poses\.txt:1: not a text file in UTF-8")

@@ -1,23 +1,30 @@
-"""The command as such: help, errors of the command line, tracebacks, pipes."""
+"""The command as such: help, examples, options, errors of the command line, tracebacks, pipes."""
 
 from __future__ import annotations
 
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
+from collections import Counter
 from functools import partial
-from importlib.metadata import EntryPoints
+from importlib.metadata import EntryPoints, version
 from pathlib import Path
 from typing import Any
 
 import pytest
+import tyro
 
+import megloc_kapture
 from megloc_kapture import plugin_loading
-from megloc_kapture.cli.arguments import summary
-from megloc_kapture.cli.console import Console
-from megloc_kapture.cli.main import COMMANDS, command_class
+from megloc_kapture.cli.arguments import EXAMPLES, summary
+from megloc_kapture.cli.common import Console
+from megloc_kapture.cli.info import shown
+from megloc_kapture.cli.main import COMMANDS, _parser, command_class
+from megloc_kapture.pipeline.presets import PRESETS, options_of, options_of_preset
+from megloc_kapture.stages.options import PipelineOptions
 
 BAD_ARGUMENTS = {
     "no command": ([], r"Missing subcommand: Expected one of \{eval, import"),
@@ -169,7 +176,7 @@ def test_doctor_finds_no_problem_here(megloc: Any) -> None:
 def test_progress_says_how_many_how_fast_and_how_long(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("megloc_kapture.cli.console._LINE_EVERY_S", 0.0)
+    monkeypatch.setattr("megloc_kapture.cli.common._LINE_EVERY_S", 0.0)
     assert list(Console().track("abc", 3, "features, 4 of 7 kept")) == ["a", "b", "c"]
     lines = capsys.readouterr().err.splitlines()
     for number, line in enumerate(lines, start=1):
@@ -234,7 +241,7 @@ def test_a_signal_ends_a_run_whatever_it_meets(number: str, told: str, meeting: 
     script = f"""
 import ctypes, signal, sys, time
 from megloc_kapture.cli import main
-from megloc_kapture.cli.doctor import Doctor
+from megloc_kapture.cli.weights import Doctor
 from megloc_kapture.errors import MeglocError
 def run(self):
 {meeting}
@@ -251,3 +258,113 @@ main.main()
     )
     assert run.stderr == f"megloc: {told}; run the same command again to go on\n"
     assert run.returncode == {"SIGINT": 130, "SIGTERM": 143}[number]
+
+
+@pytest.mark.parametrize("example", EXAMPLES)
+def test_an_example_is_taken_by_the_command(example: str) -> None:
+    program, *arguments = shlex.split(example)
+    assert program == "megloc" and arguments[0] in COMMANDS
+    parsed: Any = tyro.cli(
+        _parser(arguments), args=arguments, prog="megloc", config=(tyro.conf.OmitArgPrefixes,)
+    )
+    if getattr(parsed, "preset", None) or getattr(parsed, "set", ()):
+        options_of_preset(parsed.preset or "classic", assignments=getattr(parsed, "set", ()))
+    if hasattr(parsed, "uses"):
+        parsed.options()  # refuses what the command does not act on
+
+
+def test_every_command_has_one_to_three_examples() -> None:
+    counts = Counter(example.split()[1] for example in EXAMPLES)
+    assert set(counts) == set(COMMANDS) and max(counts.values()) <= 3
+
+
+@pytest.mark.parametrize("command", ["", "match", "weights", "weights fetch"])
+def test_a_help_page_ends_with_its_examples(megloc: Any, command: str) -> None:
+    done = megloc(*command.split(), "--help")
+    assert done.status == 0
+    *_, last = done.out.splitlines()
+    assert last.startswith(f"  megloc {command}")
+    head = done.out.rpartition("examples:\n")[0]
+    assert head.startswith("usage: ")
+
+
+def completed(script: str, *words: str) -> list[str]:
+    """What bash offers for a line that ends with the last of the words."""
+    line = (
+        f"COMP_WORDS=({shlex.join(words)}); COMP_CWORD={len(words) - 1}; COMP_LINE='{words}'; "
+        '_tyro_megloc; printf "%s\\n" "${COMPREPLY[@]}"'
+    )
+    done = subprocess.run(
+        ["bash", "-c", f"{script}\n{line}"], capture_output=True, text=True, check=True
+    )
+    return done.stdout.split()
+
+
+def script_for(shell: str) -> str:
+    megloc = Path(sys.executable).with_name("megloc")
+    return subprocess.run(
+        [megloc, "--tyro-print-completion", shell], capture_output=True, text=True, check=True
+    ).stdout
+
+
+def test_completion_knows_commands_and_their_flags() -> None:
+    script = script_for("bash")
+    assert set(COMMANDS) <= set(completed(script, "megloc", ""))
+    assert completed(script, "megloc", "loc") == ["localize"]
+    assert "--features-dir" in completed(script, "megloc", "match", "--feat")
+    assert script_for("zsh").startswith("#compdef megloc")
+
+
+def test_every_option_is_listed_with_a_meaning(megloc: Any) -> None:
+    told = megloc("options").out
+    every = list(options_of(PipelineOptions()))
+    assert len(every) > 80
+    for option in every:
+        assert f"\n{option.key} = {shown(option.value)}\n" in f"\n{told}"
+        assert option.meaning and option.meaning in told, option.key
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_value_is_shown_as_set_takes_it(preset: str) -> None:
+    for option in options_of(PRESETS[preset]):
+        text = f"{option.key}={shown(option.value)}"
+        if isinstance(option.value, tuple) or option.key == "stages" or "none" in text:
+            continue
+        try:
+            changed = options_of_preset(preset, assignments=[text])
+        except megloc_kapture.OptionError as refused:
+            # options that change nothing there are refused for that, not for their value
+            assert "changes nothing" in str(refused), text
+            continue
+        found = {one.key: one.value for one in options_of(changed)}[option.key]
+        if isinstance(found, float):
+            assert found == pytest.approx(option.value, rel=1e-3)
+        else:
+            assert found == option.value, text
+
+
+def test_a_step_one_option_and_a_plugin(megloc: Any) -> None:
+    told = megloc("options", "query_pairs", "--preset", "megloc").out
+    assert told.startswith("query_pairs.by = retrieval\n    'retrieval' | 'exhaustive'; ")
+    assert "query_pairs.top_k = 50\n" in told and "mapping_pairs" not in told
+    assert megloc("options", "query_pairs.top_k").out.count("\n") == 2
+    assert "aliked: options.threshold = 0.2\n" in megloc("options", "aliked").out
+    assert "vlad: options." in megloc("options", "vlad").out
+
+
+def test_names_that_are_nearly_right(megloc: Any) -> None:
+    megloc("options", "localisation").refused("did you mean localization")
+    megloc("options", "--preset", "moden").refused("did you mean 'modern'\\? known: classic")
+    megloc("eval", "aachn").refused("did you mean 'aachen'\\? known: ")
+    for text, meant in (
+        ("query_pairs.topk=3", "'top_k'"),
+        ("radius=3", "localization.clusters.radius"),
+        ("local_features=aliqued", "'aliked'"),
+    ):
+        megloc("eval", "synthetic-aachen", "--set", text).refused(f"did you mean {meant}")
+    megloc("weights", "fetch", "alikd-n16").refused("did you mean 'aliked-n16'")
+
+
+def test_the_version(megloc: Any) -> None:
+    assert megloc("--version").out == f"megloc-kapture {version('megloc-kapture')}\n"
+    assert megloc_kapture.__version__ == version("megloc-kapture")

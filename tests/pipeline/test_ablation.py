@@ -15,12 +15,11 @@ from megloc_kapture.pipeline.ablation import (
     variants,
     write_outcomes,
 )
-from megloc_kapture.pipeline.benchmarks import find_benchmark
-from megloc_kapture.pipeline.datasets import TWIN_PREFIX, choose_dataset
+from megloc_kapture.pipeline.datasets import choose_dataset
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
 from megloc_kapture.pipeline.plan import run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.run import Run
+from megloc_kapture.pipeline.run import Run, find_benchmark
 from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.stages.options import PipelineOptions
 
@@ -31,7 +30,7 @@ def names(*assignments: str, preset: str = "classic") -> list[str]:
 
 def megloc_on_aachen() -> PipelineOptions:
     """The paper's options with what its steps need of a dataset."""
-    changes = find_benchmark("aachen", TWIN_PREFIX).changes("megloc", query_depth=False)
+    changes = find_benchmark("aachen").changes("megloc", query_depth=False)
     return options_of_preset("megloc", changes=changes)
 
 

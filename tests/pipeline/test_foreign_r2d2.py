@@ -11,7 +11,7 @@ from megloc_kapture import Failure, KaptureMap, Localizer, Pose, Query
 from megloc_kapture.evaluation.metrics import pose_errors
 from megloc_kapture.features.r2d2 import R2D2, R2D2Options
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.pipeline.kapture_queries import KaptureQueries
+from megloc_kapture.pipeline.queries import KaptureQueries
 from megloc_kapture.values import RigidTransform
 
 pytestmark = pytest.mark.slow

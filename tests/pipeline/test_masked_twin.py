@@ -20,13 +20,12 @@ from megloc_twins.squares import build_place
 from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.tables import read_mask_counts
-from megloc_kapture.pipeline.benchmarks import find_benchmark
 from megloc_kapture.pipeline.datasets import TWIN_PREFIX, choose_dataset, twin_of
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
 from megloc_kapture.pipeline.plan import run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.run import Run
+from megloc_kapture.pipeline.run import Run, find_benchmark
 from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.stages.work import Work
 
@@ -40,7 +39,7 @@ SEED = OPTIONS.world().seed
 def localized(folder: Path, changes: Sequence[str]) -> Workspace:
     """The workspace of a finished run."""
     dataset = f"{TWIN_PREFIX}robotcar"
-    benchmark = find_benchmark(dataset, TWIN_PREFIX)
+    benchmark = find_benchmark(dataset)
     source = choose_dataset(dataset, None, import_options=benchmark.import_options)
     source = replace(source, twin=twin_of("robotcar", **SMALL))
     cheap = ["local_features.options.max_keypoints=1500", "global_features.options.num_clusters=32"]

@@ -8,9 +8,6 @@ import pytest
 
 from megloc_kapture.cli.main import main
 from megloc_kapture.io.weights import MissingWeightsError
-from megloc_kapture.pipeline.benchmarks import find_benchmark
-from megloc_kapture.pipeline.datasets import TWIN_PREFIX
-from megloc_kapture.pipeline.missing_weights import check_weights
 from megloc_kapture.pipeline.paper_steps import (
     DatasetFacts,
     LayeredOptions,
@@ -18,7 +15,8 @@ from megloc_kapture.pipeline.paper_steps import (
     paper_steps,
     steps_text,
 )
-from megloc_kapture.pipeline.presets import options_of_preset
+from megloc_kapture.pipeline.presets import check_weights, options_of_preset
+from megloc_kapture.pipeline.run import find_benchmark
 
 FACTS = {
     "aachen": DatasetFacts(map_depth=False, query_depth=False, model=True),
@@ -70,9 +68,7 @@ OFF = {
 
 
 def layers(dataset: str, preset: str, *assignments: str) -> LayeredOptions:
-    changes = find_benchmark(dataset, TWIN_PREFIX).changes(
-        preset, query_depth=FACTS[dataset].query_depth
-    )
+    changes = find_benchmark(dataset).changes(preset, query_depth=FACTS[dataset].query_depth)
     return LayeredOptions(
         preset,
         options_of_preset(preset),

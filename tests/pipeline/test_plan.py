@@ -354,8 +354,9 @@ def test_first_leaves_alone_what_does_not_read_its_output(kitchen: Kitchen) -> N
 
 def test_a_dry_run_only_tells(kitchen: Kitchen) -> None:
     told: list[str] = []
-    reports = kitchen.cook(dry_run=True, on_report=lambda report: told.append(report.name))
-    assert [r.state for r in reports] == ["pending"] * 3 and told == ["a", "b", "c"]
+    reports = kitchen.cook(dry_run=True, say=told.append)
+    assert [r.state for r in reports] == ["pending"] * 3
+    assert told == [f"{name}: would run (not done yet)" for name in "abc"]
     kitchen.cook()
     kitchen.options["b"] = {"extra": "!"}
     reports = kitchen.cook(dry_run=True)

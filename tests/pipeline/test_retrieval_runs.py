@@ -17,10 +17,9 @@ from megloc_kapture.io.weights import MissingWeightsError
 from megloc_kapture.nets.global_descriptors import EigenPlacesNet
 from megloc_kapture.pipeline.datasets import choose_dataset
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
-from megloc_kapture.pipeline.kapture_queries import KaptureQueries
 from megloc_kapture.pipeline.plan import StageReport, run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.queries import Query
+from megloc_kapture.pipeline.queries import KaptureQueries, Query
 from megloc_kapture.pipeline.run import Run
 from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.stages.options import PipelineOptions

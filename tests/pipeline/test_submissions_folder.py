@@ -10,7 +10,7 @@ import pytest
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.provenance import write_provenance
-from megloc_kapture.pipeline.submissions_folder import keep_submission
+from megloc_kapture.pipeline.submission import keep_submission
 
 NAME = "Aachen_v1_1_eval_megloc-classic"
 

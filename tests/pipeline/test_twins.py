@@ -11,13 +11,12 @@ import pytest
 
 from megloc_kapture.evaluation.check.reading import read_reference
 from megloc_kapture.evaluation.check.submission import check_submission
-from megloc_kapture.pipeline.benchmarks import find_benchmark
 from megloc_kapture.pipeline.datasets import TWIN_PREFIX, choose_dataset, twin_of
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
 from megloc_kapture.pipeline.plan import all_kept, run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.run import Run
+from megloc_kapture.pipeline.run import Run, find_benchmark
 from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.stages.work import Work
 
@@ -47,7 +46,7 @@ def finished(
     """A twin's name, the workspace of its finished run, and what runs it again."""
     name = str(request.param)
     dataset = f"{TWIN_PREFIX}{name}"
-    benchmark = find_benchmark(dataset, TWIN_PREFIX)
+    benchmark = find_benchmark(dataset)
     source = choose_dataset(dataset, None, import_options=benchmark.import_options)
     source = replace(source, twin=twin_of(name, **SMALL[name]))
     workspace = Workspace(tmp_path_factory.mktemp(name) / "workspace")

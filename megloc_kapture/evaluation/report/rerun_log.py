@@ -15,7 +15,7 @@ from megloc_kapture.evaluation.results import ResultContext
 from megloc_kapture.geometry.cameras import focal_px, principal_point_px
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.pipeline.export_formats import Scene
+from megloc_kapture.pipeline.export import Scene
 from megloc_kapture.values import Camera, RigidTransform
 
 # images that are put in, of map and queries each: about 20 kB

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import project
-from megloc_kapture.pipeline.export_formats import (
+from megloc_kapture.pipeline.export import (
     GeoOrigin,
     PosedImage,
     Scene,

@@ -12,9 +12,9 @@ from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.datasets import choose_dataset
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
 from megloc_kapture.pipeline.executors import single_threaded
-from megloc_kapture.pipeline.kapture_queries import KaptureQueries
 from megloc_kapture.pipeline.plan import run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
+from megloc_kapture.pipeline.queries import KaptureQueries
 from megloc_kapture.pipeline.results import Results
 from megloc_kapture.pipeline.run import Run
 from megloc_kapture.pipeline.workspace import Workspace

@@ -8,9 +8,9 @@ import pytest
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.dataset_tables import Protocol
-from megloc_kapture.pipeline.benchmarks import BenchmarkFile, find_benchmark, read_benchmark
 from megloc_kapture.pipeline.datasets import TWIN_PREFIX, choose_dataset, dataset_names
 from megloc_kapture.pipeline.presets import PRESETS, options_of_preset
+from megloc_kapture.pipeline.run import BenchmarkFile, find_benchmark, read_benchmark
 
 FILES = sorted(Path(__file__).parents[2].glob("benchmarks/*.toml"))
 
@@ -47,10 +47,10 @@ def test_every_dataset_has_a_benchmark_file() -> None:
 
 
 def test_a_twin_runs_as_its_dataset_does_but_has_no_published_figures() -> None:
-    real, twin = (find_benchmark(name, TWIN_PREFIX) for name in ("inloc", "synthetic-inloc"))
+    real, twin = (find_benchmark(name) for name in ("inloc", "synthetic-inloc"))
     assert real.published
     assert twin == real.model_copy(update={"dataset": "synthetic-inloc", "published": ()})
-    assert find_benchmark("venice", TWIN_PREFIX) == BenchmarkFile(dataset="venice")
+    assert find_benchmark("venice") == BenchmarkFile(dataset="venice")
 
 
 def test_a_benchmark_changes_what_it_names_of_a_protocol() -> None:

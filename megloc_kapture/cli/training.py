@@ -1,4 +1,4 @@
-"""``megloc train-field`` and ``megloc render``: a map as a neural field, and views of it."""
+"""``megloc train``, ``train-field`` and ``render``: networks, and a map as a neural field."""
 
 from __future__ import annotations
 
@@ -11,19 +11,85 @@ import tyro
 
 from megloc_kapture.cli.common import (
     Common,
+    Folders,
     Force,
     Input,
+    Inputs,
     Linked,
     Output,
+    Texts,
     Working,
+    assigned_pairs,
     camera_of_text,
+    refuse_given,
 )
 from megloc_kapture.errors import DataError, OptionError, OutputError
 from megloc_kapture.io.images import WRITABLE_SUFFIXES
 from megloc_kapture.io.kapture.sensors import unit_quaternion
-from megloc_kapture.io.output_folders import staged_output
 from megloc_kapture.pipeline.executors import single_threaded
+from megloc_kapture.stages.work import Work
 from megloc_kapture.values import RigidTransform
+
+
+@dataclass(frozen=True, kw_only=True)
+class Train(Linked, Common):
+    """Train SuperGlue, or a detector's descriptors, on kapture folders with depth and on
+    photographs. It goes on where it was interrupted."""
+
+    task: Annotated[
+        tyro.conf.Positional[Literal["matcher", "descriptor"]], tyro.conf.arg(metavar="TASK")
+    ]
+    """matcher: SuperGlue on frozen features; descriptor: of a frozen detector's keypoints."""
+    input: Inputs = ()
+    """Kapture folder with poses and depth; may be repeated."""
+    photographs: Folders = ()
+    """Folder of images, trained on under random homographies; may be repeated."""
+    held_out: Folders = ()
+    """Kapture folder with poses and depth to evaluate on; may be repeated."""
+    licence: Texts = ()
+    """Licence of a folder, for the manifest: FOLDER=TEXT; may be repeated."""
+    output: Output
+    """File to write: X.safetensors; beside it X.json, X.csv and X.state.pt."""
+    features: str | None = None
+    """Extractor whose features are matched, or whose detector is frozen; superpoint unless
+    given."""
+    set: Texts = ()
+    """Change an option: key.key=value (steps=20000, pairs.max_size_px=800); may be repeated."""
+    threads: int = 1
+    """Threads that prepare pairs."""
+    force: Force = False
+    """Begin again where files of another training stand."""
+
+    def run(self) -> int:
+        """Run it."""
+        # only this command waits for torch
+        from megloc_kapture.pipeline.presets import options_with
+        from megloc_kapture.training.train import TASKS, TrainingData, train
+
+        console = self.console()
+        changes = {} if self.features is None else {"features.name": self.features}
+        options = options_with(TASKS[self.task], self.set, changes)
+        licences = assigned_pairs("--licence", self.licence, "FOLDER=TEXT")
+        data = TrainingData(
+            [self.kapture(path) for path in self.input],
+            self.photographs,
+            [self.kapture(path) for path in self.held_out],
+            {Path(folder): licence for folder, licence in licences},
+        )
+        last = train(
+            options,
+            data,
+            self.output,
+            force=self.force,
+            threads=self.threads,
+            work=Work(track=console.track),
+        )
+        for name, value in last.items():
+            if value == value:
+                console.result(f"{name.replace('_', ' '):20s}{value:>12.6g}")
+        console.result(f"trained: {self.output}")
+        return 0
+
 
 FIELD = "field"
 RENDERED = "rendered"
@@ -76,19 +142,10 @@ class TrainField(Linked, Common):
         from megloc_kapture.stages.neural_field import STATE_FILE, train_field_of_map
 
         console = self.console()
+        of_same_name = vars(self).keys() & FieldTrainingOptions.model_fields
         try:
             options = FieldTrainingOptions(
-                kind=self.kind,
-                gaussians=self.gaussians,
-                steps=self.steps,
-                minutes=self.minutes,
-                max_side_px=self.max_side,
-                held_out_every=self.held_out_every,
-                lights=self.lights,
-                seed=self.seed,
-                device=self.device,
-                half_precision=self.half_precision,
-                compiled=self.compiled,
+                max_side_px=self.max_side, **{name: vars(self)[name] for name in of_same_name}
             )
         except ValidationError as error:
             raise OptionError(first_problem(error)) from error
@@ -117,7 +174,7 @@ class TrainField(Linked, Common):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Render(Linked, Working, Common):
+class Render(Linked, Working):
     """Render a view of a neural field, views of a result, or views that no camera took."""
 
     field: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FIELD")]
@@ -145,33 +202,24 @@ class Render(Linked, Working, Common):
     def run(self) -> int:
         """Run it."""
         from megloc_kapture.stages.neural_field import render_along, views_between
-        from megloc_kapture.stages.work import Work
 
         console = self.console()
         if sum(each is not None for each in (self.pose, self.along, self.between)) != 1:
             raise OptionError("say what to render: --pose and --camera, --along or --between")
         many = self.along or self.between
         if many is None:
-            for name in ("max_side", "workers", "scheduler"):
-                if getattr(self, name) is not None:
-                    flag = "--" + name.replace("_", "-")
-                    raise OptionError(f"{flag} changes nothing: it is of --along and --between")
+            others = {"workers": self.workers, "scheduler": self.scheduler}
+            refuse_given("--along and --between", max_side=self.max_side, **others)
             self._render_one()
             console.result(f"rendered: {self.output}")
             return 0
         if self.max_side is not None and self.max_side < 1:
             raise OptionError(f"--max-side {self.max_side} is not positive")
-        for name in ("camera", "depth"):
-            if getattr(self, name) is not None:
-                raise OptionError(f"--{name} changes nothing: it is of --pose")
+        refuse_given("--pose", camera=self.camera, depth=self.depth)
         data = self.kapture(many).read()
         if not data.poses():
             raise DataError("no image here has a pose", path=many)
-        with (
-            single_threaded(),
-            staged_output(self.output, kind=RENDERED, force=self.force) as out,
-            self.open_executor(out) as executor,
-        ):
+        with self.staged(self.output, RENDERED, force=self.force) as (out, work):
             count = render_along(
                 self.field,
                 data if self.between is None else views_between(data),
@@ -179,7 +227,7 @@ class Render(Linked, Working, Common):
                 appearance=self.appearance,
                 max_side_px=self.max_side,
                 min_shown=0.0 if self.between is None else _MIN_SHOWN,
-                work=Work(executor, console.track),
+                work=work,
             )
         console.result(f"{count} views rendered: {self.output}")
         return 0

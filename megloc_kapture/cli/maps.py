@@ -1,0 +1,243 @@
+"""Commands of maps: of photographs, refined, with depth; and poses that a map makes better."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from megloc_kapture.cli.common import (
+    Choosing,
+    Force,
+    Input,
+    Linked,
+    Output,
+    Reading,
+    Texts,
+    Working,
+    camera_of_text,
+)
+from megloc_kapture.cli.stages import StageCommand, restrictions_beside
+from megloc_kapture.errors import OptionError
+from megloc_kapture.evaluation.report.refinement import consistency_sentence
+from megloc_kapture.io.colmap_mapping import Mapper
+from megloc_kapture.io.files import read_json_model
+from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.tables import CONSISTENCY_FILE, read_consistency
+from megloc_kapture.pipeline.photograph_maps import (
+    MAPPING_OPTIONS,
+    describe_map,
+    options_of_photographs,
+    plan_photographs,
+    structure_options,
+)
+from megloc_kapture.pipeline.photographs import Photographs
+from megloc_kapture.pipeline.plan import run_plan
+from megloc_kapture.pipeline.presets import DEFAULT_PRESET
+from megloc_kapture.pipeline.workspace import Workspace
+from megloc_kapture.plugin_loading import plugin_names
+from megloc_kapture.plugins import POSE_REFINERS
+from megloc_kapture.stages.densifying import densify_map, fitted_to_poses
+from megloc_kapture.stages.map_refinement import REPORT_FILE, RefinementReport, refine_map
+from megloc_kapture.stages.pose_refinement import refine_poses
+from megloc_kapture.stages.stage import LOCALIZED, MAP
+from megloc_kapture.stages.stereo_depth import fuse_depth
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapPhotographs(Choosing, Working):
+    """Make a map of photographs without poses; what is done and still true is kept."""
+
+    images: tyro.conf.Positional[tuple[Path, ...]]
+    """Photographs and videos, or folders of them."""
+    output: Output
+    """Workspace, a map for all commands: the kapture map is its folder map/."""
+    mapper: Mapper = "incremental"
+    """COLMAP's mapper."""
+    scale: tuple[str, ...] = ()
+    """What tells metres: gps, the positions in EXIF; or IMAGE IMAGE METRES, two photographs and
+    the distance of their cameras. Without it the map has units of its own."""
+    camera: str | None = None
+    """Camera of all images, whose pixels are then taken as they are stored:
+    MODEL,WIDTH,HEIGHT,PARAMETERS as COLMAP has them. It stays as it is."""
+    every: int | None = None
+    """Of videos every so many frames one is taken; 30 unless given."""
+    force: Force = False
+    """Write into a folder that has other things in it."""
+
+    def run(self) -> int:
+        """Run it."""
+        console = self.console()
+        options = options_of_photographs(
+            self.preset or DEFAULT_PRESET, self.assignments(), used=MAPPING_OPTIONS
+        )
+        camera = None if self.camera is None else camera_of_text(self.camera)
+        photographs = Photographs(self.images, camera, every=self.every)
+        structure = structure_options(
+            photographs, self.mapper, self.scale, known_cameras=camera is not None
+        )
+        stages = plan_photographs(photographs, options, structure)
+        workspace = Workspace(self.output, force=self.force)
+        with self.working_in(workspace) as work:
+            run_plan(stages, workspace, work, say=console.say)
+        for line in describe_map(self.output, photographs):
+            console.result(line)
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefineMap(Reading, StageCommand):
+    """Take points and observations out of a map that its images, or depth maps, contradict.
+
+    What is rejected is chosen with --set refinement.uncertainty.max_relative_deviation=0.02 and
+    its like; without, by the preset.
+    """
+
+    uses = ("refinement",)
+
+    input: Input
+    """Kapture folder of the map; it stays as it is."""
+    output: Output
+    """Kapture folder of the refined map."""
+    ply: bool = False
+    """Write the kept and the rejected points as PLY files, coloured by uncertainty."""
+    force: Force = False
+    """Write into a folder that has other things in it."""
+
+    def run(self) -> int:
+        """Run it."""
+        console = self.console()
+        changes: dict[str, object] = {"refinement": {"ply": True}} if self.ply else {}
+        options = self.options(changes).refinement
+        source = self.kapture(self.input)
+        with self.staged(self.output, MAP, force=self.force) as (out, work):
+            refine_map(source, out, options, work=work)
+        for row in report_lines(self.output):
+            console.say(row)
+        return 0
+
+
+def report_lines(root: Path) -> list[str]:
+    """What the refinement of a map removed, as a table; empty where it was not refined.
+
+    Raises
+    ------
+    DataError : the report is broken.
+    """
+    path = root / "reconstruction" / REPORT_FILE
+    if not path.is_file():
+        return []
+    report = read_json_model(path, RefinementReport)
+    rows: list[tuple[str, object, object]] = [
+        ("", "points", "observations"),
+        ("before", report.points_before, report.observations_before),
+        *(
+            (one.name.replace("_", " "), f"-{one.points}", f"-{one.observations}")
+            for one in report.filters
+        ),
+        ("after", report.points_after, report.observations_after),
+    ]
+    return [f"{name:22s}{points!s:>10s}{seen!s:>14s}" for name, points, seen in rows]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Densify(Reading, StageCommand):
+    """Estimate depth of a map's images that have none, by multi-view stereo.
+
+    The depth maps are kapture depth records; what a map with depth allows (verification, ranking
+    by looks, refinement by rendering) works as with a depth sensor's.
+    """
+
+    uses = ("mvs",)
+
+    input: Input
+    """Kapture folder of the map, with points; it stays as it is."""
+    output: Output
+    """Kapture folder of the map with depth."""
+    by: str | None = None
+    """Estimator: sweep, patchmatchnet, colmap or a plugin; sweep unless given."""
+    points: bool = False
+    """Lift keypoints that have no point through the depth, with their uncertainty."""
+    fuse: Path | None = None
+    """Write all depth as one cloud to this PLY file."""
+    force: Force = False
+    """Write into a folder that has other things in it."""
+
+    def run(self) -> int:
+        """Run it."""
+        console = self.console()
+        chosen: dict[str, object] = {"mode": "points" if self.points else "depth"}
+        if self.by is not None:
+            chosen["estimator"] = {"name": self.by}
+        options = self.options({"mvs": chosen}).mvs
+        source = self.kapture(self.input)
+        with self.staged(self.output, MAP, force=self.force) as (out, work):
+            counts = densify_map(
+                source, out, options, restrictions=restrictions_beside(self.input), work=work
+            )
+            console.say(
+                f"depth of {counts['images_with_depth']} of {counts['images']} images, on "
+                f"{100 * counts['fill']:.0f} % of their pixels"
+                + (f"; {counts['points_lifted']} keypoints lifted" if self.points else "")
+            )
+            if self.fuse is not None:
+                agreement = fitted_to_poses(source, options)[0].agreement
+                fused = fuse_depth(KaptureFolder(out), self.fuse, agreement, work=work)
+                console.say(f"{fused} points in {self.fuse}")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefinePoses(Linked, StageCommand):
+    """Refine the poses of localized queries; a pose that gets no better stays, and says why."""
+
+    uses = ("pose_refinement",)
+
+    input: Input
+    """Kapture map, with images and depth maps. Read only."""
+    query: Path
+    """Kapture folder with the queries' images, and their depth maps for icp."""
+    poses: Path
+    """Result of megloc localize or megloc eval: kapture folder with status.csv."""
+    output: Output
+    """Kapture folder of the refined result, with status.csv and the tables of refinement."""
+    by: Texts = ()
+    """Pose refiner: icp, rendering or field; repeated, one after another; the preset's unless
+    given."""
+    force: Force = False
+    """Write into a folder that has other things in it."""
+
+    def run(self) -> int:
+        """Run it."""
+        console = self.console()
+        changes: dict[str, object] = {"pose_refinement": {"by": list(self.by)}} if self.by else {}
+        options = self.options(changes).pose_refinement
+        if self.by:  # in this order, with the options that --set gives them
+            options = options.with_refiners(self.by)
+        if not options.refines():
+            names = ", ".join(plugin_names(POSE_REFINERS))
+            raise OptionError(f"no pose refiner is chosen; --by takes: {names}")
+        with self.staged(self.output, LOCALIZED, force=self.force) as (out, work):
+            counts = refine_poses(
+                self.kapture(self.input),
+                self.kapture(self.query),
+                self.kapture(self.poses),
+                out,
+                options,
+                restrictions=restrictions_beside(self.query),
+                work=work,
+            )
+        accepted = ", ".join(
+            f"{count:g} accepted by {name.removeprefix('accepted_by_')}"
+            for name, count in counts.items()
+            if name.startswith("accepted_by_")
+        )
+        console.result(
+            f"{counts['queries']:g} poses, {accepted}; status.csv and refinement.csv in "
+            f"{self.output}"
+        )
+        if (table := self.output / CONSISTENCY_FILE).is_file():
+            for row in read_consistency(table):
+                console.result(consistency_sentence(row))
+        return 0

@@ -1,0 +1,216 @@
+"""``megloc map``, ``refine-map`` and ``refine-poses`` as their users meet them."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from kapture.io.csv import kapture_from_dir
+
+from megloc_kapture.cli.main import main
+from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.kapture.points import read_point_covariances
+from megloc_kapture.io.tables import read_status
+from megloc_kapture.pipeline.kapture_map import KaptureMap
+from megloc_kapture.service.server import map_overview
+
+FEW = ("--set", "local_features.options.max_keypoints=700", "--executor", "inline")
+
+
+@pytest.fixture(scope="module")
+def unposed(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """``photos/``, and ``map``, the workspace made of them."""
+    root: Path = tmp_path_factory.mktemp("unposed")
+    (root / "photos").mkdir()
+    for image in (scene / "mapping" / "sensors" / "records_data").iterdir():
+        shutil.copyfile(image, root / "photos" / image.name)
+    with pytest.raises(SystemExit) as end:
+        main(["map", str(root / "photos"), "-o", str(root / "map"), *FEW])
+    assert end.value.code == 0
+    return root
+
+
+def test_what_is_done_is_kept(megloc: Any, unposed: Path) -> None:
+    done = megloc("map", unposed / "photos", "-o", unposed / "map", *FEW)
+    assert done.status == 0
+    assert done.out.splitlines() == [
+        f"map of 7 of 7 photographs: {unposed / 'map' / 'map'}",
+        "the map has no metres, but units of its own; --scale IMAGE IMAGE METRES tells it",
+    ]
+    assert done.err.count("up to date") == 9
+
+
+def test_every_command_says_units(megloc: Any, unposed: Path, scene: Path, tmp_path: Path) -> None:
+    workspace, localized = unposed / "map", tmp_path / "localized"
+    assert "unit              none: units of its own" in megloc("info", workspace).out
+    query = scene / "query" / "sensors" / "records_data"
+    done = megloc("localize", "-i", workspace, "--images", query, "-o", localized)
+    assert done.status == 0 and "4 of 4 queries" in done.out
+    assert "positions are in units of the map" in done.err
+    done = megloc("evaluate", "-i", localized, "-o", tmp_path / "report")
+    assert "the map is in units of its own" in done.out and " m\n" not in done.out
+    page = (tmp_path / "report" / "report.html").read_text(encoding="utf-8")
+    assert "The map is in units of its own" in page and "of the first candidate" not in page
+    truth = ("--gt", scene / "query_gt")
+    megloc("evaluate", "-i", localized, *truth).refused("thresholds are in metres")
+    shutil.copytree(localized, tmp_path / "copy", symlinks=True)
+    both = ("-i", localized, "-i", tmp_path / "copy")
+    megloc("evaluate", *both).refused("thresholds are in metres")
+    assert json.loads(map_overview(KaptureMap.open(workspace / "map")))["unit"] == "units"
+
+
+def test_a_model_of_unknown_scale(megloc: Any, colmap_room: Path, tmp_path: Path) -> None:
+    for unit, told in (("units", "none: units of its own"), ("m", "metres")):
+        folder = tmp_path / unit
+        assert megloc("import", "colmap", colmap_room, "-o", folder, "--unit", unit).status == 0
+        assert f"unit              {told}" in megloc("info", folder).out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("--scale", "0000.jpg", "0002.jpg"), "takes gps, or two photographs and the metres"),
+        (("--scale", "0000.jpg", "0002.jpg", "far"), "'far' is no distance in metres"),
+        (("--set", "localization.rigs=true"), "localization"),
+        (("--camera", "PINHOLE,1"), "not such a list"),
+        (("--every", "3"), "there is no video"),
+        (("--preset", "modrn"), "unknown preset"),
+    ],
+)
+def test_what_cannot_be_is_refused(
+    megloc: Any, unposed: Path, tmp_path: Path, arguments: tuple[str, ...], told: str
+) -> None:
+    megloc("map", unposed / "photos", "-o", tmp_path / "map", *arguments).refused(told)
+    assert not (tmp_path / "map").exists()
+
+
+def test_a_known_camera_stays(megloc: Any, unposed: Path, tmp_path: Path) -> None:
+    camera = "PINHOLE,400,300,300,302,200,150"
+    done = megloc("map", unposed / "photos", "-o", tmp_path / "map", "--camera", camera, *FEW)
+    assert done.status == 0, done.err
+    found = KaptureMap.open(tmp_path / "map" / "map").camera("0000.jpg")
+    assert (found.model, found.params) == ("PINHOLE", (300.0, 302.0, 200.0, 150.0))
+
+
+def rows_of(text: str) -> dict[str, tuple[int, int]]:
+    """The table's rows: points and observations by name."""
+    found = re.findall(r"(before|after|[a-z]+(?: [a-z]+)?) +(-?\d+) +(-?\d+)$", text, re.MULTILINE)
+    return {name: (int(points), int(seen)) for name, points, seen in found}
+
+
+def test_a_foreign_map_is_refined_and_localized_in(
+    megloc: Any,
+    shared_data: Path,
+    tmp_path: Path,
+    contents: Callable[[Path], dict[str, bytes]],
+) -> None:
+    place = shared_data / "foreign_maps" / "virtual_gallery"
+    before = contents(place)
+    out = tmp_path / "refined"
+    keep = ("--set", "refinement.uncertainty.keep_quantile=0.9")
+    close = ("--set", "refinement.consistency.max_reprojection_error_px=3")
+    done = megloc("refine-map", "-i", place / "map", "-o", out, *keep, *close, "--ply")
+    assert done.status == 0
+    assert contents(place) == before
+    told = megloc("info", out).out
+    rows = rows_of(told)
+    assert rows == rows_of(done.err)
+    assert list(rows) == ["before", "reprojection error", "uncertainty", "after"]
+    sums = np.array(list(rows.values()))
+    np.testing.assert_array_equal(sums[:-1].sum(axis=0), sums[-1])
+    assert (sums[1:-1] < 0).any(axis=0).all()
+    old, new = KaptureFolder(place / "map"), KaptureFolder(out)
+    assert rows["before"] == (len(old.points3d()), sum(map(len, old.observations().values())))
+    assert rows["after"] == (len(new.points3d()), sum(map(len, new.observations().values())))
+    left = {tuple(row) for row in new.points3d().tolist()}
+    assert left < {tuple(row) for row in old.points3d().tolist()}
+    covariances = read_point_covariances(out, len(new.points3d()))
+    assert covariances is not None
+    known = int(np.isfinite(covariances).all(axis=1).sum())
+    assert f"known of {known} points" in told
+    theirs = kapture_from_dir(str(out))
+    assert len(theirs.points3d) == len(left)
+    localized = megloc("localize", "-i", out, "--query", place / "query", "-o", tmp_path / "poses")
+    assert localized.out.startswith("4 of 4 queries localized in ")
+
+
+def test_info_of_a_map_that_was_not_refined_says_nothing_of_it(
+    megloc: Any, shared_data: Path
+) -> None:
+    told = megloc("info", shared_data / "foreign_maps" / "virtual_gallery" / "map").out
+    assert "refinement" not in told
+    assert "uncertainty" not in told
+
+
+def test_what_cannot_be_refined_is_refused(megloc: Any, gallery: Path, tmp_path: Path) -> None:
+    out = tmp_path / "refined"
+    query = megloc("refine-map", "-i", gallery / "query", "-o", out)
+    query.refused("no map to refine", "points3d.txt")
+    unknown = ("--set", "refinement.uncertainty.max_sigma=1")
+    megloc("refine-map", "-i", gallery / "map", "-o", out, *unknown).refused(
+        "unknown option refinement.uncertainty.max_sigma; did you mean 'max_robust_sigmas'. known "
+        "here: .*keep_quantile"
+    )
+    assert not out.exists()
+    (gallery / "full").mkdir()
+    (gallery / "full" / "file").touch()
+    megloc("refine-map", "-i", gallery / "map", "-o", gallery / "full").refused("is not empty")
+
+
+def test_a_broken_report_is_named(megloc: Any, gallery: Path) -> None:
+    report = gallery / "map" / "reconstruction" / "refinement.json"
+    report.write_text('{"points_before": "many"}')
+    done = megloc("info", gallery / "map")
+    assert done.status == 2
+    assert "refinement.json" in done.err
+
+
+INLINE = ("--executor", "inline")
+
+
+def command(finished: Path, output: Path) -> list[Any]:
+    return [
+        *("refine-poses", "-i", finished / "map", "--query", finished / "query"),
+        *("--poses", finished / "localized", "-o", output, *INLINE),
+    ]
+
+
+def test_poses_without_depth_stay_and_say_so(megloc: Any, finished: Path, tmp_path: Path) -> None:
+    out = tmp_path / "refined"
+    done = megloc(*command(finished, out), "--by", "icp", "-q")
+    assert (done.status, done.err) == (0, "")
+    assert done.out.startswith("4 poses, 0 accepted by icp; status.csv and refinement.csv in")
+    before, after = (KaptureFolder(place).read().poses() for place in (finished / "localized", out))
+    assert before == after
+    for status in read_status(out / "status.csv").values():
+        assert status.status == "localized"
+        assert status.refinement.startswith("icp: ") and "depth" in status.refinement
+    # the result is one to evaluate and to refine again
+    again = megloc(*command(finished, tmp_path / "again")[:5], "--poses", out, "-o", tmp_path / "b")
+    again.refused("no pose refiner is chosen; --by takes: field, icp, rendering")
+
+
+def test_refiners_work_one_after_another(megloc: Any, finished: Path, tmp_path: Path) -> None:
+    out = tmp_path / "refined"
+    done = megloc(*command(finished, out), "--by", "icp", "--by", "rendering", "-q")
+    assert done.out.startswith("4 poses, 0 accepted by icp, 0 accepted by rendering;")
+    for status in read_status(out / "status.csv").values():
+        first, second = status.refinement.split("; ")
+        assert first.startswith("icp: ") and second.startswith("rendering: ")
+
+
+def test_what_is_refused(megloc: Any, finished: Path, tmp_path: Path) -> None:
+    megloc(*command(finished, tmp_path / "out"), "--by", "magic").refused(
+        "no plugin 'magic' in megloc_kapture.pose_refiners; registered: field, icp, rendering"
+    )
+    megloc(*command(finished, tmp_path / "out"), "--by", "field").refused("train-field")
+    bare = [*command(finished, tmp_path / "out")]
+    bare[bare.index("--poses") + 1] = finished / "query"
+    megloc(*bare, "--by", "icp").refused(r"status\.csv")
+    assert not (tmp_path / "out").exists()
