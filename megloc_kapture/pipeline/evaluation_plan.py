@@ -7,7 +7,6 @@ from dataclasses import asdict, replace
 from functools import partial
 from typing import Any
 
-from megloc_kapture.cli.maps import RefineMap
 from megloc_kapture.datasets.kapture_folders import import_mapping, mapping_files
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.evaluation.evaluate import evaluate, results_without_truth
@@ -29,6 +28,7 @@ from megloc_kapture.stages.image_pairs import PairMapping, PairQueries, RerankQu
 from megloc_kapture.stages.local_features import ExtractLocalFeatures
 from megloc_kapture.stages.localized_folder import set_aside_unreadable
 from megloc_kapture.stages.map_points import GivenMap, LiftPoints, TriangulatePoints
+from megloc_kapture.stages.map_refinement import RefineMap
 from megloc_kapture.stages.matches import MatchMapping, MatchQueries
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.pose_refinement import RefinePoses

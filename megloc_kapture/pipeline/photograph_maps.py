@@ -15,7 +15,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from megloc_kapture.cli.maps import RefineMap
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.colmap_mapping import MIN_IMAGES, Mapper
 from megloc_kapture.io.dataset_tables import (
@@ -36,6 +35,7 @@ from megloc_kapture.stages.image_pairs import PairMapping
 from megloc_kapture.stages.local_features import ExtractLocalFeatures
 from megloc_kapture.stages.localized_folder import set_aside_unreadable
 from megloc_kapture.stages.map_points import TriangulatePoints
+from megloc_kapture.stages.map_refinement import RefineMap
 from megloc_kapture.stages.matches import MatchMapping
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.preprocessing import Preprocess

@@ -10,12 +10,12 @@ import numpy as np
 
 from megloc_kapture.errors import DataError, OutputError
 from megloc_kapture.evaluation.report.pictures import shrunk
+from megloc_kapture.evaluation.report.scene import Scene
 from megloc_kapture.evaluation.report.shown_queries import spread
 from megloc_kapture.evaluation.results import ResultContext
 from megloc_kapture.geometry.cameras import focal_px, principal_point_px
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.pipeline.export import Scene
 from megloc_kapture.values import Camera, RigidTransform
 
 # images that are put in, of map and queries each: about 20 kB
