@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.kapture.text import parse_float
@@ -62,9 +61,6 @@ class Sensor:
         return cls(name, sensor_type, params + tuple(_shortest(p) for p in camera.params))
 
 
-_INDEX: dict[str, Any] = {"default_factory": dict, "init": False, "repr": False, "compare": False}
-
-
 @dataclass
 class KaptureData:
     """Sensors, rigs, trajectories and image records of one kapture.
@@ -85,8 +81,12 @@ class KaptureData:
     trajectories: dict[tuple[int, str], RigidTransform] = field(default_factory=dict)
     records_camera: dict[tuple[int, str], str] = field(default_factory=dict)
     records_depth: dict[tuple[int, str], str] = field(default_factory=dict)
-    _record_by_image: dict[str, tuple[int, str]] = field(**_INDEX)
-    _rigs_of: dict[str, list[str]] = field(**_INDEX)
+    _record_by_image: dict[str, tuple[int, str]] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
+    _rigs_of: dict[str, list[str]] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
     _num_rigs: int = field(default=0, init=False, repr=False, compare=False)
 
     def image_names(self) -> list[str]:
