@@ -21,11 +21,13 @@ from megloc_kapture.datasets.formats.colmap_model import (
     ColmapModel,
 )
 from megloc_kapture.datasets.formats.colmap_reading import (
+    ColmapRigs,
     colmap_model_files,
     is_binary,
     read_colmap_model,
+    read_colmap_rigs,
+    rig_files,
 )
-from megloc_kapture.datasets.formats.colmap_rigs import ColmapRigs, read_colmap_rigs, rig_files
 from megloc_kapture.datasets.reference_map import write_reference_map
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.files import link_records

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from megloc_kapture.datasets.formats.text_lines import Line, read_lines
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.files import write_bytes
 from megloc_kapture.io.kapture.text import FLOAT_PATTERN
 from megloc_kapture.io.mat_file import read_mat_array
 from megloc_kapture.values import RigidTransform
@@ -27,7 +26,6 @@ COLOURS = "RGBcut"
 _CUTOUT = re.compile(r"([A-Za-z]+)_cutout_([0-9]{3})_([0-9]{1,3})_(-?[0-9]{1,2})\.jpg")
 _SCAN_NUMBER = re.compile(r"(?<![0-9])[0-9]{1,3}(?![0-9])")
 _MAX_TEXT_BYTES = 1 << 20  # of files that hold a few lines
-_BEFORE, _AFTER = "Before general icp:", "After general icp:"
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,16 +114,6 @@ def read_transformation(path: Path | str) -> RigidTransform:
             raise first.error("the rows of a matrix do not follow each other")
     matrix = np.array([row.numbers_of(row.fields, "matrix element") for row in rows[4:]])
     return rows[7].rigid_transform(matrix)
-
-
-def write_transformation(path: Path | str, before: RigidTransform, after: RigidTransform) -> None:
-    """Write a transformation file as published: both matrices, each under its heading."""
-    lines = []
-    for heading, pose in ((_BEFORE, before), (_AFTER, after)):
-        matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = pose.rotation_matrix(), pose.translation
-        lines += [heading, *(" ".join(f"{value:13.9f}" for value in row) for row in matrix), ""]
-    write_bytes(path, "\n".join(lines).encode())
 
 
 def read_wrong_scans(path: Path | str) -> frozenset[str]:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
+
+import numpy as np
 
 from megloc_kapture.datasets.formats.colmap_reading import read_colmap_model
 from megloc_kapture.datasets.formats.nvm import read_single_nvm
@@ -234,7 +236,8 @@ def read_points(layout: Layout, *, merged: bool) -> tuple[list[ImageKey], Sparse
         images = _keys([image.name for image in model.images], folder)
         for image in images:
             positions.setdefault(image, len(positions))
-        parts.append((model.points, [positions[image] for image in images]))
+        common = np.array([positions[image] for image in images], np.int32)
+        parts.append(replace(model.points, image_ids=common[model.points.image_ids]))
     return list(positions), SparsePoints.joined(parts)
 
 

@@ -12,7 +12,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from kapture.converter.colmap.database import COLMAPDatabase
+from megloc_twins.model_files import write_colmap_binary, write_colmap_text, write_nvm
 
+from megloc_kapture.datasets.aachen.layout import read_query_list
 from megloc_kapture.datasets.formats import fourseasons_files, inloc_files, robotcar_files
 from megloc_kapture.datasets.formats.colmap_database import ColmapDatabase
 from megloc_kapture.datasets.formats.colmap_model import (
@@ -20,13 +22,9 @@ from megloc_kapture.datasets.formats.colmap_model import (
     TEXT_FILES,
     ColmapImage,
     ColmapModel,
-    write_colmap_binary,
-    write_colmap_text,
 )
-from megloc_kapture.datasets.formats.colmap_reading import read_colmap_model
-from megloc_kapture.datasets.formats.colmap_rigs import read_colmap_rigs
-from megloc_kapture.datasets.formats.nvm import NvmModel, read_nvm, write_nvm
-from megloc_kapture.datasets.formats.query_list import read_query_list
+from megloc_kapture.datasets.formats.colmap_reading import read_colmap_model, read_colmap_rigs
+from megloc_kapture.datasets.formats.nvm import NvmModel, read_nvm
 from megloc_kapture.datasets.formats.sparse_points import SparsePoints
 from megloc_kapture.datasets.formats.text_lines import TextFile, read_rigid_matrix
 from megloc_kapture.errors import DataError
@@ -243,7 +241,7 @@ def test_colmap_database(tmp_path: Path, database: Path, edits: list[tuple[str, 
             features = {
                 name: (opened.keypoints(name), opened.descriptors(name)) for name in opened.images
             }
-            return opened.cameras(), features, opened.feature_type()
+            return features, opened.feature_type()
 
     outcome(read, path)
     assert [entry.name for entry in tmp_path.iterdir()] == ["d.db"]
