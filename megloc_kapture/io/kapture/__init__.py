@@ -5,54 +5,72 @@ is needed only by who wants its objects (:func:`to_kapture`), and imported there
 second.
 """
 
-from megloc_kapture.io.kapture.data import KaptureData, Sensor
+from megloc_kapture.io.kapture.data import (
+    KaptureData as KaptureData,
+)
+from megloc_kapture.io.kapture.data import (
+    Sensor as Sensor,
+)
 from megloc_kapture.io.kapture.features import (
-    FeatureConfig,
-    FeatureKind,
-    FeatureReader,
-    FeatureWriter,
-    feature_folder,
+    FeatureConfig as FeatureConfig,
 )
-from megloc_kapture.io.kapture.folder import KaptureFolder, to_kapture
+from megloc_kapture.io.kapture.features import (
+    FeatureKind as FeatureKind,
+)
+from megloc_kapture.io.kapture.features import (
+    FeatureReader as FeatureReader,
+)
+from megloc_kapture.io.kapture.features import (
+    FeatureWriter as FeatureWriter,
+)
+from megloc_kapture.io.kapture.features import (
+    feature_folder as feature_folder,
+)
+from megloc_kapture.io.kapture.folder import (
+    KaptureFolder as KaptureFolder,
+)
+from megloc_kapture.io.kapture.folder import (
+    to_kapture as to_kapture,
+)
 from megloc_kapture.io.kapture.matches import (
-    ImagePair,
-    MatchesReader,
-    MatchesWriter,
-    read_pairs,
-    write_pairs,
+    ImagePair as ImagePair,
 )
-from megloc_kapture.io.kapture.observations import Observations, write_observations
+from megloc_kapture.io.kapture.matches import (
+    MatchesReader as MatchesReader,
+)
+from megloc_kapture.io.kapture.matches import (
+    MatchesWriter as MatchesWriter,
+)
+from megloc_kapture.io.kapture.matches import (
+    read_pairs as read_pairs,
+)
+from megloc_kapture.io.kapture.matches import (
+    write_pairs as write_pairs,
+)
+from megloc_kapture.io.kapture.observations import (
+    Observations as Observations,
+)
+from megloc_kapture.io.kapture.observations import (
+    write_observations as write_observations,
+)
 from megloc_kapture.io.kapture.points import (
-    read_point_covariances,
-    write_point_covariances,
-    write_points3d,
+    read_point_covariances as read_point_covariances,
 )
-from megloc_kapture.io.kapture.sensors import unit_quaternion, write_sensors
-from megloc_kapture.io.kapture.text import writable_name
-from megloc_kapture.io.kapture.vectors import KaptureVectors
-
-__all__ = [
-    "FeatureConfig",
-    "FeatureKind",
-    "FeatureReader",
-    "FeatureWriter",
-    "ImagePair",
-    "KaptureData",
-    "KaptureFolder",
-    "KaptureVectors",
-    "MatchesReader",
-    "MatchesWriter",
-    "Observations",
-    "Sensor",
-    "feature_folder",
-    "read_pairs",
-    "read_point_covariances",
-    "to_kapture",
-    "unit_quaternion",
-    "write_observations",
-    "write_pairs",
-    "write_point_covariances",
-    "write_points3d",
-    "write_sensors",
-    "writable_name",
-]
+from megloc_kapture.io.kapture.points import (
+    write_point_covariances as write_point_covariances,
+)
+from megloc_kapture.io.kapture.points import (
+    write_points3d as write_points3d,
+)
+from megloc_kapture.io.kapture.sensors import (
+    unit_quaternion as unit_quaternion,
+)
+from megloc_kapture.io.kapture.sensors import (
+    write_sensors as write_sensors,
+)
+from megloc_kapture.io.kapture.text import (
+    writable_name as writable_name,
+)
+from megloc_kapture.io.kapture.vectors import (
+    KaptureVectors as KaptureVectors,
+)

@@ -1,16 +1,23 @@
-"""The folder of weights: checkpoints found, checked, read safely, added and converted.
+"""The folder of weights: checkpoints found, checked, read safely, shared, added and converted.
 
 It is MEGLOC_WEIGHTS, else ``megloc-kapture/weights`` in the user's cache. A file may lie in it or
 in a folder of it, so that a collection sorted by network will do.
+
+Processes of a machine share what they read: the first of them writes the tensors into a folder of
+the run; it and the others map that file into memory. What is mapped is the system's cache of the
+file, which is there once, and is not counted against a process. Kept is what was read and checked,
+so that a file of the user may change meanwhile.
 """
 
 from __future__ import annotations
 
+import fcntl
 import glob
 import hashlib
 import os
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -27,7 +34,6 @@ from megloc_kapture.io.weights.registry import (
     lookup,
     registry,
 )
-from megloc_kapture.io.weights.shared import shared_tensors
 
 if TYPE_CHECKING:
     import torch
@@ -35,6 +41,7 @@ if TYPE_CHECKING:
 FOLDER_VARIABLE = "MEGLOC_WEIGHTS"
 SOURCE_KEY = "source_sha256"  # of a converted file's metadata
 UNVERIFIED = "unverified"  # folder of files that a user has instead of the published ones
+_shared_folder: Path | None = None
 
 
 class MissingWeightsError(DataError):
@@ -172,10 +179,8 @@ def how_to_get(weights: Weights) -> str:
 
 def describe(name: str, path: Path) -> WeightsFile:
     """The checkpoint at a path, as it is now."""
-    try:
+    with _reading(path):
         states = [part.stat() for part in _parts(path)]
-    except OSError as error:
-        raise DataError(f"cannot read: {error.strerror or error}", path=path) from error
     size = sum(state.st_size for state in states)
     return WeightsFile(name, path, size, max(state.st_mtime_ns for state in states))
 
@@ -184,13 +189,10 @@ def describe(name: str, path: Path) -> WeightsFile:
 def sha256_of(file: WeightsFile) -> str:
     """sha256 of a checkpoint, hexadecimal; of a TensorFlow one, of its files one after another."""
     digest = hashlib.sha256()
-    try:
+    with _reading(file.path):
         for part in file.parts():
             with open(part, "rb") as content:
-                while block := content.read(1 << 20):
-                    digest.update(block)
-    except OSError as error:
-        raise DataError(f"cannot read: {error.strerror or error}", path=file.path) from error
+                hashlib.file_digest(content, lambda: digest)
     return digest.hexdigest()
 
 
@@ -205,14 +207,12 @@ def read_weights(file: WeightsFile) -> dict[str, torch.Tensor]:
     DataError : it cannot be read, is damaged, holds objects that are never loaded, or its sha256
         is not the one that the registry knows; names the file.
     """
-    return shared_tensors(file, partial(_read, file))
+    return _shared_tensors(file, partial(_read, file))
 
 
 def _read(file: WeightsFile) -> dict[str, torch.Tensor]:
-    try:
+    with _reading(file.path):
         contents = {part: part.read_bytes() for part in file.parts()}
-    except OSError as error:
-        raise DataError(f"cannot read: {error.strerror or error}", path=file.path) from error
     digest = hashlib.sha256()
     for content in contents.values():
         digest.update(content)
@@ -225,6 +225,49 @@ def _read(file: WeightsFile) -> dict[str, torch.Tensor]:
         return contents[beside]
 
     return read_checkpoint(contents[file.path], str(file.path), read_beside)
+
+
+def share_weights(folder: Path | None) -> None:
+    """Let this process share what it reads with the others that are told the same folder."""
+    global _shared_folder
+    _shared_folder = folder
+
+
+def _shared_tensors(
+    key: object, read: Callable[[], dict[str, torch.Tensor]]
+) -> dict[str, torch.Tensor]:
+    """Tensors by name, of a file that the first process wrote; without a folder what is read.
+
+    ``key`` tells checkpoints apart; it is equal in all processes.
+    """
+    if _shared_folder is None:
+        return read()
+    import torch
+
+    path = _shared_folder / f"weights-{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}"
+    found: dict[str, torch.Tensor] = {}
+    try:
+        with open(path.with_suffix(".lock"), "wb") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)  # the others wait for the first
+            if not path.is_file():
+                found = read()
+                with atomic_write(path) as file:
+                    torch.save({name: _whole(tensor) for name, tensor in found.items()}, file)
+    except (OSError, OutputError, RuntimeError):  # torch's, too, where there is no room
+        with suppress(OSError):
+            path.unlink()
+        return found or read()
+    found = torch.load(path, mmap=True, weights_only=True)
+    for tensor in found.values():  # ``load_strictly`` takes the memory as it is
+        tensor.is_shared_file = True  # type: ignore[attr-defined]
+    return found
+
+
+def _whole(tensor: torch.Tensor) -> torch.Tensor:
+    """Not a view, which would be written with all that it is a part of."""
+    if tensor.is_contiguous() and tensor.untyped_storage().nbytes() == tensor.nbytes:
+        return tensor
+    return tensor.contiguous().clone()
 
 
 def check_sha256(file: WeightsFile, found: str) -> None:
@@ -331,6 +374,14 @@ def convert_weights(source: Path, output: Path, *, force: bool = False) -> int:
     # one key only: the library writes several in no fixed order
     write_bytes(output, save(tensors, {SOURCE_KEY: sha256_of(file)}))
     return len(tensors)
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise DataError(f"cannot read: {error.strerror or error}", path=path) from error
 
 
 def _parts(path: Path) -> list[Path]:

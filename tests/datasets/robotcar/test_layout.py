@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
-
 from megloc_kapture.datasets.formats.robotcar_files import (
     ImageKey,
     parse_image,
@@ -18,6 +16,8 @@ from megloc_kapture.datasets.formats.robotcar_files import (
     read_test_list,
     read_train_poses,
 )
+from scipy.spatial.transform import Rotation
+
 from megloc_kapture.datasets.formats.text_lines import read_rigid_matrix
 from megloc_kapture.errors import DataError
 
