@@ -15,7 +15,7 @@ from kapture.converter.colmap.database import COLMAPDatabase
 from megloc_twins.model_files import write_colmap_binary, write_colmap_text, write_nvm
 
 from megloc_kapture.datasets.aachen.layout import read_query_list
-from megloc_kapture.datasets.formats import fourseasons_files, inloc_files
+from megloc_kapture.datasets.formats import fourseasons_files
 from megloc_kapture.datasets.formats.colmap_database import ColmapDatabase
 from megloc_kapture.datasets.formats.colmap_model import (
     BINARY_FILES,
@@ -27,6 +27,7 @@ from megloc_kapture.datasets.formats.colmap_reading import read_colmap_model, re
 from megloc_kapture.datasets.formats.nvm import NvmModel, read_nvm
 from megloc_kapture.datasets.formats.sparse_points import SparsePoints
 from megloc_kapture.datasets.formats.text_lines import TextFile, read_rigid_matrix
+from megloc_kapture.datasets.inloc.layout import read_transformation, read_wrong_scans
 from megloc_kapture.datasets.robotcar import layout as robotcar_layout
 from megloc_kapture.errors import DataError
 from megloc_kapture.values import Camera, RigidTransform
@@ -56,8 +57,8 @@ TEXTS: dict[Callable[[Path], Any], str] = {
     robotcar_layout.read_train_poses: "dawn/rear/1.png 1 0 0 10.0 0 1 0 0.0 0 0 1 -2.0 0 0 0 1\n",
     read_query_list: "query/day/a.jpg SIMPLE_RADIAL 1600 1200 1469.2 800 600 -0.0353\r\n"
     "query/b.jpg PINHOLE 768 1024 971.838 384 512 -0.00177789",
-    inloc_files.read_transformation: f"Before general icp:\n{MATRIX}\nAfter general icp:\n{MATRIX}",
-    inloc_files.read_wrong_scans: "known wrong:\n\n008\nDUC_scan_12.ptx 31\r\n2017\n",
+    read_transformation: f"Before general icp:\n{MATRIX}\nAfter general icp:\n{MATRIX}",
+    read_wrong_scans: "known wrong:\n\n008\nDUC_scan_12.ptx 31\r\n2017\n",
 }
 
 POINTS = SparsePoints(

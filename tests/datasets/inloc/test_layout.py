@@ -10,7 +10,7 @@ import scipy.io
 from megloc_twins.model_files import write_transformation
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.datasets.formats.inloc_files import (
+from megloc_kapture.datasets.inloc.layout import (
     Cutout,
     parse_cutout_name,
     read_cutout_points,
