@@ -28,6 +28,7 @@ from megloc_kapture.datasets.formats.colmap_reading import (
     read_colmap_rigs,
     rig_files,
 )
+from megloc_kapture.datasets.kapture_folders import is_kapture
 from megloc_kapture.datasets.reference_map import write_reference_map
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.files import link_records
@@ -74,7 +75,7 @@ class ColmapFolders:
 def is_colmap(path: Path) -> bool:
     """Whether a folder is a COLMAP model, or one of COLMAP's workspaces, and no kapture."""
     path = Path(path)
-    return not (path / "sensors" / "sensors.txt").is_file() and bool(_models(path))
+    return not is_kapture(path) and bool(_models(path))
 
 
 def find_colmap(

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
-from megloc_kapture.datasets.kapture_folders import MAPPING, QUERY, QUERY_GT
+from megloc_kapture.datasets.kapture_folders import MAPPING, QUERY, QUERY_GT, is_kapture
 from megloc_kapture.datasets.reference_map import ReferenceModel, write_reference_map
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.dataset_tables import (
@@ -239,7 +239,7 @@ def read_ground_truth(
     DataError : the folder is broken.
     """
     folder = root / GROUND_TRUTH
-    if not (folder / QUERY / "sensors" / "sensors.txt").is_file():
+    if not is_kapture(folder / QUERY):
         return None, {}
     true_poses = KaptureFolder(folder / QUERY).read().poses()
     poses = {

@@ -20,7 +20,7 @@ from megloc_kapture.datasets.aachen.layout import (
     Layout,
     Version,
 )
-from megloc_kapture.datasets.kapture_form import without_model
+from megloc_kapture.datasets.kapture_folders import without_model
 from megloc_kapture.datasets.official import (
     Count,
     DatasetCard,

@@ -15,14 +15,14 @@ from megloc_kapture.datasets.formats.colmap_reading import colmap_model_files, r
 from megloc_kapture.datasets.formats.nvm import NvmModel, read_single_nvm
 from megloc_kapture.datasets.formats.sparse_points import SparsePoints
 from megloc_kapture.datasets.formats.text_lines import Line, read_lines
-from megloc_kapture.datasets.kapture_folders import MAPPING, QUERY
-from megloc_kapture.datasets.kapture_form import (
+from megloc_kapture.datasets.kapture_folders import (
+    MAPPING,
+    QUERY,
     KaptureImage,
-    image_files,
-    input_files,
     is_kapture,
     kapture_parent,
     read_images,
+    tables_and_images,
 )
 from megloc_kapture.datasets.official import Missing
 from megloc_kapture.errors import DataError, OptionError
@@ -270,7 +270,7 @@ class KaptureLayout:
     def input_files(self) -> Iterator[Path]:
         """Every file an import may depend on."""
         folders = (self.root / MAPPING, *self._queries())
-        yield from input_files(folder for folder in folders if is_kapture(folder))
+        yield from tables_and_images(folder for folder in folders if is_kapture(folder))
 
     def read(self, wanted: Wanted, missing: Missing) -> tuple[AachenImages, dict[str, Path]]:
         """Read the images, and the file of each.
@@ -283,11 +283,11 @@ class KaptureLayout:
         DataError : a broken kapture folder, a query whose name says neither day nor night.
         OptionError : v1.0 is wanted, and this is v1.1, whose poses are others.
         """
-        mapping = read_images(self.root / MAPPING, missing)
+        mapping = read_images(self.root / MAPPING, missing.require)
         queries: list[KaptureImage] = []
         for folder in self._queries():
             if missing.require(folder / "sensors" / "sensors.txt"):
-                queries += read_images(folder, missing)
+                queries += read_images(folder, missing.require)
         images = AachenImages(self._version(wanted, [*mapping, *queries]))
         by_condition: dict[str, list[KaptureImage]] = {DAY: [], NIGHT: []}
         for image in queries:
@@ -307,7 +307,7 @@ class KaptureLayout:
             if (pose := image.cam_from_world) is not None:
                 camera_id = cameras.setdefault(image.sensor_id, len(cameras))
                 images.add_map_image(image.name, position, camera_id, image.camera, pose)
-        return images, image_files([*mapping, *queries])
+        return images, {image.name: image.file for image in [*mapping, *queries]}
 
     def _queries(self) -> list[Path]:
         parts = [self.root / name for name in _QUERY_PARTS.values()]

@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.datasets.formats.text_lines import Line, read_lines
-from megloc_kapture.datasets.kapture_folders import MAPPING, QUERY
-from megloc_kapture.datasets.kapture_form import kapture_parent
+from megloc_kapture.datasets.kapture_folders import MAPPING, QUERY, kapture_parent
 from megloc_kapture.datasets.official import Missing
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.kapture import KaptureFolder

@@ -11,7 +11,7 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from megloc_kapture.datasets.formats.sparse_points import SparsePoints
-from megloc_kapture.datasets.kapture_form import image_files, without_model
+from megloc_kapture.datasets.kapture_folders import without_model
 from megloc_kapture.datasets.official import (
     Count,
     DatasetCard,
@@ -219,7 +219,7 @@ class RobotCar:
             missing,
             remarks,
             reference_images=sum(key.condition == REFERENCE_CONDITION for key in images.files),
-            image_files=image_files(images.files.values()),
+            image_files={image.name: image.file for image in images.files.values()},
         )
 
     def _dataset(

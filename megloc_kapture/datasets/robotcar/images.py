@@ -13,13 +13,14 @@ from pathlib import Path
 import numpy as np
 
 from megloc_kapture.datasets.formats.text_lines import read_rigid_matrix
-from megloc_kapture.datasets.kapture_folders import MAPPING, QUERY
-from megloc_kapture.datasets.kapture_form import (
+from megloc_kapture.datasets.kapture_folders import (
+    MAPPING,
+    QUERY,
     KaptureImage,
-    input_files,
     is_kapture,
     parents,
     read_images,
+    tables_and_images,
 )
 from megloc_kapture.datasets.official import Missing, with_poses
 from megloc_kapture.datasets.robotcar.layout import (
@@ -288,7 +289,7 @@ class LocationFolders:
         """Every file an import may depend on."""
         if self.test_list.is_file():
             yield self.test_list
-        yield from input_files(folder for _, folder in self.parts())
+        yield from tables_and_images(folder for _, folder in self.parts())
 
     def read(self, missing: Missing) -> SeasonsImages:
         """Read all images.
@@ -300,7 +301,7 @@ class LocationFolders:
         """
         found = SeasonsImages()
         for location, folder in self.parts():
-            for image in read_images(folder, missing):
+            for image in read_images(folder, missing.require):
                 found.add(image, location, folder)
             found.add_rigs(folder)
         return found
