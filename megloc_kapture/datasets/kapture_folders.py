@@ -8,7 +8,7 @@ same. Images keep their official names, and the queries have no poses.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,6 +24,8 @@ from megloc_kapture.io.dataset_tables import (
     WORLD_FILE,
     ImageGroup,
     Protocol,
+    RelocalizationPair,
+    World,
     read_groups,
     read_names,
     read_nowhere,
@@ -89,14 +91,8 @@ def input_files(root: Path) -> Iterator[Path]:
             yield from (path for path in files if part != QUERY or path.is_file())
     if (nowhere := table_path(root / QUERY_GT, NOWHERE_FILE)).is_file():
         yield nowhere
-    for name in (
-        GROUPS_FILE,
-        PRIORS_FILE,
-        PROTOCOL_FILE,
-        WORLD_FILE,
-        NAMES_FILE,
-        RELOCALIZATION_FILE,
-    ):
+    own = (GROUPS_FILE, PRIORS_FILE, PROTOCOL_FILE, WORLD_FILE, NAMES_FILE, RELOCALIZATION_FILE)
+    for name in own:
         if (table := table_path(root / SIDE_TABLES, name)).is_file():
             yield table
 
@@ -167,7 +163,7 @@ def import_kapture_folders(
         write_sensors(output / QUERY_GT, _renamed(truth_data, rename, is_truth=True))
         if nowhere := [rename(name) for name in read_nowhere(root / QUERY_GT)]:
             write_nowhere(output / QUERY_GT, nowhere)
-    _write_side_tables(root, output, rename, map_data, query_data, protocol_change)
+    _import_side_tables(root, output, rename, map_data, query_data, protocol_change)
     return {
         "map_images": len(map_data.image_names()),
         "map_images_with_pose": len(poses),
@@ -185,9 +181,7 @@ def import_mapping(mapping: KaptureFolder, output: Path) -> dict[str, float]:
     names = set(data.image_names())
     found = read_groups(_tables_beside(mapping))
     groups = {name: group for name, group in found.items() if name in names}
-    write_protocol(output / SIDE_TABLES, Protocol())
-    if groups:
-        write_groups(output / SIDE_TABLES, groups)
+    write_side_tables(output / SIDE_TABLES, Protocol(), groups=groups)
     return {"map_images": len(names), "map_images_with_pose": len(poses)}
 
 
@@ -265,7 +259,7 @@ def _link_queries(source: Path, output: Path, prefix: str) -> None:
             raise output_error(link, error) from error
 
 
-def _write_side_tables(
+def _import_side_tables(
     root: Path,
     output: Path,
     rename: Callable[[str], str],
@@ -282,21 +276,40 @@ def _write_side_tables(
         # a name that both have says the same of both
         if name in of_map or name not in of_query:
             groups[name] = group
-    if groups:
-        write_groups(target, groups)
-    priors = read_priors(source)
-    if priors:
-        write_priors(target, {rename(query): permitted for query, permitted in priors.items()})
-    names = read_names(source)
-    if names:
-        write_names(target, {rename(query): name for query, name in names.items()})
-    pairs = read_relocalization(source)
-    if pairs:
-        write_relocalization(target, [replace(pair, query=rename(pair.query)) for pair in pairs])
     protocol = read_protocol(source)
-    write_protocol(target, protocol_change(protocol) if protocol_change else protocol)
-    if (source / WORLD_FILE).is_file():
-        write_world(target, read_world(source))
+    write_side_tables(
+        target,
+        protocol_change(protocol) if protocol_change else protocol,
+        groups=groups,
+        priors={rename(query): permitted for query, permitted in read_priors(source).items()},
+        names={rename(query): name for query, name in read_names(source).items()},
+        pairs=[replace(pair, query=rename(pair.query)) for pair in read_relocalization(source)],
+        world=read_world(source) if (source / WORLD_FILE).is_file() else None,
+    )
+
+
+def write_side_tables(
+    folder: Path,
+    protocol: Protocol,
+    *,
+    groups: Mapping[str, ImageGroup],
+    priors: Mapping[str, Sequence[str]] | None = None,
+    names: Mapping[str, str] | None = None,
+    pairs: Sequence[RelocalizationPair] = (),
+    world: World | None = None,
+) -> None:
+    """Write the tables of ``megloc/`` that have anything to say."""
+    write_protocol(folder, protocol)
+    if world is not None:
+        write_world(folder, world)
+    if groups:
+        write_groups(folder, groups)
+    if priors:
+        write_priors(folder, priors)
+    if names:
+        write_names(folder, names)
+    if pairs:
+        write_relocalization(folder, pairs)
 
 
 # ----------------------------------------------------------- challenges as kapture has them
