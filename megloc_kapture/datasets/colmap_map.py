@@ -156,13 +156,7 @@ class ColmapReconstruction:
 
     @classmethod
     def read(cls, source: ColmapFolders) -> ColmapReconstruction:
-        """Read the model.
-
-        Raises
-        ------
-        DataError : something is missing or broken, a camera model that kapture does not have, or
-            names of images that it cannot hold.
-        """
+        """Read the model; DataError names what is broken, or what kapture cannot hold."""
         model = read_colmap_model(source.model)
         names = kapture_names(model, source.model)
         rigs = read_colmap_rigs(source.model, binary=is_binary(source.model))
@@ -276,11 +270,7 @@ def kapture_names(model: ColmapModel, folder: Path) -> dict[str, str]:
     """The name in kapture of each image of a model, by its name there.
 
     kapture separates fields by commas and blanks: a comma, a blank at either end and a # at the
-    beginning become ``_``.
-
-    Raises
-    ------
-    DataError : two images would have one name.
+    beginning become ``_``. DataError where two images would have one name.
     """
     names: dict[str, str] = {}
     taken: dict[str, str] = {}

@@ -84,9 +84,7 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
     def keypoints(self, name: str) -> NDArray[np.float32]:
         """Keypoints of an image, float32 (N, 2), COLMAP pixels; none is no error.
 
-        Raises
-        ------
-        DataError : no such image, or a row that does not fit its own sizes.
+        DataError where there is no such image, or a row does not fit its own sizes.
         """
         found = self._blob("keypoints", name)
         if found is None:
@@ -103,11 +101,8 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
     def feature_type(self) -> FeatureType | None:
         """The type of all features; None where there are no descriptors to tell it.
 
-        Types that we do not know have COLMAP's number in their name, and bytes.
-
-        Raises
-        ------
-        DataError : features of several types.
+        Types that we do not know have COLMAP's number in their name, and bytes. DataError where
+        there are several types.
         """
         if "descriptors" not in self._tables:
             return None
@@ -129,10 +124,7 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
     def descriptors(self, name: str, expected: FeatureType = _TYPES[_SIFT]) -> NDArray[Any] | None:
         """Descriptors of an image, (N, D) of the type's numbers; None where it has none.
 
-        Raises
-        ------
-        DataError : no such image, another type of descriptors, or a row that does not fit its own
-            sizes.
+        DataError where image or type are others, or a row does not fit its own sizes.
         """
         found = self._blob("descriptors", name)
         if found is None or found[0] == 0:

@@ -169,9 +169,7 @@ def read_lines(path: Path, *, blank: bool = False, comments: bool = False) -> li
 def read_rigid_matrix(path: Path, *, comments: bool = False) -> RigidTransform:
     """The transform of a file with a 4x4 matrix, four lines of numbers between commas or blanks.
 
-    Raises
-    ------
-    DataError : other lines, or no rigid transform; names file and line.
+    DataError names file and line.
     """
     lines = read_lines(path, comments=comments)
     for index, line in enumerate(lines):
@@ -192,9 +190,7 @@ def read_rigid_matrix(path: Path, *, comments: bool = False) -> RigidTransform:
 def image_name(text: str) -> str:
     """The name of an image, a plain path below the images' folder; without ``./`` before it.
 
-    Raises
-    ------
-    DataError : not UTF-8, or a path that is not plain; does not name the file.
+    DataError, which does not name the file, where it is not UTF-8 or not plain.
     """
     try:
         text.encode()
@@ -213,12 +209,7 @@ def shown(text: str) -> str:
 
 
 def check_plain(path: Path) -> None:
-    """Refuse what is no file: a pipe or a device might never end.
-
-    Raises
-    ------
-    DataError : missing, not a plain file, or out of reach.
-    """
+    """Raise DataError where a file is missing or none: a pipe or a device might never end."""
     with reading(path):
         try:
             mode = os.stat(path).st_mode

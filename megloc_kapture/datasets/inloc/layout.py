@@ -120,15 +120,10 @@ def parse_cutout_name(name: str) -> Cutout:
 
 
 def read_transformation(path: Path | str) -> RigidTransform:
-    """``floor_from_scan`` of a scan, after refinement.
+    """``floor_from_scan`` of a scan, after refinement; DataError names file and line.
 
     The file has two 4x4 matrices, before refinement and after it, row by row; what else stands in
     it is text.
-
-    Raises
-    ------
-    DataError : missing, not two matrices, or the second is no rotation with a translation; names
-        file and line.
     """
     path = Path(path)
     rows = [line for line in _few_lines(path) if _has_four_numbers(line)]
