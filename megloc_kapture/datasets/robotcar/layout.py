@@ -214,7 +214,7 @@ class Layout:
 
 
 def image_finder(layout: Layout, missing: Missing) -> Callable[[ImageKey], str | None]:
-    """A function that returns the path of an image below ``images/``, with the type it has on disk.
+    """Make a function that finds an image's path below ``images/``, with the type it has on disk.
 
     Of an image that is not there it returns None, and notes it as missing.
     """
