@@ -18,11 +18,12 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+from megloc_twins.model_files import write_transformation
 from refinement import REGARDLESS, Thresholds
 from scenes import errors_of, megloc
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.datasets.formats.inloc_files import read_transformation, write_transformation
+from megloc_kapture.datasets.inloc.layout import read_transformation
 from megloc_kapture.io.tables import (
     CONSISTENCY_FILE,
     REFINEMENT_FILE,

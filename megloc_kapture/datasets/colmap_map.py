@@ -21,11 +21,14 @@ from megloc_kapture.datasets.formats.colmap_model import (
     ColmapModel,
 )
 from megloc_kapture.datasets.formats.colmap_reading import (
+    ColmapRigs,
     colmap_model_files,
     is_binary,
     read_colmap_model,
+    read_colmap_rigs,
+    rig_files,
 )
-from megloc_kapture.datasets.formats.colmap_rigs import ColmapRigs, read_colmap_rigs, rig_files
+from megloc_kapture.datasets.kapture_folders import is_kapture
 from megloc_kapture.datasets.reference_map import write_reference_map
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.files import link_records
@@ -72,7 +75,7 @@ class ColmapFolders:
 def is_colmap(path: Path) -> bool:
     """Whether a folder is a COLMAP model, or one of COLMAP's workspaces, and no kapture."""
     path = Path(path)
-    return not (path / "sensors" / "sensors.txt").is_file() and bool(_models(path))
+    return not is_kapture(path) and bool(_models(path))
 
 
 def find_colmap(
@@ -153,13 +156,7 @@ class ColmapReconstruction:
 
     @classmethod
     def read(cls, source: ColmapFolders) -> ColmapReconstruction:
-        """Read the model.
-
-        Raises
-        ------
-        DataError : something is missing or broken, a camera model that kapture does not have, or
-            names of images that it cannot hold.
-        """
+        """Read the model; DataError names what is broken, or what kapture cannot hold."""
         model = read_colmap_model(source.model)
         names = kapture_names(model, source.model)
         rigs = read_colmap_rigs(source.model, binary=is_binary(source.model))
@@ -273,11 +270,7 @@ def kapture_names(model: ColmapModel, folder: Path) -> dict[str, str]:
     """The name in kapture of each image of a model, by its name there.
 
     kapture separates fields by commas and blanks: a comma, a blank at either end and a # at the
-    beginning become ``_``.
-
-    Raises
-    ------
-    DataError : two images would have one name.
+    beginning become ``_``. DataError where two images would have one name.
     """
     names: dict[str, str] = {}
     taken: dict[str, str] = {}

@@ -1,12 +1,18 @@
-"""Any pair of kapture folders as a dataset: mapping/, query/ and perhaps query_gt/ and megloc/."""
+"""Any pair of kapture folders as a dataset: mapping/, query/ and perhaps query_gt/ and megloc/; and
+challenge datasets as naver's kapture distributes them, the official images in kapture folders.
+
+kapture's downloader unpacks an archive per part, ``mapping/`` and ``query/`` (Aachen's queries by
+day and at night apart, RobotCar's locations each in a folder of its own); its importers write the
+same. Images keep their official names, and the queries have no poses.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.dataset_tables import (
     GROUPS_FILE,
     NAMES_FILE,
@@ -18,6 +24,8 @@ from megloc_kapture.io.dataset_tables import (
     WORLD_FILE,
     ImageGroup,
     Protocol,
+    RelocalizationPair,
+    World,
     read_groups,
     read_names,
     read_nowhere,
@@ -40,6 +48,14 @@ from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
 from megloc_kapture.values import Camera, RigidTransform
 
 MAPPING, QUERY, QUERY_GT = "mapping", "query", "query_gt"
+_SENSORS = "sensors/sensors.txt"
+# below the root; kapture's guide to converting Aachen puts them beside the official files
+_PARENTS = ("", "kapture")
+
+
+def is_kapture(folder: Path) -> bool:
+    """True where a folder is a kapture."""
+    return (folder / _SENSORS).is_file()
 
 
 def check_root(root: Path) -> Path:
@@ -54,10 +70,10 @@ def check_root(root: Path) -> Path:
         raise DataError("no such folder", path=root)
     for part in (MAPPING, QUERY):
         try:  # is_file() of Python 3.14 takes what may not be read for missing
-            (root / part / "sensors" / "sensors.txt").stat()
+            (root / part / _SENSORS).stat()
         except (FileNotFoundError, NotADirectoryError) as error:
             raise DataError(
-                f"{part}/sensors/sensors.txt is missing; a dataset of kapture folders has "
+                f"{part}/{_SENSORS} is missing; a dataset of kapture folders has "
                 "mapping/ and query/, and query_gt/ where the true poses are known",
                 path=root,
             ) from error
@@ -74,25 +90,14 @@ def input_files(root: Path) -> Iterator[Path]:
             yield from (path for path in files if part != QUERY or path.is_file())
     if (nowhere := table_path(root / QUERY_GT, NOWHERE_FILE)).is_file():
         yield nowhere
-    for name in (
-        GROUPS_FILE,
-        PRIORS_FILE,
-        PROTOCOL_FILE,
-        WORLD_FILE,
-        NAMES_FILE,
-        RELOCALIZATION_FILE,
-    ):
+    own = (GROUPS_FILE, PRIORS_FILE, PROTOCOL_FILE, WORLD_FILE, NAMES_FILE, RELOCALIZATION_FILE)
+    for name in own:
         if (table := table_path(root / SIDE_TABLES, name)).is_file():
             yield table
 
 
 def files_of(folder: KaptureFolder, *, images: bool = True) -> Iterator[Path]:
-    """Every file of a kapture folder that an import depends on.
-
-    Parameters
-    ----------
-    images : with the images, their masks and depth maps.
-    """
+    """Every file of a kapture folder that an import depends on; ``images`` with masks and depth."""
     sensors = folder.root / "sensors"
     yield from sorted(sensors.glob("*.txt"))
     if not images:
@@ -151,13 +156,13 @@ def import_kapture_folders(
     write_sensors(output / QUERY, _renamed(query_data, rename, is_truth=False))
     _link_queries(query.root, output / QUERY, query_prefix)
     truth = 0
-    if (root / QUERY_GT / "sensors" / "sensors.txt").is_file():
+    if is_kapture(root / QUERY_GT):
         truth_data = KaptureFolder(root / QUERY_GT).read()
         truth = len(truth_data.poses())
         write_sensors(output / QUERY_GT, _renamed(truth_data, rename, is_truth=True))
         if nowhere := [rename(name) for name in read_nowhere(root / QUERY_GT)]:
             write_nowhere(output / QUERY_GT, nowhere)
-    _write_side_tables(root, output, rename, map_data, query_data, protocol_change)
+    _import_side_tables(root, output, rename, map_data, query_data, protocol_change)
     return {
         "map_images": len(map_data.image_names()),
         "map_images_with_pose": len(poses),
@@ -175,9 +180,7 @@ def import_mapping(mapping: KaptureFolder, output: Path) -> dict[str, float]:
     names = set(data.image_names())
     found = read_groups(_tables_beside(mapping))
     groups = {name: group for name, group in found.items() if name in names}
-    write_protocol(output / SIDE_TABLES, Protocol())
-    if groups:
-        write_groups(output / SIDE_TABLES, groups)
+    write_side_tables(output / SIDE_TABLES, Protocol(), groups=groups)
     return {"map_images": len(names), "map_images_with_pose": len(poses)}
 
 
@@ -200,23 +203,13 @@ def _map_poses(mapping: KaptureFolder) -> dict[str, RigidTransform]:
 
 
 def check_images(folder: KaptureFolder) -> None:
-    """Every image is there, is an image, and has the size its camera says; headers only.
-
-    Raises
-    ------
-    DataError : names the first that is not.
-    """
+    """Check each image as :func:`check_image` does; DataError names the first that fails."""
     for image in folder.read().image_names():
         check_image(folder, image)
 
 
 def check_image(folder: KaptureFolder, image: str) -> None:
-    """The image is there, is an image, and has the size its camera says; its header only.
-
-    Raises
-    ------
-    DataError : it is not; names its file.
-    """
+    """Raise DataError where an image's header is missing, none, or not of its camera's size."""
     check_image_size(folder.image_path(image), folder.read().camera_of(image))
 
 
@@ -265,7 +258,7 @@ def _link_queries(source: Path, output: Path, prefix: str) -> None:
             raise output_error(link, error) from error
 
 
-def _write_side_tables(
+def _import_side_tables(
     root: Path,
     output: Path,
     rename: Callable[[str], str],
@@ -282,18 +275,113 @@ def _write_side_tables(
         # a name that both have says the same of both
         if name in of_map or name not in of_query:
             groups[name] = group
-    if groups:
-        write_groups(target, groups)
-    priors = read_priors(source)
-    if priors:
-        write_priors(target, {rename(query): permitted for query, permitted in priors.items()})
-    names = read_names(source)
-    if names:
-        write_names(target, {rename(query): name for query, name in names.items()})
-    pairs = read_relocalization(source)
-    if pairs:
-        write_relocalization(target, [replace(pair, query=rename(pair.query)) for pair in pairs])
     protocol = read_protocol(source)
-    write_protocol(target, protocol_change(protocol) if protocol_change else protocol)
-    if (source / WORLD_FILE).is_file():
-        write_world(target, read_world(source))
+    write_side_tables(
+        target,
+        protocol_change(protocol) if protocol_change else protocol,
+        groups=groups,
+        priors={rename(query): permitted for query, permitted in read_priors(source).items()},
+        names={rename(query): name for query, name in read_names(source).items()},
+        pairs=[replace(pair, query=rename(pair.query)) for pair in read_relocalization(source)],
+        world=read_world(source) if (source / WORLD_FILE).is_file() else None,
+    )
+
+
+def write_side_tables(
+    folder: Path,
+    protocol: Protocol,
+    *,
+    groups: Mapping[str, ImageGroup],
+    priors: Mapping[str, Sequence[str]] | None = None,
+    names: Mapping[str, str] | None = None,
+    pairs: Sequence[RelocalizationPair] = (),
+    world: World | None = None,
+) -> None:
+    """Write the tables of ``megloc/`` that have anything to say."""
+    write_protocol(folder, protocol)
+    if world is not None:
+        write_world(folder, world)
+    if groups:
+        write_groups(folder, groups)
+    if priors:
+        write_priors(folder, priors)
+    if names:
+        write_names(folder, names)
+    if pairs:
+        write_relocalization(folder, pairs)
+
+
+# ----------------------------------------------------------- challenges as kapture has them
+
+
+@dataclass(frozen=True, slots=True)
+class KaptureImage:
+    """One image of a kapture folder.
+
+    Parameters
+    ----------
+    name : below ``records_data``.
+    file : it, or the link to it.
+    sensor_id : of its camera in the folder's ``sensors.txt``.
+    cam_from_world : None where the folder has no pose for it.
+    """
+
+    name: str
+    file: Path
+    timestamp: int
+    sensor_id: str
+    camera: Camera
+    cam_from_world: RigidTransform | None
+
+
+def parents(root: Path) -> tuple[Path, ...]:
+    """The folders in which the parts of a dataset may lie, the root first."""
+    return tuple(Path(root) / name for name in _PARENTS)
+
+
+def kapture_parent(root: Path) -> Path | None:
+    """The folder, ``root`` or one in it, that has ``mapping/`` as a kapture folder; else None."""
+    return next((parent for parent in parents(root) if is_kapture(parent / MAPPING)), None)
+
+
+def without_model(root: Path) -> OptionError:
+    """The error where a dataset's own model is asked for and kapture folders are there."""
+    return OptionError(
+        f"the reference model is read from the official layout, and {root} has kapture folders; "
+        "in a kapture map megloc localize localizes"
+    )
+
+
+def read_images(folder: Path, is_there: Callable[[Path], bool]) -> list[KaptureImage]:
+    """Read the camera images of a kapture folder in the order of their times, then sensors' ids.
+
+    An image whose file is not there is left out; of each camera the first image's size is checked.
+
+    Raises
+    ------
+    DataError : broken tables, an uncalibrated camera, an image of another size than its camera's.
+    """
+    kapture = KaptureFolder(folder)
+    data = kapture.read()
+    images = []
+    checked: set[str] = set()
+    for (timestamp, sensor_id), name in sorted(data.records_camera.items()):
+        file = kapture.image_path(name)
+        if not is_there(file):
+            continue
+        if sensor_id not in checked:
+            check_image(kapture, name)
+            checked.add(sensor_id)
+        pose = data.device_from_world(timestamp, sensor_id)
+        camera = data.camera_of(name)
+        images.append(KaptureImage(name, file, timestamp, sensor_id, camera, pose))
+    return images
+
+
+def tables_and_images(folders: Iterable[Path]) -> Iterator[Path]:
+    """Every file that the images of these kapture folders come from."""
+    for folder in folders:
+        kapture = KaptureFolder(folder)
+        yield from files_of(kapture, images=False)
+        images = (kapture.image_path(name) for name in kapture.read().image_names())
+        yield from (image for image in images if image.exists())

@@ -87,9 +87,7 @@ def import_megadepth(
 def read_megadepth_depth(path: Path) -> NDArray[np.float32] | None:
     """A depth map (H, W), 0 where unknown; None of an image that has only an order of depths.
 
-    Raises
-    ------
-    DataError : no HDF5 file with an array ``depth`` of its own; names it.
+    DataError where the file is no HDF5 file with an array ``depth`` of its own.
     """
     import h5py
 

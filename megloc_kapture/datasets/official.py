@@ -11,7 +11,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
-from megloc_kapture.datasets.kapture_folders import MAPPING, QUERY, QUERY_GT
+from megloc_kapture.datasets.kapture_folders import (
+    MAPPING,
+    QUERY,
+    QUERY_GT,
+    is_kapture,
+    write_side_tables,
+)
 from megloc_kapture.datasets.reference_map import ReferenceModel, write_reference_map
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.dataset_tables import (
@@ -21,12 +27,6 @@ from megloc_kapture.io.dataset_tables import (
     RelocalizationPair,
     World,
     read_groups,
-    write_groups,
-    write_names,
-    write_priors,
-    write_protocol,
-    write_relocalization,
-    write_world,
 )
 from megloc_kapture.io.files import link_records
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
@@ -65,7 +65,7 @@ class DatasetCard(Options):
 
 @dataclass(frozen=True, slots=True)
 class Count:
-    """One line of an import's summary: what was found, beside what is published."""
+    """A line of an import's summary: what was found, beside what is published."""
 
     what: str
     found: int
@@ -189,17 +189,15 @@ def write_official(dataset: OfficialDataset, output: Path, *, allow_missing: boo
         link_records(output / part, {n: f for n, f in dataset.image_files.items() if n in own})
     if dataset.query_gt is not None and dataset.query_gt.trajectories:
         write_sensors(output / QUERY_GT, dataset.query_gt)
-    tables = output / SIDE_TABLES
-    write_protocol(tables, dataset.protocol)
-    write_world(tables, dataset.world)
-    if dataset.groups:
-        write_groups(tables, dataset.groups)
-    if dataset.priors:
-        write_priors(tables, dataset.priors)
-    if dataset.names:
-        write_names(tables, dataset.names)
-    if dataset.relocalization:
-        write_relocalization(tables, dataset.relocalization)
+    write_side_tables(
+        output / SIDE_TABLES,
+        dataset.protocol,
+        groups=dataset.groups,
+        priors=dataset.priors,
+        names=dataset.names,
+        pairs=dataset.relocalization,
+        world=dataset.world,
+    )
     if dataset.reference is not None:
         names, points = dataset.reference.read()
         write_reference_map(
@@ -239,7 +237,7 @@ def read_ground_truth(
     DataError : the folder is broken.
     """
     folder = root / GROUND_TRUTH
-    if not (folder / QUERY / "sensors" / "sensors.txt").is_file():
+    if not is_kapture(folder / QUERY):
         return None, {}
     true_poses = KaptureFolder(folder / QUERY).read().poses()
     poses = {

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -31,13 +32,7 @@ _MAX_SHIFT_PX = 1.0
 
 @dataclass(frozen=True)
 class ReferenceModel:
-    """The model a dataset ships.
-
-    Parameters
-    ----------
-    read : returns the names of its images, in its order, and its points.
-    database : COLMAP database with its features; None where there is none.
-    """
+    """The model a dataset ships: reads the names of its images and its points; its database."""
 
     read: Callable[[], tuple[Sequence[str], SparsePoints]]
     database: Path | None
@@ -96,51 +91,45 @@ def write_reference_map(
 
     recorded = set(data.records_camera.values())
     names = tuple(sorted(recorded.intersection(image_names)))
+    features: Features = partial(_seen_features, points)
     with ExitStack() as stack:
-        features: _SeenFeatures | _DatabaseFeatures = _SeenFeatures(points)
         if database is not None:
             opened = stack.enter_context(ColmapDatabase(database))
-            features = _DatabaseFeatures(
+            of_database = _DatabaseFeatures(
                 points, opened, output, keypoints_type, database_names or {}
             )
-            stack.callback(features.close)
+            stack.callback(of_database.close)
+            features = of_database.of_image
         config = FeatureConfig(keypoints_type.upper(), np.dtype(np.float32), 2)
         writer = FeatureWriter(output, "keypoints", keypoints_type, config)
         stack.enter_context(writer)
-        observations = _write_features(names, image_names, points, features, writer)
+        with_empty = database is not None
+        observations, num_keypoints = _write_features(
+            names, image_names, points, features, writer, with_empty=with_empty
+        )
     write_observations(output, {keypoints_type: observations})
     return {
         "images": len(names),
-        "keypoints": features.num_keypoints,
+        "keypoints": num_keypoints,
         "points": len(points),
         "observations": len(observations),
     }
 
 
-class _SeenFeatures:
-    """The features that see points, numbered without gaps."""
+# keypoints of an image (N, 2), and which of them each of its observations, given as rows, is
+Features = Callable[[str, NDArray[np.int64]], tuple[NDArray[np.float32], NDArray[np.int64]]]
 
-    complete = False
 
-    def __init__(self, points: SparsePoints) -> None:
-        self._points = points
-        self.num_keypoints = 0
-
-    def of_image(
-        self, name: str, rows: NDArray[np.int64]
-    ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-        """Keypoints of an image (N, 2), and which of them each of its observations is."""
-        _, first, numbers = np.unique(
-            self._points.feature_ids[rows], return_index=True, return_inverse=True
-        )
-        self.num_keypoints += len(first)
-        return self._points.xy_px[rows[first]], numbers
+def _seen_features(
+    points: SparsePoints, name: str, rows: NDArray[np.int64]
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """The features of an image that see points, numbered without gaps."""
+    _, first, numbers = np.unique(points.feature_ids[rows], return_index=True, return_inverse=True)
+    return points.xy_px[rows[first]], numbers
 
 
 class _DatabaseFeatures:
     """All features of a database, under its numbers; writes the descriptors on the way."""
-
-    complete = True
 
     def __init__(
         self,
@@ -150,36 +139,27 @@ class _DatabaseFeatures:
         keypoints_type: str,
         names: Mapping[str, str],
     ) -> None:
+        self._database = database
         self._type = database.feature_type() or FeatureType(keypoints_type, "u1")
         if self._type.name != keypoints_type:
-            raise DataError(
-                f"has features of type {self._type.name}, not {keypoints_type}", path=database.path
-            )
+            raise self._error(f"has features of type {self._type.name}, not {keypoints_type}")
         self._names = names
         self._points = points
-        self._database = database
         self._output = output
-        self._keypoints_type = keypoints_type
         self._by_stem: dict[str, list[str]] = {}
         for name in database.images:
             self._by_stem.setdefault(_without_suffix(name), []).append(name)
         self._writer: FeatureWriter | None = None
         self._without: list[str] = []
-        self.num_keypoints = 0
 
     def of_image(
         self, name: str, rows: NDArray[np.int64]
     ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-        """See :meth:`_SeenFeatures.of_image`.
-
-        Raises
-        ------
-        DataError : the database does not have the features of the model.
-        """
+        """See Features; DataError where the database does not have the features of the model."""
         name_there = self._name_there(name)
         if name_there is None:
             if len(rows):
-                raise DataError(f"has no image {name!r}", path=self._database.path)
+                raise self._error(f"has no image {name!r}")
             self._without.append(name)
             return np.empty((0, 2), np.float32), np.empty(0, np.int64)
         keypoints = self._database.keypoints(name_there)
@@ -190,7 +170,6 @@ class _DatabaseFeatures:
             self._write_descriptors(name, name_there, descriptors, len(keypoints))
         elif len(keypoints) == 0:
             self._without.append(name)
-        self.num_keypoints += len(keypoints)
         return keypoints, numbers
 
     def close(self) -> None:
@@ -207,9 +186,7 @@ class _DatabaseFeatures:
             return name
         found = self._by_stem.get(_without_suffix(name), [])
         if len(found) > 1:
-            raise DataError(
-                f"has several images for {name!r}: {', '.join(found)}", path=self._database.path
-            )
+            raise self._error(f"has several images for {name!r}: {', '.join(found)}")
         return found[0] if found else None
 
     def _check(
@@ -224,76 +201,77 @@ class _DatabaseFeatures:
             return
         last = int(numbers.max())
         if last >= len(keypoints):
-            raise DataError(
+            raise self._error(
                 f"is not of this model: its image {name!r} has {len(keypoints)} keypoints, "
-                f"the model names feature {last}",
-                path=self._database.path,
+                f"the model names feature {last}"
             )
         shifts = np.abs(keypoints[numbers] - xy_px).max(axis=1)
         worst = int(np.argmax(shifts))
         if shifts[worst] > _MAX_SHIFT_PX:
             x, y = keypoints[numbers[worst]].tolist()
             there = xy_px[worst].tolist()
-            raise DataError(
+            raise self._error(
                 f"is not of this model: feature {int(numbers[worst])} of {name!r} is at "
-                f"({x:.1f}, {y:.1f}), in the model at ({there[0]:.1f}, {there[1]:.1f})",
-                path=self._database.path,
+                f"({x:.1f}, {y:.1f}), in the model at ({there[0]:.1f}, {there[1]:.1f})"
             )
 
     def _write_descriptors(
         self, name: str, name_there: str, descriptors: NDArray[Any], num_keypoints: int
     ) -> None:
+        kind = self._type.name
         if self._writer is None:
-            config = FeatureConfig(
-                self._type.name.upper(),
-                descriptors.dtype,
-                descriptors.shape[1],
-                self._keypoints_type,
-                "L2",
-            )
-            self._writer = FeatureWriter(self._output, "descriptors", self._keypoints_type, config)
+            size = descriptors.shape[1]
+            config = FeatureConfig(kind.upper(), descriptors.dtype, size, kind, "L2")
+            self._writer = FeatureWriter(self._output, "descriptors", kind, config)
         expected = (num_keypoints, self._writer.config.dsize)
         if descriptors.shape != expected:
-            raise DataError(
+            raise self._error(
                 f"descriptors of {name_there!r} have the shape {descriptors.shape}, "
-                f"expected {expected}",
-                path=self._database.path,
+                f"expected {expected}"
             )
         self._writer.write(name, descriptors)
+
+    def _error(self, message: str) -> DataError:
+        return DataError(message, path=self._database.path)
 
 
 def _write_features(
     names: Sequence[str],
     image_names: Sequence[str],
     points: SparsePoints,
-    features: _SeenFeatures | _DatabaseFeatures,
+    features: Features,
     writer: FeatureWriter,
-) -> Observations:
-    """Write the keypoints of images ``names``, and return the observations with their numbers."""
+    *,
+    with_empty: bool,
+) -> tuple[Observations, int]:
+    """Write the keypoints of images ``names``; returns the observations and how many they are."""
     positions = {name: position for position, name in enumerate(image_names)}
     order = image_order(points.image_ids)
     ends = np.cumsum([0, *np.bincount(points.image_ids, minlength=len(image_names)).tolist()])
     numbers = np.zeros(len(order), np.int32)
     kept = np.zeros(len(order), np.bool_)
     new_ids = np.zeros(len(image_names), np.int32)
+    num_keypoints = 0
     for new_id, name in enumerate(names):
         position = positions[name]
         new_ids[position] = new_id
         # ascending, as the order among equals is kept
         rows = order[ends[position] : ends[position + 1]]
-        keypoints, numbers_of_image = features.of_image(name, rows)
-        if len(keypoints) or features.complete:
+        keypoints, numbers_of_image = features(name, rows)
+        num_keypoints += len(keypoints)
+        if len(keypoints) or with_empty:
             writer.write(name, keypoints)
         numbers[rows] = numbers_of_image
         kept[rows] = _first_time(points.point_ids[rows], numbers_of_image)
     selected = slice(None) if kept.all() else np.flatnonzero(kept)
-    return Observations(
+    observations = Observations(
         writer.type_name,
         tuple(names),
         points.point_ids[selected],
         new_ids[points.image_ids[selected]],
         numbers[selected],
     )
+    return observations, num_keypoints
 
 
 def _first_time(point_ids: NDArray[np.int64], numbers: NDArray[np.int64]) -> NDArray[np.bool_]:

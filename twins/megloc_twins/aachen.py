@@ -17,13 +17,8 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
 from megloc_kapture.datasets.aachen.layout import Layout
-from megloc_kapture.datasets.formats.colmap_model import (
-    ColmapImage,
-    ColmapModel,
-    write_colmap_binary,
-)
-from megloc_kapture.datasets.formats.nvm import NvmModel, write_nvm
-from megloc_kapture.datasets.formats.query_list import write_query_list
+from megloc_kapture.datasets.formats.colmap_model import ColmapImage, ColmapModel
+from megloc_kapture.datasets.formats.nvm import NvmModel
 from megloc_kapture.datasets.official import GROUND_TRUTH
 from megloc_kapture.io.kapture import write_sensors
 from megloc_kapture.stages.work import HERE, Work
@@ -31,6 +26,7 @@ from megloc_kapture.values import Camera
 from megloc_twins.dataset import ModelTwinOptions, SyntheticDataset, shuffled, write_lines
 from megloc_twins.frames import Frame, in_frame, kapture_records, looking_at, noise_seed
 from megloc_twins.lighting import Condition, day_lighting
+from megloc_twins.model_files import write_colmap_binary, write_nvm, write_query_list
 from megloc_twins.moving_objects import place_moving_objects
 from megloc_twins.options import SyntheticWorldOptions, stream
 from megloc_twins.portable import settled_pose

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.datasets.formats.inloc_files import COLOURS, POINTS, write_transformation
+from megloc_kapture.datasets.inloc.layout import COLOURS, POINTS
 from megloc_kapture.datasets.official import GROUND_TRUTH
 from megloc_kapture.io.dataset_tables import SIDE_TABLES, ImageGroup, write_groups
 from megloc_kapture.io.images import write_image
@@ -30,6 +30,7 @@ from megloc_twins.indoor_floors import (
     lamp_lighting,
     query_views,
 )
+from megloc_twins.model_files import write_transformation
 from megloc_twins.options import SyntheticWorldOptions, stream
 from megloc_twins.portable import product, settled
 from megloc_twins.rasterization import NO_SURFACE, sample_grid, visible_surfaces

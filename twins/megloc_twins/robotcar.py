@@ -7,19 +7,15 @@ until they are written in those that the twin publishes.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.datasets.formats.colmap_model import (
-    ColmapImage,
-    ColmapModel,
-    write_colmap_text,
-)
-from megloc_kapture.datasets.formats.nvm import NvmModel, write_nvm
+from megloc_kapture.datasets.formats.colmap_model import ColmapImage, ColmapModel
+from megloc_kapture.datasets.formats.nvm import NvmModel
 from megloc_kapture.datasets.formats.sparse_points import SparsePoints
 from megloc_kapture.datasets.official import GROUND_TRUTH
 from megloc_kapture.datasets.robotcar.images import RIG_ID
@@ -37,6 +33,7 @@ from megloc_twins.frames import (
     noise_seed,
 )
 from megloc_twins.lighting import road_lighting
+from megloc_twins.model_files import write_colmap_text, write_nvm
 from megloc_twins.moving_objects import place_moving_objects
 from megloc_twins.options import SyntheticWorldOptions, stream
 from megloc_twins.portable import settled_pose
@@ -356,7 +353,8 @@ def _write_models(
         rng = stream(options.seed, "robotcar", "points", place)
         points = drawn.points(here, points_per_frame=options.points_per_image, rng=rng)
         write_colmap_text(layout.individual_model(_location(place)), _colmap_model(here, points))
-        parts.append((points, positions))
+        own = np.array(positions, np.int32)
+        parts.append(replace(points, image_ids=own[points.image_ids]))
     merged = NvmModel(
         names=tuple(f"./{_png(frame.name)}" for frame in frames),
         focal_px=np.array([frame.camera.params[0] for frame in frames]),

@@ -1,4 +1,4 @@
-"""COLMAP's databases (sqlite): cameras, images, keypoints and descriptors; never written to.
+"""COLMAP's databases (sqlite): images, keypoints and descriptors; never written to.
 
 The file is opened as one that nobody changes (``immutable``): sqlite would otherwise put files of
 its own beside a database in WAL mode, which is what COLMAP's are, or fail in a read-only folder.
@@ -9,7 +9,6 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import quote
@@ -17,10 +16,8 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.datasets.formats.colmap_model import camera_of, model_of_id
 from megloc_kapture.datasets.formats.text_lines import check_plain, image_name
 from megloc_kapture.errors import DataError
-from megloc_kapture.values import Camera
 
 _SIZE_END = 2**31
 # x y; x y scale orientation; x y and an affine shape
@@ -48,20 +45,12 @@ _TYPES = {
 _SIFT_SIZE = 128
 
 
-@dataclass(frozen=True, slots=True)
-class DatabaseImage:
-    """One row of the table of images."""
-
-    image_id: int
-    camera_id: int
-
-
 class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
     """An open database. Use as a context manager.
 
     Attributes
     ----------
-    images : by name (without ``./`` before it), sorted.
+    images : name (without ``./`` before it) -> id, sorted by name.
 
     Raises
     ------
@@ -92,34 +81,10 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
             self._connection.close()
             raise
 
-    def cameras(self) -> dict[int, Camera]:
-        """All cameras by their ids.
-
-        Raises
-        ------
-        DataError : a camera of an unknown model, or parameters that are none.
-        """
-        cameras = {}
-        for camera_id, model_id, width, height, content in self._rows(
-            "cameras", "camera_id, model, width, height, params"
-        ):
-            what = f"camera {camera_id!r}"
-            self._check_integer(model_id, 0, _SIZE_END, f"{what}: model")
-            self._check_integer(width, 0, _SIZE_END, f"{what}: width")
-            self._check_integer(height, 0, _SIZE_END, f"{what}: height")
-            with self._about(what):
-                model, num_params = model_of_id(model_id)
-            params = self._array(content, "<f8", (num_params,), what)
-            with self._about(what):
-                cameras[int(camera_id)] = camera_of(model, width, height, params.tolist())
-        return dict(sorted(cameras.items()))
-
     def keypoints(self, name: str) -> NDArray[np.float32]:
         """Keypoints of an image, float32 (N, 2), COLMAP pixels; none is no error.
 
-        Raises
-        ------
-        DataError : no such image, or a row that does not fit its own sizes.
+        DataError where there is no such image, or a row does not fit its own sizes.
         """
         found = self._blob("keypoints", name)
         if found is None:
@@ -136,11 +101,8 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
     def feature_type(self) -> FeatureType | None:
         """The type of all features; None where there are no descriptors to tell it.
 
-        Types that we do not know have COLMAP's number in their name, and bytes.
-
-        Raises
-        ------
-        DataError : features of several types.
+        Types that we do not know have COLMAP's number in their name, and bytes. DataError where
+        there are several types.
         """
         if "descriptors" not in self._tables:
             return None
@@ -162,10 +124,7 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
     def descriptors(self, name: str, expected: FeatureType = _TYPES[_SIFT]) -> NDArray[Any] | None:
         """Descriptors of an image, (N, D) of the type's numbers; None where it has none.
 
-        Raises
-        ------
-        DataError : no such image, another type of descriptors, or a row that does not fit its own
-            sizes.
+        DataError where image or type are others, or a row does not fit its own sizes.
         """
         found = self._blob("descriptors", name)
         if found is None or found[0] == 0:
@@ -193,26 +152,29 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
         connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(longest, 2**31 - 1))
         return connection
 
-    def _read_images(self) -> dict[str, DatabaseImage]:
+    def _read_images(self) -> dict[str, int]:
         images = {}
         for image_id, name, camera_id in self._rows("images", "image_id, name, camera_id"):
             if not isinstance(name, str) or not isinstance(camera_id, int):
                 raise self._error(f"image {image_id!r} has no name or no camera")
-            with self._about(f"image {image_id}"):
+            try:
                 known = image_name(name)
+            except DataError as error:
+                raise self._error(f"image {image_id}: {error.message}") from None
             if known in images:
                 raise self._error(f"image {known!r} is listed twice")
-            images[known] = DatabaseImage(int(image_id), camera_id)
+            images[known] = int(image_id)
         return dict(sorted(images.items()))
 
     def _blob(self, table: str, name: str) -> tuple[int, int, Any] | None:
         """(rows, columns, content) of an image in a table; None where it is not there."""
-        image = self.images.get(name)
-        if image is None:
+        if name not in self.images:
             raise self._error(f"has no image {name!r}")
         if table not in self._tables:
             return None
-        found = list(self._rows(table, "rows, cols, data", f"WHERE image_id = {image.image_id:d}"))
+        found = list(
+            self._rows(table, "rows, cols, data", f"WHERE image_id = {self.images[name]:d}")
+        )
         if not found:
             return None
         rows, columns, content = found[0]
@@ -231,7 +193,7 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
     def _check_sift(self, name: str) -> None:
         """Since version 4 there may be others, whose numbers are no bytes."""
         if self._has_types():
-            condition = f"WHERE image_id = {self.images[name].image_id:d}"
+            condition = f"WHERE image_id = {self.images[name]:d}"
             kinds = [kind for (kind,) in self._rows("descriptors", "type", condition)]
             if kinds != [_SIFT]:
                 raise self._error(f"descriptors of {name!r} are not SIFT (type {kinds[0]!r})")
@@ -258,14 +220,6 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
             yield
         except (sqlite3.Error, UnicodeDecodeError, OverflowError) as error:
             raise self._error(f"no readable COLMAP database: {error}") from error
-
-    @contextmanager
-    def _about(self, what: str) -> Iterator[None]:
-        """Errors of values say which, and name the file."""
-        try:
-            yield
-        except DataError as error:
-            raise self._error(f"{what}: {error.message}") from None
 
     def _error(self, message: str) -> DataError:
         return DataError(message, path=self.path)

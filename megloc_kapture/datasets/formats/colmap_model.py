@@ -1,24 +1,28 @@
-"""A COLMAP model in memory, and its files: text (``cameras.txt``, ...) and binary."""
+"""A COLMAP model in memory, and the reader of its binary files (``cameras.bin``, ...).
+
+The reader is our own, as pycolmap's does not come back from damaged files.
+"""
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.datasets.formats.sparse_points import SparsePoints, Tracks, image_order
+from megloc_kapture.datasets.formats.sparse_points import SparsePoints, image_order
+from megloc_kapture.datasets.formats.text_lines import check_plain, image_name, reading
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.files import atomic_write
+from megloc_kapture.io.kapture.sensors import unit_quaternion
 from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, RigidTransform
 
-# the ids of camera models, as binary models and databases have them
-CAMERA_MODELS: tuple[str, ...] = tuple(CAMERA_MODEL_NUM_PARAMS)
-# the models that follow them since version 4, which kapture does not have; number of parameters
+# the models that follow kapture's since version 4; number of parameters
 _LATER_MODELS = {
     "RAD_TAN_THIN_PRISM_FISHEYE": 16,
     "SIMPLE_DIVISION": 4,
@@ -36,17 +40,12 @@ MAX_SIZE = 2**31 - 1  # of images, in px
 TEXT_FILES = ("cameras.txt", "images.txt", "points3D.txt")
 BINARY_FILES = ("cameras.bin", "images.bin", "points3D.bin")
 
-# records of the binary files, all little-endian
-BINARY_COUNT = struct.Struct("<Q")
-BINARY_CAMERA = struct.Struct("<IiQQ")  # id, model, width, height
-BINARY_IMAGE = struct.Struct("<I7dI")  # id, quaternion, translation, camera
+# rows of the binary files
 BINARY_FEATURE = np.dtype([("xy", "<f8", (2,)), ("point", "<i8")])
 BINARY_POINT = np.dtype(
     [("id", "<u8"), ("xyz", "<f8", (3,)), ("rgb", "u1", (3,)), ("error", "<f8"), ("length", "<u8")]
 )
-
-_NO_POINT = -1
-_UNKNOWN_ERROR_PX = -1.0
+_MAX_NAME_BYTES = 4096
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,12 +75,7 @@ class ColmapModel:
 
 
 def model_of_id(model_id: int) -> tuple[str, int]:
-    """Name and number of parameters of a camera model.
-
-    Raises
-    ------
-    DataError : no model has this number; does not name the file.
-    """
+    """Name and number of parameters of a camera model; DataError where none has this number."""
     counts = {**CAMERA_MODEL_NUM_PARAMS, **_LATER_MODELS}
     if not 0 <= model_id < len(counts):
         raise DataError(f"unknown camera model {model_id}")
@@ -90,12 +84,7 @@ def model_of_id(model_id: int) -> tuple[str, int]:
 
 
 def camera_of(model: str, width: int, height: int, params: Sequence[float]) -> Camera:
-    """The camera of a model of COLMAP's, in one that kapture has.
-
-    Raises
-    ------
-    DataError : kapture has none, or see :class:`Camera`; does not name the file.
-    """
+    """The camera in a model that kapture has; DataError, without a file, where it has none."""
     if len(params) == _LATER_MODELS.get(model) and model in _SAME_AS:
         same = _SAME_AS[model]
         more = (0.0,) * (CAMERA_MODEL_NUM_PARAMS[same] - len(params))
@@ -118,16 +107,16 @@ class ImageTable:
 
     Parameters
     ----------
-    tracks : as a points' file has them, with COLMAP's ids of the images; None: not read.
+    points : as their file has them, with COLMAP's ids of the images; None: not read.
     """
 
-    def __init__(self, cameras: dict[int, Camera], tracks: Tracks | None) -> None:
+    def __init__(self, cameras: dict[int, Camera], points: SparsePoints | None) -> None:
         self.cameras = cameras
-        self.tracks = tracks
+        self.points = points
         self._images: dict[int, ColmapImage] = {}
         self._names: set[str] = set()
         # the observations of each image, found once
-        image_ids = np.empty(0, np.int32) if tracks is None else tracks.image_ids
+        image_ids = np.empty(0, np.int32) if points is None else points.image_ids
         self._order = image_order(image_ids)
         ids, starts = np.unique(image_ids[self._order], return_index=True)
         rows = np.split(self._order, starts[1:]) if len(ids) else []
@@ -135,12 +124,7 @@ class ImageTable:
         self._xy_px = np.zeros((len(image_ids), 2), np.float32)
 
     def add(self, image: ColmapImage) -> None:
-        """Take one more image.
-
-        Raises
-        ------
-        DataError : its id or name is taken, or its camera unknown; does not name the file.
-        """
+        """Take one more image; DataError where id or name are taken, or its camera is unknown."""
         if image.image_id in self._images:
             raise DataError(f"image id {image.image_id} is listed twice")
         if image.name in self._names:
@@ -153,17 +137,11 @@ class ImageTable:
         self._names.add(image.name)
 
     def add_features(self, image_id: int, features_px: NDArray[np.floating[Any]]) -> None:
-        """Take what tracks need of all features (M, 2) of an image.
-
-        Raises
-        ------
-        DataError : a track names a feature that the image does not have, or that is not finite;
-            does not name the file.
-        """
-        if self.tracks is None or image_id not in self._rows:
+        """Take what tracks need of all features (M, 2) of an image; DataError where it is none."""
+        if self.points is None or image_id not in self._rows:
             return
         rows = self._rows[image_id]
-        ids = self.tracks.feature_ids[rows]
+        ids = self.points.feature_ids[rows]
         last = int(ids.max())
         if last >= len(features_px):
             raise DataError(
@@ -176,14 +154,9 @@ class ImageTable:
         self._xy_px[rows] = found
 
     def model(self, points_file: Path) -> ColmapModel:
-        """The model of all images, sorted by their ids.
-
-        Raises
-        ------
-        DataError : a track names an image that there is not; names ``points_file``.
-        """
+        """The model of all images, sorted by their ids; DataError where a track needs more."""
         images = tuple(image for _, image in sorted(self._images.items()))
-        if self.tracks is None:
+        if self.points is None:
             return ColmapModel(self.cameras, images, SparsePoints.none())
         known = {image.image_id: position for position, image in enumerate(images)}
         positions = np.zeros(len(self._order), np.int32)
@@ -193,134 +166,170 @@ class ImageTable:
                     f"a track names image {image_id}, which is not there", path=points_file
                 )
             positions[rows] = known[image_id]
-        return ColmapModel(self.cameras, images, self.tracks.points(positions, self._xy_px))
-
-
-def write_colmap_text(folder: Path, model: ColmapModel) -> None:
-    """Write ``cameras.txt``, ``images.txt`` and ``points3D.txt``; points get the ids 1, 2, ...
-
-    Numbers are the shortest texts that read back the same.
-
-    Raises
-    ------
-    ValueError : ids, names or tracks that a COLMAP model cannot hold.
-    OutputError : cannot be written.
-    """
-    _check_writable(model)
-    points = model.points.sorted_by_point()
-    with atomic_write(folder / TEXT_FILES[0]) as file:
-        file.write(b"# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]\n")
-        for camera_id, camera in sorted(model.cameras.items()):
-            params = " ".join(map(repr, camera.params))
-            row = f"{camera_id} {camera.model} {camera.width} {camera.height} {params}\n"
-            file.write(row.encode())
-    with atomic_write(folder / TEXT_FILES[1]) as file:
-        file.write(
-            b"# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME\n# POINTS2D[] as X Y POINT3D_ID\n"
+        return ColmapModel(
+            self.cameras, images, replace(self.points, image_ids=positions, xy_px=self._xy_px)
         )
-        for image, xy_px, seen in _features(model):
-            pose = (*image.cam_from_world.quat_wxyz, *image.cam_from_world.translation)
-            numbers = " ".join(repr(float(value)) for value in pose)
-            features = " ".join(
-                f"{x} {y} {point + 1 if point >= 0 else -1}"
-                for (x, y), point in zip(xy_px.astype(str).tolist(), seen.tolist(), strict=True)
-            )
-            row = f"{image.image_id} {numbers} {image.camera_id} {image.name}\n{features}\n"
-            file.write(row.encode())
-    ids = np.array([image.image_id for image in model.images], dtype=np.int64)
-    image_ids = ids[points.image_ids].tolist() if len(ids) else []
-    ends = np.searchsorted(points.point_ids, np.arange(len(points) + 1)).tolist()
-    elements = [
-        f" {image_id} {feature}"
-        for image_id, feature in zip(image_ids, points.feature_ids.tolist(), strict=True)
-    ]
-    with atomic_write(folder / TEXT_FILES[2]) as file:
-        file.write(b"# POINT3D_ID X Y Z R G B ERROR TRACK[] as IMAGE_ID POINT2D_IDX\n")
-        for row_number, (xyz, rgb) in enumerate(
-            zip(points.xyz.tolist(), points.rgb.tolist(), strict=True)
-        ):
-            numbers = " ".join([*map(repr, xyz), *map(str, rgb), repr(_UNKNOWN_ERROR_PX)])
-            track = "".join(elements[ends[row_number] : ends[row_number + 1]])
-            file.write(f"{row_number + 1} {numbers}{track}\n".encode())
 
 
-def write_colmap_binary(folder: Path, model: ColmapModel) -> None:
-    """Write ``cameras.bin``, ``images.bin`` and ``points3D.bin``; points get the ids 1, 2, ...
-
-    Raises
-    ------
-    ValueError : ids, names or tracks that a COLMAP model cannot hold.
-    OutputError : cannot be written.
-    """
-    _check_writable(model)
-    points = model.points.sorted_by_point()
-    with atomic_write(folder / BINARY_FILES[0]) as file:
-        file.write(BINARY_COUNT.pack(len(model.cameras)))
-        for camera_id, camera in sorted(model.cameras.items()):
-            model_id = CAMERA_MODELS.index(camera.model)
-            file.write(BINARY_CAMERA.pack(camera_id, model_id, camera.width, camera.height))
-            file.write(struct.pack(f"<{len(camera.params)}d", *camera.params))
-    with atomic_write(folder / BINARY_FILES[1]) as file:
-        file.write(BINARY_COUNT.pack(len(model.images)))
-        for image, xy_px, seen in _features(model):
-            pose = (*image.cam_from_world.quat_wxyz, *image.cam_from_world.translation)
-            file.write(BINARY_IMAGE.pack(image.image_id, *pose, image.camera_id))
-            file.write(image.name.encode() + b"\0" + BINARY_COUNT.pack(len(seen)))
-            features = np.empty(len(seen), BINARY_FEATURE)
-            features["xy"] = xy_px
-            features["point"] = np.where(seen >= 0, seen + 1, _NO_POINT)
-            file.write(features.tobytes())
-    ids = np.array([image.image_id for image in model.images], dtype="<i4")
-    pairs = np.empty((len(points.image_ids), 2), "<i4")
-    pairs[:, 0] = ids[points.image_ids] if len(ids) else 0
-    pairs[:, 1] = points.feature_ids
-    ends = np.searchsorted(points.point_ids, np.arange(len(points) + 1)).tolist()
-    heads = np.empty(len(points), BINARY_POINT)
-    heads["id"] = np.arange(1, len(points) + 1)
-    heads["xyz"], heads["rgb"], heads["error"] = points.xyz, points.rgb, _UNKNOWN_ERROR_PX
-    heads["length"] = np.diff(ends)
-    with atomic_write(folder / BINARY_FILES[2]) as file:
-        file.write(BINARY_COUNT.pack(len(points)))
-        for row, head in enumerate(heads):
-            file.write(head.tobytes() + pairs[ends[row] : ends[row + 1]].tobytes())
+# ---------------------------------------------------------------------------------- binary
 
 
-def _features(
-    model: ColmapModel,
-) -> Iterator[tuple[ColmapImage, NDArray[np.float32], NDArray[np.int64]]]:
-    """Each image with the features a file lists: where (M, 2), and the row of the point or -1.
+class BinaryFile(AbstractContextManager["BinaryFile"]):
+    """A little-endian file; every count is compared with the size before memory is taken."""
 
-    Features that the model does not know, because no point needs them, stand at (0, 0): their
-    rows keep the others' indices.
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        check_plain(path)
+        with reading(path):
+            self._file = open(path, "rb", buffering=1 << 20)  # noqa: SIM115
+        self.size = os.fstat(self._file.fileno()).st_size
+        self.position = 0
 
-    Raises
-    ------
-    ValueError : a feature sees two points, which no COLMAP model can say.
-    """
-    points = model.points
-    points.check_images(len(model.images))
-    order = image_order(points.image_ids)
-    ends = np.searchsorted(points.image_ids[order], np.arange(len(model.images) + 1)).tolist()
-    for position, image in enumerate(model.images):
-        rows = order[ends[position] : ends[position + 1]]
-        ids = points.feature_ids[rows]
-        if len(np.unique(ids)) != len(ids) or (len(ids) and ids.min() < 0):
-            raise ValueError(f"a feature of image {image.name!r} is negative or in two tracks")
-        size = int(ids.max()) + 1 if len(ids) else 0
-        xy_px = np.zeros((size, 2), np.float32)
-        seen = np.full(size, _NO_POINT, np.int64)
-        xy_px[ids] = points.xy_px[rows]
-        seen[ids] = points.point_ids[rows]
-        yield image, xy_px, seen
+    def __exit__(self, *raised: object) -> None:
+        self._file.close()
+
+    def error(self, message: str, position: int) -> DataError:
+        """The error for what stands at a position."""
+        return DataError(f"{message} (byte {position} of {self.size})", path=self.path)
+
+    @contextmanager
+    def named(self, start: int) -> Iterator[None]:
+        """Let DataErrors that name no file name this one and what begins at ``start``."""
+        try:
+            yield
+        except DataError as error:
+            raise (error if error.path else self.error(error.message, start)) from None
+
+    def take(self, num_bytes: int, what: str) -> bytes:
+        """The next bytes; DataError where the file ends before."""
+        start = self.position
+        self.skip(num_bytes, what)
+        with reading(self.path):
+            self._file.seek(start)
+            content = self._file.read(num_bytes)
+        if len(content) != num_bytes:  # it has become shorter
+            raise self.error(f"the file ends within {what}", start)
+        return content
+
+    def skip(self, num_bytes: int, what: str) -> None:
+        """Pass over the next bytes; DataError where the file ends before."""
+        if num_bytes > self.size - self.position:
+            raise self.error(f"the file ends within {what}", self.position)
+        self.position += num_bytes
+
+    def unpack(self, record: str, what: str) -> tuple[Any, ...]:
+        """The values of the next record, in the letters of :mod:`struct`."""
+        return struct.unpack(f"<{record}", self.take(struct.calcsize(f"<{record}"), what))
+
+    def count(self, what: str, item_bytes: int) -> int:
+        """The next uint64, a number of things that take ``item_bytes`` or more each."""
+        start = self.position
+        (number,) = self.unpack("Q", f"the number of {what}")
+        if number * item_bytes > self.size - self.position:
+            raise self.error(f"{number} {what} do not fit into the file", start)
+        return int(number)
+
+    def name(self, what: str) -> str:
+        """The next bytes up to a NUL, which is taken too; DataError without one soon."""
+        start = self.position
+        content = self.take(min(_MAX_NAME_BYTES + 1, self.size - start), what)
+        end = content.find(b"\0")
+        if end < 0:
+            raise self.error(f"{what} does not end", start)
+        self.position = start + end + 1
+        return content[:end].decode("utf-8", errors="surrogateescape")
+
+    def finish(self, what: str) -> None:
+        """Raise DataError where bytes follow after all that was to come."""
+        if self.position != self.size:
+            left = self.size - self.position
+            raise self.error(f"{left} bytes follow after the last of {what}", self.position)
 
 
-def _check_writable(model: ColmapModel) -> None:
-    """Raise ValueError where ids or names are not fit for a model's files."""
-    ids = [image.image_id for image in model.images]
-    if len(set(ids)) != len(ids) or not all(0 <= i <= MAX_IMAGE_ID for i in ids):
-        raise ValueError("image ids are out of range or not unique")
-    for image in model.images:
-        if image.camera_id not in model.cameras:
-            raise ValueError(f"image {image.name!r} has the unknown camera {image.camera_id}")
-        if not image.name or image.name.split() != [image.name] or "\0" in image.name:
-            raise ValueError(f"image name {image.name!r} has blanks, as COLMAP cannot read it")
+def read_binary_cameras(path: Path) -> dict[int, Camera]:
+    """Cameras by id; DataError names the file and the byte."""
+    cameras: dict[int, Camera] = {}
+    with BinaryFile(path) as file:
+        for _ in range(file.count("cameras", 40)):
+            start = file.position
+            with file.named(start):
+                camera_id, model_id, width, height = file.unpack("IiQQ", "a camera")
+                model, num_params = model_of_id(model_id)
+                values = file.unpack(f"{num_params}d", "a camera")
+                if camera_id in cameras:
+                    raise DataError(f"camera {camera_id} is listed twice")
+                if max(width, height) > MAX_SIZE:
+                    raise DataError(f"image size {width}x{height} is out of range")
+                cameras[camera_id] = camera_of(model, width, height, values)
+        file.finish("the cameras")
+    return cameras
+
+
+def add_binary_images(path: Path, images: ImageTable) -> None:
+    """Add the images and what tracks need of their features; DataError names file and byte."""
+    with BinaryFile(path) as file:
+        for _ in range(file.count("images", 73)):
+            with file.named(file.position):
+                image = _read_image(file)
+                images.add(image)
+                size = file.count("features", BINARY_FEATURE.itemsize) * BINARY_FEATURE.itemsize
+                if images.points is None:
+                    file.skip(size, "the features of an image")
+                else:
+                    content = file.take(size, "the features of an image")
+                    features = np.frombuffer(content, BINARY_FEATURE)["xy"]
+                    images.add_features(image.image_id, features)
+        file.finish("the images")
+
+
+def _read_image(file: BinaryFile) -> ColmapImage:
+    image_id, *pose, camera_id = file.unpack("I7dI", "an image")
+    name = image_name(file.name("an image's name"))
+    if image_id > MAX_IMAGE_ID:
+        raise DataError(f"image id {image_id} is out of range")
+    return ColmapImage(image_id, name, camera_id, finite_pose(pose, f"image {name!r}"))
+
+
+def finite_pose(values: Sequence[float], what: str) -> RigidTransform:
+    """The transform of qw qx qy qz tx ty tz; DataError where they are none."""
+    w, x, y, z, tx, ty, tz = values
+    if not np.isfinite([tx, ty, tz]).all():
+        raise DataError(f"the pose of {what} is not finite")
+    return RigidTransform(unit_quaternion((w, x, y, z)), (tx, ty, tz))
+
+
+def read_binary_points(path: Path) -> SparsePoints:
+    """Points, with COLMAP's ids of images; DataError names the file and byte or point."""
+    with BinaryFile(path) as file:
+        head = BINARY_POINT.itemsize
+        count = file.count("points", head)
+        begin = file.position
+        content = file.take(file.size - begin, "the points")
+        starts = np.empty(count, np.int64)
+        end = 0
+        for row in range(count):
+            starts[row] = end
+            length = int.from_bytes(content[end + head - 8 : end + head], "little")
+            end += head + 8 * length
+            if end > len(content):
+                raise file.error("the file ends within a point", begin + int(starts[row]))
+        file.position = begin + end
+        file.finish("the points")
+    data = np.frombuffer(content, np.uint8)
+    # byte by byte of the heads, as an index of all of them would take eight times the file
+    head_bytes = np.empty((count, head), np.uint8)
+    is_track = np.ones(len(data), np.bool_)
+    for offset in range(head):
+        head_bytes[:, offset] = data[starts + offset]
+        is_track[starts + offset] = False
+    heads = head_bytes.view(BINARY_POINT)[:, 0]
+    track = data[is_track].view("<i4").reshape(-1, 2)
+    finite = np.isfinite(heads["xyz"]).all(axis=1)
+    if not finite.all():
+        row = int(np.argmin(finite))
+        raise DataError(f"point {row + 1} of {count} is not finite", path=path)
+    if len(track) and track.min() < 0:
+        raise DataError("a track names an image or a feature that is out of range", path=path)
+    return SparsePoints.of_rows(
+        np.concatenate([heads["xyz"], heads["rgb"]], axis=1), heads["length"], track
+    )

@@ -70,12 +70,7 @@ class StereoCalibration:
 
 
 def read_calibration(folder: Path) -> StereoCalibration:
-    """Read the three files of a calibration folder that the undistorted images need.
-
-    Raises
-    ------
-    DataError : one of them is missing or broken; names file and line.
-    """
+    """Read the three files of a calibration folder; DataError names file and line."""
     cam0, cam1 = (read_pinhole(folder / name) for name in CAMERA_FILES)
     return StereoCalibration(cam0, cam1, read_rigid_matrix(folder / STEREO_FILE, comments=True))
 
@@ -83,9 +78,7 @@ def read_calibration(folder: Path) -> StereoCalibration:
 def read_pinhole(path: Path) -> Camera:
     """Read ``undistorted_calib_N.txt``: ``Pinhole fx fy cx cy 0 0 0 0``, the size, twice.
 
-    Raises
-    ------
-    DataError : another camera model, distortion, or sizes that differ; names file and line.
+    DataError names file and line, also of another camera model, distortion and other sizes.
     """
     lines = read_lines(path, comments=True)
     if len(lines) not in (2, 4):
@@ -119,10 +112,8 @@ def _size(line: Line) -> tuple[int, int]:
 
 
 def _pinhole(line: Line, width: int, height: int, params: Sequence[float]) -> Camera:
-    try:
+    with line.named():
         return Camera("PINHOLE", width, height, tuple(params))
-    except DataError as error:
-        raise line.error(error.message) from error
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,13 +138,8 @@ class GnssPose:
 def read_times(path: Path) -> list[int]:
     """Read ``times.txt``: timestamps (ns) of a recording's frames, published or not, in its order.
 
-    The time in seconds and the exposure that follow are checked and left: a float of seconds has
-    lost the last digits of the nanoseconds.
-
-    Raises
-    ------
-    DataError : a line other than ``timestamp seconds [exposure_ms]``, a timestamp given twice, or
-        no frame; names file and line.
+    The seconds and the exposure that follow are checked and left: a float of seconds has lost the
+    last digits of the nanoseconds. DataError names file and line.
     """
 
     def parse(line: Line) -> None:
@@ -167,11 +153,7 @@ def read_gnss_poses(path: Path) -> dict[int, GnssPose]:
     """Read ``GNSSPoses.txt``: rows by their timestamps (ns), in the file's order.
 
     A row has 8 to 11 fields, ``timestamp tx ty tz qx qy qz qw [scale [fusion_quality [v3]]]``; the
-    published header announces 11, the published rows have 10.
-
-    Raises
-    ------
-    DataError : a row that is none, a timestamp given twice, no row; names file and line.
+    published header announces 11, the published rows have 10. DataError names file and line.
     """
 
     def parse(line: Line) -> GnssPose:
@@ -187,10 +169,7 @@ def read_gnss_poses(path: Path) -> dict[int, GnssPose]:
 def read_poses(path: Path) -> dict[int, RigidTransform]:
     """Read ``poses.txt`` of the ECCV 2020 challenge: ``world_from_cam`` by timestamp (ns), metres.
 
-    Raises
-    ------
-    DataError : a row other than ``timestamp tx ty tz qx qy qz qw``, a timestamp given twice, no
-        row; names file and line.
+    Rows are ``timestamp tx ty tz qx qy qz qw``; DataError names file and line.
     """
     return _by_timestamp(path, "pose", lambda line: _transform(line, line.comma_fields[1:]))
 
@@ -198,11 +177,7 @@ def read_poses(path: Path) -> dict[int, RigidTransform]:
 def read_keyframe_accuracy(path: Path) -> set[int]:
     """Read ``keyframe_accuracy.txt``: timestamps (ns) of keyframes known to better than 0.05 m.
 
-    Text after a timestamp in its line is not documented and not looked at.
-
-    Raises
-    ------
-    DataError : a line that does not begin with a timestamp; names file and line.
+    Text after a timestamp is not documented and not looked at. DataError names file and line.
     """
     return {_timestamp(line, line.comma_fields[0]) for line in read_lines(path, comments=True)}
 
@@ -238,10 +213,8 @@ def _transform(line: Line, fields: Sequence[str]) -> RigidTransform:
     qx, qy, qz, qw = line.numbers_of(fields[3:], "rotation")
     if max(abs(tx), abs(ty), abs(tz)) > MAX_DISTANCE_M:
         raise line.error(f"the translation {tx:g} {ty:g} {tz:g} leads beyond the earth")
-    try:
+    with line.named():
         return RigidTransform(unit_quaternion((qw, qx, qy, qz)), (tx, ty, tz))
-    except DataError as error:
-        raise line.error(error.message) from None
 
 
 def _scale(line: Line, text: str) -> float:
@@ -274,12 +247,7 @@ def read_transformations(path: Path) -> Transformations:
     """Read ``Transformations.txt``: pairs of a line ``# name: ...`` and one of numbers.
 
     Names that are not needed are passed over. Blank lines between the pairs are there in some
-    releases and not in others.
-
-    Raises
-    ------
-    DataError : numbers without a name before them, a name given twice, one of the three transforms
-        absent or broken; names file and line.
+    releases and not in others. DataError names file and line.
     """
     found: dict[str, Line] = {}
     name: str | None = None
@@ -329,13 +297,7 @@ class Keyframe:
 
 
 def read_keyframe(path: Path) -> Keyframe:
-    """Read ``KeyFrame_<timestamp>.txt``.
-
-    Raises
-    ------
-    DataError : one of timestamp, camera, pose and point cloud is absent or broken, or the cloud
-        has another number of points than announced; names file and line.
-    """
+    """Read ``KeyFrame_<timestamp>.txt``; DataError names file and line."""
     lines = read_lines(path, blank=True)
     first = _first_lines(lines, path)
     timestamp = _timestamp(lines[first[_TIME_TAG]], lines[first[_TIME_TAG]].text)
@@ -423,13 +385,7 @@ def parse_relocalization_name(name: str) -> tuple[str | None, str] | None:
 
 
 def read_relocalization(path: Path) -> list[RelocalizationRow]:
-    """Read the pairs of a relocalization file, in its order.
-
-    Raises
-    ------
-    DataError : a line other than ``reference query [tx ty tz qx qy qz qw]``, or no pair; names
-        file and line.
-    """
+    """Read the pairs of a relocalization file, in its order; DataError names file and line."""
     rows = []
     for line in read_lines(path, comments=True):
         fields = line.comma_fields

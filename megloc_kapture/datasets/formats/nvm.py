@@ -18,14 +18,12 @@ from megloc_kapture.datasets.formats.sparse_points import (
     MAX_FEATURE_ID,
     PIXEL_END,
     SparsePoints,
-    Tracks,
     are_counts,
     check_pixel,
-    read_tracks,
+    read_points,
 )
 from megloc_kapture.datasets.formats.text_lines import Line, NumberRows, TextFile
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.files import atomic_write
 from megloc_kapture.io.kapture.sensors import unit_quaternion
 from megloc_kapture.values import RigidTransform
 
@@ -33,7 +31,6 @@ HEADER = "NVM_V3"
 FIXED_CALIBRATION = "FixedK"
 _CAMERA_FIELDS = "name, focal length, quaternion, centre, distortion, 0"
 _HEAD = 7  # fields of a point before its measurements
-_POINTS_AT_ONCE = 1 << 14
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,10 +149,8 @@ def _model(
     names: list[str], rows: list[tuple[Line, list[float]]], points: SparsePoints
 ) -> NvmModel:
     for line, row in rows:
-        try:
+        with line.named():
             row[1:5] = unit_quaternion((row[1], row[2], row[3], row[4]))
-        except DataError as error:
-            raise line.error(error.message) from None
     values = np.array([row for _, row in rows])
     return NvmModel(
         tuple(names),
@@ -171,13 +166,13 @@ def _read_points(file: TextFile, count: int, num_images: int, *, with_points: bo
     blocks = file.blocks(count, "points")
     if with_points:
         parse = partial(_parse_points, num_images=num_images)
-        return read_tracks(blocks, parse, partial(_check_point, num_images=num_images)).points()
+        return read_points(blocks, parse, partial(_check_point, num_images=num_images))
     for _ in blocks:
         pass
     return SparsePoints.none()
 
 
-def _parse_points(rows: NumberRows, num_images: int) -> Tracks | None:
+def _parse_points(rows: NumberRows, num_images: int) -> SparsePoints | None:
     """The points of rows of numbers; None where one is no point."""
     if (rows.lengths < _HEAD).any():
         return None
@@ -191,7 +186,7 @@ def _parse_points(rows: NumberRows, num_images: int) -> Tracks | None:
         and are_counts(observations[:, 1], MAX_FEATURE_ID + 1)
         and (np.abs(observations[:, 2:]) < PIXEL_END).all()
     )
-    return Tracks.of_rows(heads[:, :6], lengths, observations) if good else None
+    return SparsePoints.of_rows(heads[:, :6], lengths, observations) if good else None
 
 
 def _check_point(line: Line, num_images: int) -> None:
@@ -212,52 +207,3 @@ def _check_point(line: Line, num_images: int) -> None:
         line.count_of(fields[start], "image index", num_images)
         line.count_of(fields[start + 1], "feature index", MAX_FEATURE_ID + 1)
         check_pixel(line, fields[start + 2 : start + 4])
-
-
-def write_nvm(path: Path, model: NvmModel) -> None:
-    """Write one model as COLMAP's exporter does: k with NVM's sign, pixels as they are.
-
-    Numbers are the shortest texts that read back the same.
-
-    Raises
-    ------
-    ValueError : a name with blanks in it, or observations of no image or point.
-    OutputError : cannot be written.
-    """
-    for name in model.names:
-        if not name or name.split() != [name]:
-            raise ValueError(f"image name {name!r} has blanks and cannot stand in an NVM file")
-    points = model.points.sorted_by_point()
-    points.check_images(len(model.names))
-    cameras = np.column_stack(
-        [model.focal_px, model.quat_wxyz, model.centers, 0.0 - model.k_colmap]
-    )
-    with atomic_write(path) as file:
-        file.write(f"NVM_V3 \n \n{len(model.names)}  \n".encode())
-        for name, row in zip(model.names, cameras.tolist(), strict=True):
-            file.write(f"{name} {' '.join(map(repr, row))} 0\n".encode())
-        file.write(f"\n{len(points)}\n".encode())
-        for start in range(0, len(points), _POINTS_AT_ONCE):
-            file.write(_point_lines(points, start, start + _POINTS_AT_ONCE).encode())
-
-
-def _point_lines(points: SparsePoints, start: int, stop: int) -> str:
-    xyz, rgb = points.xyz[start:stop].tolist(), points.rgb[start:stop].tolist()
-    ends = np.searchsorted(points.point_ids, np.arange(start, start + len(xyz) + 1))
-    rows = slice(int(ends[0]), int(ends[-1]))
-    measurements = [
-        f" {image} {feature} {x} {y}"
-        for image, feature, (x, y) in zip(
-            points.image_ids[rows].tolist(),
-            points.feature_ids[rows].tolist(),
-            points.xy_px[rows].astype(str).tolist(),
-            strict=True,
-        )
-    ]
-    lines = []
-    offsets = (ends - ends[0]).tolist()
-    for (x, y, z), (r, g, b), begin, end in zip(xyz, rgb, offsets[:-1], offsets[1:], strict=True):
-        lines.append(
-            f"{x!r} {y!r} {z!r} {r} {g} {b} {end - begin}{''.join(measurements[begin:end])}\n"
-        )
-    return "".join(lines)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple, Self
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from megloc_kapture.datasets.formats.text_lines import Block, Line, NumberRows, shown
 from megloc_kapture.errors import DataError
@@ -64,43 +64,46 @@ class SparsePoints:
     @classmethod
     def none(cls) -> SparsePoints:
         """No points."""
-        return cls(
-            np.empty((0, 3)),
-            np.empty((0, 3), np.uint8),
-            np.empty(0, np.int64),
-            np.empty(0, np.int32),
-            np.empty(0, np.int32),
-            np.empty((0, 2), np.float32),
-        )
+        return cls.of_rows(np.empty((0, 6)), np.empty(0), np.empty((0, 2)))
 
     @classmethod
-    def joined(cls, parts: Sequence[tuple[SparsePoints, ArrayLike]]) -> SparsePoints:
-        """The points of several models of one world, behind one another.
-
-        An image that is in several models must have its features numbered the same in all.
+    def of_rows(
+        cls, heads: NDArray[Any], lengths: NDArray[Any], observations: NDArray[Any]
+    ) -> SparsePoints:
+        """Points from the numbers of a file, in its order.
 
         Parameters
         ----------
-        parts : each model's points, and the positions (I,) of its images in the common list.
+        heads : (P, 6): X Y Z R G B.
+        lengths : (P,), the number of observations of each.
+        observations : (O, 2) or (O, 4): image, feature and, where the file says it, x y; else
+            these are zeros.
         """
-        if not parts:
-            return cls.none()
-        firsts = np.cumsum([0, *(len(points) for points, _ in parts[:-1])])
+        xy_px = np.zeros((len(observations), 2), np.float32)
+        if observations.shape[1] == 4:
+            xy_px[:] = observations[:, 2:]
         return cls(
-            np.concatenate([points.xyz for points, _ in parts]),
-            np.concatenate([points.rgb for points, _ in parts]),
-            np.concatenate(
-                [points.point_ids + first for (points, _), first in zip(parts, firsts, strict=True)]
-            ),
-            np.concatenate(
-                [
-                    np.asarray(positions, dtype=np.int32)[points.image_ids]
-                    for points, positions in parts
-                ]
-            ),
-            np.concatenate([points.feature_ids for points, _ in parts]),
-            np.concatenate([points.xy_px for points, _ in parts]),
+            heads[:, :3].copy(),
+            heads[:, 3:].astype(np.uint8),
+            np.repeat(np.arange(len(heads), dtype=np.int64), lengths.astype(np.int64)),
+            observations[:, 0].astype(np.int32),
+            observations[:, 1].astype(np.int32),
+            xy_px,
         )
+
+    @classmethod
+    def joined(cls, parts: Sequence[SparsePoints]) -> SparsePoints:
+        """The points of several models of one list of images, behind one another.
+
+        An image that is in several models must have its features numbered the same in all.
+        """
+        firsts = np.cumsum([0, *(len(part) for part in parts)])
+        moved = [
+            replace(part, point_ids=part.point_ids + first)
+            for part, first in zip(parts, firsts[:-1], strict=True)
+        ] or [cls.none()]
+        names = [field.name for field in fields(cls)]
+        return cls(*(np.concatenate([getattr(part, n) for part in moved]) for n in names))
 
     def check_images(self, num_images: int) -> None:
         """Raise ValueError where ``image_ids`` do not count in a list of that many images."""
@@ -121,85 +124,20 @@ class SparsePoints:
         if not (ids[1:] < ids[:-1]).any():
             return self
         order = np.argsort(ids, kind="stable")
-        return SparsePoints(
-            self.xyz,
-            self.rgb,
-            ids[order],
-            self.image_ids[order],
-            self.feature_ids[order],
-            self.xy_px[order],
+        return replace(
+            self,
+            point_ids=ids[order],
+            image_ids=self.image_ids[order],
+            feature_ids=self.feature_ids[order],
+            xy_px=self.xy_px[order],
         )
 
 
-class Tracks(NamedTuple):
-    """Points in the order of a file, and the tracks of each behind one another.
-
-    Parameters
-    ----------
-    xyz, rgb, lengths : float64 (P, 3), uint8 (P, 3), int32 (P,), of the points.
-    image_ids, feature_ids : int32 (O,), of the observations.
-    xy_px : float32 (O, 2); zeros where the file does not say it.
-    """
-
-    xyz: NDArray[np.float64]
-    rgb: NDArray[np.uint8]
-    lengths: NDArray[np.int32]
-    image_ids: NDArray[np.int32]
-    feature_ids: NDArray[np.int32]
-    xy_px: NDArray[np.float32]
-
-    @classmethod
-    def joined(cls, parts: Sequence[Tracks]) -> Self:
-        """Those of the parts behind one another."""
-        if not parts:
-            parts = [cls.of_rows(np.empty((0, 6)), np.empty(0), np.empty((0, 2)))]
-        return cls(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
-
-    @classmethod
-    def of_rows(
-        cls,
-        heads: NDArray[np.float64],
-        lengths: NDArray[Any],
-        observations: NDArray[np.float64],
-    ) -> Self:
-        """From the numbers of a text.
-
-        Parameters
-        ----------
-        heads : (P, 6): X Y Z R G B.
-        observations : (O, 2) or (O, 4): image, feature and, where the text says it, x y.
-        """
-        xy_px = np.zeros((len(observations), 2), np.float32)
-        if observations.shape[1] == 4:
-            xy_px[:] = observations[:, 2:]
-        return cls(
-            heads[:, :3].copy(),
-            heads[:, 3:].astype(np.uint8),
-            lengths.astype(np.int32),
-            observations[:, 0].astype(np.int32),
-            observations[:, 1].astype(np.int32),
-            xy_px,
-        )
-
-    def points(
-        self, image_ids: NDArray[np.int32] | None = None, xy_px: NDArray[np.float32] | None = None
-    ) -> SparsePoints:
-        """The same as SparsePoints, with other images and pixels where they are given."""
-        return SparsePoints(
-            self.xyz,
-            self.rgb,
-            np.repeat(np.arange(len(self.lengths), dtype=np.int64), self.lengths),
-            self.image_ids if image_ids is None else image_ids,
-            self.feature_ids,
-            self.xy_px if xy_px is None else xy_px,
-        )
-
-
-def read_tracks(
+def read_points(
     blocks: Iterable[Block],
-    parse: Callable[[NumberRows], Tracks | None],
+    parse: Callable[[NumberRows], SparsePoints | None],
     check: Callable[[Line], None],
-) -> Tracks:
+) -> SparsePoints:
     """Read points of which each is a row of numbers.
 
     Parameters
@@ -220,7 +158,7 @@ def read_tracks(
                 check(line)
             raise DataError("not made of points", path=block.path, line=block.first_line)
         parts.append(found)
-    return Tracks.joined(parts)
+    return SparsePoints.joined(parts)
 
 
 def are_counts(values: NDArray[np.float64], end: float) -> bool:

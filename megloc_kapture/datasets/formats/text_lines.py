@@ -2,8 +2,8 @@
 
 CRLF line ends, blank lines, a byte order mark and a missing end of the last line are accepted in
 every file. Small files are read whole, line by line. Large ones are a :class:`TextFile`, whose rows
-of numbers become arrays block by block; where a block is not made of numbers, the reader of the
-format goes through its lines one by one for the one to name.
+of numbers become arrays block by block; where a block is not made of numbers, the format's reader
+checks its lines one by one.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import re
 import stat
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.files import check_relative, read_text
+from megloc_kapture.io.kapture.sensors import unit_quaternion
 from megloc_kapture.io.kapture.text import FLOAT_PATTERN
 from megloc_kapture.values import RigidTransform
 
@@ -72,6 +73,14 @@ class Line:
         """The error for this line."""
         return DataError(message, path=self.path, line=self.number)
 
+    @contextmanager
+    def named(self) -> Iterator[None]:
+        """Let DataErrors that name no file name this line."""
+        try:
+            yield
+        except DataError as error:
+            raise (error if error.path is not None else self.error(error.message)) from None
+
     def expect(self, fields: Sequence[str], counts: int | Iterable[int], form: str) -> None:
         """Raise DataError where there is another number of fields; ``form`` lists them."""
         expected = (counts,) if isinstance(counts, int) else tuple(counts)
@@ -108,18 +117,17 @@ class Line:
 
     def name_of(self, text: str) -> str:
         """An image's name, see :func:`image_name`."""
-        try:
+        with self.named():
             return image_name(text)
-        except DataError as error:
-            raise self.error(error.message) from None
+
+    def pose_of(self, texts: Sequence[str]) -> RigidTransform:
+        """The transform of qw qx qy qz tx ty tz; DataError where they are none."""
+        w, x, y, z, tx, ty, tz = self.numbers_of(texts, "pose")
+        with self.named():
+            return RigidTransform(unit_quaternion((w, x, y, z)), (tx, ty, tz))
 
     def rigid_transform(self, matrix: NDArray[np.float64]) -> RigidTransform:
-        """The transform of a 4x4 matrix.
-
-        Raises
-        ------
-        DataError : no rotation, another last row than 0 0 0 1, or a position beyond the earth.
-        """
+        """The transform of a 4x4 matrix; DataError where it is none or leads beyond the earth."""
         rotation, position = matrix[:3, :3], matrix[:3, 3]
         # huge elements may overflow; what comes of it is not below the limit
         with np.errstate(over="ignore", invalid="ignore"):
@@ -160,9 +168,7 @@ def read_lines(path: Path, *, blank: bool = False, comments: bool = False) -> li
 def read_rigid_matrix(path: Path, *, comments: bool = False) -> RigidTransform:
     """The transform of a file with a 4x4 matrix, four lines of numbers between commas or blanks.
 
-    Raises
-    ------
-    DataError : other lines, or no rigid transform; names file and line.
+    DataError names file and line.
     """
     lines = read_lines(path, comments=comments)
     for index, line in enumerate(lines):
@@ -183,9 +189,7 @@ def read_rigid_matrix(path: Path, *, comments: bool = False) -> RigidTransform:
 def image_name(text: str) -> str:
     """The name of an image, a plain path below the images' folder; without ``./`` before it.
 
-    Raises
-    ------
-    DataError : not UTF-8, or a path that is not plain; does not name the file.
+    DataError, which does not name the file, where it is not UTF-8 or not plain.
     """
     try:
         text.encode()
@@ -204,20 +208,23 @@ def shown(text: str) -> str:
 
 
 def check_plain(path: Path) -> None:
-    """Refuse what is no file: a pipe or a device might never end.
-
-    Raises
-    ------
-    DataError : missing, not a plain file, or out of reach.
-    """
-    try:
-        mode = os.stat(path).st_mode
-    except FileNotFoundError as error:
-        raise DataError("file is missing", path=path) from error
-    except OSError as error:
-        raise DataError(f"cannot read: {error.strerror}", path=path) from error
+    """Raise DataError where a file is missing or none: a pipe or a device might never end."""
+    with reading(path):
+        try:
+            mode = os.stat(path).st_mode
+        except FileNotFoundError as error:
+            raise DataError("file is missing", path=path) from error
     if not stat.S_ISREG(mode):
         raise DataError("not a plain file", path=path)
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Make an OSError a DataError that names the file or folder."""
+    try:
+        yield
+    except OSError as error:
+        raise DataError(f"cannot read: {error.strerror}", path=path) from error
 
 
 # ------------------------------------------------------------------------------------ large files
@@ -268,13 +275,7 @@ class Block(NamedTuple):
 
 
 class NumberRows(NamedTuple):
-    """Rows of numbers.
-
-    Parameters
-    ----------
-    values : float64 (N,), the rows behind one another, others between them.
-    starts, lengths : int64 (R,), of the rows in ``values``.
-    """
+    """Rows of numbers: where ``starts`` and ``lengths`` (R,) say, in ``values`` (N,)."""
 
     values: NDArray[np.float64]
     starts: NDArray[np.int64]
@@ -311,10 +312,8 @@ class TextFile(AbstractContextManager["TextFile"]):
         self.last_line = 0
         self._block_bytes = block_bytes
         check_plain(self.path)
-        try:
+        with reading(self.path):
             self._file = open(self.path, "rb")  # noqa: SIM115
-        except OSError as error:
-            raise DataError(f"cannot read: {error.strerror}", path=path) from error
         if self._read(len(_BYTE_ORDER_MARK)) != _BYTE_ORDER_MARK:
             self._file.seek(0)
 
@@ -351,12 +350,7 @@ class TextFile(AbstractContextManager["TextFile"]):
         return block
 
     def blocks(self, num_rows: int, what: str) -> Iterator[Block]:
-        """Blocks of ``num_rows`` lines that are not blank.
-
-        Raises
-        ------
-        DataError : the file ends before; says after how many of ``what``.
-        """
+        """Blocks of ``num_rows`` lines that are not blank; DataError where the file ends before."""
         left = num_rows
         while left:
             block = self.block(left)
@@ -374,16 +368,12 @@ class TextFile(AbstractContextManager["TextFile"]):
         self._file.close()
 
     def _read(self, size: int) -> bytes:
-        try:
+        with reading(self.path):
             return self._file.read(size)
-        except OSError as error:
-            raise DataError(f"cannot read: {error.strerror}", path=self.path) from error
 
     def _rest_of_line(self) -> bytes:
-        try:
+        with reading(self.path):
             content = self._file.readline(_MAX_LINE_BYTES)
-        except OSError as error:
-            raise DataError(f"cannot read: {error.strerror}", path=self.path) from error
         if len(content) == _MAX_LINE_BYTES:
             message = f"a line of more than {_MAX_LINE_BYTES} bytes"
             raise DataError(message, path=self.path, line=self.last_line + 1)

@@ -24,13 +24,11 @@ from megloc_kapture.datasets.formats.fourseasons_files import (
 from megloc_kapture.datasets.fourseasons.images import (
     ChallengeTables,
     ImageRecords,
-    challenge_tables,
-    write_depth_maps,
-)
-from megloc_kapture.datasets.fourseasons.poses import (
     KeyframePoses,
     LocalFrame,
+    challenge_tables,
     read_keyframe_poses,
+    write_depth_maps,
 )
 from megloc_kapture.datasets.fourseasons.recordings import (
     ACCURACY,
@@ -55,11 +53,13 @@ from megloc_kapture.datasets.official import (
 )
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.protocols import protocol_of
-from megloc_kapture.io.dataset_tables import ImageGroup, Protocol
+from megloc_kapture.io.dataset_tables import ImageGroup
 from megloc_kapture.io.kapture import KaptureData
 from megloc_kapture.values import Options, RigidTransform
 
 NAME = "4seasons"
+# of other long-term benchmarks, where no challenge asks
+_GENERAL_THRESHOLDS = ((0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
 
 
 class FourSeasonsOptions(Options):
@@ -166,32 +166,36 @@ class FourSeasons:
         truth: dict[tuple[int, str], RigidTransform] = {}
         cars: dict[str, str] = {}
         for recording in chosen.queries:
-            known = self._query_poses(recording, frame, missing)
+            found = self._poses(recording, missing) if frame.earth_from_scene else None
+            known = {} if found is None else frame.cams_from_local(found)
             times = self._query_times(recording, known, chosen.files, missing)
             calibration = recording.calibration(root)
             cars[recording.name] = query.add(recording, calibration, times)
             truth |= {(time, cars[recording.name]): pose for time, pose in known.items()}
         tables = challenge_tables(chosen.files, chosen.recordings, local, mapping.data, query.data)
         truth |= {(time, cars[name]): pose for (name, time), pose in tables.truth.items()}
-        groups = image_groups(chosen, mapping.data, query.data)
+        groups = _image_groups(chosen, mapping.data, query.data)
         beside, beside_groups = read_ground_truth(root, query.data, frame.world())
         for image in groups.keys() & beside_groups.keys():
             condition = beside_groups[image].condition or groups[image].condition
             groups[image] = groups[image].model_copy(update={"condition": condition})
         query_gt = _known_poses(query.data, truth, beside)
         used = (*chosen.references, *chosen.queries)
+        rules: dict[str, Any] = {"conditions": tuple(one.name for one in chosen.queries)}
+        if not chosen.files:  # without a challenge nobody takes a pose file: absolute poses in ECEF
+            rules |= {"thresholds": _GENERAL_THRESHOLDS, "pose_file": "ltvl"}
         return OfficialDataset(
             mapping=mapping.data,
             query=query.data,
             query_gt=query_gt,
             links={recording.name: recording.folder for recording in used},
-            protocol=protocol(NAME, chosen.queries, challenge=bool(chosen.files)),
+            protocol=protocol_of(NAME).model_copy(update=rules),
             groups=groups,
             priors=tables.priors,
             relocalization=tables.pairs,
             world=frame.world(),
-            summary=summary(chosen, poses, mapping.data, query.data, query_gt),
-            remarks=remarks(poses, frame, tables, self.options.min_fusion_quality),
+            summary=_summary(chosen, poses, mapping.data, query.data, query_gt),
+            remarks=_remarks(poses, frame, tables, self.options.min_fusion_quality),
             missing=missing,
             write_more=partial(write_depth_maps, mapping.depth_jobs)
             if self.options.depth
@@ -201,18 +205,21 @@ class FourSeasons:
     def _select(self, root: Path, missing: Missing) -> Selection:
         return select(root, self.options.reference, self.options.queries, missing)
 
+    def _poses(
+        self, recording: Recording, missing: Missing, *, on_earth: bool = True
+    ) -> KeyframePoses | None:
+        quality = self.options.min_fusion_quality
+        return read_keyframe_poses(
+            recording, min_fusion_quality=quality, on_earth=on_earth, missing=missing
+        )
+
     def _reference_poses(
         self, references: Sequence[Recording], missing: Missing
     ) -> dict[str, KeyframePoses]:
         found = {}
         for recording in references:
             # the frame of a poses.txt is its recording's own
-            poses = read_keyframe_poses(
-                recording,
-                min_fusion_quality=self.options.min_fusion_quality,
-                on_earth=len(references) > 1,
-                missing=missing,
-            )
+            poses = self._poses(recording, missing, on_earth=len(references) > 1)
             if poses is None:
                 raise DataError(
                     f"no poses for the map: {GNSS_POSES} and {TRANSFORMATIONS} are needed"
@@ -248,19 +255,6 @@ class FourSeasons:
                 )
             mapping.add_depth(recording, calibration, scales)
 
-    def _query_poses(
-        self, recording: Recording, frame: LocalFrame, missing: Missing
-    ) -> dict[int, RigidTransform]:
-        if frame.earth_from_scene is None:
-            return {}
-        poses = read_keyframe_poses(
-            recording,
-            min_fusion_quality=self.options.min_fusion_quality,
-            on_earth=True,
-            missing=missing,
-        )
-        return {} if poses is None else frame.cams_from_local(poses)
-
     def _query_times(
         self,
         recording: Recording,
@@ -293,11 +287,7 @@ def _known_poses(
     return with_poses(query, poses) if poses else None
 
 
-# of other long-term benchmarks, where no challenge asks
-GENERAL_THRESHOLDS = ((0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
-
-
-def image_groups(
+def _image_groups(
     chosen: Selection, mapping: KaptureData, query: KaptureData
 ) -> dict[str, ImageGroup]:
     """Groups of all images: a query's condition is its recording.
@@ -321,18 +311,7 @@ def image_groups(
     return groups
 
 
-def protocol(name: str, queries: Sequence[Recording], *, challenge: bool) -> Protocol:
-    """The scoring rules: the MLAD challenges' where one is there, else those of long-term sets.
-
-    Without a challenge nobody takes a pose file; ours has absolute poses in ECEF then.
-    """
-    own: dict[str, Any] = {"conditions": tuple(recording.name for recording in queries)}
-    if not challenge:
-        own |= {"thresholds": GENERAL_THRESHOLDS, "pose_file": "ltvl"}
-    return protocol_of(name).model_copy(update=own)
-
-
-def summary(
+def _summary(
     chosen: Selection,
     poses: Mapping[str, KeyframePoses],
     mapping: KaptureData,
@@ -365,7 +344,7 @@ def summary(
     return counts
 
 
-def remarks(
+def _remarks(
     poses: Mapping[str, KeyframePoses],
     frame: LocalFrame,
     tables: ChallengeTables,

@@ -18,7 +18,8 @@ from megloc_kapture.datasets.formats.fourseasons_files import (
     read_relocalization,
     timestamp_of_name,
 )
-from megloc_kapture.datasets.kapture_form import is_kapture
+from megloc_kapture.datasets.formats.text_lines import reading
+from megloc_kapture.datasets.kapture_folders import is_kapture
 from megloc_kapture.datasets.official import Count, Missing
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.kapture import KaptureFolder
@@ -60,12 +61,7 @@ class Recording:
 
     @property
     def has_poses(self) -> bool:
-        """True where poses of its keyframes are published and here.
-
-        Raises
-        ------
-        DataError : a broken kapture folder.
-        """
+        """True where poses of its keyframes are published and here."""
         if self.kapture is not None:
             return bool(self.kapture.read().trajectories)
         return (self.folder / GNSS_POSES).is_file() or (self.folder / POSES).is_file()
@@ -87,27 +83,15 @@ class Recording:
         return self.folder / KEYFRAMES / f"KeyFrame_{timestamp}.txt"
 
     def times_on_disk(self, camera: str) -> list[int]:
-        """Timestamps (ns) of a camera's undistorted images, sorted.
-
-        Raises
-        ------
-        DataError : the folder cannot be read.
-        """
+        """Timestamps (ns) of a camera's undistorted images, sorted."""
         folder = self.folder / _IMAGES / camera
-        try:
+        with reading(folder):
             names = os.listdir(folder) if folder.is_dir() else []
-        except OSError as error:
-            raise DataError(f"cannot read: {error.strerror}", path=folder) from error
         times = (timestamp_of_name(n.removesuffix(".png")) for n in names if n.endswith(".png"))
         return sorted(time for time in times if time is not None)
 
     def calibration(self, root: Path) -> StereoCalibration:
-        """The cameras of its undistorted images.
-
-        Raises
-        ------
-        DataError : broken, or there is none; names the file.
-        """
+        """The cameras of its undistorted images; DataError names the file."""
         if self.kapture is None:
             return read_calibration(self.calibration_folder(root))
         data = self.kapture.read()
@@ -133,12 +117,7 @@ class Recording:
         return [folder / name for name in (*CAMERA_FILES, STEREO_FILE)]
 
     def calibration_folder(self, root: Path) -> Path:
-        """The folder of a calibration: its own, or the dataset's.
-
-        Raises
-        ------
-        DataError : there is none.
-        """
+        """The folder of a calibration: its own, or the dataset's; DataError without one."""
         for folder in (self.folder, root):
             for name in CALIBRATION_FOLDERS:
                 if (folder / name).is_dir():
@@ -176,12 +155,7 @@ class RelocalizationFile:
 
 
 def find_recordings(root: Path) -> dict[str, Recording]:
-    """The recordings below a dataset's root by name, sorted.
-
-    Raises
-    ------
-    DataError : the root cannot be read, or has no recording.
-    """
+    """The recordings below a dataset's root by name, sorted; DataError where there is none."""
     found = {
         folder.name: Recording(folder.name, folder)
         for folder in _folders(root)
@@ -209,20 +183,15 @@ def _kapture_recordings(root: Path) -> dict[str, Recording]:
 def _folders(root: Path) -> list[Path]:
     if not root.is_dir():
         raise DataError("no such folder", path=root)
-    try:
+    with reading(root):
         return sorted(path for path in root.iterdir() if path.is_dir())
-    except OSError as error:
-        raise DataError(f"cannot read: {error.strerror}", path=root) from error
 
 
 def find_relocalization_files(root: Path, recordings: Iterable[str]) -> list[RelocalizationFile]:
     """The relocalization files below a dataset's root, sorted by source and name.
 
-    A file whose name leaves out its source must lie in the source's folder.
-
-    Raises
-    ------
-    DataError : two of them have one name, and so would the files to hand in.
+    A file whose name leaves out its source must lie in the source's folder. DataError where two
+    have one name, for so would the files to hand in.
     """
     known = set(recordings)
     found: dict[str, RelocalizationFile] = {}

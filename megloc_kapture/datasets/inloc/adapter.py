@@ -6,14 +6,14 @@ its scan stands in the floor; its depth from the points the scanner measured in 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.datasets.formats.inloc_files import Cutout
-from megloc_kapture.datasets.inloc.depth import DepthJob, depth_camera, write_depth_maps
 from megloc_kapture.datasets.inloc.layout import (
     DISTRACTOR_FLOORS,
     FLOORS,
@@ -21,8 +21,10 @@ from megloc_kapture.datasets.inloc.layout import (
     PITCHES_DEG,
     POINTS_SUFFIX,
     YAWS_DEG,
+    Cutout,
     Layout,
     Scan,
+    read_cutout_points,
 )
 from megloc_kapture.datasets.official import (
     Count,
@@ -36,7 +38,7 @@ from megloc_kapture.datasets.official import (
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.protocols import protocol_of
 from megloc_kapture.io.dataset_tables import ImageGroup, World
-from megloc_kapture.io.images import image_size
+from megloc_kapture.io.images import image_size, write_depth_map
 from megloc_kapture.io.kapture import KaptureData, Sensor
 from megloc_kapture.values import Camera, Options, RigidTransform
 
@@ -51,6 +53,9 @@ _PUBLISHED_SCANS = {"DUC1": 50, "DUC2": 80, "CSE3": 7, "CSE4": 75, "CSE5": 65}
 _PUBLISHED_QUERIES = 356
 _EXIF_ORIENTATION = 0x0112
 _MANY_GIGABYTES = 5
+# the points of another image are off by a good part of its width, those of its own by little
+_MAX_OFFSET = 0.03
+_CHECKED_EVERY = 8  # rows and columns
 
 
 class InLocOptions(Options):
@@ -177,8 +182,8 @@ class InLoc:
                 "DUC1 and DUC2 apart, here all queries stand together."
             )
         step = self.options.depth_step
-        depths = [depth_camera(job.camera, step) for job in map_.depth_jobs]
-        gigabytes = sum(4 * camera.width * camera.height for camera in depths) / 1e9
+        cameras = [depth_camera(job.camera, step) for job in map_.depth_jobs]
+        gigabytes = sum(4 * camera.width * camera.height for camera in cameras) / 1e9
         if gigabytes > _MANY_GIGABYTES:
             remarks.append(
                 f"The depth maps take {gigabytes:.0f} GB; with depth_step = {4 * step} it would "
@@ -197,15 +202,10 @@ class InLoc:
         return remarks
 
 
-def cutout_camera(width: int, height: int) -> Camera:
-    """The camera of cutouts of a size: 60 degrees wide."""
-    focal = _CUTOUT_FOCAL_SHARE * width
-    return Camera("SIMPLE_PINHOLE", width, height, (focal, width / 2, height / 2))
-
-
-def query_camera(width: int, height: int) -> Camera:
-    """The telephone's camera, its images upright or not."""
-    focal = _FOCAL_SHARE * max(width, height)
+def _camera(path: Path, focal_share: float, *, longer: bool) -> Camera:
+    """The camera of an image, of a focal length in parts of its width or longer side."""
+    width, height = image_size(path)
+    focal = focal_share * (max(width, height) if longer else width)
     return Camera("SIMPLE_PINHOLE", width, height, (focal, width / 2, height / 2))
 
 
@@ -229,7 +229,7 @@ class _Map:
                 continue
             pose = poses[cutout.image]
             image = f"{CUTOUTS}/{scan.location}/{cutout.image}"
-            camera = cutout_camera(*image_size(scan.folder / cutout.image))
+            camera = _camera(scan.folder / cutout.image, _CUTOUT_FOCAL_SHARE, longer=False)
             timestamp = _timestamp(scan, cutout)
             self.groups[image] = ImageGroup(frame=scan.floor, location=scan.location)
             sensor = self._sensor(camera)
@@ -282,7 +282,7 @@ def _queries(names: list[str], folder: Path) -> tuple[KaptureData, int]:
     data, turned = KaptureData(), 0
     for timestamp, name in enumerate(names):
         path = folder / last_part(name)
-        camera = query_camera(*image_size(path))
+        camera = _camera(path, _FOCAL_SHARE, longer=True)
         sensor = f"iphone7_{camera.width}x{camera.height}"
         data.sensors[sensor] = Sensor.from_camera(camera, name=sensor)
         data.records_camera[timestamp, sensor] = name
@@ -298,3 +298,76 @@ def _is_turned(path: Path) -> bool:
             return image.getexif().get(_EXIF_ORIENTATION, 1) != 1
     except Exception:  # pillow raises many kinds on broken metadata, which nobody needs
         return False
+
+
+# ----------------------------------------------------------------------------------- depth
+
+
+@dataclass(frozen=True)
+class DepthJob:
+    """One depth map to make: of a cutout's points, for its camera, as a record's file."""
+
+    points: Path
+    cutout: Cutout
+    camera: Camera
+    record: str
+
+
+def depth_camera(camera: Camera, step: int) -> Camera:
+    """The SIMPLE_PINHOLE camera of every ``step``-th pixel of each row and column, from the first.
+
+    The centre of a kept pixel is that of the pixel it was: (0.5, 0.5) stays where it is.
+    """
+    focal, cx, cy = camera.params
+    return Camera(
+        "SIMPLE_PINHOLE",
+        -(-camera.width // step),
+        -(-camera.height // step),
+        (focal / step, (cx - 0.5) / step + 0.5, (cy - 0.5) / step + 0.5),
+    )
+
+
+def cutout_depth(job: DepthJob, step: int) -> NDArray[np.float32]:
+    """Depth of a cutout's measured points along its camera's axis.
+
+    Returns
+    -------
+    float32 (H, W) of :func:`depth_camera`, metres; 0 where nothing came back.
+
+    Raises
+    ------
+    DataError : the file is broken, or its points are not those of this cutout.
+    """
+    camera = job.camera
+    points = read_cutout_points(job.points, camera.width, camera.height)
+    rotation = job.cutout.cam_from_scan().rotation_matrix()
+    _check_place(job, points[::_CHECKED_EVERY, ::_CHECKED_EVERY] @ rotation.T)
+    z = points[::step, ::step] @ rotation[2]
+    return np.where(np.isfinite(z) & (z > 0), z, 0.0).astype(np.float32)
+
+
+def write_depth_maps(jobs: Sequence[DepthJob], step: int, records: Path) -> None:
+    """Write depth maps below ``records``, see :func:`cutout_depth`; OutputError where it fails."""
+    for job in jobs:
+        write_depth_map(records / job.record, cutout_depth(job, step))
+
+
+def _check_place(job: DepthJob, in_camera: NDArray[np.float64]) -> None:
+    """Refuse points that are not seen where they stand in the file."""
+    focal, cx, cy = job.camera.params
+    rows, columns = (np.arange(n) * _CHECKED_EVERY + 0.5 for n in in_camera.shape[:2])
+    seen = np.isfinite(in_camera).all(axis=2)
+    if not seen.any():
+        return
+    x, y, z = in_camera[seen].T
+    at_x = np.broadcast_to(columns, seen.shape)[seen] - cx
+    at_y = np.broadcast_to(rows[:, None], seen.shape)[seen] - cy
+    with np.errstate(all="ignore"):
+        offset = np.hypot(focal * x / z - at_x, focal * y / z - at_y)
+    offset_px = float(np.median(np.where((z > 0) & np.isfinite(offset), offset, np.inf)))
+    if offset_px > _MAX_OFFSET * job.camera.width:
+        raise DataError(
+            f"its points lie {offset_px:.0f} px (median) from their pixels in {job.cutout.image}: "
+            "not the scan of this image",
+            path=job.points,
+        )

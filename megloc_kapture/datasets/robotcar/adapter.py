@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, model_validator
 
 from megloc_kapture.datasets.formats.sparse_points import SparsePoints
-from megloc_kapture.datasets.kapture_form import image_files, without_model
+from megloc_kapture.datasets.kapture_folders import without_model
 from megloc_kapture.datasets.official import (
     Count,
     DatasetCard,
@@ -21,37 +23,77 @@ from megloc_kapture.datasets.official import (
 from megloc_kapture.datasets.reference_map import ReferenceModel
 from megloc_kapture.datasets.robotcar.images import (
     Car,
-    RobotCarOptions,
+    LocationFolders,
     Selection,
     mapping_data,
-    query_data,
     query_truth,
     read_car,
     select,
-    with_rig_of_model,
 )
-from megloc_kapture.datasets.robotcar.kapture_form import LocationFolders
 from megloc_kapture.datasets.robotcar.layout import (
     CAMERAS,
-    NUM_LOCATIONS,
-    NUM_QUERIES,
-    NUM_REFERENCE_IMAGES,
-    NUM_REGISTERED,
-    NUM_TEST,
-    NUM_TRAIN,
-    QUERIES_PER_CAMERA,
+    REFERENCE_CONDITION,
     SCORED_CAMERA,
-    ImageFiles,
     Layout,
+    ModelChoice,
+    image_finder,
     read_points,
     read_queries,
     read_reference,
 )
 from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.protocols import protocol_of
-from megloc_kapture.io.dataset_tables import ImageGroup, Protocol, World
+from megloc_kapture.io.dataset_tables import ImageGroup, World
+from megloc_kapture.values import Options
 
-__all__ = ["RobotCar", "RobotCarOptions"]
+# what is published, or was counted by others in the published lists
+_NUM_LOCATIONS = 49
+_NUM_REFERENCE_IMAGES = 26_121
+_NUM_REGISTERED = 20_862
+_NUM_QUERIES = 11_934
+_NUM_TRAIN, _NUM_TEST = 1_906, 1_872
+_QUERIES_PER_CAMERA = {
+    "dawn": 483,
+    "dusk": 394,
+    "overcast-summer": 463,
+    "overcast-winter": 390,
+    "rain": 421,
+    "snow": 489,
+    "sun": 460,
+    "night": 438,
+    "night-rain": 440,
+}
+
+
+class RobotCarOptions(Options):
+    """The part of RobotCar Seasons to import, and the published model of its poses."""
+
+    version: Literal["auto", 1, 2] = Field(
+        default="auto", description="of the benchmark; auto is 2 where its test list is there"
+    )
+    model: ModelChoice = Field(
+        default="auto", description="that the map's poses come from; auto prefers the merged one"
+    )
+    queries: Literal["all", "train", "test"] = Field(
+        default="all", description="version 2: import only the moments of one of its lists"
+    )
+    train_as_map: bool = Field(
+        default=False, description="version 2: its training images are map images, not queries"
+    )
+    reference_model: bool = Field(
+        default=False, description="import the model's points as a kapture map of SIFT features"
+    )
+    location_prior: bool = Field(
+        default=True,
+        description="a query is matched with map images of its location and camera only, which "
+        "the benchmark permits to know; false: with all",
+    )
+
+    @model_validator(mode="after")
+    def _usable(self) -> RobotCarOptions:
+        if self.train_as_map and self.queries == "train":
+            raise ValueError("train_as_map leaves nothing for queries=train")
+        return self
 
 
 class RobotCar:
@@ -87,32 +129,28 @@ class RobotCar:
 
     def check(self, root: Path) -> None:
         """Raise MeglocError, quickly, when ``root`` cannot be what is wanted of RobotCar."""
-        if _folders_of(root) is not None:
+        if LocationFolders.find(root) is not None:
             if self.options.reference_model:
                 raise without_model(root)
-            return
-        absent = _absent(Layout(root))
-        if absent:
+        elif absent := Layout(root).absent():
             raise self.card.without(root, absent)
 
     def input_files(self, root: Path) -> Iterator[Path]:
         """Every file an import may depend on, images included."""
-        folders = _folders_of(root)
-        if folders is not None:
+        if (folders := LocationFolders.find(root)) is not None:
             yield from folders.input_files()
-            yield from ground_truth_files(Path(root))
-            return
-        layout = Layout(root)
-        single = [of(camera) for of in (layout.intrinsics, layout.extrinsics) for camera in CAMERAS]
-        single += [layout.train_list, layout.test_list, layout.merged_model]
-        if self.options.reference_model:
-            single.append(layout.feature_database)
-        yield from (path for path in single if path.is_file())
-        yield from layout.query_lists().values()
-        for folder in layout.individual_models().values():
-            yield from sorted(path for path in folder.iterdir() if path.is_file())
-        yield from layout.image_files()
-        yield from ground_truth_files(layout.root)
+        else:
+            layout = Layout(root)
+            single = [of(name) for of in (layout.intrinsics, layout.extrinsics) for name in CAMERAS]
+            single += [layout.train_list, layout.test_list, layout.merged_model]
+            if self.options.reference_model:
+                single.append(layout.feature_database)
+            yield from (path for path in single if path.is_file())
+            yield from layout.query_lists().values()
+            for folder in layout.individual_models().values():
+                yield from sorted(path for path in folder.iterdir() if path.is_file())
+            yield from layout.image_files()
+        yield from ground_truth_files(Path(root))
 
     def read(self, root: Path, *, allow_missing: bool = False) -> OfficialDataset:
         """Read the dataset.
@@ -123,84 +161,100 @@ class RobotCar:
         OptionError : an option of version 2 where version 1 is read.
         """
         self.check(root)
-        folders = _folders_of(root)
-        if folders is not None:
-            return self._read_folders(folders, Missing(Path(root)), allow_missing=allow_missing)
+        missing = Missing(Path(root))
+        options = self.options
+        chosen: dict[str, Any] = {"part": options.queries, "train_as_map": options.train_as_map}
+        if (folders := LocationFolders.find(root)) is not None:
+            return self._read_folders(folders, missing, chosen, allow_missing=allow_missing)
         layout = Layout(root)
         version = self._version(is_second=layout.test_list.is_file())
-        missing = Missing(layout.root)
         queries = read_queries(layout, version, missing, allow_missing=allow_missing)
         wanted = sorted({name for listed in queries.locations.values() for name in listed})
         reference = read_reference(layout, self.options.model, wanted, missing)
-        selection = select(
-            self.options,
-            version,
-            reference,
-            queries,
-            cameras={camera for camera in CAMERAS if missing.require(layout.intrinsics(camera))},
-            find=ImageFiles(layout, missing).find,
-        )
-        car = read_car(layout, selection, missing)
-        dataset = self._dataset(selection, car, missing, layout.num_reference_images())
-        return replace(
-            dataset,
+        cameras = {camera for camera in CAMERAS if missing.require(layout.intrinsics(camera))}
+        find = image_finder(layout, missing)
+        selection = select(version, reference, queries, cameras=cameras, find=find, **chosen)
+        model = None
+        if self.options.reference_model:
+            there = layout.feature_database.is_file()
+            points = partial(_read_points, layout, selection)
+            model = ReferenceModel(points, layout.feature_database if there else None)
+        return self._dataset(
+            selection,
+            read_car(layout, selection, missing),
+            missing,
+            self._about_reference(layout),
+            reference_images=layout.num_reference_images(),
             links={"": layout.images},
-            remarks=[*dataset.remarks, *self._about_reference(layout)],
-            reference=ReferenceModel(
-                partial(_read_points, layout, selection),
-                layout.feature_database if layout.feature_database.is_file() else None,
-            )
-            if self.options.reference_model
-            else None,
+            reference=model,
         )
 
     def _read_folders(
-        self, folders: LocationFolders, missing: Missing, *, allow_missing: bool
+        self,
+        folders: LocationFolders,
+        missing: Missing,
+        chosen: dict[str, Any],
+        *,
+        allow_missing: bool,
     ) -> OfficialDataset:
         images = folders.read(missing)
         listed = folders.test_list.is_file()
-        version = self._version(is_second=listed or images.has_training_images())
+        # of queries only version 2 publishes poses
+        version = self._version(is_second=listed or bool(images.poses(reference=False)))
         queries = images.queries(version, folders.test_list, allow_missing=allow_missing)
+        paths = {key: image.name for key, image in images.files.items()}
+        reference = images.reference()
         selection = select(
-            self.options,
-            version,
-            images.reference(),
-            queries,
-            cameras=images.cameras,
-            find=images.find,
+            version, reference, queries, cameras=images.cameras, find=paths.get, **chosen
         )
-        dataset = self._dataset(selection, images.car(), missing, images.num_reference())
         remarks = [f"Read from kapture folders, as version {version}."]
         if version == 2 and not listed:
             remarks.append(
                 f"Without {folders.test_list.name}, which kapture leaves out, the pose file holds "
                 "all rear images whose poses are not public; the list may be put into the root."
             )
-        return replace(
-            dataset,
-            image_files=image_files(images.files.values()),
-            remarks=[*dataset.remarks, *remarks],
+        return self._dataset(
+            selection,
+            images.car(),
+            missing,
+            remarks,
+            reference_images=sum(key.condition == REFERENCE_CONDITION for key in images.files),
+            image_files={image.name: image.file for image in images.files.values()},
         )
 
     def _dataset(
-        self, selection: Selection, car: Car, missing: Missing, reference_images: int
+        self,
+        selection: Selection,
+        car: Car,
+        missing: Missing,
+        remarks: list[str],
+        *,
+        reference_images: int,
+        **more: Any,
     ) -> OfficialDataset:
-        """The part that does not depend on the layout of the images."""
-        car = with_rig_of_model(car, selection.reference)
-        mapping, query = mapping_data(selection, car), query_data(selection, car)
+        """The dataset; ``more`` is what depends on the layout of the images."""
+        car = car.with_rig_of(selection.reference)
+        mapping, query = mapping_data(selection, car), car.data(selection.query_images)
         beside, _ = read_ground_truth(missing.root, query, World())  # names tell conditions
-        groups = image_groups(selection)
+        groups = _image_groups(selection)
+        others = "test images" if selection.version == 2 else "other queries"
+        truth = (
+            "The true poses of version 2's training images are public (robotcar_v2_train.txt); "
+            f"those of the {others} are kept by visuallocalization.net, which scores the rear "
+            "camera only."
+        )
         return OfficialDataset(
             mapping=mapping,
             query=query,
             query_gt=query_truth(selection, query, beside),
             groups=groups,
-            priors=query_priors(selection, groups) if self.options.location_prior else {},
-            names=pose_file_names(selection),
-            protocol=protocol(self.name, selection.version),
-            summary=summary(selection, reference_images=reference_images),
-            remarks=remarks(selection),
+            priors=_query_priors(selection, groups) if self.options.location_prior else {},
+            names=_pose_file_names(selection),
+            protocol=protocol_of(self.name).model_copy(update={"truth": truth}),
+            summary=_summary(selection, reference_images),
+            remarks=[*_remarks(selection), *remarks],
             missing=missing,
+            **more,
         )
 
     def _about_reference(self, layout: Layout) -> list[str]:
@@ -227,16 +281,6 @@ class RobotCar:
         return version
 
 
-def _folders_of(root: Path) -> LocationFolders | None:
-    """The locations' kapture folders where they are there instead of the official files."""
-    return LocationFolders.find(root) if _absent(Layout(root)) else None
-
-
-def _absent(layout: Layout) -> list[str]:
-    """Names of the official layout's folders that are not there."""
-    return [path.name for path in (layout.images, layout.models) if not path.is_dir()]
-
-
 def _read_points(layout: Layout, selection: Selection) -> tuple[list[str], SparsePoints]:
     """Names of the images of the dataset's own model, in its order, and its points."""
     images, points = read_points(layout, merged=selection.reference.merged)
@@ -244,7 +288,7 @@ def _read_points(layout: Layout, selection: Selection) -> tuple[list[str], Spars
     return [selection.map_images.get(image, f"{image.path}.jpg") for image in images], points
 
 
-def image_groups(selection: Selection) -> dict[str, ImageGroup]:
+def _image_groups(selection: Selection) -> dict[str, ImageGroup]:
     """Condition and location of all images, and which queries are scored."""
     locations = selection.queries.locations
     groups = {}
@@ -260,7 +304,7 @@ def image_groups(selection: Selection) -> dict[str, ImageGroup]:
     return groups
 
 
-def query_priors(
+def _query_priors(
     selection: Selection, groups: Mapping[str, ImageGroup]
 ) -> dict[str, tuple[str, ...]]:
     """The permitted map images of each query: those of its location and camera.
@@ -278,7 +322,7 @@ def query_priors(
     return priors
 
 
-def pose_file_names(selection: Selection) -> dict[str, str]:
+def _pose_file_names(selection: Selection) -> dict[str, str]:
     """Rows of the pose file, in the order of the list: the images the server scores."""
     paths = selection.query_images
     if selection.version == 2:
@@ -291,49 +335,32 @@ def pose_file_names(selection: Selection) -> dict[str, str]:
     }
 
 
-def protocol(dataset: str, version: int) -> Protocol:
-    """The scoring rules of the benchmark."""
-    public = "The true poses of version 2's training images are public (robotcar_v2_train.txt)"
-    others = "test images" if version == 2 else "other queries"
-    return protocol_of(dataset).model_copy(
-        update={
-            "truth": f"{public}; those of the {others} are kept by visuallocalization.net, which "
-            "scores the rear camera only."
-        }
-    )
-
-
-def summary(selection: Selection, *, reference_images: int) -> list[Count]:
-    """Counts of models and lists, beside those published, and of what is imported.
-
-    Parameters
-    ----------
-    reference_images : how many are on disk, with a pose or without.
-    """
+def _summary(selection: Selection, reference_images: int) -> list[Count]:
+    """Counts of models and lists, and of what is imported; of reference images those on disk."""
     queries, reference = selection.queries, selection.reference
     locations = {location for listed in queries.locations.values() for location in listed}
     counts = [
-        Count("locations with queries", len(locations), NUM_LOCATIONS),
-        Count("reference images", reference_images, NUM_REFERENCE_IMAGES),
-        Count("reference images with a pose", len(reference.poses), NUM_REGISTERED),
-        Count("query images", len(queries.locations), NUM_QUERIES),
+        Count("locations with queries", len(locations), _NUM_LOCATIONS),
+        Count("reference images", reference_images, _NUM_REFERENCE_IMAGES),
+        Count("reference images with a pose", len(reference.poses), _NUM_REGISTERED),
+        Count("query images", len(queries.locations), _NUM_QUERIES),
     ]
     found = Counter((image.condition, image.camera) for image in queries.locations)
-    others = sorted({condition for condition, _ in found} - set(QUERIES_PER_CAMERA))
-    for condition in (*QUERIES_PER_CAMERA, *others):
-        published = QUERIES_PER_CAMERA.get(condition)
+    others = sorted({condition for condition, _ in found} - set(_QUERIES_PER_CAMERA))
+    for condition in (*_QUERIES_PER_CAMERA, *others):
+        published = _QUERIES_PER_CAMERA.get(condition)
         for camera in CAMERAS:
             counts.append(Count(f"  {condition}, {camera}", found[condition, camera], published))
     if selection.version == 2:
-        counts.append(Count("training images with a pose", len(queries.train), NUM_TRAIN))
-        counts.append(Count("test images", len(queries.test), NUM_TEST))
+        counts.append(Count("training images with a pose", len(queries.train), _NUM_TRAIN))
+        counts.append(Count("test images", len(queries.test), _NUM_TEST))
     map_images = len(selection.map_images) + len(selection.train_images)
     counts.append(Count("map images imported", map_images))
     counts.append(Count("query images imported", len(selection.query_images)))
     return counts
 
 
-def remarks(selection: Selection) -> list[str]:
+def _remarks(selection: Selection) -> list[str]:
     """Sentences for the user about this import."""
     said = [
         "The rig is the one that the reference model's poses show, as extrinsics/ does not agree "

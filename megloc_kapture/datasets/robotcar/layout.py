@@ -1,26 +1,25 @@
-"""Files of RobotCar Seasons and the published counts: images, models, lists of queries."""
+"""Files of RobotCar Seasons and the published counts: images, models, lists of queries.
+
+Images are named ``<condition>/<camera>/<microseconds>``; the files say ``.png`` or ``.jpg`` for the
+same image, and some begin a name with ``./``.
+"""
 
 from __future__ import annotations
 
 import os
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cache, partial
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
+
+import numpy as np
 
 from megloc_kapture.datasets.formats.colmap_reading import read_colmap_model
 from megloc_kapture.datasets.formats.nvm import read_single_nvm
-from megloc_kapture.datasets.formats.robotcar_files import (
-    ImageKey,
-    ListedImage,
-    parse_image,
-    read_query_location,
-    read_test_list,
-    read_train_poses,
-)
 from megloc_kapture.datasets.formats.sparse_points import SparsePoints
+from megloc_kapture.datasets.formats.text_lines import Line, read_lines, shown
 from megloc_kapture.datasets.official import Missing
 from megloc_kapture.errors import DataError
 from megloc_kapture.values import RigidTransform
@@ -28,30 +27,123 @@ from megloc_kapture.values import RigidTransform
 CAMERAS = ("left", "rear", "right")
 SCORED_CAMERA = "rear"
 REFERENCE_CONDITION = "overcast-reference"
-DAY = ("dawn", "dusk", "overcast-summer", "overcast-winter", "rain", "snow", "sun")
-NIGHT = ("night", "night-rain")
-
-# what is published, or was counted by others in the published lists
-NUM_LOCATIONS = 49
-NUM_REFERENCE_IMAGES = 26_121
-NUM_REGISTERED = 20_862
-NUM_QUERIES = 11_934
-NUM_TRAIN, NUM_TEST = 1_906, 1_872
-QUERIES_PER_CAMERA = {
-    "dawn": 483,
-    "dusk": 394,
-    "overcast-summer": 463,
-    "overcast-winter": 390,
-    "rain": 421,
-    "snow": 489,
-    "sun": 460,
-    "night": 438,
-    "night-rain": 440,
-}
-
 _FILE_TYPES = (".jpg", ".png")
 _MODEL = re.compile(r"([0-9]{1,6})_aligned")
 _QUERY_LIST = re.compile(r"queries_location_([0-9]{1,6})\.txt")
+INTRINSICS_KEYS = ("fx", "fy", "cx", "cy")
+
+_PART = r"[A-Za-z0-9][A-Za-z0-9_-]*"
+_IMAGE = re.compile(
+    rf"(?:(?P<condition>{_PART})/)?(?P<camera>{_PART})/(?P<stem>[0-9]{{1,19}})\.(?:jpg|png)"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class ImageKey:
+    """An image: its condition, ``""`` where a list leaves it out, its camera and its time."""
+
+    condition: str
+    camera: str
+    stem: str
+
+    @property
+    def timestamp(self) -> int:
+        """The time in microseconds."""
+        return int(self.stem)
+
+    @property
+    def path(self) -> str:
+        """Path below ``images/``, without the file type."""
+        return f"{self.condition}/{self.camera}/{self.stem}"
+
+
+class ListedImage(NamedTuple):
+    """An image of a list, its line, and its pose; the identity where the list has no poses."""
+
+    image: ImageKey
+    line: Line
+    cam_from_world: RigidTransform
+
+
+def parse_image(text: str) -> ImageKey | None:
+    """The image a name stands for, with or without condition; None where it is no image name."""
+    found = _IMAGE.fullmatch(text.removeprefix("./"))
+    if found is None:
+        return None
+    return ImageKey(found["condition"] or "", found["camera"], found["stem"])
+
+
+def read_intrinsics(path: Path) -> tuple[float, float, float, float]:
+    """Read ``<camera>_intrinsics.txt``: fx, fy, cx, cy in pixels, whatever their order there.
+
+    DataError names file and line, also of a key that is unknown, given twice or absent.
+    """
+    values: dict[str, float] = {}
+    lines = read_lines(path)
+    for line in lines:
+        if len(line.fields) != 2 or line.fields[0] not in INTRINSICS_KEYS:
+            raise line.error(
+                f"expected a line 'key value', key one of {', '.join(INTRINSICS_KEYS)}"
+            )
+        key, text = line.fields
+        if key in values:
+            raise line.error(f"{key} is given twice")
+        values[key] = line.number_of(text, key)
+    absent = [key for key in INTRINSICS_KEYS if key not in values]
+    if absent:
+        number = lines[-1].number if lines else 1
+        raise DataError(f"{', '.join(absent)} missing; it ends here", path=path, line=number)
+    fx, fy, cx, cy = (values[key] for key in INTRINSICS_KEYS)
+    return fx, fy, cx, cy
+
+
+def read_query_location(path: Path) -> list[ListedImage]:
+    """Read ``queries_location_NNN.txt``, in its order; DataError names file and line."""
+    return _some([_listed(line, line.text) for line in read_lines(path)], path)
+
+
+def read_test_list(path: Path) -> list[ListedImage]:
+    """Read ``robotcar_v2_test.txt``, in its order; DataError names file and line.
+
+    The official list leaves the condition out (``rear/123.png``); a list that has it is read too.
+    """
+    listed: dict[tuple[str, str], ListedImage] = {}
+    for line in read_lines(path):
+        entry = _listed(line, line.text, conditions=False)
+        if listed.setdefault((entry.image.camera, entry.image.stem), entry) is not entry:
+            raise line.error(f"{line.text!r} is listed twice")
+    return _some(list(listed.values()), path)
+
+
+def read_train_poses(path: Path) -> list[ListedImage]:
+    """Read ``robotcar_v2_train.txt``: a name and the 4x4 matrix ``world_from_cam`` per line.
+
+    DataError names file and line, also of an image given twice.
+    """
+    listed: dict[ImageKey, ListedImage] = {}
+    for line in read_lines(path):
+        line.expect(line.fields, 17, "a name and 16 matrix elements")
+        image = _listed(line, line.fields[0]).image
+        if image in listed:
+            raise line.error(f"{line.fields[0]!r} is given twice")
+        values = line.numbers_of(line.fields[1:], "matrix element")
+        world_from_cam = line.rigid_transform(np.array(values).reshape(4, 4))
+        listed[image] = ListedImage(image, line, world_from_cam.inverse())
+    return _some(list(listed.values()), path)
+
+
+def _some(entries: list[ListedImage], path: Path) -> list[ListedImage]:
+    if not entries:
+        raise DataError("no image in the list", path=path, line=1)
+    return entries
+
+
+def _listed(line: Line, text: str, *, conditions: bool = True) -> ListedImage:
+    image = parse_image(text)
+    if image is None or (conditions and not image.condition):
+        form = "condition/camera/time.jpg" if conditions else "camera/time.png"
+        raise line.error(f"expected {form}, got {shown(text)}")
+    return ListedImage(image, line, RigidTransform.identity())
 
 
 class Layout:
@@ -75,6 +167,10 @@ class Layout:
         self.feature_database = self.models / "overcast-reference.db"
         self.train_list = self.root / "robotcar_v2_train.txt"
         self.test_list = self.root / "robotcar_v2_test.txt"
+
+    def absent(self) -> list[str]:
+        """Names of the layout's folders that are not there."""
+        return [path.name for path in (self.images, self.models) if not path.is_dir()]
 
     def intrinsics(self, camera: str) -> Path:
         """Intrinsics of a camera."""
@@ -117,24 +213,22 @@ class Layout:
                         yield folder / name
 
 
-@dataclass
-class ImageFiles:
-    """Finds an image under the file type it has on disk; remembers those that are not there."""
+def image_finder(layout: Layout, missing: Missing) -> Callable[[ImageKey], str | None]:
+    """Make a function that finds an image's path below ``images/``, with the type it has on disk.
 
-    layout: Layout
-    missing: Missing
-    _names: dict[Path, frozenset[str]] = field(default_factory=dict)
+    Of an image that is not there it returns None, and notes it as missing.
+    """
+    names = cache(lambda folder: frozenset(_sorted_names(folder)))
 
-    def find(self, image: ImageKey) -> str | None:
-        """Path of an image below ``images/``; None, and noted as missing, where there is none."""
-        folder = self.layout.images / image.condition / image.camera
-        if folder not in self._names:
-            self._names[folder] = frozenset(_sorted_names(folder))
+    def find(image: ImageKey) -> str | None:
+        folder = layout.images / image.condition / image.camera
         for file_type in _FILE_TYPES:
-            if image.stem + file_type in self._names[folder]:
+            if image.stem + file_type in names(folder):
                 return image.path + file_type
-        self.missing.files.append(folder / f"{image.stem}{_FILE_TYPES[0]}")
+        missing.files.append(folder / f"{image.stem}{_FILE_TYPES[0]}")
         return None
+
+    return find
 
 
 def _numbered(folder: Path, pattern: re.Pattern[str]) -> dict[str, Path]:
@@ -158,14 +252,7 @@ ModelChoice = Literal["auto", "merged", "individual"]
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """Reference poses.
-
-    Parameters
-    ----------
-    poses : image -> ``cam_from_world``, in the models' order.
-    locations : image -> its location, for the images of the individual models that are there.
-    merged : whether the poses are the merged model's.
-    """
+    """``cam_from_world`` by image, in the models' order; locations as far as models tell."""
 
     poses: Mapping[ImageKey, RigidTransform]
     locations: Mapping[ImageKey, str]
@@ -177,16 +264,13 @@ def read_reference(
 ) -> Reference:
     """Read the poses of the reference images, and which location each is of.
 
-    Of an image in several individual models the first counts; all share one world.
+    Of an image in several individual models the first counts; all share one world. DataError names
+    a broken model, an image name that is none, and two images of one camera and time.
 
     Parameters
     ----------
     wanted : locations that have queries; their individual models are missing where the poses
         have to come from them.
-
-    Raises
-    ------
-    DataError : a broken model, an image name that is none, two images of one camera and time.
     """
     individual = layout.individual_models()
     merged = model == "merged" or (
@@ -218,12 +302,7 @@ def read_reference(
 
 
 def read_points(layout: Layout, *, merged: bool) -> tuple[list[ImageKey], SparsePoints]:
-    """The images and points of the merged model, or of all individual models behind one another.
-
-    Raises
-    ------
-    DataError : a broken model.
-    """
+    """The images and points of the merged model, or of all individual ones behind one another."""
     if merged:
         nvm = read_single_nvm(layout.merged_model, with_points=True)
         return _keys(nvm.names, layout.merged_model), nvm.points
@@ -234,7 +313,8 @@ def read_points(layout: Layout, *, merged: bool) -> tuple[list[ImageKey], Sparse
         images = _keys([image.name for image in model.images], folder)
         for image in images:
             positions.setdefault(image, len(positions))
-        parts.append((model.points, [positions[image] for image in images]))
+        common = np.array([positions[image] for image in images], np.int32)
+        parts.append(replace(model.points, image_ids=common[model.points.image_ids]))
     return list(positions), SparsePoints.joined(parts)
 
 
@@ -276,10 +356,8 @@ class Queries:
 def read_queries(layout: Layout, version: int, missing: Missing, *, allow_missing: bool) -> Queries:
     """Read the lists of queries of a version; those of version 2 are read wherever they are.
 
-    Raises
-    ------
-    DataError : a broken list; two images of one camera and time; an image of version 2 that no
-        location lists, unless missing data is allowed. Names file and line.
+    DataError names file and line, also of two images of one camera and time and, unless missing
+    data is allowed, of an image of version 2 that no location lists.
     """
     lists = layout.query_lists()
     if not lists:
@@ -295,7 +373,9 @@ def read_queries(layout: Layout, version: int, missing: Missing, *, allow_missin
     train: dict[ImageKey, RigidTransform] = {}
     test: dict[ImageKey, str] = {}
     unlisted = 0
-    if _wanted(layout.train_list, version, missing):
+    # version 1 is the better for the public poses, but does not need them
+    wanted = version == 2 and missing.require(layout.train_list)
+    if wanted or layout.train_list.is_file():
         for entry in read_train_poses(layout.train_list):
             known = _scored_query(entry, at_time, allow_missing)
             unlisted += known is None
@@ -314,21 +394,11 @@ def read_test_names(
     *,
     allow_missing: bool,
 ) -> tuple[dict[ImageKey, str], int]:
-    """Read version 2's list of test images.
+    """Read version 2's list of test images: query -> its text in the list, in its order.
 
-    Parameters
-    ----------
-    at_time : (camera, time) -> query; the list leaves conditions out.
-    train : queries whose poses are public, which are in another list.
-
-    Returns
-    -------
-    Query -> its text in the list, in its order, and how many of the list are no queries.
-
-    Raises
-    ------
-    DataError : a broken list, a training image in it, or one that is no query, unless missing
-        data is allowed; names the line.
+    Of an image that has a public pose (in ``train``) DataError names the line. Also returns how
+    many of the list are no queries. ``at_time`` : (camera, time) -> query, for the list leaves
+    conditions out.
     """
     test: dict[ImageKey, str] = {}
     unlisted = 0
@@ -342,22 +412,12 @@ def read_test_names(
     return test, unlisted
 
 
-def _wanted(path: Path, version: int, missing: Missing) -> bool:
-    """Version 1 is the better for the public poses, but does not need them."""
-    return missing.require(path) if version == 2 else path.is_file()
-
-
 def note_time(
     image: ImageKey,
     at_time: dict[tuple[str, int], ImageKey],
     error: Callable[[str], DataError],
 ) -> None:
-    """Note the camera and time of an image in ``at_time``.
-
-    Raises
-    ------
-    DataError : an unknown camera, or another image has its camera and time; made by ``error``.
-    """
+    """Note the camera and time of an image; raise ``error`` where another has them."""
     if image.camera not in CAMERAS:
         known = ", ".join(CAMERAS)
         raise error(f"{image.path} is of camera {image.camera!r}; known: {known}")

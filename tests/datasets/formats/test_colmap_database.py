@@ -13,7 +13,6 @@ from kapture.converter.colmap.database import COLMAPDatabase
 
 from megloc_kapture.datasets.formats.colmap_database import ColmapDatabase
 from megloc_kapture.errors import DataError
-from megloc_kapture.values import Camera
 
 import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
 
@@ -67,12 +66,8 @@ def test_what_others_write_is_read(tmp_path: Path, write: Any) -> None:
     os.rename(tmp_path / "plain.db", path)
     before = sorted(tmp_path.iterdir()), path.read_bytes()
     with ColmapDatabase(path) as database:
-        cameras = database.cameras()
-        params = (1243.94, 800.0, 531.5, -0.10977)
-        assert cameras == {1: Camera("SIMPLE_RADIAL", 1600, 1063, params)}
         assert list(database.images) == sorted(written)
         for name, (keypoints, descriptors) in written.items():
-            assert database.images[name].camera_id == 1
             found = database.keypoints(name)
             assert found.dtype == np.float32
             assert np.array_equal(found, keypoints[:, :2])
@@ -89,7 +84,7 @@ def test_what_others_write_is_read(tmp_path: Path, write: Any) -> None:
     assert (sorted(tmp_path.iterdir()), path.read_bytes()) == before
 
 
-def test_a_database_without_features_has_cameras_and_images(tmp_path: Path) -> None:
+def test_a_database_without_features_has_images(tmp_path: Path) -> None:
     connection = sqlite3.connect(tmp_path / "d.db")
     connection.execute("CREATE TABLE cameras (camera_id, model, width, height, params)")
     connection.execute("CREATE TABLE images (image_id, name, camera_id)")
@@ -98,7 +93,6 @@ def test_a_database_without_features_has_cameras_and_images(tmp_path: Path) -> N
     connection.close()
     with ColmapDatabase(tmp_path / "d.db") as database:
         assert list(database.images) == ["db/7.jpg"]
-        assert database.cameras() == {}
         assert database.keypoints("db/7.jpg").shape == (0, 2)
         assert database.descriptors("db/7.jpg") is None
 
@@ -107,28 +101,21 @@ def test_a_database_that_is_still_being_written_is_refused(tmp_path: Path) -> No
     path = tmp_path / "d.db"
     write_with_pycolmap(path)
     writer = sqlite3.connect(path)
-    writer.execute("UPDATE cameras SET width = 5")
+    writer.execute("UPDATE images SET name = 'new.jpg' WHERE image_id = 1")
     writer.commit()
     assert (tmp_path / "d.db-wal").stat().st_size > 0
     with pytest.raises(DataError, match=r"d\.db: was not closed: what is in d\.db-wal"):
         ColmapDatabase(path)
     writer.close()
     with ColmapDatabase(path) as database:
-        assert database.cameras()[1].width == 5
+        assert "new.jpg" in database.images
 
 
 @pytest.mark.parametrize(
     ("statement", "match"),
     [
-        ("UPDATE cameras SET model = 18", "camera 1: unknown camera model 18"),
-        ("UPDATE cameras SET model = 12", "camera 1: cameras of the model SIMPLE_DIVISION"),
-        ("UPDATE cameras SET model = 'x'", "camera 1: model is 'x'"),
-        ("UPDATE cameras SET width = 2.5", "camera 1: width is 2.5"),
-        ("UPDATE cameras SET height = -1", "camera 1: height is -1"),
-        ("UPDATE cameras SET height = 0", "camera 1: image size 1600x0"),
-        ("UPDATE cameras SET params = x'00'", "camera 1: expected 32 bytes of data, got 1 bytes"),
-        ("UPDATE cameras SET params = NULL", "camera 1: expected 32 bytes of data, got 0 bytes"),
-        ("UPDATE cameras SET params = 'text'", "expected 32 bytes of data, got no bytes"),
+        ("UPDATE descriptors SET data = 'text'", "expected 640 bytes of data, got no bytes"),
+        ("UPDATE descriptors SET cols = 2.5", "columns is 2.5"),
         ("UPDATE images SET name = x'ff' WHERE image_id = 1", "has no name or no camera"),
         ("UPDATE images SET name = '../a' WHERE image_id = 1", "leads out of its folder"),
         ("UPDATE images SET name = './c.jpg' WHERE image_id = 1", "'c.jpg' is listed twice"),
@@ -145,7 +132,6 @@ def test_a_database_that_is_still_being_written_is_refused(tmp_path: Path) -> No
         ("ALTER TABLE descriptors ADD COLUMN type INTEGER DEFAULT 1", "are not SIFT"),
         ("ALTER TABLE descriptors DROP COLUMN data", "no readable COLMAP database: no such col"),
         ("DROP TABLE images", "it has no table 'images'"),
-        ("DROP TABLE cameras", "it has no table 'cameras'"),
     ],
 )
 def test_what_does_not_fit_is_named(tmp_path: Path, statement: str, match: str) -> None:
@@ -157,7 +143,6 @@ def test_what_does_not_fit_is_named(tmp_path: Path, statement: str, match: str) 
     connection.commit()
     connection.close()
     with pytest.raises(DataError, match=match) as caught, ColmapDatabase(path) as database:
-        database.cameras()
         database.keypoints("db/7.jpg")
         database.descriptors("db/7.jpg")
     assert str(caught.value).startswith(f"{path}: ")

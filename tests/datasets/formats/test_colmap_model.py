@@ -11,13 +11,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from megloc_twins.model_files import write_colmap_binary, write_colmap_text
 
-from megloc_kapture.datasets.formats.colmap_model import (
-    ColmapImage,
-    ColmapModel,
-    write_colmap_binary,
-    write_colmap_text,
-)
+from megloc_kapture.datasets.formats.colmap_model import ColmapImage, ColmapModel
 from megloc_kapture.datasets.formats.colmap_reading import colmap_model_files, read_colmap_model
 from megloc_kapture.datasets.formats.sparse_points import SparsePoints
 from megloc_kapture.datasets.formats.text_lines import TextFile

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from megloc_kapture.datasets.formats.colmap_rigs import ColmapRigs, read_colmap_rigs, rig_files
+from megloc_kapture.datasets.formats.colmap_reading import ColmapRigs, read_colmap_rigs, rig_files
 from megloc_kapture.errors import DataError
 
 import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py

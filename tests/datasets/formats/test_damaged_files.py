@@ -12,23 +12,23 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from kapture.converter.colmap.database import COLMAPDatabase
+from megloc_twins.model_files import write_colmap_binary, write_colmap_text, write_nvm
 
-from megloc_kapture.datasets.formats import fourseasons_files, inloc_files, robotcar_files
+from megloc_kapture.datasets.aachen.layout import read_query_list
+from megloc_kapture.datasets.formats import fourseasons_files
 from megloc_kapture.datasets.formats.colmap_database import ColmapDatabase
 from megloc_kapture.datasets.formats.colmap_model import (
     BINARY_FILES,
     TEXT_FILES,
     ColmapImage,
     ColmapModel,
-    write_colmap_binary,
-    write_colmap_text,
 )
-from megloc_kapture.datasets.formats.colmap_reading import read_colmap_model
-from megloc_kapture.datasets.formats.colmap_rigs import read_colmap_rigs
-from megloc_kapture.datasets.formats.nvm import NvmModel, read_nvm, write_nvm
-from megloc_kapture.datasets.formats.query_list import read_query_list
+from megloc_kapture.datasets.formats.colmap_reading import read_colmap_model, read_colmap_rigs
+from megloc_kapture.datasets.formats.nvm import NvmModel, read_nvm
 from megloc_kapture.datasets.formats.sparse_points import SparsePoints
 from megloc_kapture.datasets.formats.text_lines import TextFile, read_rigid_matrix
+from megloc_kapture.datasets.inloc.layout import read_transformation, read_wrong_scans
+from megloc_kapture.datasets.robotcar import layout as robotcar_layout
 from megloc_kapture.errors import DataError
 from megloc_kapture.values import Camera, RigidTransform
 
@@ -51,14 +51,14 @@ TEXTS: dict[Callable[[Path], Any], str] = {
     fourseasons_files.read_keyframe: f"# timestamp\n{TIME}\n\n# fx, fy\n1,1,1,1,8,4,1\n\n"
     f"# camToWorld:\n{POSE}\n\n# Exposure\n0.25\n\n# Point Cloud\n# u,v\n1.0,2.0,0.5,9,0,0,1\n"
     "1,2,3,4,5,6,7,8,\n",
-    robotcar_files.read_intrinsics: "fx 400.0\nfy 400.0\ncx 508.2\ncy 498.187378\n",
-    robotcar_files.read_query_location: "dawn/left/1418721355075498.jpg\ndawn/rear/14.jpg\n",
-    robotcar_files.read_test_list: "rear/1418721355075498.png\nrear/1418721354984638.png\n",
-    robotcar_files.read_train_poses: "dawn/rear/1.png 1 0 0 10.0 0 1 0 0.0 0 0 1 -2.0 0 0 0 1\n",
+    robotcar_layout.read_intrinsics: "fx 400.0\nfy 400.0\ncx 508.2\ncy 498.187378\n",
+    robotcar_layout.read_query_location: "dawn/left/1418721355075498.jpg\ndawn/rear/14.jpg\n",
+    robotcar_layout.read_test_list: "rear/1418721355075498.png\nrear/1418721354984638.png\n",
+    robotcar_layout.read_train_poses: "dawn/rear/1.png 1 0 0 10.0 0 1 0 0.0 0 0 1 -2.0 0 0 0 1\n",
     read_query_list: "query/day/a.jpg SIMPLE_RADIAL 1600 1200 1469.2 800 600 -0.0353\r\n"
     "query/b.jpg PINHOLE 768 1024 971.838 384 512 -0.00177789",
-    inloc_files.read_transformation: f"Before general icp:\n{MATRIX}\nAfter general icp:\n{MATRIX}",
-    inloc_files.read_wrong_scans: "known wrong:\n\n008\nDUC_scan_12.ptx 31\r\n2017\n",
+    read_transformation: f"Before general icp:\n{MATRIX}\nAfter general icp:\n{MATRIX}",
+    read_wrong_scans: "known wrong:\n\n008\nDUC_scan_12.ptx 31\r\n2017\n",
 }
 
 POINTS = SparsePoints(
@@ -243,7 +243,7 @@ def test_colmap_database(tmp_path: Path, database: Path, edits: list[tuple[str, 
             features = {
                 name: (opened.keypoints(name), opened.descriptors(name)) for name in opened.images
             }
-            return opened.cameras(), features, opened.feature_type()
+            return features, opened.feature_type()
 
     outcome(read, path)
     assert [entry.name for entry in tmp_path.iterdir()] == ["d.db"]

@@ -11,10 +11,11 @@ import kapture.io.csv
 import numpy as np
 import pytest
 from kapture.io.records import TransferAction
+from megloc_twins.model_files import write_nvm
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.datasets.formats.nvm import NvmModel, read_nvm, write_nvm
+from megloc_kapture.datasets.formats.nvm import NvmModel, read_nvm
 from megloc_kapture.datasets.formats.sparse_points import SparsePoints
 from megloc_kapture.datasets.formats.text_lines import TextFile
 from megloc_kapture.errors import DataError

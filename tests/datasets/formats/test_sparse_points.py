@@ -30,11 +30,11 @@ def test_rows_are_grouped_by_image_in_their_order(highest: int) -> None:
 
 def test_models_are_joined_behind_one_another() -> None:
     first, second = points(2, [(0, 0, 5), (1, 1, 6)]), points(3, [(0, 1, 7), (2, 0, 8)])
-    joined = SparsePoints.joined([(first, [3, 0]), (SparsePoints.none(), []), (second, [0, 2])])
+    joined = SparsePoints.joined([first, SparsePoints.none(), second])
     assert len(joined) == 5
     assert joined.rgb[:, 0].tolist() == [2, 2, 3, 3, 3]
     assert joined.point_ids.tolist() == [0, 1, 2, 4]
-    assert joined.image_ids.tolist() == [3, 0, 2, 0]
+    assert joined.image_ids.tolist() == [0, 1, 1, 0]
     assert joined.feature_ids.tolist() == [5, 6, 7, 8]
     assert joined.xy_px.dtype == np.float32
     assert joined.image_ids.dtype == np.int32

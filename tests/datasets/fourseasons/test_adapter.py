@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from megloc_kapture.datasets.formats.fourseasons_files import read_keyframe
 from megloc_kapture.datasets.fourseasons.adapter import FourSeasons, FourSeasonsOptions
-from megloc_kapture.datasets.fourseasons.poses import LocalFrame, read_keyframe_poses
+from megloc_kapture.datasets.fourseasons.images import LocalFrame, read_keyframe_poses
 from megloc_kapture.datasets.fourseasons.recordings import Recording
 from megloc_kapture.datasets.official import Missing, OfficialDataset, write_official
 from megloc_kapture.errors import DataError, OptionError

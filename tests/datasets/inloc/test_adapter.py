@@ -12,8 +12,7 @@ from inloc_files import CENTRES, HEIGHT, SCANS, VIEWS, WIDTH, Floats, scanned, w
 from PIL import Image
 
 import megloc_kapture  # noqa: F401  before kapture
-from megloc_kapture.datasets.inloc.adapter import InLoc, InLocOptions
-from megloc_kapture.datasets.inloc.depth import depth_camera
+from megloc_kapture.datasets.inloc.adapter import InLoc, InLocOptions, depth_camera
 from megloc_kapture.datasets.official import OfficialDataset, write_official
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.dataset_tables import read_groups, read_names, read_protocol

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.datasets.formats.robotcar_files import ImageKey
 from megloc_kapture.datasets.robotcar.images import middle_transform, rig_of_model
+from megloc_kapture.datasets.robotcar.layout import ImageKey
 from megloc_kapture.values import RigidTransform
 
 

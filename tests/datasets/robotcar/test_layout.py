@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.datasets.formats.robotcar_files import (
+from megloc_kapture.datasets.formats.text_lines import read_rigid_matrix
+from megloc_kapture.datasets.robotcar.layout import (
     ImageKey,
     parse_image,
     read_intrinsics,
@@ -18,7 +19,6 @@ from megloc_kapture.datasets.formats.robotcar_files import (
     read_test_list,
     read_train_poses,
 )
-from megloc_kapture.datasets.formats.text_lines import read_rigid_matrix
 from megloc_kapture.errors import DataError
 
 INTRINSICS = "fx 400.000000\nfy 400.000000\ncx 508.222931\ncy 498.187378\n"

@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.io
+from megloc_twins.model_files import write_transformation
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.datasets.formats.inloc_files import (
+from megloc_kapture.datasets.inloc.layout import (
     Cutout,
     parse_cutout_name,
     read_cutout_points,
     read_transformation,
     read_wrong_scans,
-    write_transformation,
 )
 from megloc_kapture.errors import DataError
 from megloc_kapture.values import RigidTransform
