@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.evaluation.metrics import Threshold
-from megloc_kapture.evaluation.report.renderers import REPORT_HTML
+from megloc_kapture.evaluation.report.document import REPORT_HTML
 from megloc_kapture.evaluation.report.reports import RECALL_JSON
 from megloc_kapture.io.colmap_mapping import Mapper
 from megloc_kapture.io.kapture import KaptureFolder

@@ -14,7 +14,7 @@ from megloc_kapture.cli.common import Common, Deciding, Force, Working
 from megloc_kapture.cli.console import Console
 from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.metrics import Threshold
-from megloc_kapture.evaluation.report.renderers import REPORT_HTML
+from megloc_kapture.evaluation.report.document import REPORT_HTML
 from megloc_kapture.evaluation.report.reports import (
     AGREEMENT_TEXT,
     RECALL_JSON,

@@ -3,23 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import combinations
-from typing import TYPE_CHECKING, Any
+from dataclasses import astuple, dataclass
+from itertools import combinations, product
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.metrics import ALL, LEVEL, Threshold, within
-from megloc_kapture.evaluation.scoring import (
-    Evaluation,
-    Reported,
-    query_columns,
-)
-
-if TYPE_CHECKING:
-    pass
+from megloc_kapture.evaluation.scoring import Evaluation, Reported, query_columns
 
 SIGNIFICANCE = 0.05
 DIFFERENCES_COLUMNS = (
@@ -123,24 +116,19 @@ class Comparison(Reported):
     def differences(self) -> dict[str, list[Any]]:
         """Column -> values, of every query that one result alone finds, by pair and threshold."""
         index = {name: i for i, name in enumerate(self.evaluations[0].errors.names)}
-        rows = []
+        columns: dict[str, list[Any]] = {name: [] for name in DIFFERENCES_COLUMNS}
         for test in self.tests:
-            for finder, other, names in (
-                (test.first, test.second, test.only_first),
-                (test.second, test.first, test.only_second),
-            ):
-                by, missing = self.evaluations[finder], self.evaluations[other]
-                for name in names:
-                    found, missed = by.queries[index[name]], missing.queries[index[name]]
-                    rows.append(
-                        (
-                            *(test.threshold.position_m, test.threshold.angle_deg),
-                            *(by.label, missing.label, name, found.condition),
-                            *(found.position_m, found.angle_deg),
-                            *(missed.position_m, missed.angle_deg),
-                        )
-                    )
-        return {name: [row[i] for row in rows] for i, name in enumerate(DIFFERENCES_COLUMNS)}
+            bounds = test.threshold.position_m, test.threshold.angle_deg
+            first, second = self.evaluations[test.first], self.evaluations[test.second]
+            alone = [(first, second, name) for name in test.only_first]
+            alone += [(second, first, name) for name in test.only_second]
+            for finder, other, name in alone:
+                found, missed = finder.queries[index[name]], other.queries[index[name]]
+                named = finder.label, other.label, name, found.condition
+                errors = found.position_m, found.angle_deg, missed.position_m, missed.angle_deg
+                for column, value in zip(columns.values(), (*bounds, *named, *errors), strict=True):
+                    column.append(value)
+        return columns
 
 
 def compare(evaluations: Sequence[Evaluation]) -> Comparison:
@@ -256,24 +244,18 @@ def _family(
     evaluations: Sequence[Evaluation], pairs: Sequence[tuple[int, int]], rows: Sequence[str]
 ) -> tuple[PairedTest, ...]:
     names = np.array(evaluations[0].errors.names, dtype=object)
-    thresholds = evaluations[0].thresholds
-    members = evaluations[0].members
+    thresholds, members = evaluations[0].thresholds, evaluations[0].members
     met = [[within(e.errors, threshold) for threshold in thresholds] for e in evaluations]
-    keys = [
-        (pair, row, index) for pair in pairs for row in rows for index in range(len(thresholds))
-    ]
+    keys = list(product(pairs, rows, range(len(thresholds))))
     tables = []
     for (i, j), row, index in keys:
         a, b, chosen = met[i][index], met[j][index], members[row]
         tables.append((a & ~b & chosen, b & ~a & chosen, a & b & chosen, ~a & ~b & chosen))
-    p_values = mcnemar(
-        [int(only_first.sum()) for only_first, *_ in tables],
-        [int(only_second.sum()) for _, only_second, *_ in tables],
-    )
+    p_values = mcnemar(*([int(table[side].sum()) for table in tables] for side in (0, 1)))
     return tuple(
         PairedTest(
-            first=first,
-            second=second,
+            first=pair[0],
+            second=pair[1],
             row=row,
             threshold=thresholds[index],
             only_first=tuple(names[only_first].tolist()),
@@ -283,12 +265,9 @@ def _family(
             p_value=float(p),
             p_adjusted=float(adjusted),
         )
-        for ((first, second), row, index), (
-            only_first,
-            only_second,
-            both,
-            neither,
-        ), p, adjusted in zip(keys, tables, p_values, holm(p_values), strict=True)
+        for (pair, row, index), (only_first, only_second, both, neither), p, adjusted in zip(
+            keys, tables, p_values, holm(p_values), strict=True
+        )
     )
 
 
@@ -296,16 +275,14 @@ def _median_differences(
     evaluations: Sequence[Evaluation], pairs: Sequence[tuple[int, int]]
 ) -> tuple[MedianDifference, ...]:
     medians = [evaluation.row().median_position_m for evaluation in evaluations]
-    if len(evaluations[0].queries) < MIN_RESAMPLED:
-        nothing = float("nan"), float("nan")
-        return tuple(MedianDifference(i, j, medians[i], medians[j], *nothing) for i, j in pairs)
-    resampled = [resampled_medians(evaluation.errors.position_m) for evaluation in evaluations]
-    return tuple(
-        MedianDifference(
-            i, j, medians[i], medians[j], *difference_interval(resampled[i], resampled[j])
-        )
-        for i, j in pairs
-    )
+    few = len(evaluations[0].queries) < MIN_RESAMPLED
+    resampled = [] if few else [resampled_medians(e.errors.position_m) for e in evaluations]
+    found = []
+    for i, j in pairs:
+        unknown = float("nan"), float("nan")
+        interval = unknown if few else difference_interval(resampled[i], resampled[j])
+        found.append(MedianDifference(i, j, medians[i], medians[j], *interval))
+    return tuple(found)
 
 
 @dataclass(frozen=True, slots=True)
@@ -330,14 +307,19 @@ class SeedsAt:
 
     Parameters
     ----------
-    always, sometimes, never : queries within the threshold in all, some or none of the runs.
+    mean, deviation, smallest, largest : of recall, as in :class:`Spread`.
+    found_always, found_sometimes, found_never : queries within the threshold in all, some or none
+        of the runs.
     """
 
     threshold: Threshold
-    recall: Spread
-    always: int
-    sometimes: int
-    never: int
+    mean: float
+    deviation: float
+    smallest: float
+    largest: float
+    found_always: int
+    found_sometimes: int
+    found_never: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -389,25 +371,20 @@ def over_seeds(evaluations: Sequence[Evaluation]) -> Seeds:
     met = np.stack([[within(e.errors, t) for t in first.thresholds] for e in evaluations])
     rows = []
     for position, (name, chosen) in enumerate(first.members.items()):
-        found = met[:, :, chosen]
         of_runs = [evaluation.rows[position] for evaluation in evaluations]
+        recall = []
+        for index, threshold in enumerate(first.thresholds):
+            always = met[:, index, chosen].all(axis=0)
+            ever = met[:, index, chosen].any(axis=0)
+            spread = _spread([row.recall[index].recall for row in of_runs])
+            counts = (int(own.sum()) for own in (always, ever & ~always, ~ever))
+            recall.append(SeedsAt(threshold, *astuple(spread), *counts))
         rows.append(
             SeedsRow(
                 name=name,
                 num_queries=int(chosen.sum()),
                 num_localized=_spread([float(row.num_localized) for row in of_runs]),
-                recall=tuple(
-                    SeedsAt(
-                        threshold=threshold,
-                        recall=_spread([row.recall[index].recall for row in of_runs]),
-                        always=int(found[:, index].all(axis=0).sum()),
-                        sometimes=int(
-                            (found[:, index].any(axis=0) & ~found[:, index].all(axis=0)).sum()
-                        ),
-                        never=int((~found[:, index].any(axis=0)).sum()),
-                    )
-                    for index, threshold in enumerate(first.thresholds)
-                ),
+                recall=tuple(recall),
                 median_position_m=_spread([row.median_position_m for row in of_runs]),
             )
         )

@@ -20,7 +20,7 @@ from PIL import Image
 
 import megloc_kapture as megloc_package
 from megloc_kapture.evaluation.evaluate import evaluate
-from megloc_kapture.evaluation.report.shown_queries import StoredInliers, shown_queries
+from megloc_kapture.evaluation.report.queries import StoredInliers, shown_queries
 from megloc_kapture.io.tables import read_status
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")

@@ -17,6 +17,7 @@ from megloc_kapture.evaluation.statistics import (
     Comparison,
     MedianDifference,
     PairedTest,
+    SeedsAt,
     Spread,
 )
 from megloc_kapture.evaluation.without_truth import (
@@ -76,7 +77,7 @@ def format_p(p_value: float) -> str:
     return "p < 0.001" if p_value < 0.001 else f"p = {p_value:.2g}"
 
 
-def format_spread(spread: Spread, *, percent: bool = False) -> str:
+def format_spread(spread: Spread | SeedsAt, *, percent: bool = False) -> str:
     """``89.8 +- 0.3``; ``inf`` where a run has no such figure."""
     if not math.isfinite(spread.mean):
         return "inf"
@@ -128,10 +129,10 @@ def notes(evaluation: Evaluation) -> list[str]:
     kinds = {query.fallback for query in evaluation.queries} - {"none"}
     if row.num_fallback:
         whose = " or the one ".join(_FALLBACK_POSES[kind] for kind in sorted(kinds))
+        given = counted(row.num_fallback, "query", "queries")
         said.append(
-            f"{counted(row.num_fallback, 'query', 'queries')} could not be localized and "
-            f"{_verb(row.num_fallback, 'bears', 'bear')} the pose {whose} "
-            "instead; recall and the median of all count it as any pose"
+            f"{given} could not be localized and {_verb(row.num_fallback, 'bears', 'bear')} the "
+            f"pose {whose} instead; recall and the median of all count it as any pose"
         )
     if row.num_missing == row.num_queries:
         said.append("no query has a pose")
@@ -181,16 +182,23 @@ def confidence_sentences(confidence: Confidence, coarsest: Threshold) -> list[st
     return said
 
 
-def retrieval_note(result: ResultWithoutTruth) -> str:
-    """The legend of :func:`result_table`, or that there is no retrieval to agree with."""
-    first = result.rows[-1].first_candidate
+def no_retrieval(result: ResultWithoutTruth) -> str:
+    """The reason why nothing is said about agreement with retrieval; empty where it is said."""
     if result.context.unit != METRES:
         return f"the map is in {result.context.unit} of its own, so nothing is said about distances"
-    if first is None:
+    if result.rows[-1].first_candidate is None:
         return (
             "no map or no ranked candidates are known, so nothing is said about agreement with "
             "retrieval"
         )
+    return ""
+
+
+def retrieval_note(result: ResultWithoutTruth) -> str:
+    """The legend of :func:`result_table`, or that there is no retrieval to agree with."""
+    first = result.rows[-1].first_candidate
+    if (unknown := no_retrieval(result)) or first is None:
+        return unknown
     return (
         "first, nearest: the candidate map image that is ranked first, or lies nearest to the "
         f"pose; facing: % that look within {PRIOR_ANGLE_DEG:g} degrees of the first; "

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from megloc_kapture.evaluation.report.document import Paragraph, Pictures
-from megloc_kapture.evaluation.report.masks import SegmentedClasses, class_colors, mask_blocks
+from megloc_kapture.evaluation.report.panels import SegmentedClasses, class_colors, mask_blocks
 from megloc_kapture.evaluation.report.reports import render_report
 from megloc_kapture.evaluation.results import ResultContext, context_of
 from megloc_kapture.evaluation.scoring import evaluate_poses
