@@ -87,12 +87,7 @@ def confidence_of(
     queries: Sequence[QueryResult], coarsest: Threshold, nowhere: Sequence[QueryResult] = ()
 ) -> Confidence | None:
     """Judge the confidences of a result's poses; None where no pose has one and no query is known
-    to show nothing of the map.
-
-    Parameters
-    ----------
-    nowhere : queries that show nothing of the map: each pose of one is wrong.
-    """
+    to show nothing of the map (``nowhere``, each pose of which is wrong)."""
     posed = [q for q in queries if q.outcome == "localized" and q.confidence is not None]
     strays = [q for q in nowhere if q.outcome == "localized"]
     posed += [q for q in strays if q.confidence is not None]

@@ -161,8 +161,7 @@ def results_without_truth(
 
     Parameters
     ----------
-    results : kapture folders, pose files or image -> pose, one or several.
-    mapping, labels : as in :func:`evaluate_results`.
+    results, mapping, labels : as in :func:`evaluate_results`.
     map_poses : ``cam_from_world`` of the map's images; by default those of the first result that
         has a map.
 

@@ -93,25 +93,35 @@ class MedianDifference:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Comparison(Reported):
+class SeveralResults(Reported):
+    """Results on the same queries, in the order they were given."""
+
+    evaluations: tuple[Evaluation, ...]
+
+    def per_query(self) -> dict[str, list[Any]]:
+        """Column -> one value per query; those of a result are called ``label: column``."""
+        columns: dict[str, list[Any]] = {}
+        for evaluation in self.evaluations:
+            for name, values in query_columns(evaluation.queries).items():
+                shared = name in ("image", "condition")
+                columns.setdefault(name if shared else f"{evaluation.label}: {name}", values)
+        return columns
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Comparison(SeveralResults):
     """Results on the same queries, compared two by two.
 
     Parameters
     ----------
-    evaluations : the results, in the order they were given.
     tests : of all queries together, by pair of results and threshold; one family for Holm.
     tests_by_row : of the conditions and pools; another family.
     medians : one per pair of results.
     """
 
-    evaluations: tuple[Evaluation, ...]
     tests: tuple[PairedTest, ...]
     tests_by_row: tuple[PairedTest, ...]
     medians: tuple[MedianDifference, ...]
-
-    def per_query(self) -> dict[str, list[Any]]:
-        """Column -> one value per query; those of a result are called ``label: column``."""
-        return _columns_by_label(self.evaluations)
 
     def differences(self) -> dict[str, list[Any]]:
         """Column -> values, of every query that one result alone finds, by pair and threshold."""
@@ -132,12 +142,8 @@ class Comparison(Reported):
 
 
 def compare(evaluations: Sequence[Evaluation]) -> Comparison:
-    """Compare at least two results on the same queries, thresholds and conditions.
-
-    Raises
-    ------
-    OptionError : fewer than two, two with one label, or not of the same queries and thresholds.
-    """
+    """Compare at least two results on the same queries, thresholds and conditions; OptionError: see
+    :func:`check_comparable`."""
     check_comparable(evaluations)
     pairs = list(combinations(range(len(evaluations)), 2))
     rows = [name for name in evaluations[0].members if name != ALL]
@@ -150,13 +156,8 @@ def compare(evaluations: Sequence[Evaluation]) -> Comparison:
 
 
 def check_comparable(evaluations: Sequence[Evaluation]) -> None:
-    """Refuse results that do not belong beside each other.
-
-    Raises
-    ------
-    OptionError : fewer than two, two with one label, or not of the same queries, thresholds and
-        conditions.
-    """
+    """Raise OptionError for results that do not belong beside each other: fewer than two, two with
+    one label, or not of the same queries, thresholds and conditions."""
     if len(evaluations) < 2:
         raise OptionError("at least two results are needed to compare")
     first = evaluations[0]
@@ -173,14 +174,11 @@ def check_comparable(evaluations: Sequence[Evaluation]) -> None:
 
 
 def mcnemar(only_first: ArrayLike, only_second: ArrayLike) -> NDArray[np.float64]:
-    """Two-sided p-values of the exact McNemar test.
+    """Two-sided p-values of the exact McNemar test, of numbers (...) of queries that one of two
+    results alone finds.
 
     Queries that both or neither find say nothing about a difference; of the others each falls to
     either side with probability one half when the methods are equally good.
-
-    Parameters
-    ----------
-    only_first, only_second : whole numbers (...) of queries that one of the two finds.
     """
     from scipy.special import bdtr
 
@@ -218,10 +216,8 @@ def resampled_medians(values: NDArray[np.float64], *, seed: int = 0) -> NDArray[
 def difference_interval(
     first: NDArray[np.float64], second: NDArray[np.float64]
 ) -> tuple[float, float]:
-    """The middle 95 % of ``first - second``, paired medians of :func:`resampled_medians`.
-
-    Where both are infinite their difference is zero.
-    """
+    """The middle 95 % of ``first - second``, paired medians of :func:`resampled_medians`; the
+    difference of infinities is zero."""
     with np.errstate(invalid="ignore"):
         apart = first - second
     apart = np.where(np.isnan(apart), 0.0, apart)
@@ -341,30 +337,15 @@ class SeedsRow:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Seeds(Reported):
-    """All runs and what they have in common.
+class Seeds(SeveralResults):
+    """Runs of one method and what they have in common; ``rows`` as those of each run."""
 
-    Parameters
-    ----------
-    evaluations : the runs, in the order they were given.
-    rows : as those of each run.
-    """
-
-    evaluations: tuple[Evaluation, ...]
     rows: tuple[SeedsRow, ...]
-
-    def per_query(self) -> dict[str, list[Any]]:
-        """Column -> one value per query; those of a result are called ``label: column``."""
-        return _columns_by_label(self.evaluations)
 
 
 def over_seeds(evaluations: Sequence[Evaluation]) -> Seeds:
-    """Mean and spread of at least two runs of one method.
-
-    Raises
-    ------
-    OptionError : fewer than two, or not of the same queries, thresholds and conditions.
-    """
+    """Mean and spread of at least two runs of one method; OptionError: see
+    :func:`check_comparable`."""
     check_comparable(evaluations)
     first = evaluations[0]
     # runs, thresholds, queries
@@ -400,12 +381,3 @@ def _spread(values: Sequence[float]) -> Spread:
         smallest=float(numbers.min()),
         largest=float(numbers.max()),
     )
-
-
-def _columns_by_label(evaluations: Sequence[Evaluation]) -> dict[str, list[Any]]:
-    columns: dict[str, list[Any]] = {}
-    for evaluation in evaluations:
-        for name, values in query_columns(evaluation.queries).items():
-            shared = name in ("image", "condition")
-            columns.setdefault(name if shared else f"{evaluation.label}: {name}", values)
-    return columns

@@ -239,10 +239,8 @@ def compare_poses(
 
     Parameters
     ----------
-    keys : per row its name in the file.
+    keys, queries : per row its name in the file, and its query, None where the name is unknown.
     quats, translations : float64 (N, 4) and (N, 3), in the order of the file's columns.
-    queries : per row its query, None where the name is unknown.
-    reference : with cameras.
     """
     cameras, world = reference.cameras, reference.world
     if cameras is None or not len(keys):
@@ -303,7 +301,6 @@ def compare_relative(
     keys : per row its two timestamps.
     quats, translations : float64 (N, 4) and (N, 3), in the order of the file's columns.
     pairs : per row the reference's image (of the map) and the query's, None where it is unknown.
-    reference : with cameras.
     """
     cameras = reference.cameras
     if cameras is None or not len(keys):

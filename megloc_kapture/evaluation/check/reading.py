@@ -174,12 +174,7 @@ class Rows:
 
 
 def read_rows(path: Path, kind: PoseFileFormat) -> Rows:
-    """Read what can be read of a pose file.
-
-    Raises
-    ------
-    DataError : it cannot be read at all, or is no text in UTF-8; names file and line.
-    """
+    """Read what can be read of a pose file; DataError: nothing can, or it is no text in UTF-8."""
     scan = _Scan(kind)
     lines = read_text(path).split("\n")
     if lines[-1] and kind == "ltvl":
@@ -323,11 +318,7 @@ class Reference:
 
 def read_reference(folder: Path) -> Reference:
     """Read what is there of an import or workspace: ``mapping/``, ``query/``, ``megloc/``.
-
-    Raises
-    ------
-    DataError : none of the three is there, or one is broken.
-    """
+    DataError: none of the three is there, or one is broken."""
     tables = folder / SIDE_TABLES
     parts = [folder / name for name in (_MAPPING, _QUERY)]
     there = [part for part in parts if (part / "sensors" / "sensors.txt").is_file()]

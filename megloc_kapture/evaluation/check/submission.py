@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import compress
@@ -160,16 +161,12 @@ def _check_pairs(
 
 
 def match_pairs(named: Mapping[str, int], expected: Collection[str]) -> tuple[bool, list[Finding]]:
-    """Compare the rows of an MLAD file with the pairs that are asked for.
+    """Whether the two timestamps of an MLAD file's rows are swapped, and what is wrong with them.
 
     Parameters
     ----------
     named : keys (two timestamps with a blank between) -> line.
     expected : the keys of the relocalization file, in its order.
-
-    Returns
-    -------
-    Whether the two timestamps are swapped, and what is wrong.
     """
     wanted = dict.fromkeys(expected)
     unknown = [key for key in named if key not in wanted]
@@ -197,12 +194,7 @@ def match_pairs(named: Mapping[str, int], expected: Collection[str]) -> tuple[bo
 def match_names(
     named: Mapping[str, int], reference: Reference, dataset: str
 ) -> tuple[Mapping[str, str], list[Finding]]:
-    """Find the query that each name of a file stands for.
-
-    Parameters
-    ----------
-    named : names of the file -> line.
-    reference : its ``expected`` names, and the queries that are not scored.
+    """Find the query that each name of a file (-> line) stands for.
 
     Returns
     -------
@@ -352,9 +344,9 @@ def _ends_alike(name: str, images: Iterable[str]) -> bool:
 
 
 def _by_stem(names: Iterable[str]) -> dict[str, list[str]]:
-    found: dict[str, list[str]] = {}
+    found: dict[str, list[str]] = defaultdict(list)
     for name in names:
-        found.setdefault(_stem(name), []).append(name)
+        found[_stem(name)].append(name)
     return found
 
 

@@ -129,29 +129,27 @@ def notes(evaluation: Evaluation) -> list[str]:
     kinds = {query.fallback for query in evaluation.queries} - {"none"}
     if row.num_fallback:
         whose = " or the one ".join(_FALLBACK_POSES[kind] for kind in sorted(kinds))
-        given = counted(row.num_fallback, "query", "queries")
+        bear = "queries could not be localized and bear"
+        given = counted(row.num_fallback, "query could not be localized and bears", bear)
         said.append(
-            f"{given} could not be localized and {_verb(row.num_fallback, 'bears', 'bear')} the "
-            f"pose {whose} instead; recall and the median of all count it as any pose"
+            f"{given} the pose {whose} instead; recall and the median of all count it as any pose"
         )
     if row.num_missing == row.num_queries:
         said.append("no query has a pose")
     missing = evaluation.without_truth
     if missing:
         shown = ", ".join(missing[:_NAMES_SHOWN]) + (", ..." if missing[_NAMES_SHOWN:] else "")
-        said.append(
-            f"{counted(len(missing), 'image has', 'images have')} no true pose and "
-            f"{_verb(len(missing), 'is', 'are')} not counted: {shown}"
-        )
+        lack = "images have no true pose and are"
+        told = counted(len(missing), "image has no true pose and is", lack)
+        said.append(f"{told} not counted: {shown}")
         if evaluation.truth_known_by:
             said.append(evaluation.truth_known_by.rstrip("."))
         if not evaluation.estimated and row.num_missing == row.num_queries:
             said.append("no estimated image is in the ground truth: do the names agree?")
     if evaluation.not_scored:
-        said.append(
-            f"{counted(len(evaluation.not_scored), 'image', 'images')} with a true pose "
-            f"{_verb(len(evaluation.not_scored), 'is', 'are')} not scored by this benchmark"
-        )
+        number = len(evaluation.not_scored)
+        told = counted(number, "image with a true pose is", "images with a true pose are")
+        said.append(f"{told} not scored by this benchmark")
     return said
 
 
@@ -162,8 +160,8 @@ def confidence_sentences(confidence: Confidence, coarsest: Threshold) -> list[st
         interval = f"{100 * confidence.wrong_low:.1f}-{100 * confidence.wrong_high:.1f}"
         said.append(
             f"of {counted(confidence.num_poses, 'pose', 'poses')} with a confidence "
-            f"{confidence.num_wrong} {_verb(confidence.num_wrong, 'is', 'are')} wrong (beyond "
-            f"{coarsest}): {format_share(confidence.num_wrong, confidence.num_poses)} % "
+            f"{counted(confidence.num_wrong, 'is', 'are')} wrong (beyond {coarsest}): "
+            f"{format_share(confidence.num_wrong, confidence.num_poses)} % "
             f"({interval})"
         )
     if confidence.num_wrong:
@@ -298,7 +296,3 @@ def _signed(metres: float) -> str:
     if math.isinf(metres):
         return "-inf" if metres < 0 else "+inf"
     return f"{'-' if metres < 0 else '+'}{format_metres(abs(metres))}"
-
-
-def _verb(number: int, one: str, many: str) -> str:
-    return one if number == 1 else many
