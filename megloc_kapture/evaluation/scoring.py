@@ -356,7 +356,6 @@ def evaluate_pairs(
     references: Poses,
     *,
     thresholds: Sequence[Threshold],
-    scored: Collection[str] | None = None,
     statuses: Mapping[str, QueryStatus] | None = None,
     label: str = "",
 ) -> Evaluation:
@@ -368,7 +367,6 @@ def evaluate_pairs(
     ----------
     estimated : ``cam_from_world`` of a pair's query; pairs may be absent.
     truth, references : ``cam_from_world`` of queries and references, in the same frame, metres.
-    scored : the images that count; pairs of others are left out.
     statuses : rows of ``status.csv`` by image.
 
     Returns
@@ -392,15 +390,14 @@ def evaluate_pairs(
     if len(named) != len(pairs):
         raise DataError("a pair of reference and query is listed twice in one file")
     called = _conditions(dict.fromkeys(pair.file for pair in pairs))
-    asked = {n: p for n, p in named.items() if scored is None or p.query in scored}
     statuses = statuses or {}
-    of_pairs = {n: statuses[p.query] for n, p in asked.items() if p.query in statuses}
+    of_pairs = {n: statuses[p.query] for n, p in named.items() if p.query in statuses}
     by_center = evaluate_poses(
-        {n: estimated[p] for n, p in asked.items() if p in estimated},
-        {n: truth[p.query] for n, p in asked.items() if p.query in truth},
-        conditions={n: called[p.file] for n, p in asked.items()} if len(called) > 1 else None,
+        {n: estimated[p] for n, p in named.items() if p in estimated},
+        {n: truth[p.query] for n, p in named.items() if p.query in truth},
+        conditions={n: called[p.file] for n, p in named.items()} if len(called) > 1 else None,
         thresholds=thresholds,
-        scored=asked.keys(),
+        scored=named.keys(),
         statuses=of_pairs,
         condition_order=list(called.values()),
         label=label,
@@ -427,7 +424,7 @@ def evaluate_pairs(
     return replace(
         relative,
         without_truth=by_center.without_truth,
-        pairs={name: asked[name] for name in names},
+        pairs={name: named[name] for name in names},
         by_center=by_center,
     )
 

@@ -197,12 +197,12 @@ def holm(p_values: ArrayLike) -> NDArray[np.float64]:
     return adjusted
 
 
-def resampled_medians(values: NDArray[np.float64], *, seed: int = 0) -> NDArray[np.float64]:
+def resampled_medians(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Medians (2000,) of values (N,) drawn again with replacement; values may be infinite.
 
-    The same seed and N draw the same positions, so that results on the same queries stay paired.
+    The same N draws the same positions, so that results on the same queries stay paired.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     size = len(values)
     step = max(_CHUNK // max(size, 1), 1)
     medians = np.empty(NUM_RESAMPLES)

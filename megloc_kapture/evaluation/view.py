@@ -179,7 +179,7 @@ def _write_recording(path: Path, scene: Scene, context: ResultContext) -> None:
         with contextlib.suppress(DataError):  # a frustum without its image is better than none
             if folder is not None:
                 read = read_image_rgb(folder.image_path(image))
-                pixels, scale = shrunk(read, width=_WIDTH, height=_WIDTH)
+                pixels, scale = shrunk(read, (_WIDTH, _WIDTH))
         log(
             where,
             rr.Pinhole(

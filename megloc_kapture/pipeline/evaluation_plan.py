@@ -272,21 +272,19 @@ class Evaluate(_RunStage):
         provenance = self.settings() | {"versions": package_versions()}
         output = work.out / EVALUATION
         # two runs give the same bytes, so seconds stand in manifests and timing.csv alone
-        contexts = [replace(context_of(localized), seconds={})]
+        context = replace(context_of(localized), seconds={})
         if not truth.is_dir():
             found = results_without_truth(
                 [localized], benchmark_of(tables), map_poses=map_poses, labels=[label]
             )
-            write_report(
-                output, found, map_poses=map_poses, provenance=provenance, contexts=contexts
-            )
+            found = replace(found, results=(replace(found.results[0], context=context),))
+            write_report(output, found, map_poses=map_poses, provenance=provenance)
             return {"queries_with_truth": 0}
         evaluation = evaluate(
             localized, truth, side_tables=tables, label=label, mapping=work.path(MAPPING)
         )
-        write_report(
-            output, evaluation, map_poses=map_poses, provenance=provenance, contexts=contexts
-        )
+        evaluation = replace(evaluation, context=context)
+        write_report(output, evaluation, map_poses=map_poses, provenance=provenance)
         row = evaluation.row()
         recall = {f"recall at {at.threshold}": round(at.recall, 4) for at in row.recall}
         return {"queries_with_truth": len(evaluation.queries), **recall}

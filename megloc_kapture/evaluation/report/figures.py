@@ -304,7 +304,7 @@ def errors_against_inliers(evaluation: Evaluation, *, prefix: str = "inliers") -
         return to_svg(figure, prefix)
 
 
-def confidence_curves(confidence: Confidence, *, prefix: str = "confidence") -> Markup:
+def confidence_curves(confidence: Confidence) -> Markup:
     """The reliability diagram, and the risk against the coverage."""
     with styled_figure(10.5, 4.0) as figure:
         reliability, curve = figure.subplots(1, 2)
@@ -327,7 +327,7 @@ def confidence_curves(confidence: Confidence, *, prefix: str = "confidence") -> 
             xlabel="queries answered (%)", ylabel="wrong among them (%)", xlim=(0, 102),
             ylim=(0, max(5.0, 1.1 * float(risk.max(initial=0.0)))),
         )  # fmt: skip
-        return to_svg(figure, prefix)
+        return to_svg(figure, "confidence")
 
 
 def _condition_colors(evaluation: Evaluation) -> dict[str, str]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -430,12 +430,12 @@ def _small(folder: KaptureFolder | None, image: str, box: tuple[int, int]) -> Sm
     """An image made small; None where it cannot be read."""
     with contextlib.suppress(DataError):
         if folder is not None:
-            return read_small(folder.image_path(image), width=box[0], height=box[1])
+            return read_small(folder.image_path(image), box)
     return None
 
 
 def query_pictures(
-    chosen: Sequence[Chosen], context: ResultContext, map_poses: Mapping[str, RigidTransform]
+    chosen: Sequence[Chosen], context: ResultContext, map_poses: Poses
 ) -> list[Pictures]:
     """Pictures of all chosen queries of one result."""
     ranked = are_ranked(one.candidates for one in chosen)

@@ -132,9 +132,7 @@ def evaluation_page(
     return (*sections, *_section("Queries, the worst first", [Paragraph(told), table]))
 
 
-def comparison_page(
-    comparison: Comparison, map_poses: Poses, contexts: Sequence[ResultContext]
-) -> tuple[Section, ...]:
+def comparison_page(comparison: Comparison, map_poses: Poses) -> tuple[Section, ...]:
     """The differences of several results on the same queries, then each of them."""
     items = tuple(
         # a p-value is not broken over two lines
@@ -146,12 +144,10 @@ def comparison_page(
         f"{_BELOW} Intervals of two results may overlap although the paired test above finds them "
         "different: it looks at the same queries."
     )
-    return _several(comparison.evaluations, first, below, map_poses, contexts)
+    return _several(comparison.evaluations, first, below, map_poses)
 
 
-def seeds_page(
-    seeds: Seeds, map_poses: Poses, contexts: Sequence[ResultContext]
-) -> tuple[Section, ...]:
+def seeds_page(seeds: Seeds, map_poses: Poses) -> tuple[Section, ...]:
     """Mean and spread over runs of one method, then each of them."""
     told = (
         "Recall in percent: mean and standard deviation of a run; below it the smallest and the "
@@ -159,20 +155,16 @@ def seeds_page(
     )
     found = [Heading("How often a query is found"), tables.found_table(seeds)]
     first = _section("Mean and spread", [Paragraph(told), tables.seeds_table(seeds), *found])
-    return _several(seeds.evaluations, first, _BELOW, map_poses, contexts)
+    return _several(seeds.evaluations, first, _BELOW, map_poses)
 
 
 def without_truth_page(
-    found: WithoutTruth,
-    map_poses: Poses,
-    contexts: Sequence[ResultContext],
-    stored: StoredInliers,
+    found: WithoutTruth, map_poses: Poses, stored: StoredInliers
 ) -> tuple[Section, ...]:
     """Localized shares, agreement with retrieval and between results, and doubtful queries."""
     sections = [Section((Paragraph(f"No recall: {found.statement} {CAUTION}", "note"),))]
-    several = list(zip(found.results, contexts, strict=True))
-    for number, (result, context) in enumerate(several):
-        views = views_of(result, map_poses, context.frames, prefix=f"above{number}-")
+    for number, result in enumerate(found.results):
+        views = views_of(result, map_poses, result.context.frames, prefix=f"above{number}-")
         said = "Camera centres from above"
         if are_ranked(query.candidates for query in result.queries):
             said += ", a grey line from the first candidate to the pose"
@@ -188,25 +180,26 @@ def without_truth_page(
         whole = [agreement_sentence(row, found) for row in found.agreement if row.name == ALL]
         table = tables.agreement_table(found, found.agreement)
         sections += _section("Do they agree?", [Paragraph(told), table, *map(Paragraph, whole)])
-    if len(several) == 1:
+    if len(found.results) == 1:
         sections += _section("Queries", gallery_blocks(stored, shown_queries(found.results[0])))
-    for result, context in several:
+    for result in found.results:
         sections += _pictured(
             f"{result.label}: localized, but least sure",
             "Far from every candidate, or from few inliers. Left the query, right the candidate "
             "with most matches. ",
-            query_pictures(doubtful_queries(result), context, map_poses),
+            query_pictures(doubtful_queries(result), result.context, map_poses),
             "estimated",
         )
-    if len(several) == 1:
-        sections += _seconds(contexts[0])
-    for result, context in several:
-        changed = refinement_blocks(context, result.poses)
+    if len(found.results) == 1:
+        sections += _seconds(stored.context)
+    for result in found.results:
+        changed = refinement_blocks(result.context, result.poses)
         sections += _section(f"{result.label}: what refinement changed", changed)
-    for result, context in several:
-        sections += _section(f"{result.label}: what masks hide", mask_blocks(context.masked))
+    for result in found.results:
+        masked = mask_blocks(result.context.masked)
+        sections += _section(f"{result.label}: what masks hide", masked)
     # of one map or of several: the first shows what stereo makes of such images
-    sections += _section(_DEPTH, depth_blocks(contexts[0]) if contexts else ())
+    sections += _section(_DEPTH, depth_blocks(stored.context))
     return tuple(sections)
 
 
@@ -215,7 +208,6 @@ def _several(
     first: list[Section],
     below: str,
     map_poses: Poses,
-    contexts: Sequence[ResultContext],
 ) -> tuple[Section, ...]:
     colors = tables.colors_of([evaluation.label for evaluation in evaluations])
     number = evaluations[0].row().num_queries
@@ -234,16 +226,17 @@ def _several(
         *_section(_recall_heading(evaluations[0]), recall),
         *_section(_ERRORS, curves),
     ]
-    pictures = [QueryPictures(context, map_poses) for context in contexts]
+    pictures = [QueryPictures(evaluation.context, map_poses) for evaluation in evaluations]
     sections += _pictured(
         "Queries to look at",
         "First those the results disagree about, then those that are worst in all of them. Left "
         "the query, right the candidate with most matches, of the result that does worst on it. ",
         [pictures[worst].of(chosen) for worst, chosen in disputed_queries(evaluations)],
     )
-    for number, (evaluation, context) in enumerate(zip(evaluations, contexts, strict=True)):
+    for number, evaluation in enumerate(evaluations):
+        frames, prefix = evaluation.context.frames, f"above{number}-"
         inliers = figures.errors_against_inliers(evaluation, prefix=f"inliers{number}")
-        views = views_of(evaluation, map_poses, context.frames, prefix=f"above{number}-")
+        views = views_of(evaluation, map_poses, frames, prefix=prefix)
         blocks = [*_notes(evaluation), Heading(_WHERE), Paragraph(_FROM_ABOVE), *views]
         if inliers is not None:
             blocks += [Heading(_INLIERS), Figure(inliers, narrow=True)]

@@ -159,7 +159,7 @@ def _masked_image(
     """The three panels of an image; raises DataError where it or its mask cannot be read."""
     pixels = read_image_rgb(folder.image_path(image))
     mask = read_image_rgb(_mask_path(folder, image))[:, :, 0] > 0
-    small, scale = shrunk(pixels, width=_MASK_BOX[0], height=_MASK_BOX[1])
+    small, scale = shrunk(pixels, _MASK_BOX)
     hidden = ~_resized(mask.astype(np.uint8), small.shape).astype(bool)
     shaded = small.astype(np.float64)
     shaded[hidden] += _SHADE_SHARE * (_SHADE - shaded[hidden])
@@ -252,7 +252,7 @@ def _with_depth(folder: KaptureFolder, row: DepthRow, unit: str) -> Pictures:
     record = depth_records(folder.read()).get(row.image)
     if record is None:
         raise DataError(f"no depth record of {row.image}", path=folder.root)
-    small = read_small(folder.image_path(row.image), width=_DEPTH_BOX[0], height=_DEPTH_BOX[1])
+    small = read_small(folder.image_path(row.image), _DEPTH_BOX)
     panels = [Picture(image_tag(small, row.image))]
 
     def show(pixels: NDArray[np.uint8], name: str, caption: str) -> None:
@@ -331,15 +331,14 @@ def rendered_queries(
         raise DataError("no image here is a query of the result with a pose", path=rendered.root)
     if len(shown) > MAX_QUERIES:
         notes.append(f"Renderings are shown of {MAX_QUERIES} of {len(shown)} queries.")
-    width, height = _RENDERED_BOX
     for query in shown[:MAX_QUERIES]:
         name = images[Path(query.image).with_suffix("")]
         panels = found.setdefault(query.name, [])
         with contextlib.suppress(DataError):
             if photographs is not None:
                 path = photographs.image_path(query.image)
-                panels.append(("photograph", read_small(path, width=width, height=height).address))
-        picture = read_small(rendered.image_path(name), width=width, height=height)
+                panels.append(("photograph", read_small(path, _RENDERED_BOX).address))
+        picture = read_small(rendered.image_path(name), _RENDERED_BOX)
         panels.append(("rendered at the pose", picture.address))
         if (record := depths.get(name)) is not None:
             size = {"width": record.camera.width, "height": record.camera.height}

@@ -33,23 +33,16 @@ class SmallImage:
     address: str
 
 
-def read_small(path: Path, *, width: int, height: int) -> SmallImage:
-    """An image that fits into ``width`` x ``height`` pixels; never made larger.
-
-    Raises
-    ------
-    DataError : the image is missing or broken.
-    """
-    return encoded(*shrunk(read_image_rgb(path), width=width, height=height))
+def read_small(path: Path, box: tuple[int, int]) -> SmallImage:
+    """An image as :func:`shrunk`; DataError: it is missing or broken."""
+    return encoded(*shrunk(read_image_rgb(path), box))
 
 
-def shrunk(
-    pixels: NDArray[np.uint8], *, width: int, height: int
-) -> tuple[NDArray[np.uint8], float]:
-    """Pixels (H, W, 3) made to fit into ``width`` x ``height``, never larger; and the scale."""
+def shrunk(pixels: NDArray[np.uint8], box: tuple[int, int]) -> tuple[NDArray[np.uint8], float]:
+    """Pixels (H, W, 3) made to fit into a width and height, never larger; and the scale."""
     import cv2  # only a report with images waits for it
 
-    scale = min(width / pixels.shape[1], height / pixels.shape[0], 1.0)
+    scale = min(box[0] / pixels.shape[1], box[1] / pixels.shape[0], 1.0)
     size = (max(round(pixels.shape[1] * scale), 1), max(round(pixels.shape[0] * scale), 1))
     return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8), scale
 

@@ -165,7 +165,7 @@ def order_of_badness(query: QueryResult) -> tuple[float, float, str]:
     return -query.position_m, -query.angle_deg, query.image
 
 
-def worst_queries(evaluation: Evaluation, number: int = NUM_SHOWN) -> list[Chosen]:
+def worst_queries(evaluation: Evaluation) -> list[Chosen]:
     """The worst queries of a result; at most half of them without a pose, where others are left.
 
     Of those without a pose the ones with most inliers come first: they failed most narrowly.
@@ -174,14 +174,12 @@ def worst_queries(evaluation: Evaluation, number: int = NUM_SHOWN) -> list[Chose
     lost = [query for query in ranked if query.outcome == "missing"]
     lost.sort(key=lambda query: (-(query.num_inliers or 0), query.image))
     posed = [query for query in ranked if query.outcome != "missing"]
-    num_posed = min(len(posed), max(number - len(lost), (number + 1) // 2))
-    shown = posed[:num_posed] + lost[: number - num_posed]
+    num_posed = min(len(posed), max(NUM_SHOWN - len(lost), (NUM_SHOWN + 1) // 2))
+    shown = posed[:num_posed] + lost[: NUM_SHOWN - num_posed]
     return [_chosen(evaluation, query, "; ".join(query_facts(query))) for query in shown]
 
 
-def disputed_queries(
-    evaluations: Sequence[Evaluation], number: int = NUM_SHOWN
-) -> list[tuple[int, Chosen]]:
+def disputed_queries(evaluations: Sequence[Evaluation]) -> list[tuple[int, Chosen]]:
     """Queries that results disagree about most, then those that are worst in all of them.
 
     Returns
@@ -196,8 +194,8 @@ def disputed_queries(
     best = errors.min(axis=0)
     by_dispute = sorted(np.flatnonzero(dispute > 0).tolist(), key=lambda i: (-dispute[i], names[i]))
     by_error = sorted(range(len(names)), key=lambda i: (-best[i], -errors[:, i].max(), names[i]))
-    chosen = by_dispute[: number - number // 3]
-    chosen += [i for i in by_error if i not in set(chosen)][: number - len(chosen)]
+    chosen = by_dispute[: NUM_SHOWN - NUM_SHOWN // 3]
+    chosen += [i for i in by_error if i not in set(chosen)][: NUM_SHOWN - len(chosen)]
     found = []
     for index in chosen:
         worst = int(np.argmax(errors[:, index]))
@@ -207,7 +205,7 @@ def disputed_queries(
     return found
 
 
-def doubtful_queries(result: ResultWithoutTruth, number: int = NUM_SHOWN) -> list[Chosen]:
+def doubtful_queries(result: ResultWithoutTruth) -> list[Chosen]:
     """Localized queries that are least sure: far from every candidate, or of few inliers."""
     localized = [query for query in result.queries if query.outcome == "localized"]
     known = [q.num_inliers for q in localized if q.num_inliers is not None]
@@ -233,7 +231,7 @@ def doubtful_queries(result: ResultWithoutTruth, number: int = NUM_SHOWN) -> lis
             *(q.image, q.image, ("; ".join(facts(q)),)),
             *(q.candidates, result.poses[q.image], "estimated"),
         )
-        for q in sorted(localized, key=doubt)[:number]
+        for q in sorted(localized, key=doubt)[:NUM_SHOWN]
     ]
 
 

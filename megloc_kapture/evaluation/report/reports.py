@@ -35,7 +35,7 @@ from megloc_kapture.evaluation.report.wording import (
     notes,
     retrieval_note,
 )
-from megloc_kapture.evaluation.results import Poses, ResultContext
+from megloc_kapture.evaluation.results import Poses
 from megloc_kapture.evaluation.scoring import Evaluation
 from megloc_kapture.evaluation.statistics import Comparison, MedianDifference, PairedTest, Seeds
 from megloc_kapture.evaluation.without_truth import CAUTION, ResultWithoutTruth, WithoutTruth
@@ -58,7 +58,6 @@ def report_of(
     *,
     map_poses: Poses | None = None,
     provenance: Mapping[str, Any] | None = None,
-    contexts: Sequence[ResultContext] | None = None,
     view: bool = False,
 ) -> Document:
     """The report of one result, of several, of runs with seeds, or of results without truth.
@@ -66,9 +65,8 @@ def report_of(
     Parameters
     ----------
     map_poses : ``cam_from_world`` of the map's images, for the view from above; by default those
-        of the first context that has a map.
+        of the first result that has a map.
     provenance : options, preset, inputs: plain JSON data, shown at the end with the versions.
-    contexts : images, masks and matches of each result, by default those it brings along.
     view : add the 3D view of a single result, a file beside the page that leads to it.
 
     Raises
@@ -83,23 +81,21 @@ def report_of(
     else:
         results = reported.results if isinstance(reported, WithoutTruth) else reported.evaluations
     title = " and ".join(result.label for result in results)
-    if contexts is None:
-        contexts = [result.context for result in results]
     if map_poses is None:
-        map_poses = next((poses for context in contexts if (poses := context.map_poses())), {})
+        map_poses = next((poses for own in results if (poses := own.context.map_poses())), {})
     # the gallery and the view show the same inliers
-    stored = StoredInliers(contexts[0])
+    stored = StoredInliers(results[0].context)
     if isinstance(reported, Evaluation):
         title = title or "Evaluation"
         page = pages.evaluation_page(reported, map_poses, stored)
     elif isinstance(reported, Comparison):
-        page = pages.comparison_page(reported, map_poses, contexts)
+        page = pages.comparison_page(reported, map_poses)
     elif isinstance(reported, Seeds):
         title = f"{len(results)} runs of one method"
-        page = pages.seeds_page(reported, map_poses, contexts)
+        page = pages.seeds_page(reported, map_poses)
     else:
         title = title or "Without truth"
-        page = pages.without_truth_page(reported, map_poses, contexts, stored)
+        page = pages.without_truth_page(reported, map_poses, stored)
     beside = _view(results[0], stored, title) if view and len(results) == 1 else {}
     if beside:
         link = Markup('<a class="view" href="{}">See it in 3D</a>').format(VIEW_HTML)

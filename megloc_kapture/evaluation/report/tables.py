@@ -71,10 +71,7 @@ def recall_table(evaluations: Sequence[Evaluation]) -> Table:
         return Cell("") if at % size else _name_cell(rows[at])
 
     def localized(row: RecallRow) -> Cell:
-        if not row.num_fallback:
-            return Cell(str(row.num_localized))
-        page = f"{row.num_localized} +{row.num_fallback}" if several else str(row.num_localized)
-        return Cell(f"{row.num_localized} (+{row.num_fallback})", page=page)
+        return _localized_cell(row, several=several)
 
     def of_all(row: RecallRow) -> Cell:
         return _median_cell(row.median_position_m, row.median_angle_deg)
@@ -190,10 +187,6 @@ def result_table(result: ResultWithoutTruth) -> Table:
     distances = " / ".join(f"{distance:g}" for distance in PRIOR_DISTANCES_M) + " m"
     fallbacks = rows[-1].num_fallback
 
-    def localized(row: RowWithoutTruth) -> Cell:
-        added = f" (+{row.num_fallback})" if row.num_fallback else ""
-        return Cell(f"{row.num_localized}{added}", page=str(row.num_localized))
-
     def share(row: RowWithoutTruth) -> str:
         return format_share(row.num_localized, row.num_queries)
 
@@ -211,7 +204,7 @@ def result_table(result: ResultWithoutTruth) -> Table:
     columns = [
         column("condition" if rows[1:] else "", rows, _name_cell),
         _count("queries", rows, _queries),
-        _count("localized", rows, localized),
+        _count("localized", rows, _localized_cell),
         _count("%", rows, share),
     ]
     if fallbacks:
@@ -332,6 +325,14 @@ def _queries(row: _Named) -> int:
 def _name_cell(row: _Named) -> Cell:
     """The name of a row, cut short in text."""
     return Cell(shortened(display_name(row.name)), page=display_name(row.name))
+
+
+def _localized_cell(row: RecallRow | RowWithoutTruth, *, several: bool = False) -> Cell:
+    """A number of queries; with that of fallback poses, which otherwise have a column."""
+    number, added = row.num_localized, row.num_fallback
+    if not added:
+        return Cell(str(number))
+    return Cell(f"{number} (+{added})", page=f"{number} +{added}" if several else str(number))
 
 
 def _total_last(rows: Sequence[object]) -> tuple[str, ...]:

@@ -266,13 +266,13 @@ def test_pictures_are_small_jpegs_of_the_image(tmp_path: Path) -> None:
     gradient[:, :, 0] = np.linspace(0, 255, 800)
     gradient[:, :, 2] = 128
     write_image(tmp_path / "wide.png", gradient)
-    picture = read_small(tmp_path / "wide.png", width=200, height=150)
+    picture = read_small(tmp_path / "wide.png", (200, 150))
     assert (picture.width, picture.height, picture.scale) == (200, 75, 0.25)
     content = base64.b64decode(picture.address.removeprefix("data:image/jpeg;base64,"))
     decoded = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)[:, :, ::-1]
     expected = cv2.resize(gradient, (200, 75), interpolation=cv2.INTER_AREA)
     assert np.abs(decoded.astype(int) - expected).mean() < 3.0
-    again = read_small(tmp_path / "wide.png", width=200, height=150)
+    again = read_small(tmp_path / "wide.png", (200, 150))
     assert again == picture
     # one that fits already is not made larger
-    assert read_small(tmp_path / "wide.png", width=9000, height=9000).width == 800
+    assert read_small(tmp_path / "wide.png", (9000, 9000)).width == 800
