@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.evaluation.metrics import Threshold
-from megloc_kapture.evaluation.report.renderers import REPORT_HTML
+from megloc_kapture.evaluation.report.document import REPORT_HTML
 from megloc_kapture.evaluation.report.reports import RECALL_JSON
 from megloc_kapture.io.colmap_mapping import Mapper
 from megloc_kapture.io.images import guessed_camera, photo_of, read_photo, turned_upright

@@ -15,6 +15,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -157,7 +158,7 @@ def measure(workspace: Path, num_queries: int, num_map_images: int) -> list[Time
     timed(
         steps,
         "write tables and report",
-        lambda: write_report(workspace / "out", evaluation, contexts=[context_of(localized)]),
+        lambda: write_report(workspace / "out", replace(evaluation, context=context_of(localized))),
     )
     timed(
         steps,

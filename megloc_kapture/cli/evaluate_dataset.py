@@ -12,8 +12,12 @@ import tyro
 from megloc_kapture.cli.common import Console, Deciding, Force, Working
 from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.metrics import Threshold
-from megloc_kapture.evaluation.report.renderers import REPORT_HTML
-from megloc_kapture.evaluation.report.reports import AGREEMENT_TEXT, RECALL_JSON, RECALL_TEXT
+from megloc_kapture.evaluation.report.document import REPORT_HTML
+from megloc_kapture.evaluation.report.reports import (
+    AGREEMENT_TEXT,
+    RECALL_JSON,
+    RECALL_TEXT,
+)
 from megloc_kapture.io.tables import STATUS_FILE, read_status
 from megloc_kapture.pipeline.ablation import ablate, outcomes_text, write_outcomes
 from megloc_kapture.pipeline.datasets import DatasetChoice

@@ -87,12 +87,7 @@ def confidence_of(
     queries: Sequence[QueryResult], coarsest: Threshold, nowhere: Sequence[QueryResult] = ()
 ) -> Confidence | None:
     """Judge the confidences of a result's poses; None where no pose has one and no query is known
-    to show nothing of the map.
-
-    Parameters
-    ----------
-    nowhere : queries that show nothing of the map: each pose of one is wrong.
-    """
+    to show nothing of the map (``nowhere``, each pose of which is wrong)."""
     posed = [q for q in queries if q.outcome == "localized" and q.confidence is not None]
     strays = [q for q in nowhere if q.outcome == "localized"]
     posed += [q for q in strays if q.confidence is not None]
@@ -133,17 +128,15 @@ def confidence_of(
     )
 
 
-def reliability(
-    confidences: NDArray[np.float64], right: NDArray[np.bool_], num_bins: int = NUM_BINS
-) -> tuple[Bin, ...]:
+def reliability(confidences: NDArray[np.float64], right: NDArray[np.bool_]) -> tuple[Bin, ...]:
     """Bins of equal width over confidences (N,) from 0 to 1, and which poses (N,) are right."""
-    number = np.clip(np.ceil(confidences * num_bins).astype(int) - 1, 0, num_bins - 1)
+    number = np.clip(np.ceil(confidences * NUM_BINS).astype(int) - 1, 0, NUM_BINS - 1)
     found = []
-    for index in range(num_bins):
+    for index in range(NUM_BINS):
         own = number == index
         count = int(own.sum())
         mean = float(confidences[own].mean()) if count else float("nan")
-        edges = index / num_bins, (index + 1) / num_bins
+        edges = index / NUM_BINS, (index + 1) / NUM_BINS
         found.append(Bin(*edges, count, int(right[own].sum()), mean))
     return tuple(found)
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.metrics import Threshold
-from megloc_kapture.evaluation.pairs import evaluate_pairs
 from megloc_kapture.evaluation.protocols import Benchmark, benchmark_of
 from megloc_kapture.evaluation.results import (
     Poses,
@@ -20,7 +19,7 @@ from megloc_kapture.evaluation.results import (
     result_in_memory,
     side_tables_near,
 )
-from megloc_kapture.evaluation.scoring import Evaluation, evaluate_poses
+from megloc_kapture.evaluation.scoring import Evaluation, evaluate_pairs, evaluate_poses
 from megloc_kapture.evaluation.without_truth import WithoutTruth, evaluate_without_truth
 from megloc_kapture.io.dataset_tables import METRES, read_nowhere, unit_of
 from megloc_kapture.io.kapture import KaptureFolder
@@ -116,13 +115,7 @@ def evaluate_results(
     references = _references(contexts, benchmark, mapping) if relative else {}
     limits = thresholds or benchmark.thresholds()
     evaluations = []
-    for source, label, context in zip(results, labels or _labels(results), contexts, strict=True):
-        if isinstance(source, Mapping):
-            found = result_in_memory(source, label=label)
-        else:
-            found = read_result(
-                source, benchmark, images=true_poses, references=references, label=label
-            )
+    for found in _read(results, benchmark, contexts, labels, true_poses, references):
         if relative:
             evaluation = evaluate_pairs(
                 found.poses_of_pairs(benchmark.pairs),
@@ -131,12 +124,25 @@ def evaluate_results(
                 references,
                 thresholds=limits,
                 statuses=found.statuses,
-                label=label,
+                label=found.label,
             )
         else:
-            evaluation = _by_centers(found, true_poses, benchmark, limits, nowhere)
+            known = {*true_poses, *found.poses, *nowhere}
+            evaluation = evaluate_poses(
+                found.poses,
+                true_poses,
+                conditions=benchmark.conditions(known),
+                thresholds=limits,
+                scored=benchmark.scored(known),
+                statuses=found.statuses,
+                condition_order=benchmark.protocol.conditions,
+                pools=benchmark.protocol.pools,
+                label=found.label,
+                nowhere=nowhere,
+                confidences=found.confidences,
+            )
         known_by = benchmark.protocol.truth
-        evaluations.append(replace(evaluation, truth_known_by=known_by, context=context))
+        evaluations.append(replace(evaluation, truth_known_by=known_by, context=found.context))
     return evaluations
 
 
@@ -155,8 +161,7 @@ def results_without_truth(
 
     Parameters
     ----------
-    results : kapture folders, pose files or image -> pose, one or several.
-    mapping, labels : as in :func:`evaluate_results`.
+    results, mapping, labels : as in :func:`evaluate_results`.
     map_poses : ``cam_from_world`` of the map's images; by default those of the first result that
         has a map.
 
@@ -170,17 +175,7 @@ def results_without_truth(
     if map_poses is None:
         map_poses = next((poses for context in contexts if (poses := context.map_poses())), {})
     known = {image for context in contexts for image in context.query_images()}
-    found = [
-        replace(
-            result_in_memory(source, label=label)
-            if isinstance(source, Mapping)
-            else read_result(source, benchmark, images=known, references=map_poses, label=label),
-            context=context,
-        )
-        for source, label, context in zip(
-            results, labels or _labels(results), contexts, strict=True
-        )
-    ]
+    found = _read(results, benchmark, contexts, labels, known, map_poses)
     queries = set(benchmark.names) or {pair.query for pair in benchmark.pairs}
     if not queries:
         of_results = {image for result in found for image in result.images}
@@ -195,6 +190,26 @@ def results_without_truth(
         map_poses=map_poses,
         statement=benchmark.protocol.truth,
     )
+
+
+def _read(
+    results: Sequence[Localized],
+    benchmark: Benchmark,
+    contexts: Sequence[ResultContext],
+    labels: Sequence[str] | None,
+    images: Collection[str],
+    references: Poses,
+) -> list[Result]:
+    found = []
+    for source, label, context in zip(results, labels or _labels(results), contexts, strict=True):
+        if isinstance(source, Mapping):
+            result = result_in_memory(source, label=label)
+        else:
+            result = read_result(
+                source, benchmark, images=images, references=references, label=label
+            )
+        found.append(replace(result, context=context))
+    return found
 
 
 def _context(source: Localized, mapping: Path | str | None) -> ResultContext:
@@ -227,29 +242,6 @@ def _labels(results: Sequence[Localized]) -> list[str]:
         (f"result {number}" if results[1:] else "") if isinstance(source, Mapping) else str(source)
         for number, source in enumerate(results, start=1)
     ]
-
-
-def _by_centers(
-    result: Result,
-    truth: Poses,
-    benchmark: Benchmark,
-    thresholds: Sequence[Threshold],
-    nowhere: Sequence[str],
-) -> Evaluation:
-    known = {*truth, *result.poses, *nowhere}
-    return evaluate_poses(
-        result.poses,
-        truth,
-        conditions=benchmark.conditions(known),
-        thresholds=thresholds,
-        scored=benchmark.scored(known),
-        statuses=result.statuses,
-        condition_order=benchmark.protocol.conditions,
-        pools=benchmark.protocol.pools,
-        label=result.label,
-        nowhere=nowhere,
-        confidences=result.confidences,
-    )
 
 
 def _references(

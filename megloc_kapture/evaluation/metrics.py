@@ -31,12 +31,7 @@ class Threshold(Options):
 
     @classmethod
     def parse(cls, text: str) -> Threshold:
-        """From ``"0.25,2"`` (metres, degrees) or ``"0.25"`` (position only).
-
-        Raises
-        ------
-        OptionError : the text is neither.
-        """
+        """From ``"0.25,2"`` (metres, degrees) or ``"0.25"`` (position only); else OptionError."""
         parts = text.replace(",", " ").split()
         try:
             numbers = [float(part) for part in parts]
@@ -118,24 +113,17 @@ LEVEL = 0.95
 def confidence_interval(
     successes: ArrayLike, trials: ArrayLike, *, level: float = LEVEL
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Exact (Clopper-Pearson) confidence interval of a share.
+    """Exact (Clopper-Pearson) confidence interval of a share; 0 to 1 where there was no trial.
 
     It holds the true share with at least ``level`` probability, whatever the share and the number
     of trials. Wilson's interval is a little narrower but does so on average only: with 98 queries
-    its 95 % are 91 % where recall is near 99 %, which is where papers compare. The exact one costs
-    a few tenths of a percent of width there.
-
-    Queries count as independent draws. Those of one drive are not quite, so that the interval of
-    such a set is rather too narrow than too wide.
+    its 95 % are 91 % where recall is near 99 %, which is where papers compare. Queries count as
+    independent draws; those of one drive are not quite, which makes the interval too narrow.
 
     Parameters
     ----------
     successes, trials : whole numbers (...), ``0 <= successes <= trials``; shapes broadcast.
     level : confidence, above 0 and below 1.
-
-    Returns
-    -------
-    low, high : float64 (...); 0 and 1 where there was no trial.
     """
     from scipy.special import betaincinv
 
@@ -166,9 +154,7 @@ class RecallAt(Options):
     Parameters
     ----------
     num_within : queries within the threshold, of the row's ``num_queries``.
-    recall : their ratio.
-    low, high : the 95 % confidence interval of ``recall``
-        (:func:`megloc_kapture.evaluation.metrics.confidence_interval`).
+    recall : their ratio; ``low``, ``high``: its 95 % :func:`confidence_interval`.
     """
 
     threshold: Threshold
@@ -223,12 +209,8 @@ def recall_row(
     members: NDArray[np.bool_] | None = None,
     fallback: NDArray[np.bool_] | None = None,
 ) -> RecallRow:
-    """Recall and medians of the queries ``members`` (N,), by default all of ``errors``.
-
-    Parameters
-    ----------
-    fallback : (N,) whether the query's pose is a fallback; by default none is.
-    """
+    """Recall and medians of the queries ``members`` (N,), by default all; ``fallback`` (N,) says
+    whether a query's pose is one, by default none is."""
     chosen = np.ones(len(errors.names), bool) if members is None else members
     guessed = np.zeros(len(errors.names), bool) if fallback is None else fallback
     posed = errors.has_pose & chosen
@@ -265,8 +247,8 @@ def row_members(
     order: Sequence[str] = (),
     pools: Mapping[str, Sequence[str]] | None = None,
 ) -> dict[str, NDArray[np.bool_]]:
-    """The rows of a recall table and the queries they count: one row per condition, then one per
-    pool, then ``"all"``.
+    """The rows of a recall table and the queries they count, bool (N,): one row per condition, then
+    one per pool, then ``"all"``.
 
     A pool counts the queries of its conditions together; it is not the mean of their recalls.
 
@@ -276,10 +258,6 @@ def row_members(
         there is only the row ``"all"``.
     order : conditions in the order to report them; others follow, sorted, those without last.
     pools : name -> conditions; a pool without queries is left out.
-
-    Returns
-    -------
-    Name -> bool (N,).
 
     Raises
     ------
@@ -297,8 +275,7 @@ def row_members(
         if pooled.any():
             members[pool] = pooled
     _check_free(ALL, members)
-    members[ALL] = np.ones(len(of_query), bool)
-    return members
+    return {**members, ALL: np.ones(len(of_query), bool)}
 
 
 def recall_rows(

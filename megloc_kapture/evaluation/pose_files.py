@@ -29,6 +29,7 @@ from megloc_kapture.values import RigidTransform
 
 COLUMNS = "name qw qx qy qz tx ty tz"
 
+Poses = Mapping[str, RigidTransform]
 # how images are called: by a rule, or by a table in the order of the challenge's list
 Names = PoseFileNames | Mapping[str, str]
 
@@ -67,7 +68,7 @@ def _check_names(names: Mapping[str, str]) -> None:
         bearer[name] = image
 
 
-def format_pose_file(poses: Mapping[str, RigidTransform], *, names: Names = "full") -> str:
+def format_pose_file(poses: Poses, *, names: Names = "full") -> str:
     """The text of a pose file.
 
     Numbers have the fewest digits that read back to the same float64, so nothing is lost.
@@ -91,16 +92,8 @@ def format_pose_file(poses: Mapping[str, RigidTransform], *, names: Names = "ful
     return "".join(lines)
 
 
-def write_pose_file(
-    path: Path | str, poses: Mapping[str, RigidTransform], *, names: Names = "full"
-) -> None:
-    """Write a pose file atomically; see :func:`format_pose_file`.
-
-    Raises
-    ------
-    DataError : a pose or name that must not be handed in.
-    OutputError : the file cannot be written.
-    """
+def write_pose_file(path: Path | str, poses: Poses, *, names: Names = "full") -> None:
+    """Write a pose file atomically; see :func:`format_pose_file`. OutputError: it cannot be."""
     write_bytes(path, format_pose_file(poses, names=names).encode("utf-8"))
 
 
@@ -115,8 +108,7 @@ def read_pose_file(path: Path | str) -> dict[str, RigidTransform]:
         length by 1e-3 or more (below, it is normalised), a name given twice, or a last line
         that is not ended: it may be cut short. Names file and line.
     """
-    text = read_text(path)
-    lines = text.split("\n")
+    lines = read_text(path).split("\n")
     if lines.pop() != "":
         raise DataError(
             "the last line is not ended, so the file may be cut short; add a newline if it is not",
@@ -128,14 +120,12 @@ def read_pose_file(path: Path | str) -> dict[str, RigidTransform]:
         fields = line.split()
         if not fields:
             continue
-        if len(fields) != 8:
-            raise DataError(
-                f"{len(fields)} columns instead of 8 ({COLUMNS})", path=path, line=number
-            )
         name = fields[0]
-        if name in poses:
-            raise DataError(f"{name!r} is given twice", path=path, line=number)
         try:
+            if len(fields) != 8:
+                raise DataError(f"{len(fields)} columns instead of 8 ({COLUMNS})")
+            if name in poses:
+                raise DataError(f"{name!r} is given twice")
             qw, qx, qy, qz, tx, ty, tz = (parse_number(field) for field in fields[1:])
             poses[name] = checked_pose((qw, qx, qy, qz), (tx, ty, tz), repr(name))
         except DataError as error:
@@ -144,7 +134,7 @@ def read_pose_file(path: Path | str) -> dict[str, RigidTransform]:
 
 
 def poses_by_image(
-    poses: Mapping[str, RigidTransform],
+    poses: Poses,
     images: Iterable[str],
     names: Mapping[str, str] | None = None,
 ) -> dict[str, RigidTransform]:
@@ -181,12 +171,8 @@ def poses_by_image(
 
 
 def parse_number(text: str) -> float:
-    """A decimal number; "nan" and the like become one that :func:`checked_pose` refuses.
-
-    Raises
-    ------
-    DataError : anything else that Python would take ("1_0", digits of other scripts) or not take.
-    """
+    """A decimal number; "nan" and the like become one that :func:`checked_pose` refuses. DataError:
+    anything else that Python would take ("1_0", digits of other scripts) or not take."""
     if FLOAT_PATTERN.fullmatch(text):
         return float(text)
     if text.lower().lstrip("+-") in ("nan", "inf", "infinity"):
@@ -200,11 +186,7 @@ def checked_pose(
     whose: str,
 ) -> RigidTransform:
     """The pose with a unit quaternion; one that is unit to rounding keeps its very digits.
-
-    Raises
-    ------
-    DataError : not finite, or a quaternion off unit length by 1e-3 or more; names ``whose``.
-    """
+    DataError: not finite, or a quaternion off unit length by 1e-3 or more; names ``whose``."""
     if not all(math.isfinite(v) for v in (*quat_wxyz, *translation)):
         raise DataError(f"{whose}: the pose is not finite")
     norm = math.sqrt(sum(q * q for q in quat_wxyz))
@@ -231,12 +213,8 @@ class RelativePose:
 
 
 def timestamp_of(image: str) -> int:
-    """The timestamp that an image of 4Seasons is named after (``.../1600000000000000000.png``).
-
-    Raises
-    ------
-    DataError : the name is no timestamp.
-    """
+    """The timestamp that an image of 4Seasons is named after (``.../1600000000000000000.png``);
+    DataError: the name is no timestamp."""
     stem = PurePosixPath(image).stem
     if not _TIMESTAMP.fullmatch(stem):
         raise DataError(f"image {image!r} is not named after a timestamp, as MLAD's rows need")
@@ -299,11 +277,11 @@ def read_mlad_file(path: Path | str) -> list[RelativePose]:
         columns = columns or (2 if len(fields) == 2 else 9)
         try:
             row = _row(fields, columns)
+            pair = (row.reference, row.query)
+            if pair in known:
+                raise DataError(f"pair {pair[0]} {pair[1]} is given twice")
         except DataError as error:
             raise DataError(error.message, path=path, line=number) from error
-        pair = (row.reference, row.query)
-        if pair in known:
-            raise DataError(f"pair {pair[0]} {pair[1]} is given twice", path=path, line=number)
         known.add(pair)
         rows.append(row)
     return rows

@@ -73,11 +73,7 @@ PROTOCOLS = {
 
 def protocol_of(name: str) -> Protocol:
     """The protocol of a dataset; ``synthetic-X`` is scored as X is, and its truth is there.
-
-    Raises
-    ------
-    OptionError : an unknown name; lists the known ones.
-    """
+    OptionError: an unknown name; lists the known ones."""
     if name in PROTOCOLS:
         return PROTOCOLS[name]
     layout = name.removeprefix(TWIN_PREFIX)
@@ -134,12 +130,9 @@ class Benchmark:
 
 
 def benchmark_of(side_tables: Path | str | None = None, dataset: str | None = None) -> Benchmark:
-    """Benchmark of a workspace, of a dataset by name, or the default.
+    """Benchmark of a workspace's ``megloc/`` folder, of a dataset by name, or the default.
 
-    Parameters
-    ----------
-    side_tables : the workspace's ``megloc/`` folder.
-    dataset : takes the place of the workspace's protocol; groups and frame stay the workspace's.
+    A name takes the place of the workspace's protocol; groups and frame stay the workspace's.
 
     Raises
     ------

@@ -91,12 +91,7 @@ class _Scores(BaseModel):
 
 def read_confidences(target: Path | str) -> dict[str, float]:
     """Image -> confidence of its pose, as the provenance beside a pose file has it under
-    ``confidence``; empty where there is none.
-
-    Raises
-    ------
-    DataError : the provenance is broken, or has something else there.
-    """
+    ``confidence``; empty where there is none. DataError: it is broken, or has something else."""
     path = provenance_path(target)
     return read_json_model(path, _Scores).confidence if path.is_file() else {}
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from pydantic import BaseModel, Field
@@ -47,6 +48,9 @@ from megloc_kapture.io.tables import (
 )
 from megloc_kapture.stages.localized_folder import query_status
 from megloc_kapture.values import Camera, Failure, Pose, RefinementRow, RigidTransform
+
+Read = TypeVar("Read")
+Poses = Mapping[str, RigidTransform]
 
 # parts of a workspace; datasets and the pipeline write them
 # the map's own keypoints are what queries were matched with; before there is one, its images do
@@ -91,21 +95,11 @@ class ResultContext:
     unit: str = METRES
 
     def map_poses(self) -> dict[str, RigidTransform]:
-        """``cam_from_world`` of the map's images; empty without a map.
-
-        Raises
-        ------
-        DataError : the map is broken.
-        """
+        """``cam_from_world`` of the map's images; empty without a map. DataError: it is broken."""
         return {} if self.mapping is None else self.mapping.read().poses()
 
     def query_images(self) -> list[str]:
-        """Names of the queries; empty where they are not known.
-
-        Raises
-        ------
-        DataError : the folder is broken.
-        """
+        """Names of the queries; empty where they are not known. DataError: the folder is broken."""
         return [] if self.queries is None else self.queries.read().image_names()
 
 
@@ -135,37 +129,39 @@ def context_of(result: Path | str, *, mapping: Path | str | None = None) -> Resu
     ------
     DataError : broken side tables, or a broken table of clusters, of refinement or of consistency.
     """
-    clusters = Path(result) / CLUSTERS_FILE
-    refinement = Path(result) / REFINEMENT_FILE
-    consistency = Path(result) / CONSISTENCY_FILE
-    workspace = workspace_of(result)
-    features = []
+    workspace, found = workspace_of(result), Path(result)
+    features, candidates, maps = [], [found], []
     if workspace is not None:
         # where pairs with few matches were tried again, those matches hold
-        pyramids = [workspace / name for name in (_QUERY_PYRAMID, _MAPPING_PYRAMID)]
+        pyramids = (workspace / name for name in (_QUERY_PYRAMID, _MAPPING_PYRAMID))
         there = [folder for folder in pyramids if folder.is_dir()]
         features = [workspace, *there, workspace / _QUERY_MATCHES]
-    candidates = [Path(result)]
-    if workspace is not None:
         # the keypoints stand in the images that features were extracted from
-        candidates = [workspace / _PREPARED / _QUERY, workspace / _QUERY, Path(result)]
+        candidates = [workspace / _PREPARED / _QUERY, workspace / _QUERY, found]
+        maps = [workspace / name for name in _MAPS]
     queries = next((path for path in candidates if (path / _SENSORS).is_file()), None)
-    map_path = None if mapping is None else Path(mapping)
-    if map_path is None and workspace is not None:
-        maps = (workspace / name for name in _MAPS)
-        map_path = next((path for path in maps if (path / _SENSORS).is_file()), None)
+    map_path = next((path for path in maps if (path / _SENSORS).is_file()), None)
+    if mapping is not None:
+        map_path = Path(mapping)
     groups = {} if workspace is None else read_groups(workspace / SIDE_TABLES)
+    refinements: dict[str, list[RefinementRow]] = {}
+    for row in _if_there(read_refinement, found / REFINEMENT_FILE) or ():
+        refinements.setdefault(row.image, []).append(row)
     return ResultContext(
         queries=None if queries is None else KaptureFolder(queries, features_dirs=features),
         mapping=None if map_path is None else KaptureFolder(map_path, features_dirs=features),
         frames={image: group.frame for image, group in groups.items() if group.frame},
-        clusters=read_clusters(clusters) if clusters.is_file() else {},
-        refinements=_by_image(read_refinement(refinement)) if refinement.is_file() else {},
-        consistency=read_consistency(consistency) if consistency.is_file() else (),
+        clusters=_if_there(read_clusters, found / CLUSTERS_FILE) or {},
+        refinements=refinements,
+        consistency=_if_there(read_consistency, found / CONSISTENCY_FILE) or (),
         unit=unit_of(result),
         masked=[] if workspace is None else _masked(workspace),
         seconds={} if workspace is None else _seconds(workspace / _MANIFESTS),
     )
+
+
+def _if_there(read: Callable[[Path], Read], path: Path) -> Read | None:
+    return read(path) if path.is_file() else None
 
 
 class _Manifest(BaseModel):
@@ -179,9 +175,8 @@ class _Manifest(BaseModel):
 def _seconds(folder: Path) -> dict[str, float]:
     found = []
     for path in sorted(folder.glob("*.json")):
-        with contextlib.suppress(
-            DataError
-        ):  # a stage without a manifest that can be read runs anew
+        # a stage without a manifest that can be read runs anew
+        with contextlib.suppress(DataError):
             found.append(read_json_model(path, _Manifest))
     return {one.stage: one.seconds for one in sorted(found, key=lambda one: one.started)}
 
@@ -197,13 +192,6 @@ def are_ranked(candidates: Iterable[Sequence[str]]) -> bool:
     return chance > 0.01
 
 
-def _by_image(rows: Iterable[RefinementRow]) -> dict[str, list[RefinementRow]]:
-    found: dict[str, list[RefinementRow]] = {}
-    for row in rows:
-        found.setdefault(row.image, []).append(row)
-    return found
-
-
 def _masked(workspace: Path) -> list[KaptureFolder]:
     found = []
     for role in _ROLES:
@@ -212,9 +200,6 @@ def _masked(workspace: Path) -> list[KaptureFolder]:
         if (folder / _MASKS).is_dir() and (folder / _SENSORS).is_file():
             found.append(KaptureFolder(folder, features_dirs=[workspace]))
     return found
-
-
-Poses = Mapping[str, RigidTransform]
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,15 +258,15 @@ def read_result(
     DataError : broken, or of another kind; names file and line.
     """
     path = Path(source)
-    if benchmark.protocol.pose_file == "mlad" and benchmark.pairs and not _is_kapture(path):
+    is_mlad = benchmark.protocol.pose_file == "mlad"
+    if is_mlad and benchmark.pairs and not (path / "sensors").is_dir():
         by_pair = _read_mlad(path, benchmark.pairs, references or {}, benchmark.world)
         poses = {pair.query: pose for pair, pose in by_pair.items()}
         return Result(label, poses, tuple(sorted(poses)), by_pair=by_pair)
     if path.is_dir():
         data = KaptureFolder(path).read()
         found = _in_frame_of(benchmark.world, data.poses(), path)
-        statuses = path / STATUS_FILE
-        rows = read_status(statuses) if statuses.is_file() else None
+        rows = _if_there(read_status, path / STATUS_FILE)
         return Result(label, found, tuple(sorted(data.image_names())), rows)
     poses = poses_by_image(read_pose_file(path), images, benchmark.names)
     if benchmark.world != World():
@@ -319,10 +304,6 @@ def distinct_labels(sources: Sequence[Path]) -> list[str]:
     return labels if all(labels) else [str(source) for source in sources]
 
 
-def _is_kapture(path: Path) -> bool:
-    return (path / "sensors").is_dir()
-
-
 def _in_frame_of(world: World, poses: dict[str, RigidTransform], result: Path) -> Poses:
     """Poses of a workspace that was recentred in another way, brought to the truth's frame."""
     tables = side_tables_near(result)
@@ -336,20 +317,19 @@ def _read_mlad(
     path: Path, pairs: Sequence[RelocalizationPair], references: Poses, world: World
 ) -> dict[RelocalizationPair, RigidTransform]:
     files = {pair.file for pair in pairs}
+    found_files = {path.name if path.name in files else min(files): path}
     if path.is_dir():
         found_files = {file: path / file for file in sorted(files) if (path / file).is_file()}
         if not found_files:
             raise DataError(
                 f"neither a kapture folder nor one with pose files ({min(files)})", path=path
             )
-    else:
-        if path.name not in files and len(files) > 1:
-            raise DataError(
-                f"which relocalization file it answers is not clear; call it as that one: "
-                f"{', '.join(sorted(files))}",
-                path=path,
-            )
-        found_files = {path.name if path.name in files else min(files): path}
+    elif path.name not in files and len(files) > 1:
+        raise DataError(
+            "which relocalization file it answers is not clear; call it as that one: "
+            f"{', '.join(sorted(files))}",
+            path=path,
+        )
     found: dict[RelocalizationPair, RigidTransform] = {}
     for file, pose_file in found_files.items():
         asked = {
@@ -360,17 +340,16 @@ def _read_mlad(
         for row in read_mlad_file(pose_file):
             pair = asked.get((row.reference, row.query))
             if pair is None:
-                raise DataError(
-                    f"pair {row.reference} {row.query} is not asked for", path=pose_file
-                )
-            if row.query_from_reference is None:
-                raise DataError("has pairs without poses, as a relocalization file", path=pose_file)
-            if pair.reference not in references:
-                raise DataError(
-                    f"reference {pair.reference!r} has no pose in the map", path=pose_file
-                )
-            pose = _in_local_units(row.query_from_reference, world.official_from_local.scale)
-            found[pair] = pose @ references[pair.reference]
+                problem = f"pair {row.reference} {row.query} is not asked for"
+            elif row.query_from_reference is None:
+                problem = "has pairs without poses, as a relocalization file"
+            elif pair.reference not in references:
+                problem = f"reference {pair.reference!r} has no pose in the map"
+            else:
+                pose = _in_local_units(row.query_from_reference, world.official_from_local.scale)
+                found[pair] = pose @ references[pair.reference]
+                continue
+            raise DataError(problem, path=pose_file)
     return found
 
 

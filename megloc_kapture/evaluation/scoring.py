@@ -1,11 +1,18 @@
-"""One result against true poses: errors, outcomes, recall."""
+"""One result against true poses: errors, outcomes, recall; and by MLAD's metric of pairs.
+
+The MLAD challenges hand out pairs of a reference and a query and score ``|t - t_true|`` of
+``query_from_reference``, without the rotation. That length mixes the error of the camera's centre
+with the error of its rotation times the distance of the two cameras, so the distance of the
+centres is reported beside it.
+"""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
@@ -22,7 +29,8 @@ from megloc_kapture.evaluation.metrics import (
     recall_rows,
     row_members,
 )
-from megloc_kapture.evaluation.results import ResultContext
+from megloc_kapture.evaluation.results import Poses, ResultContext
+from megloc_kapture.geometry.poses import compose, invert, stack_poses
 from megloc_kapture.io.dataset_tables import RelocalizationPair
 from megloc_kapture.io.files import write_bytes
 from megloc_kapture.io.tables import Fallback, QueryStatus
@@ -33,24 +41,34 @@ if TYPE_CHECKING:
 
     from megloc_kapture.evaluation.report.reports import AnyReported
     from megloc_kapture.evaluation.statistics import Comparison
+    from megloc_kapture.evaluation.without_truth import NearCandidates
 
 Outcome = Literal["localized", "fallback", "missing"]
+# column of a table of queries -> attribute
+_COLUMNS = {
+    **{name: name for name in ("image", "condition", "outcome")},
+    **{"position_error_m": "position_m", "angle_error_deg": "angle_deg"},
+    **{name: name for name in ("num_matches", "num_inliers", "confidence", "reason")},
+}
 
 
 @dataclass(frozen=True, slots=True)
 class QueryResult:
-    """The outcome of one scored query.
+    """The outcome of one query.
 
     Parameters
     ----------
     image, condition : the query and what it is reported under (``""``: nothing).
     outcome : ``localized``, ``fallback`` (its pose is a guess) or ``missing`` (no pose).
     reason : why it was not localized; empty for a localized query.
-    position_m, angle_deg : errors in metres and degrees, infinite without a pose.
+    position_m, angle_deg : errors in metres and degrees, infinite without a pose; NaN where the
+        truth is not known.
     num_matches, num_inliers : from the status table; None without one.
     fallback : what kind of guess a fallback pose is.
     candidates : map images the pose comes from, best first; from the status table.
     confidence : probability that the pose is right, as the result says; None where it does not.
+    near : its distance from the candidates; None where nobody asked, without an estimated pose, or
+        where no candidate has a pose in the map.
     """
 
     image: str
@@ -64,6 +82,7 @@ class QueryResult:
     fallback: Fallback = "none"
     candidates: tuple[str, ...] = ()
     confidence: float | None = None
+    near: NearCandidates | None = None
 
 
 class Reported(ABC):
@@ -82,13 +101,8 @@ class Reported(ABC):
         return report_text(cast("AnyReported", self)).removesuffix("\n")
 
     def html(self, path: Path | str) -> None:
-        """Write the report as an HTML page.
-
-        Raises
-        ------
-        DataError : the map that the context of a result knows is broken.
-        OutputError : the file cannot be written.
-        """
+        """Write the report as an HTML page; raises DataError where the map that the context of a
+        result knows is broken, OutputError where the file cannot be written."""
         from megloc_kapture.evaluation.report.reports import render_report
 
         write_bytes(path, render_report(cast("AnyReported", self)).encode("utf-8"))
@@ -129,9 +143,8 @@ class Evaluation(Reported):
     pairs : of MLAD's challenges, what a query is called in ``queries`` -> its pair; else empty.
     nowhere : queries that show nothing of the map, sorted by name; they are right without a pose,
         and stand in no row.
-    by_center : None where the position error is the distance of the camera centres. Where it is
-        another (see :mod:`megloc_kapture.evaluation.scoring`), the same queries' evaluation by
-        that distance.
+    by_center : of MLAD's pairs, the same queries' evaluation by the distance of the camera centres;
+        None where that is the position error anyway.
     """
 
     label: str
@@ -140,8 +153,8 @@ class Evaluation(Reported):
     members: Mapping[str, NDArray[np.bool_]]
     queries: tuple[QueryResult, ...]
     errors: PoseErrors
-    truth: Mapping[str, RigidTransform]
-    estimated: Mapping[str, RigidTransform]
+    truth: Poses
+    estimated: Poses
     without_truth: tuple[str, ...]
     not_scored: tuple[str, ...]
     truth_known_by: str = ""
@@ -156,12 +169,8 @@ class Evaluation(Reported):
         return confidence_of(self.queries, self.thresholds[-1], self.nowhere)
 
     def compare(self, *others: Evaluation) -> Comparison:
-        """Test the differences from results on the same queries, which need other labels.
-
-        Raises
-        ------
-        OptionError : two results of one label, or not of the same queries and thresholds.
-        """
+        """Test the differences from results on the same queries, which need other labels; see
+        :func:`megloc_kapture.evaluation.statistics.compare`."""
         from megloc_kapture.evaluation.statistics import compare
 
         return compare([self, *others])
@@ -189,23 +198,15 @@ class Evaluation(Reported):
 
 def query_columns(queries: Sequence[QueryResult]) -> dict[str, list[Any]]:
     """Column -> one value per query, as tables of queries have them."""
-    known = any(query.confidence is not None for query in queries)
-    return {
-        "image": [query.image for query in queries],
-        "condition": [query.condition for query in queries],
-        "outcome": [query.outcome for query in queries],
-        "position_error_m": [query.position_m for query in queries],
-        "angle_error_deg": [query.angle_deg for query in queries],
-        "num_matches": [query.num_matches for query in queries],
-        "num_inliers": [query.num_inliers for query in queries],
-        **({"confidence": [query.confidence for query in queries]} if known else {}),
-        "reason": [query.reason for query in queries],
-    }
+    shown = dict(_COLUMNS)
+    if all(query.confidence is None for query in queries):
+        del shown["confidence"]
+    return {name: [getattr(query, own) for query in queries] for name, own in shown.items()}
 
 
 def evaluate_poses(
-    estimated: Mapping[str, RigidTransform],
-    truth: Mapping[str, RigidTransform],
+    estimated: Poses,
+    truth: Poses,
     *,
     conditions: Mapping[str, str] | None = None,
     thresholds: Sequence[Threshold] = DEFAULT_THRESHOLDS,
@@ -252,18 +253,20 @@ def evaluate_poses(
     wanted = set(estimated) if scored is None else set(estimated) | set(scored)
     if errors is None:
         errors = pose_errors(estimated, truth, counted)
-    queries = tuple(
-        _query_result(
-            name, (position_m, angle_deg), name in estimated, conditions, statuses, confidences
+
+    def result(name: str, position_m: float, angle_deg: float) -> QueryResult:
+        status = (statuses or {}).get(name)
+        return query_result(
+            name,
+            (conditions or {}).get(name, ""),
+            status,
+            has_pose=name in estimated,
+            errors=(position_m, angle_deg),
+            confidence=(confidences or {}).get(name),
         )
-        for name, position_m, angle_deg in zip(
-            counted, errors.position_m.tolist(), errors.angle_deg.tolist(), strict=True
-        )
-    )
-    strays = tuple(
-        _query_result(name, (np.inf, np.inf), name in estimated, conditions, statuses, confidences)
-        for name in sorted(nowhere)
-    )
+
+    found = zip(counted, errors.position_m.tolist(), errors.angle_deg.tolist(), strict=True)
+    queries = tuple(result(*one) for one in found)
     members = row_members(
         [query.condition for query in queries], order=condition_order, pools=pools
     )
@@ -277,42 +280,162 @@ def evaluate_poses(
         errors=errors,
         truth={name: truth[name] for name in counted},
         estimated={name: estimated[name] for name in counted if name in estimated},
-        nowhere=strays,
+        nowhere=tuple(result(name, np.inf, np.inf) for name in sorted(nowhere)),
         without_truth=tuple(sorted(wanted - set(truth) - set(nowhere))),
         not_scored=tuple(sorted(set(truth) - set(counted))),
     )
 
 
-def _query_result(
+def query_result(
     image: str,
-    errors: tuple[float, float],
+    condition: str,
+    status: QueryStatus | None,
+    *,
     has_pose: bool,
-    conditions: Mapping[str, str] | None,
-    statuses: Mapping[str, QueryStatus] | None,
-    confidences: Mapping[str, float] | None,
+    errors: tuple[float, float],
+    confidence: float | None = None,
+    no_pose: str = "no pose in the result",
+    near: NearCandidates | None = None,
 ) -> QueryResult:
-    status = None if statuses is None else statuses.get(image)
-    outcome: Outcome = "localized"
-    reason = ""
-    fallback: Fallback = "none"
-    if not has_pose:
-        outcome = "missing"
-        reason = "no pose in the result" if status is None else status.reason
-        if status is not None and status.status == "localized":
-            reason = "status says localized, but the result has no pose"
-    elif status is not None and status.fallback != "none":
+    """The outcome of a query.
+
+    Parameters
+    ----------
+    status : its row of ``status.csv``, whose confidence goes before ``confidence``.
+    errors : metres and degrees.
+    no_pose : the reason of a query without pose and without status.
+    """
+    if status is None:
+        outcome: Outcome = "localized" if has_pose else "missing"
+        reason = "" if has_pose else no_pose
+        return QueryResult(image, condition, outcome, reason, *errors, confidence=confidence)
+    outcome, reason = "missing", status.reason
+    if has_pose and status.fallback == "none":
+        outcome, reason = "localized", ""
+    elif has_pose:
         outcome = "fallback"
-        reason, fallback = status.reason, status.fallback
+    elif status.status == "localized":
+        reason = "status says localized, but the result has no pose"
     return QueryResult(
-        image=image,
-        condition="" if conditions is None else conditions.get(image, ""),
-        outcome=outcome,
-        reason=reason,
-        position_m=errors[0],
-        angle_deg=errors[1],
-        num_matches=None if status is None else status.num_matches,
-        num_inliers=None if status is None else status.num_inliers,
-        fallback=fallback,
-        candidates=() if status is None else status.candidates,
-        confidence=(confidences or {}).get(image) if status is None else status.confidence,
+        image,
+        condition,
+        outcome,
+        reason,
+        *errors,
+        status.num_matches,
+        status.num_inliers,
+        status.fallback if has_pose else "none",
+        status.candidates,
+        status.confidence,
+        near,
     )
+
+
+def relative_translation_errors(
+    estimated: tuple[NDArray[np.float64], NDArray[np.float64]],
+    truth: tuple[NDArray[np.float64], NDArray[np.float64]],
+    references: tuple[NDArray[np.float64], NDArray[np.float64]],
+) -> NDArray[np.float64]:
+    """``|t - t_true|`` (N,) of ``query_from_reference``, in metres.
+
+    Parameters
+    ----------
+    estimated, truth, references : ``cam_from_world`` of the queries, and of the reference each is
+        paired with, in one frame: quaternions (N, 4), w first, and translations (N, 3).
+    """
+    world_from_reference = invert(*references)
+    _, found = compose(*estimated, *world_from_reference)
+    _, true = compose(*truth, *world_from_reference)
+    return np.asarray(np.linalg.norm(found - true, axis=1), dtype=np.float64)
+
+
+def evaluate_pairs(
+    estimated: Mapping[RelocalizationPair, RigidTransform],
+    truth: Poses,
+    pairs: Sequence[RelocalizationPair],
+    references: Poses,
+    *,
+    thresholds: Sequence[Threshold],
+    statuses: Mapping[str, QueryStatus] | None = None,
+    label: str = "",
+) -> Evaluation:
+    """Evaluate by MLAD's metric: every pair counts once, and each file is a condition.
+
+    A pair is called by its query; where that stands in several, with reference and file as well.
+
+    Parameters
+    ----------
+    estimated : ``cam_from_world`` of a pair's query; pairs may be absent.
+    truth, references : ``cam_from_world`` of queries and references, in the same frame, metres.
+    statuses : rows of ``status.csv`` by image.
+
+    Returns
+    -------
+    The errors' position is the relative translation's; ``by_center`` has the distances of the
+    centres. Pairs whose query has no true pose are named in ``without_truth``.
+
+    Raises
+    ------
+    DataError : a reference has no pose, a pair is listed twice, or no pair can be counted.
+    OptionError : there is no threshold.
+    """
+    absent = next((pair for pair in pairs if pair.reference not in references), None)
+    if absent is not None:
+        raise DataError(f"reference {absent.reference!r} of {absent.file!r} has no pose in the map")
+    times = Counter(pair.query for pair in pairs)
+    named = {
+        p.query if times[p.query] == 1 else f"{p.query} from {p.reference}, {p.file}": p
+        for p in pairs
+    }
+    if len(named) != len(pairs):
+        raise DataError("a pair of reference and query is listed twice in one file")
+    called = _conditions(dict.fromkeys(pair.file for pair in pairs))
+    statuses = statuses or {}
+    of_pairs = {n: statuses[p.query] for n, p in named.items() if p.query in statuses}
+    by_center = evaluate_poses(
+        {n: estimated[p] for n, p in named.items() if p in estimated},
+        {n: truth[p.query] for n, p in named.items() if p.query in truth},
+        conditions={n: called[p.file] for n, p in named.items()} if len(called) > 1 else None,
+        thresholds=thresholds,
+        scored=named.keys(),
+        statuses=of_pairs,
+        condition_order=list(called.values()),
+        label=label,
+    )
+    names = by_center.errors.names
+    found = by_center.errors.has_pose
+    posed = [name for name, has in zip(names, found, strict=True) if has]
+    position_m = np.full(len(names), np.inf)
+    position_m[found] = relative_translation_errors(
+        stack_poses(estimated[named[name]] for name in posed),
+        stack_poses(truth[named[name].query] for name in posed),
+        stack_poses(references[named[name].reference] for name in posed),
+    )
+    relative = evaluate_poses(
+        by_center.estimated,
+        by_center.truth,
+        conditions={query.image: query.condition for query in by_center.queries},
+        thresholds=thresholds,
+        statuses=of_pairs,
+        condition_order=list(by_center.members),
+        label=label,
+        errors=PoseErrors(names, position_m, by_center.errors.angle_deg),
+    )
+    return replace(
+        relative,
+        without_truth=by_center.without_truth,
+        pairs={name: named[name] for name in names},
+        by_center=by_center,
+    )
+
+
+def _conditions(files: Iterable[str]) -> dict[str, str]:
+    """Relocalization file -> what it is called as a condition: the recording it is about."""
+    whole = {file: PurePosixPath(file).stem for file in files}
+    short = {}
+    for file, stem in whole.items():
+        target = stem.rsplit("_to_", 1)[-1]
+        for prefix in ("relocalizationFile_", "reloc_", "recording_"):
+            target = target.removeprefix(prefix)
+        short[file] = target
+    return short if len(set(short.values())) == len(short) else whole

@@ -3,23 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import combinations
-from typing import TYPE_CHECKING, Any
+from dataclasses import astuple, dataclass
+from itertools import combinations, product
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.metrics import ALL, LEVEL, Threshold, within
-from megloc_kapture.evaluation.scoring import (
-    Evaluation,
-    Reported,
-    query_columns,
-)
-
-if TYPE_CHECKING:
-    pass
+from megloc_kapture.evaluation.scoring import Evaluation, Reported, query_columns
 
 SIGNIFICANCE = 0.05
 DIFFERENCES_COLUMNS = (
@@ -100,56 +93,57 @@ class MedianDifference:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Comparison(Reported):
+class SeveralResults(Reported):
+    """Results on the same queries, in the order they were given."""
+
+    evaluations: tuple[Evaluation, ...]
+
+    def per_query(self) -> dict[str, list[Any]]:
+        """Column -> one value per query; those of a result are called ``label: column``."""
+        columns: dict[str, list[Any]] = {}
+        for evaluation in self.evaluations:
+            for name, values in query_columns(evaluation.queries).items():
+                shared = name in ("image", "condition")
+                columns.setdefault(name if shared else f"{evaluation.label}: {name}", values)
+        return columns
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Comparison(SeveralResults):
     """Results on the same queries, compared two by two.
 
     Parameters
     ----------
-    evaluations : the results, in the order they were given.
     tests : of all queries together, by pair of results and threshold; one family for Holm.
     tests_by_row : of the conditions and pools; another family.
     medians : one per pair of results.
     """
 
-    evaluations: tuple[Evaluation, ...]
     tests: tuple[PairedTest, ...]
     tests_by_row: tuple[PairedTest, ...]
     medians: tuple[MedianDifference, ...]
 
-    def per_query(self) -> dict[str, list[Any]]:
-        """Column -> one value per query; those of a result are called ``label: column``."""
-        return _columns_by_label(self.evaluations)
-
     def differences(self) -> dict[str, list[Any]]:
         """Column -> values, of every query that one result alone finds, by pair and threshold."""
         index = {name: i for i, name in enumerate(self.evaluations[0].errors.names)}
-        rows = []
+        columns: dict[str, list[Any]] = {name: [] for name in DIFFERENCES_COLUMNS}
         for test in self.tests:
-            for finder, other, names in (
-                (test.first, test.second, test.only_first),
-                (test.second, test.first, test.only_second),
-            ):
-                by, missing = self.evaluations[finder], self.evaluations[other]
-                for name in names:
-                    found, missed = by.queries[index[name]], missing.queries[index[name]]
-                    rows.append(
-                        (
-                            *(test.threshold.position_m, test.threshold.angle_deg),
-                            *(by.label, missing.label, name, found.condition),
-                            *(found.position_m, found.angle_deg),
-                            *(missed.position_m, missed.angle_deg),
-                        )
-                    )
-        return {name: [row[i] for row in rows] for i, name in enumerate(DIFFERENCES_COLUMNS)}
+            bounds = test.threshold.position_m, test.threshold.angle_deg
+            first, second = self.evaluations[test.first], self.evaluations[test.second]
+            alone = [(first, second, name) for name in test.only_first]
+            alone += [(second, first, name) for name in test.only_second]
+            for finder, other, name in alone:
+                found, missed = finder.queries[index[name]], other.queries[index[name]]
+                named = finder.label, other.label, name, found.condition
+                errors = found.position_m, found.angle_deg, missed.position_m, missed.angle_deg
+                for column, value in zip(columns.values(), (*bounds, *named, *errors), strict=True):
+                    column.append(value)
+        return columns
 
 
 def compare(evaluations: Sequence[Evaluation]) -> Comparison:
-    """Compare at least two results on the same queries, thresholds and conditions.
-
-    Raises
-    ------
-    OptionError : fewer than two, two with one label, or not of the same queries and thresholds.
-    """
+    """Compare at least two results on the same queries, thresholds and conditions; OptionError: see
+    :func:`check_comparable`."""
     check_comparable(evaluations)
     pairs = list(combinations(range(len(evaluations)), 2))
     rows = [name for name in evaluations[0].members if name != ALL]
@@ -162,13 +156,8 @@ def compare(evaluations: Sequence[Evaluation]) -> Comparison:
 
 
 def check_comparable(evaluations: Sequence[Evaluation]) -> None:
-    """Refuse results that do not belong beside each other.
-
-    Raises
-    ------
-    OptionError : fewer than two, two with one label, or not of the same queries, thresholds and
-        conditions.
-    """
+    """Raise OptionError for results that do not belong beside each other: fewer than two, two with
+    one label, or not of the same queries, thresholds and conditions."""
     if len(evaluations) < 2:
         raise OptionError("at least two results are needed to compare")
     first = evaluations[0]
@@ -185,14 +174,11 @@ def check_comparable(evaluations: Sequence[Evaluation]) -> None:
 
 
 def mcnemar(only_first: ArrayLike, only_second: ArrayLike) -> NDArray[np.float64]:
-    """Two-sided p-values of the exact McNemar test.
+    """Two-sided p-values of the exact McNemar test, of numbers (...) of queries that one of two
+    results alone finds.
 
     Queries that both or neither find say nothing about a difference; of the others each falls to
     either side with probability one half when the methods are equally good.
-
-    Parameters
-    ----------
-    only_first, only_second : whole numbers (...) of queries that one of the two finds.
     """
     from scipy.special import bdtr
 
@@ -211,12 +197,12 @@ def holm(p_values: ArrayLike) -> NDArray[np.float64]:
     return adjusted
 
 
-def resampled_medians(values: NDArray[np.float64], *, seed: int = 0) -> NDArray[np.float64]:
+def resampled_medians(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Medians (2000,) of values (N,) drawn again with replacement; values may be infinite.
 
-    The same seed and N draw the same positions, so that results on the same queries stay paired.
+    The same N draws the same positions, so that results on the same queries stay paired.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     size = len(values)
     step = max(_CHUNK // max(size, 1), 1)
     medians = np.empty(NUM_RESAMPLES)
@@ -230,10 +216,8 @@ def resampled_medians(values: NDArray[np.float64], *, seed: int = 0) -> NDArray[
 def difference_interval(
     first: NDArray[np.float64], second: NDArray[np.float64]
 ) -> tuple[float, float]:
-    """The middle 95 % of ``first - second``, paired medians of :func:`resampled_medians`.
-
-    Where both are infinite their difference is zero.
-    """
+    """The middle 95 % of ``first - second``, paired medians of :func:`resampled_medians`; the
+    difference of infinities is zero."""
     with np.errstate(invalid="ignore"):
         apart = first - second
     apart = np.where(np.isnan(apart), 0.0, apart)
@@ -256,24 +240,18 @@ def _family(
     evaluations: Sequence[Evaluation], pairs: Sequence[tuple[int, int]], rows: Sequence[str]
 ) -> tuple[PairedTest, ...]:
     names = np.array(evaluations[0].errors.names, dtype=object)
-    thresholds = evaluations[0].thresholds
-    members = evaluations[0].members
+    thresholds, members = evaluations[0].thresholds, evaluations[0].members
     met = [[within(e.errors, threshold) for threshold in thresholds] for e in evaluations]
-    keys = [
-        (pair, row, index) for pair in pairs for row in rows for index in range(len(thresholds))
-    ]
+    keys = list(product(pairs, rows, range(len(thresholds))))
     tables = []
     for (i, j), row, index in keys:
         a, b, chosen = met[i][index], met[j][index], members[row]
         tables.append((a & ~b & chosen, b & ~a & chosen, a & b & chosen, ~a & ~b & chosen))
-    p_values = mcnemar(
-        [int(only_first.sum()) for only_first, *_ in tables],
-        [int(only_second.sum()) for _, only_second, *_ in tables],
-    )
+    p_values = mcnemar(*([int(table[side].sum()) for table in tables] for side in (0, 1)))
     return tuple(
         PairedTest(
-            first=first,
-            second=second,
+            first=pair[0],
+            second=pair[1],
             row=row,
             threshold=thresholds[index],
             only_first=tuple(names[only_first].tolist()),
@@ -283,12 +261,9 @@ def _family(
             p_value=float(p),
             p_adjusted=float(adjusted),
         )
-        for ((first, second), row, index), (
-            only_first,
-            only_second,
-            both,
-            neither,
-        ), p, adjusted in zip(keys, tables, p_values, holm(p_values), strict=True)
+        for (pair, row, index), (only_first, only_second, both, neither), p, adjusted in zip(
+            keys, tables, p_values, holm(p_values), strict=True
+        )
     )
 
 
@@ -296,16 +271,14 @@ def _median_differences(
     evaluations: Sequence[Evaluation], pairs: Sequence[tuple[int, int]]
 ) -> tuple[MedianDifference, ...]:
     medians = [evaluation.row().median_position_m for evaluation in evaluations]
-    if len(evaluations[0].queries) < MIN_RESAMPLED:
-        nothing = float("nan"), float("nan")
-        return tuple(MedianDifference(i, j, medians[i], medians[j], *nothing) for i, j in pairs)
-    resampled = [resampled_medians(evaluation.errors.position_m) for evaluation in evaluations]
-    return tuple(
-        MedianDifference(
-            i, j, medians[i], medians[j], *difference_interval(resampled[i], resampled[j])
-        )
-        for i, j in pairs
-    )
+    few = len(evaluations[0].queries) < MIN_RESAMPLED
+    resampled = [] if few else [resampled_medians(e.errors.position_m) for e in evaluations]
+    found = []
+    for i, j in pairs:
+        unknown = float("nan"), float("nan")
+        interval = unknown if few else difference_interval(resampled[i], resampled[j])
+        found.append(MedianDifference(i, j, medians[i], medians[j], *interval))
+    return tuple(found)
 
 
 @dataclass(frozen=True, slots=True)
@@ -330,14 +303,19 @@ class SeedsAt:
 
     Parameters
     ----------
-    always, sometimes, never : queries within the threshold in all, some or none of the runs.
+    mean, deviation, smallest, largest : of recall, as in :class:`Spread`.
+    found_always, found_sometimes, found_never : queries within the threshold in all, some or none
+        of the runs.
     """
 
     threshold: Threshold
-    recall: Spread
-    always: int
-    sometimes: int
-    never: int
+    mean: float
+    deviation: float
+    smallest: float
+    largest: float
+    found_always: int
+    found_sometimes: int
+    found_never: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -359,55 +337,35 @@ class SeedsRow:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Seeds(Reported):
-    """All runs and what they have in common.
+class Seeds(SeveralResults):
+    """Runs of one method and what they have in common; ``rows`` as those of each run."""
 
-    Parameters
-    ----------
-    evaluations : the runs, in the order they were given.
-    rows : as those of each run.
-    """
-
-    evaluations: tuple[Evaluation, ...]
     rows: tuple[SeedsRow, ...]
-
-    def per_query(self) -> dict[str, list[Any]]:
-        """Column -> one value per query; those of a result are called ``label: column``."""
-        return _columns_by_label(self.evaluations)
 
 
 def over_seeds(evaluations: Sequence[Evaluation]) -> Seeds:
-    """Mean and spread of at least two runs of one method.
-
-    Raises
-    ------
-    OptionError : fewer than two, or not of the same queries, thresholds and conditions.
-    """
+    """Mean and spread of at least two runs of one method; OptionError: see
+    :func:`check_comparable`."""
     check_comparable(evaluations)
     first = evaluations[0]
     # runs, thresholds, queries
     met = np.stack([[within(e.errors, t) for t in first.thresholds] for e in evaluations])
     rows = []
     for position, (name, chosen) in enumerate(first.members.items()):
-        found = met[:, :, chosen]
         of_runs = [evaluation.rows[position] for evaluation in evaluations]
+        recall = []
+        for index, threshold in enumerate(first.thresholds):
+            always = met[:, index, chosen].all(axis=0)
+            ever = met[:, index, chosen].any(axis=0)
+            spread = _spread([row.recall[index].recall for row in of_runs])
+            counts = (int(own.sum()) for own in (always, ever & ~always, ~ever))
+            recall.append(SeedsAt(threshold, *astuple(spread), *counts))
         rows.append(
             SeedsRow(
                 name=name,
                 num_queries=int(chosen.sum()),
                 num_localized=_spread([float(row.num_localized) for row in of_runs]),
-                recall=tuple(
-                    SeedsAt(
-                        threshold=threshold,
-                        recall=_spread([row.recall[index].recall for row in of_runs]),
-                        always=int(found[:, index].all(axis=0).sum()),
-                        sometimes=int(
-                            (found[:, index].any(axis=0) & ~found[:, index].all(axis=0)).sum()
-                        ),
-                        never=int((~found[:, index].any(axis=0)).sum()),
-                    )
-                    for index, threshold in enumerate(first.thresholds)
-                ),
+                recall=tuple(recall),
                 median_position_m=_spread([row.median_position_m for row in of_runs]),
             )
         )
@@ -423,12 +381,3 @@ def _spread(values: Sequence[float]) -> Spread:
         smallest=float(numbers.min()),
         largest=float(numbers.max()),
     )
-
-
-def _columns_by_label(evaluations: Sequence[Evaluation]) -> dict[str, list[Any]]:
-    columns: dict[str, list[Any]] = {}
-    for evaluation in evaluations:
-        for name, values in query_columns(evaluation.queries).items():
-            shared = name in ("image", "condition")
-            columns.setdefault(name if shared else f"{evaluation.label}: {name}", values)
-    return columns

@@ -1,10 +1,14 @@
-"""A 3D view of a map, and of a result in it, as one HTML file."""
+"""A 3D view of a map, and of a result in it: one HTML file, and a recording of Rerun's viewer."""
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from megloc_kapture.errors import DataError, OptionError, OutputError
 from megloc_kapture.evaluation.evaluate import (
@@ -16,13 +20,21 @@ from megloc_kapture.evaluation.evaluate import (
 from megloc_kapture.evaluation.results import Poses, ResultContext
 from megloc_kapture.evaluation.scoring import Evaluation
 from megloc_kapture.evaluation.without_truth import ResultWithoutTruth
+from megloc_kapture.geometry.cameras import focal_px, principal_point_px
 from megloc_kapture.io.files import write_bytes
+from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.values import Camera
+from megloc_kapture.values import Camera, RigidTransform
+
+if TYPE_CHECKING:
+    from megloc_kapture.evaluation.report.scene import Scene
 
 # what the files begin with, or have near their beginning
 _OURS, _RECORDING = b'content="megloc view"', b"RRF"
 _HEAD_BYTES = 1000
+# images that are put into a recording, of map and queries each: about 20 kB
+_MAX_IMAGES, _WIDTH = 200, 480
+_GREY, _WHITE = "#8fa6bf", "#ffffff"
 
 
 def write_view(
@@ -63,15 +75,14 @@ def write_view(
     OutputError : a file cannot be written, or is another one than a view.
     ModuleNotFoundError : for ``rerun``, where the extra of that name is not installed.
     """
-    from megloc_kapture.evaluation.report.rendered import rendered_queries
+    from megloc_kapture.evaluation.report.panels import rendered_queries
+    from megloc_kapture.evaluation.report.queries import StoredInliers, shown_queries
     from megloc_kapture.evaluation.report.scene import render_view, scene_of
-    from megloc_kapture.evaluation.report.shown_queries import StoredInliers, shown_queries
 
     path = Path(path)
     _check_output(path, _OURS, force=force)
     if rerun is not None:
         _check_output(Path(rerun), _RECORDING, force=force)
-        from megloc_kapture.evaluation.report.rerun_log import write_recording
     folder = mapping if isinstance(mapping, KaptureFolder) else KaptureFolder(mapping)
     title = folder.root.resolve().name
     context, queries = ResultContext(mapping=folder), []
@@ -93,7 +104,7 @@ def write_view(
         pictures, notes = rendered_queries(views, scene.queries, context.queries)
         scene = replace(scene, rendered=pictures, notes=(*scene.notes, *notes))
     if rerun is not None:
-        write_recording(Path(rerun), scene, context)
+        _write_recording(Path(rerun), scene, context)
     write_bytes(path, render_view(scene).encode("utf-8"))
     return " ".join(scene.notes)
 
@@ -121,3 +132,94 @@ def _check_output(path: Path, mark: bytes, *, force: bool) -> None:
         raise OutputError(f"{path}: cannot be read: {error.strerror}") from error
     if not ours:
         raise OutputError(f"{path}: exists and is no view; -f overwrites it")
+
+
+def _write_recording(path: Path, scene: Scene, context: ResultContext) -> None:
+    """Write what a scene shows as ``.rrd`` (extra ``rerun``, https://rerun.io).
+
+    Below ``map``: ``points``, ``depth`` and ``cameras/NAME``; below ``queries/NAME``: ``estimate``
+    with the image, ``truth``, and ``inliers``, lines to their points. Coordinates are relative to
+    the scene's origin, which stands in ``origin``. Cameras are drawn without their distortion.
+    """
+    import rerun as rr
+
+    from megloc_kapture.evaluation.report.pictures import shrunk
+    from megloc_kapture.evaluation.report.queries import query_facts, spread
+
+    stream = rr.RecordingStream("megloc", recording_id=scene.title, send_properties=False)
+
+    def log(where: list[str], *what: Any) -> None:
+        stream.log([*where], *what, static=True)
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        stream.save(path)
+    except RuntimeError as error:
+        raise OutputError(f"{path}: cannot be written: {error}") from error
+    x, y, z = scene.origin.tolist()
+    log(["origin"], rr.TextDocument(f"coordinates are relative to {x!r} {y!r} {z!r}"))
+    own = len(scene.points) - scene.num_dense
+    for name, rows in (("points", slice(0, own)), ("depth", slice(own, None))):
+        if len(scene.points[rows]):
+            log(["map", name], rr.Points3D(scene.points[rows], colors=scene.colors[rows]))
+    size = 0.04 * scene.radius
+
+    def camera(
+        where: list[str],
+        pose: RigidTransform,
+        of: Camera | None,
+        color: str,
+        folder: KaptureFolder | None = None,
+        image: str = "",
+    ) -> None:
+        center = pose.center() - scene.origin
+        log(where, rr.Transform3D(translation=center, mat3x3=pose.rotation_matrix().T))
+        of = of or Camera.pinhole(4, 3, 4)  # as in the view where it is not known
+        scale, pixels = 1.0, None
+        with contextlib.suppress(DataError):  # a frustum without its image is better than none
+            if folder is not None:
+                read = read_image_rgb(folder.image_path(image))
+                pixels, scale = shrunk(read, (_WIDTH, _WIDTH))
+        log(
+            where,
+            rr.Pinhole(
+                focal_length=focal_px(of) * scale,
+                principal_point=np.array(principal_point_px(of)) * scale,
+                resolution=[round(of.width * scale), round(of.height * scale)],
+                image_plane_distance=size,
+                color=int(f"{color[1:]}ff", 16),
+            ),
+        )
+        if pixels is not None:
+            log(where, rr.Image(pixels).compress(jpeg_quality=75))
+
+    poses = context.map_poses()
+    with_image = {scene.cameras[at] for at in spread(len(scene.cameras), _MAX_IMAGES)}
+    for name in scene.cameras:
+        folder = context.mapping if name in with_image else None
+        of = _camera(context.mapping, name)
+        camera(["map", "cameras", name], poses[name], of, _GREY, folder, name)
+    first = 0
+    for row, (query, number) in enumerate(zip(scene.queries, scene.num_inliers, strict=True)):
+        where = ["queries", query.name]
+        log(where, rr.TextDocument(", ".join(query_facts(query))))
+        of = context.cameras.get(query.image) or _camera(context.queries, query.image)
+        if query.truth is not None:
+            camera([*where, "truth"], query.truth, of, _WHITE)
+        if query.estimated is not None:
+            folder = context.queries if row < _MAX_IMAGES else None
+            camera([*where, "estimate"], query.estimated, of, query.color, folder, query.image)
+            ends = scene.inliers[first : first + number]
+            starts = np.broadcast_to(scene.frusta[row, 0], ends.shape)
+            color = int(f"{query.color[1:]}40", 16)
+            lines = rr.LineStrips3D(np.stack([starts, ends], axis=1), colors=color)
+            log([*where, "inliers"], lines)
+        first += number
+    stream.flush()
+    stream.disconnect()
+
+
+def _camera(folder: KaptureFolder | None, image: str) -> Camera | None:
+    with contextlib.suppress(DataError):
+        return None if folder is None else folder.read().camera_of(image)
+    return None

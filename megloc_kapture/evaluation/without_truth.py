@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import combinations
+from itertools import combinations, compress
 from typing import Any
 
 import numpy as np
@@ -21,11 +21,12 @@ from megloc_kapture.evaluation.metrics import (
     recall_row,
     row_members,
 )
-from megloc_kapture.evaluation.near_candidates import NearCandidates, near_candidates
-from megloc_kapture.evaluation.results import Poses, Result, ResultContext
-from megloc_kapture.evaluation.scoring import Outcome, Reported
+from megloc_kapture.evaluation.results import Poses, Result, ResultContext, are_ranked
+from megloc_kapture.evaluation.scoring import QueryResult, Reported, query_result
+from megloc_kapture.geometry.poses import camera_centers, invert_quats, rotate, stack_poses
 from megloc_kapture.io.dataset_tables import METRES
 from megloc_kapture.io.tables import QueryStatus
+from megloc_kapture.values import RigidTransform
 
 CAUTION = (
     "None of these figures is accuracy: retrieval may look in the wrong place, and results that "
@@ -45,26 +46,22 @@ _QUARTILES = (0.25, 0.5, 0.75)
 
 
 @dataclass(frozen=True, slots=True)
-class QueryWithoutTruth:
-    """The outcome of one query.
+class NearCandidates:
+    """Distances of a pose from the map images it was estimated from.
 
     Parameters
     ----------
-    image, condition, outcome, reason, num_matches, num_inliers, candidates : as in
-        :class:`megloc_kapture.evaluation.scoring.QueryResult`.
-    near : None without an estimated pose, candidates, or their poses in the map.
-    confidence : probability that the pose is right, as the result says; None where it does not.
+    first_m, first_deg : distance to the first candidate's camera centre, and the angle between
+        the two viewing directions; NaN where nobody ranked the candidates.
+    nearest : the candidate whose centre is nearest.
+    nearest_m, nearest_deg : the same for it.
     """
 
-    image: str
-    condition: str
-    outcome: Outcome
-    reason: str
-    num_matches: int | None = None
-    num_inliers: int | None = None
-    candidates: tuple[str, ...] = ()
-    near: NearCandidates | None = None
-    confidence: float | None = None
+    first_m: float
+    first_deg: float
+    nearest: str
+    nearest_m: float
+    nearest_deg: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,11 +115,11 @@ class RowWithoutTruth:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ResultWithoutTruth:
-    """One result: rows and queries as in an evaluation, without errors."""
+    """One result: rows, and queries whose errors are NaN."""
 
     label: str
     rows: tuple[RowWithoutTruth, ...]
-    queries: tuple[QueryWithoutTruth, ...]
+    queries: tuple[QueryResult, ...]
     poses: Poses
     context: ResultContext = field(default_factory=ResultContext)
 
@@ -204,11 +201,10 @@ def evaluate_without_truth(
     map_poses: Poses | None = None,
     statement: str = "",
 ) -> WithoutTruth:
-    """Localized share, inliers, agreement with retrieval and between results.
+    """Localized share, inliers, agreement with retrieval and between results, all in one frame.
 
     Parameters
     ----------
-    results : in one frame.
     queries : every query that counts; by default all that any of the results is about.
     conditions, condition_order, pools : as in
         :func:`megloc_kapture.evaluation.scoring.evaluate_poses`.
@@ -232,7 +228,11 @@ def evaluate_without_truth(
         [of_image.get(image, "") for image in images], order=condition_order, pools=pools
     )
     pairs = list(combinations(range(len(results)), 2))
-    apart = {(i, j): _apart(results[i].poses, results[j].poses, images) for i, j in pairs}
+    apart = []
+    for i, j in pairs:
+        first, second = results[i].poses, results[j].poses
+        shared = {image: first[image] for image in images if image in first and image in second}
+        apart.append(pose_errors(shared, second, images))
     return WithoutTruth(
         statement=statement or "No true poses were given.",
         thresholds=tuple(thresholds),
@@ -241,10 +241,10 @@ def evaluate_without_truth(
         ),
         agreement=tuple(
             row
-            for pair in pairs
-            for row in _agreement(results, pair, apart[pair], members, thresholds)
+            for pair, errors in zip(pairs, apart, strict=True)
+            for row in _agreement(results, pair, errors, members, thresholds)
         ),
-        apart=tuple(apart.values()),
+        apart=tuple(apart),
     )
 
 
@@ -263,55 +263,73 @@ def _result(
     if result.context.unit == METRES:  # distances are told in metres, or not at all
         near = near_candidates(result.poses, statuses, localized, map_poses)
     queries = tuple(
-        _query(
+        query_result(
             image,
             conditions.get(image, ""),
+            statuses.get(image),
             has_pose=image in result.poses,
-            status=statuses.get(image),
-            near=near.get(image),
+            errors=(math.nan, math.nan),
             confidence=result.confidences.get(image),
+            no_pose="no pose",
+            near=near.get(image),
         )
         for image in images
     )
-    rows = tuple(
-        _row(name, [queries[index] for index in np.flatnonzero(chosen).tolist()])
-        for name, chosen in members.items()
-    )
+    rows = tuple(_row(name, list(compress(queries, chosen))) for name, chosen in members.items())
     return ResultWithoutTruth(result.label, rows, queries, result.poses, result.context)
 
 
-def _query(
-    image: str,
-    condition: str,
-    *,
-    has_pose: bool,
-    status: QueryStatus | None,
-    near: NearCandidates | None,
-    confidence: float | None,
-) -> QueryWithoutTruth:
-    if status is None:
-        outcome: Outcome = "localized" if has_pose else "missing"
-        reason = "" if has_pose else "no pose"
-        return QueryWithoutTruth(image, condition, outcome, reason, confidence=confidence)
-    outcome, reason = "missing", status.reason
-    if has_pose:
-        outcome = "localized" if status.fallback == "none" else "fallback"
-    elif not reason:
-        reason = "status says localized, but the result has no pose"
-    return QueryWithoutTruth(
-        image,
-        condition,
-        outcome,
-        reason,
-        status.num_matches,
-        status.num_inliers,
-        status.candidates,
-        near,
-        status.confidence,
-    )
+def near_candidates(
+    poses: Poses,
+    statuses: Mapping[str, QueryStatus],
+    images: Sequence[str],
+    map_poses: Poses,
+) -> dict[str, NearCandidates]:
+    """Image -> the first and the nearest of its candidates that have a pose in the map; images
+    without any are left out. ``map_poses`` are in the frame of ``poses``."""
+    index_of = {name: index for index, name in enumerate(map_poses)}
+    known = {
+        image: [index_of[c] for c in statuses[image].candidates if c in index_of]
+        for image in images
+        if image in statuses
+    }
+    known = {image: candidates for image, candidates in known.items() if candidates}
+    if not known:
+        return {}
+    counts = [len(candidates) for candidates in known.values()]
+    candidates = np.concatenate([np.array(c, dtype=np.int64) for c in known.values()])
+    centers, directions = _centers_and_directions([poses[image] for image in known])
+    map_centers, map_directions = _centers_and_directions(list(map_poses.values()))
+    owner = np.repeat(np.arange(len(known)), counts)
+    distance_m = np.linalg.norm(centers[owner] - map_centers[candidates], axis=1)
+    cosine = np.einsum("ij,ij->i", directions[owner], map_directions[candidates])
+    angle_deg = np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    names = list(map_poses)
+    ranked = are_ranked(status.candidates for status in statuses.values())
+    found, first = dict[str, NearCandidates](), 0
+    for image, count in zip(known, counts, strict=True):
+        nearest = first + int(np.argmin(distance_m[first : first + count]))
+        found[image] = NearCandidates(
+            first_m=float(distance_m[first]) if ranked else math.nan,
+            first_deg=float(angle_deg[first]) if ranked else math.nan,
+            nearest=names[int(candidates[nearest])],
+            nearest_m=float(distance_m[nearest]),
+            nearest_deg=float(angle_deg[nearest]),
+        )
+        first += count
+    return found
 
 
-def _row(name: str, queries: Sequence[QueryWithoutTruth]) -> RowWithoutTruth:
+def _centers_and_directions(
+    poses: Sequence[RigidTransform],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Camera centres (N, 3) and unit viewing directions (N, 3) in the world."""
+    quats, translations = stack_poses(poses)
+    directions = rotate(invert_quats(quats), np.array([0.0, 0.0, 1.0]))
+    return camera_centers(quats, translations), directions
+
+
+def _row(name: str, queries: Sequence[QueryResult]) -> RowWithoutTruth:
     localized = [query for query in queries if query.outcome == "localized"]
     inliers = [query.num_inliers for query in localized if query.num_inliers is not None]
     near = [query.near for query in localized if query.near is not None]
@@ -347,15 +365,6 @@ def _prior(pairs: Sequence[tuple[float, float]]) -> PriorAgreement | None:
         median_m=float(np.median(distance_m)),
         median_deg=float(np.median(angle_deg)),
     )
-
-
-def _apart(first: Poses, second: Poses, images: Sequence[str]) -> PoseErrors:
-    """Differences of two results' poses; infinite where one of them has none."""
-    both = [index for index, image in enumerate(images) if image in first and image in second]
-    shared = pose_errors(first, second, [images[index] for index in both])
-    position_m, angle_deg = np.full(len(images), np.inf), np.full(len(images), np.inf)
-    position_m[both], angle_deg[both] = shared.position_m, shared.angle_deg
-    return PoseErrors(tuple(images), position_m, angle_deg)
 
 
 def _agreement(

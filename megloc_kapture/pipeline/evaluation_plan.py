@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
-from functools import partial
 from typing import Any
 
 from megloc_kapture.datasets.kapture_folders import import_mapping, mapping_files
@@ -272,24 +271,21 @@ class Evaluate(_RunStage):
         label = f"{self._run.dataset}, {self._run.preset}"
         map_poses = work.folder(MAPPING).read().poses()
         provenance = self.settings() | {"versions": package_versions()}
-        report = partial(
-            write_report,
-            work.out / EVALUATION,
-            map_poses=map_poses,
-            provenance=provenance,
-            # two runs give the same bytes, so seconds stand in manifests and timing.csv alone
-            contexts=[replace(context_of(localized), seconds={})],
-        )
+        output = work.out / EVALUATION
+        # two runs give the same bytes, so seconds stand in manifests and timing.csv alone
+        context = replace(context_of(localized), seconds={})
         if not truth.is_dir():
             found = results_without_truth(
                 [localized], benchmark_of(tables), map_poses=map_poses, labels=[label]
             )
-            report(found)
+            found = replace(found, results=(replace(found.results[0], context=context),))
+            write_report(output, found, map_poses=map_poses, provenance=provenance)
             return {"queries_with_truth": 0}
         evaluation = evaluate(
             localized, truth, side_tables=tables, label=label, mapping=work.path(MAPPING)
         )
-        report(evaluation)
+        evaluation = replace(evaluation, context=context)
+        write_report(output, evaluation, map_poses=map_poses, provenance=provenance)
         row = evaluation.row()
         recall = {f"recall at {at.threshold}": round(at.recall, 4) for at in row.recall}
         return {"queries_with_truth": len(evaluation.queries), **recall}

@@ -22,7 +22,7 @@ from PIL import Image
 
 import megloc_kapture as megloc_package
 from megloc_kapture.evaluation.evaluate import evaluate
-from megloc_kapture.evaluation.report.shown_queries import StoredInliers, shown_queries
+from megloc_kapture.evaluation.report.queries import StoredInliers, shown_queries
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.tables import read_status
 

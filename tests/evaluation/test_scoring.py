@@ -1,13 +1,32 @@
-"""One result scored by camera centres."""
+"""One result against true poses: what is said of the whole, of each query, and of MLAD's pairs."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.evaluation.scoring import evaluate_poses
+from megloc_kapture.evaluation.evaluate import evaluate_results
+from megloc_kapture.evaluation.metrics import thresholds_from_pairs
+from megloc_kapture.evaluation.pose_files import RelativePose, format_mlad_file, relative_pose
+from megloc_kapture.evaluation.protocols import benchmark_of, protocol_of
+from megloc_kapture.evaluation.report.reports import render_report, report_text, write_report
+from megloc_kapture.evaluation.scoring import (
+    evaluate_pairs,
+    evaluate_poses,
+    relative_translation_errors,
+)
+from megloc_kapture.geometry.poses import stack_poses
+from megloc_kapture.io.dataset_tables import (
+    RelocalizationPair,
+    write_protocol,
+    write_relocalization,
+)
 from megloc_kapture.io.tables import QueryStatus
 from megloc_kapture.values import RigidTransform
 
@@ -82,3 +101,234 @@ def test_the_order_of_the_input_does_not_matter(world: Any) -> None:
     second = evaluate_poses(backwards, dict(reversed(world.truth.items())))
     assert first.rows == second.rows
     assert first.queries == second.queries
+
+
+THRESHOLDS = thresholds_from_pairs(((0.1, None), (0.2, None), (0.5, None)))
+FILE = "relocalizationFile_recording_a_to_recording_b.txt"
+Poses = dict[str, RigidTransform]
+
+
+def pose_at(center: list[float], turn_deg: float = 0.0) -> RigidTransform:
+    """A camera at ``center``, turned about its vertical axis."""
+    rotation = Rotation.from_euler("y", turn_deg, degrees=True).as_matrix()
+    return RigidTransform.from_matrix(rotation, -rotation @ np.array(center))
+
+
+def pairs_of(queries: list[str], reference: str = "ref/0.png") -> list[RelocalizationPair]:
+    return [RelocalizationPair(FILE, reference, query) for query in queries]
+
+
+def evaluate_all(
+    estimated: Poses, truth: Poses, references: Poses, pairs: list[RelocalizationPair]
+) -> Any:
+    of_pairs = {pair: estimated[pair.query] for pair in pairs if pair.query in estimated}
+    return evaluate_pairs(of_pairs, truth, pairs, references, thresholds=THRESHOLDS)
+
+
+@pytest.mark.parametrize(("distance_m", "turn_deg"), [(10.0, 1.0), (3.0, 20.0), (50.0, 0.2)])
+def test_a_rotation_alone_costs_the_chord_it_cuts(distance_m: float, turn_deg: float) -> None:
+    # right place, wrong heading: the reference is seen on a circle around the query
+    truth = {"q.png": pose_at([distance_m, 0.0, 0.0])}
+    estimated = {"q.png": pose_at([distance_m, 0.0, 0.0], turn_deg)}
+    references = {"ref/0.png": pose_at([0.0, 0.0, 0.0], 33.0)}
+    found = evaluate_all(estimated, truth, references, pairs_of(["q.png"]))
+    chord = 2 * distance_m * np.sin(np.deg2rad(turn_deg) / 2)
+    assert found.errors.position_m[0] == pytest.approx(chord, rel=1e-12)
+    assert found.by_center.errors.position_m[0] == pytest.approx(0.0, abs=1e-12)
+    assert found.errors.angle_deg[0] == pytest.approx(turn_deg)
+
+
+def test_a_shift_alone_is_the_distance_of_the_centers() -> None:
+    truth = {"q.png": pose_at([4.0, 1.0, 2.0], 50.0)}
+    estimated = {"q.png": pose_at([4.1, 1.0, 2.2], 50.0)}
+    found = evaluate_all(estimated, truth, {"ref/0.png": pose_at([9.0, 0, 0])}, pairs_of(["q.png"]))
+    assert found.errors.position_m[0] == pytest.approx(np.hypot(0.1, 0.2))
+    assert found.by_center.errors.position_m[0] == pytest.approx(np.hypot(0.1, 0.2))
+
+
+def test_equal_to_matrices() -> None:
+    rng = np.random.default_rng(0)
+
+    def random_poses() -> list[RigidTransform]:
+        return [
+            RigidTransform.from_matrix(Rotation.random(rng=rng).as_matrix(), rng.normal(size=3) * 9)
+            for _ in range(20)
+        ]
+
+    def matrix(pose: RigidTransform) -> np.ndarray:
+        result = np.eye(4)
+        quat = np.array(pose.quat_wxyz)
+        result[:3, :3] = Rotation.from_quat(quat, scalar_first=True).as_matrix()
+        result[:3, 3] = pose.translation
+        return result
+
+    estimated, truth, references = random_poses(), random_poses(), random_poses()
+    expected = []
+    for found, true, reference in zip(estimated, truth, references, strict=True):
+        world_from_reference = np.linalg.inv(matrix(reference))
+        apart = matrix(found) @ world_from_reference - matrix(true) @ world_from_reference
+        expected.append(np.linalg.norm(apart[:3, 3]))
+    ours = relative_translation_errors(*map(stack_poses, (estimated, truth, references)))
+    np.testing.assert_allclose(ours, expected, rtol=1e-12)
+
+
+def test_pairs_count_and_files_are_conditions() -> None:
+    truth = {f"q{i}.png": pose_at([i, 0.0, 0.0]) for i in range(4)}
+    estimated = {
+        "q0.png": pose_at([0.09, 0.0, 0.0]),
+        "q1.png": pose_at([1.3, 0.0, 0.0]),
+        "q2.png": pose_at([2.0, 0.0, 0.0]),
+    }
+    references = {"r0.png": pose_at([0.0, 0.0, 5.0]), "r1.png": pose_at([0.0, 5.0, 0.0])}
+    first, second = "reloc_town_1_to_town_2.txt", "reloc_park_1_to_park_2.txt"
+    pairs = [
+        RelocalizationPair(first, "r0.png", "q0.png"),
+        RelocalizationPair(first, "r1.png", "q0.png"),
+        RelocalizationPair(second, "r0.png", "q1.png"),
+        RelocalizationPair(second, "r0.png", "q3.png"),
+        RelocalizationPair(second, "r1.png", "unknown.png"),
+    ]
+    found = evaluate_pairs(
+        {pair: estimated[pair.query] for pair in pairs if pair.query in estimated},
+        truth,
+        pairs,
+        references,
+        thresholds=THRESHOLDS,
+        statuses={"q3.png": QueryStatus(image="q3.png", status="failed", reason="dark")},
+    )
+    assert [row.name for row in found.rows] == ["town_2", "park_2", "all"]
+    assert [row.num_queries for row in found.rows] == [2, 2, 4]
+    # a query of two pairs is called by its pair, one of one pair by its name
+    assert found.errors.names == (
+        f"q0.png from r0.png, {first}",
+        f"q0.png from r1.png, {first}",
+        "q1.png",
+        "q3.png",
+    )
+    assert found.image(found.errors.names[0]) == "q0.png"
+    assert [at.num_within for at in found.row("town_2").recall] == [2, 2, 2]
+    assert [at.num_within for at in found.row("park_2").recall] == [0, 0, 1]
+    assert found.queries[-1].reason == "dark"
+    assert found.without_truth == ("unknown.png",)
+    assert found.by_center.row().num_queries == 4
+
+
+def test_what_cannot_be_right_is_refused() -> None:
+    truth = {"q.png": pose_at([0.0, 0.0, 0.0])}
+    with pytest.raises(DataError, match=r"reference 'ref/0.png' .* has no pose in the map"):
+        evaluate_all({}, truth, {}, pairs_of(["q.png"]))
+    with pytest.raises(DataError, match="listed twice"):
+        evaluate_all({}, truth, {"ref/0.png": truth["q.png"]}, pairs_of(["q.png", "q.png"]))
+
+
+@pytest.fixture
+def challenge(tmp_path: Path, kaptures: Callable[..., Path]) -> tuple[Path, Path]:
+    """A workspace with two relocalization files, one query of six without a pose; a result."""
+    rng = np.random.default_rng(4)
+    workspace = tmp_path / "workspace"
+    references = {f"a/{i}.png": pose_at([i, 0.0, 0.0], 10.0 * i) for i in (100, 200)}
+    truth = {f"b/{i}.png": pose_at([i + 1.0, 0.5, 2.0], 5.0 * i) for i in (103, 104, 105)}
+    truth |= {f"c/{i}.png": pose_at([i + 1.0, 0.5, 2.0], 5.0 * i) for i in (206, 207, 208)}
+    estimated = {
+        name: pose_at((pose.center() + rng.normal(size=3) * 0.1).tolist(), 5.0 * int(name[2:5]) + 1)
+        for name, pose in list(truth.items())[:-1]
+    }
+    kaptures(workspace / "mapping", list(references), references)
+    kaptures(workspace / "query_gt", list(truth), truth)
+    kaptures(workspace / "localized", list(truth), estimated)
+    tables = workspace / "megloc"
+    write_protocol(tables, protocol_of("4seasons"))
+    write_relocalization(
+        tables,
+        [
+            RelocalizationPair(
+                f"reloc_{name[0]}.txt", "a/100.png" if name[0] == "b" else "a/200.png", name
+            )
+            for name in truth
+        ],
+    )
+    files = tmp_path / "submission"
+    for letter, reference in (("b", "a/100.png"), ("c", "a/200.png")):
+        rows = [
+            RelativePose(
+                int(reference[2:5]), int(name[2:5]), relative_pose(pose, references[reference])
+            )
+            for name, pose in estimated.items()
+            if name[0] == letter
+        ]
+        files.mkdir(exist_ok=True)
+        (files / f"reloc_{letter}.txt").write_text(format_mlad_file(rows))
+    return workspace, files
+
+
+def test_pose_files_give_the_figures_of_the_folder(
+    challenge: tuple[Path, Path], tmp_path: Path
+) -> None:
+    workspace, files = challenge
+    rules = benchmark_of(workspace / "megloc")
+    results = [workspace / "localized", files]
+    folder, submitted = evaluate_results(results, workspace / "query_gt", rules)
+    assert folder.row().num_queries == 6 and folder.row().num_missing == 1
+    np.testing.assert_allclose(submitted.errors.position_m, folder.errors.position_m, atol=1e-12)
+    assert folder.thresholds == THRESHOLDS
+    # one file of two: the other file's pairs have no pose
+    (half,) = evaluate_results(
+        [files / "reloc_b.txt"],
+        workspace / "query_gt",
+        rules,
+        mapping=workspace / "mapping",
+    )
+    assert half.row("b").num_missing == 0
+    assert half.row("c").num_missing == 3
+
+
+def test_both_errors_are_told_everywhere(challenge: tuple[Path, Path], tmp_path: Path) -> None:
+    workspace, _ = challenge
+    (found,) = evaluate_results(
+        [workspace / "localized"], workspace / "query_gt", benchmark_of(workspace / "megloc")
+    )
+    text = report_text(found)
+    assert "Error of the translation relative to the given reference at or below" in text
+    assert max(map(len, text.splitlines())) <= 100
+    assert "the same by the distance of the camera centres" in text
+    page = render_report(found)
+    assert "relative (m)" in page and "centre (m)" in page
+    paths = write_report(tmp_path / "out", found)
+    header, first, *_ = paths["per_query.csv"].read_text().splitlines()
+    assert header.endswith("reason,reference,center_error_m")
+    fields = first.split(",")
+    assert fields[-2] == "a/100.png"
+    assert float(fields[-1]) == found.by_center.errors.position_m[0]
+    assert float(fields[3]) == found.errors.position_m[0]
+    assert '"rows_by_center"' in paths["recall.json"].read_text()
+
+
+def test_bad_pose_files_are_named(challenge: tuple[Path, Path], tmp_path: Path) -> None:
+    workspace, files = challenge
+    rules = benchmark_of(workspace / "megloc")
+
+    def evaluate(source: Path) -> None:
+        evaluate_results([source], workspace / "query_gt", rules, mapping=workspace / "mapping")
+
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(DataError, match=r"neither a kapture folder .*reloc_b\.txt"):
+        evaluate(tmp_path / "empty")
+    strange = tmp_path / "poses.txt"
+    strange.write_text("100 103 0 0 0 0 0 0 1\n")
+    with pytest.raises(DataError, match=r"call it as that one: reloc_b\.txt, reloc_c\.txt"):
+        evaluate(strange)
+    (files / "reloc_b.txt").write_text("100 999 0 0 0 0 0 0 1\n")
+    with pytest.raises(DataError, match="pair 100 999 is not asked for"):
+        evaluate(files)
+    (files / "reloc_b.txt").write_text("100 103\n")
+    with pytest.raises(DataError, match="pairs without poses"):
+        evaluate(files)
+
+
+def test_without_a_map_the_option_is_named(
+    challenge: tuple[Path, Path], tmp_path: Path, kaptures: Callable[..., Path]
+) -> None:
+    workspace, _ = challenge
+    elsewhere = kaptures(tmp_path / "elsewhere", ["b/103.png"], {})
+    with pytest.raises(DataError, match="6 pairs .* --map"):
+        evaluate_results([elsewhere], workspace / "query_gt", benchmark_of(workspace / "megloc"))

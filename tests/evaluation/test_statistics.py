@@ -221,14 +221,14 @@ def test_mean_deviation_and_stability() -> None:
     whole = seeds.rows[-1]
     recalls = [0.75, 0.5, 0.75]
     at = whole.recall[0]
-    assert at.recall.mean == pytest.approx(np.mean(recalls))
-    assert at.recall.deviation == pytest.approx(np.std(recalls, ddof=1))
-    assert (at.recall.smallest, at.recall.largest) == (0.5, 0.75)
-    assert (at.always, at.sometimes, at.never) == (1, 3, 0)
-    assert (whole.recall[1].always, whole.recall[1].sometimes) == (3, 1)
+    assert at.mean == pytest.approx(np.mean(recalls))
+    assert at.deviation == pytest.approx(np.std(recalls, ddof=1))
+    assert (at.smallest, at.largest) == (0.5, 0.75)
+    assert (at.found_always, at.found_sometimes, at.found_never) == (1, 3, 0)
+    assert (whole.recall[1].found_always, whole.recall[1].found_sometimes) == (3, 1)
     assert whole.num_localized.mean == pytest.approx(11 / 3)
     day = seeds.rows[0].recall[0]
-    assert day.recall.mean == pytest.approx((1 + 1 + 0.5) / 3)
+    assert day.mean == pytest.approx((1 + 1 + 0.5) / 3)
 
 
 def test_a_run_without_median() -> None:

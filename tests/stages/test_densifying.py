@@ -21,11 +21,11 @@ from corner import CAMERA, depth_m
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.evaluation.report import depth as pictures
-from megloc_kapture.evaluation.report.depth import depth_blocks
+from megloc_kapture.evaluation.report import panels
 from megloc_kapture.evaluation.report.document import Paragraph, Pictures
+from megloc_kapture.evaluation.report.panels import depth_blocks
+from megloc_kapture.evaluation.report.queries import StoredInliers
 from megloc_kapture.evaluation.report.scene import render_view, scene_of
-from megloc_kapture.evaluation.report.shown_queries import StoredInliers
 from megloc_kapture.evaluation.results import ResultContext
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.geometry.warping import scaled_camera
@@ -290,7 +290,7 @@ def test_pictures_show_the_depth_that_is_there(densified: KaptureFolder) -> None
 def test_many_images_are_shown_in_part_and_broken_ones_left_out(
     densified: KaptureFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pictures, "MAX_IMAGES", 3)
+    monkeypatch.setattr(panels, "MAX_IMAGES", 3)
     told, _, *shown = depth_blocks(ResultContext(mapping=densified))
     assert isinstance(told, Paragraph) and told.text.endswith(" 3 are shown.")
     names = sorted(densified.read().poses())

@@ -18,7 +18,7 @@ import pytest
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, OptionError, OutputError, PluginError
-from megloc_kapture.evaluation.report.masks import SegmentedClasses
+from megloc_kapture.evaluation.report.panels import SegmentedClasses
 from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
 from megloc_kapture.io.files import read_json_model
 from megloc_kapture.io.images import image_size, read_depth_map, read_image_rgb, write_image

@@ -1,21 +1,15 @@
-"""Poses compared with the map's cameras: the mistake that explains them, and those that are far."""
+"""Poses compared with the map's cameras around them: the mistake that explains them, and those that
+are far, on another floor or a storey off."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from megloc_kapture.evaluation.check.cameras import (
-    CameraSets,
-    Nearness,
-    Neighbourhood,
-    camera_sets,
-    storey_offset,
-)
-from megloc_kapture.evaluation.check.findings import Finding, plural, some
 from megloc_kapture.evaluation.check.mistakes import (
     MIN_POSES,
     Hypothesis,
@@ -26,9 +20,38 @@ from megloc_kapture.evaluation.check.mistakes import (
     restore_relative,
     undecided,
 )
-from megloc_kapture.evaluation.check.reading import MapCameras, Reference
+from megloc_kapture.evaluation.check.reading import (
+    CameraSets,
+    Finding,
+    MapCameras,
+    Reference,
+    Severity,
+    camera_sets,
+    plural,
+    some,
+)
+from megloc_kapture.geometry.poses import rotation_matrices
 from megloc_kapture.io.dataset_tables import World
 
+# how many map cameras a pose's orientation is compared with: a panoramic scan has 36 of one centre
+_NEIGHBOURS = 48
+# a neighbour may be this much farther than the nearest: which one it is does not matter far away,
+# and a tree finds it many times faster
+_TREE_SLACK = 0.2
+# cameras nearer to each other than this share of the extent stand together
+_TOGETHER = 1 / 200
+# this many spacings, or this share of the extent, from a map camera a pose is still near it
+_NEAR_SPACINGS, _NEAR_EXTENT = 10.0, 0.1
+# coordinates that no map has; their squares must not overflow
+_INFINITE = 1e100
+# orientations this near are alike, beyond the second all are equally unlike; what one counts
+_ALIKE_DEG, _UNLIKE_DEG, _ANGLE_SCALE_DEG = 45.0, 90.0, 20.0
+# the mean of the cameras' up directions is this long where most of them stand upright
+_UPRIGHT = 0.8
+# no ceiling is lower, and no two ways of holding a camera differ so much
+_STOREY_M = 1.5
+# this many times the map's own difference in height between neighbours, for this share of poses
+_STOREY_HEIGHTS, _STOREY_SHARE, _STOREY_NEIGHBOURS = 4.0, 0.6, 8
 # a mistake of the whole file shows in this many of its poses
 _SAMPLE = 240
 # of the spacing of the map's cameras: how much off the path between its neighbours a query counts
@@ -38,6 +61,143 @@ _OTHER_FLOOR_GAIN = 2.0
 _MOST = 0.5
 # of the poses' median distance to the map, what is not far yet; up to so many of its extents
 _USUAL, _USUAL_EXTENTS = 4.0, 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class Nearness:
+    """N poses among the map's cameras.
+
+    Parameters
+    ----------
+    distance : float64 (N,), to the nearest camera, in the map's unit; infinite without any.
+    score : float64 (N,), how well each pose fits: 0 is best. It is that of the map camera which is
+        most alike, in distance and orientation together, and falls with the logarithm of both.
+        Distances count in spacings of the map's cameras, so that a table top and a city are alike.
+    fits : bool (N,), whether a camera that is near looks alike.
+    near : float64 (N,), the distance up to which a camera of its set is near.
+    extent : float64 (N,), of the cameras of its set.
+    """
+
+    distance: NDArray[np.float64]
+    score: NDArray[np.float64]
+    fits: NDArray[np.bool_]
+    near: NDArray[np.float64]
+    extent: NDArray[np.float64]
+
+
+class Neighbourhood:
+    """The map's cameras by sets: each pose is compared with the cameras of its set only.
+
+    The spacing of a set is the median distance from a camera to the next, where cameras that stand
+    together (a rig, a panoramic scan) are one; infinite where there is only one. ``sets`` has
+    positions in ``cameras``, int64 (K,) each, K > 0.
+    """
+
+    def __init__(self, cameras: MapCameras, sets: Sequence[NDArray[np.int64]]) -> None:
+        self._rows = np.concatenate(sets)
+        self._set_of_row = np.repeat(np.arange(len(sets)), [len(own) for own in sets])
+        self._quats, self._centers = cameras.quats, cameras.centers
+        # sets lie apart in a fourth dimension, so that one tree and one call serve all of them
+        size = float(np.ptp(cameras.centers, axis=0).max()) if len(cameras.centers) else 0.0
+        self._gap = 1e4 * (size or 1.0)
+        centers = cameras.centers[self._rows]
+        self._tree = cKDTree(np.column_stack([centers, self._set_of_row * self._gap]))
+        scales = [_scales(cameras.centers[own]) for own in sets]
+        self.spacing, self.near, self.extent = np.array(scales).T
+
+    def look(
+        self, quats: NDArray[np.float64], centers: NDArray[np.float64], sets: NDArray[np.int64]
+    ) -> Nearness:
+        """Compare poses with the cameras of their sets.
+
+        Parameters
+        ----------
+        quats, centers : float64 (N, 4) and (N, 3), of ``cam_from_local``; a centre that is not
+            finite is infinitely far.
+        sets : int64 (N,).
+        """
+        count = min(_NEIGHBOURS, len(self._rows))
+        with np.errstate(invalid="ignore"):
+            finite = np.abs(centers).max(axis=1, initial=0.0) < _INFINITE
+        centers = np.where(finite[:, None], centers, 0.0)
+        apart = np.column_stack([centers, sets * self._gap])
+        _, found = self._tree.query(apart, k=np.arange(1, count + 1), eps=_TREE_SLACK)
+        same = (self._set_of_row[found] == sets[:, None]) & finite[:, None]
+        cameras = self._rows[found]
+        offsets = self._centers[cameras] - centers[:, None]
+        distance = np.where(same, np.linalg.norm(offsets, axis=2), np.inf)
+        cosine = np.abs(np.einsum("nkd,nd->nk", self._quats[cameras], quats))
+        angle_deg = np.rad2deg(2.0 * np.arccos(np.minimum(cosine, 1.0)))
+        near = self.near[sets]
+        turned = np.log1p((np.minimum(angle_deg, _UNLIKE_DEG) / _ANGLE_SCALE_DEG) ** 2)
+        with np.errstate(invalid="ignore"):
+            spacings = np.where(same, distance / self.spacing[sets, None], np.inf)
+        score = (-np.log1p(spacings) - turned).max(axis=1)
+        alike = same & (distance <= near[:, None]) & (angle_deg <= _ALIKE_DEG)
+        return Nearness(distance.min(axis=1), score, alike.any(axis=1), near, self.extent[sets])
+
+
+def _scales(centers: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Spacing, the distance that is near, and the extent of the cameras of one set."""
+    extent = _extent(centers, np.median(centers, axis=0))
+    if extent > 0.0:
+        apart = _one_of_each(centers, extent)
+        if len(apart) > 1:
+            spacing = float(np.median(cKDTree(apart).query(apart, k=2)[0][:, 1]))
+            return spacing, max(_NEAR_SPACINGS * spacing, _NEAR_EXTENT * extent), extent
+    return np.inf, np.inf, np.inf
+
+
+def _one_of_each(centers: NDArray[np.float64], extent: float) -> NDArray[np.float64]:
+    """Centres with one left of those that stand together, or each would be its own neighbour."""
+    grid = extent * _TOGETHER
+    return np.unique(np.round(centers / grid), axis=0) * grid
+
+
+def _extent(centers: NDArray[np.float64], middle: NDArray[np.float64]) -> float:
+    return float(np.quantile(np.linalg.norm(centers - middle, axis=1), 0.9))
+
+
+def storey_offset(cameras: MapCameras, centers: NDArray[np.float64]) -> float | None:
+    """Height, metres, that most poses have above the map's cameras around them, where it is a
+    storey's; negative below. None where heights are usual, or the map does not say which way is up.
+
+    Parameters
+    ----------
+    cameras : of the map, in metres.
+    centers : float64 (N, 3), of the poses, in the same frame.
+    """
+    up = -rotation_matrices(cameras.quats)[:, 1, :].mean(axis=0)
+    length = float(np.linalg.norm(up))
+    centers = centers[np.isfinite(centers).all(axis=1) & (np.abs(centers) < _INFINITE).all(axis=1)]
+    if length < _UPRIGHT or not len(centers):
+        return None
+    up /= length
+    level = np.linalg.svd(up[None])[2][1:].T  # two directions
+    middle = np.median(cameras.centers, axis=0)
+    extent = _extent(cameras.centers, middle)
+    if not extent > 0:
+        return None
+    own, given = _one_of_each(cameras.centers - middle, extent), centers - middle
+    count = min(_STOREY_NEIGHBOURS, len(own) - 1)
+    if count < 1:
+        return None
+    tree, heights = cKDTree(own @ level), own @ up
+    _, found = tree.query(own @ level, k=np.arange(1, count + 2))
+    usual = np.quantile(np.abs(heights[found[:, 1:]] - heights[:, None]).min(axis=1), 0.9)
+    distance, found = tree.query(given @ level, k=np.arange(1, count + 1))
+    near = distance[:, 0] <= extent
+    if not near.any():
+        return None
+    differences = (given @ up)[:, None] - heights[found]
+    nearest = np.abs(differences).argmin(axis=1)
+    above = differences[np.arange(len(nearest)), nearest][near]
+    offset = float(np.median(above))
+    alike = np.abs(above - offset) < 0.5 * abs(offset)
+    least = max(_STOREY_M, _STOREY_HEIGHTS * float(usual))
+    if abs(offset) < least or alike.mean() * near.mean() < _STOREY_SHARE:
+        return None
+    return offset
 
 
 def path_scores(
@@ -50,8 +210,7 @@ def path_scores(
 
     Parameters
     ----------
-    centers : float64 (N, 3).
-    times : float64 (N,), of the queries, from any origin; queries of one time have no part in it.
+    centers, times : float64 (N, 3) and (N,); queries of one time have no part in it.
     scale : float64 (N,), the distance that counts.
     """
     order = np.argsort(times, kind="stable")
@@ -80,10 +239,8 @@ def compare_poses(
 
     Parameters
     ----------
-    keys : per row its name in the file.
+    keys, queries : per row its name in the file, and its query, None where the name is unknown.
     quats, translations : float64 (N, 4) and (N, 3), in the order of the file's columns.
-    queries : per row its query, None where the name is unknown.
-    reference : with cameras.
     """
     cameras, world = reference.cameras, reference.world
     if cameras is None or not len(keys):
@@ -104,17 +261,15 @@ def compare_poses(
         own = sets.other if other or "floor" in hypothesis else sets.own
         return hood.look(*poses, own[rows])
 
-    findings, explained = _explained(
-        absolute_hypotheses(frames=world != World(), floors=floors),
-        lambda hypothesis: look(hypothesis, sample),
-        len(keys),
-    )
+    hypotheses = absolute_hypotheses(frames=world != World(), floors=floors)
+    findings, explained = _explained(hypotheses, lambda own: look(own, sample), len(keys))
     if explained:
         return findings
     as_is = look(Hypothesis(), everything)
     frames = {reference.groups[i].frame for i in cameras.images if i in reference.groups}
     if sets.has_other.any():
-        findings += _other_floor(keys, as_is, look(Hypothesis(), everything, other=True), sets)
+        there = look(Hypothesis(), everything, other=True)
+        findings += _other_floor(keys, as_is, there, sets)
     elif len(frames) > 1:
         message = "which floor a query belongs to is not known here: a pose may be of the other one"
         findings.append(Finding("note", "floor-unknown", message))
@@ -146,7 +301,6 @@ def compare_relative(
     keys : per row its two timestamps.
     quats, translations : float64 (N, 4) and (N, 3), in the order of the file's columns.
     pairs : per row the reference's image (of the map) and the query's, None where it is unknown.
-    reference : with cameras.
     """
     cameras = reference.cameras
     if cameras is None or not len(keys):
@@ -154,9 +308,8 @@ def compare_relative(
     position = {image: number for number, image in enumerate(cameras.images)}
     rows = np.array([i for i, (image, _) in enumerate(pairs) if image in position], dtype=np.int64)
     findings = []
-    if len(rows) < len(keys):
-        left = plural(len(keys) - len(rows), "row")
-        message = f"{left} not compared: the map has no pose of the reference"
+    if left := len(keys) - len(rows):
+        message = f"{plural(left, 'row')} not compared: the map has no pose of the reference"
         findings.append(Finding("note", "no-reference", message))
     if not len(rows):
         return findings
@@ -176,9 +329,9 @@ def compare_relative(
 
     about_all, explained = _explained(relative_hypotheses(), look, len(rows))
     findings += about_all
-    if explained:
-        return findings
-    return findings + _far([keys[i] for i in rows], look(Hypothesis()), reference.world.unit)
+    if not explained:
+        findings += _far([keys[i] for i in rows], look(Hypothesis()), reference.world.unit)
+    return findings
 
 
 def _explained(
@@ -241,16 +394,16 @@ def _far(keys: Sequence[str], nearness: Nearness, unit: str) -> list[Finding]:
     far = order[(nearness.distance > limit)[order]].tolist()
     if not far:
         return []
-    names = tuple(keys[i] for i in far)
     told = some(f"{keys[i]} ({nearness.distance[i]:.4g} {unit})" for i in far)
+    severity: Severity = "warning"
+    message = f"{plural(len(far), 'pose')} far from every map camera they may be near: {told}"
     if len(far) > _MOST * len(keys):
+        severity = "error"
         message = (
             f"{len(far)} of {len(keys)} poses are far from every map camera they may be near, and "
             f"no classic mistake explains it; is it another frame, or another scale? {told}"
         )
-        return [Finding("error", "far", message, names=names)]
-    message = f"{plural(len(far), 'pose')} far from every map camera they may be near: {told}"
-    return [Finding("warning", "far", message, names=names)]
+    return [Finding(severity, "far", message, names=tuple(keys[i] for i in far))]
 
 
 def _storeys(cameras: MapCameras, centers: NDArray[np.float64], sets: CameraSets) -> list[Finding]:
@@ -259,8 +412,7 @@ def _storeys(cameras: MapCameras, centers: NDArray[np.float64], sets: CameraSets
         rows = sets.own == number
         if rows.sum() < MIN_POSES:
             continue
-        # without names, which heights do not need
-        own = MapCameras((), cameras.quats[members], cameras.centers[members])
+        own = MapCameras((), cameras.quats[members], cameras.centers[members])  # without names
         offset = storey_offset(own, centers[rows])
         if offset is not None:
             message = (

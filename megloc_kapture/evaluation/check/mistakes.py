@@ -7,7 +7,7 @@ under it is to read the file in the same way, which gives the right ones back.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,8 +53,7 @@ class Mistake:
 
     Parameters
     ----------
-    kind : a short name that programs can rely on.
-    said : the mistake in words.
+    kind : a short name that programs can rely on; ``said`` has it in words.
     cost : 1; more where it is rare.
     turn_wxyz : of a mistake about the world's axes: the turn ``file_from_map``, float64 (4,).
     """
@@ -109,11 +108,10 @@ def _axis_turns() -> tuple[Mistake, ...]:
 
 # of each group one at most; in the order in which they are told
 _ORDER = (Mistake("xyzw", "the quaternions are in the order x y z w; the format has w first"),)
+_INVERTED = "the poses are inverted: they are"
+_OPENGL = "y up, z back), the format has y down and z forward"
 _CONTENT = (
-    Mistake(
-        "inverted",
-        "the poses are inverted: they are world_from_cam, the format has cam_from_world",
-    ),
+    Mistake("inverted", f"{_INVERTED} world_from_cam, the format has cam_from_world"),
     Mistake("centre", "the camera's centre stands where the translation belongs: t is -R C, not C"),
     Mistake(
         "inverted-rotation",
@@ -121,50 +119,33 @@ _CONTENT = (
         1.5,
     ),
 )
-_AXES = (
-    Mistake(
-        "axes",
-        "the cameras have the axes of OpenGL and Bundler (y up, z back), the format has y down and "
-        "z forward: multiply R and t from the left with diag(1, -1, -1)",
-    ),
+_AXES = Mistake(
+    "axes",
+    f"the cameras have the axes of OpenGL and Bundler ({_OPENGL}: multiply R and t from the left "
+    "with diag(1, -1, -1)",
 )
-_WORLD_AXES = _axis_turns()
-_FRAME = (
-    Mistake(
-        "frame",
-        "the poses are in the workspace's local frame: the offset of world.json has not been "
-        "undone (megloc submit does)",
-    ),
+_FRAME = Mistake(
+    "frame",
+    "the poses are in the workspace's local frame: the offset of world.json has not been undone "
+    "(megloc submit does)",
 )
-_OTHER_FLOOR = (
-    Mistake(
-        "floor",
-        "the poses fit another floor's cameras, not those of the floor the queries belong to",
-    ),
+_OTHER_FLOOR = Mistake(
+    "floor", "the poses fit another floor's cameras, not those of the floor the queries belong to"
 )
 _RELATIVE = (
     (Mistake("wxyz", "the quaternions are in the order w x y z; the format has w last"),),
     (
         Mistake(
-            "inverted",
-            "the poses are inverted: they are reference_from_query, the format has "
-            "query_from_reference",
+            "inverted", f"{_INVERTED} reference_from_query, the format has query_from_reference"
         ),
         Mistake(
             "centre", "the query's centre stands where the translation belongs: t is -R C, not C"
         ),
         Mistake(
-            "absolute",
-            "the poses are absolute: the format has the query relative to its reference",
+            "absolute", "the poses are absolute: the format has the query relative to its reference"
         ),
     ),
-    (
-        Mistake(
-            "axes",
-            "the cameras have the axes of OpenGL (y up, z back), the format has y down and z "
-            "forward",
-        ),
-    ),
+    (Mistake("axes", f"the cameras have the axes of OpenGL ({_OPENGL}"),),
 )
 
 
@@ -175,8 +156,8 @@ def absolute_hypotheses(*, frames: bool, floors: bool) -> list[Hypothesis]:
     ----------
     frames, floors : whether the map has a frame of its own, and several floors.
     """
-    groups = [_ORDER, _CONTENT, _AXES, _WORLD_AXES]
-    groups += [_FRAME] * frames + [_OTHER_FLOOR] * floors
+    groups = [_ORDER, _CONTENT, (_AXES,), _axis_turns()]
+    groups += [(_FRAME,)] * frames + [(_OTHER_FLOOR,)] * floors
     # several rare mistakes at once explain chance as well as they explain a file
     return [
         own
@@ -196,10 +177,10 @@ def relative_hypotheses() -> list[Hypothesis]:
     ]
 
 
-def _combined(groups: Sequence[tuple[Mistake, ...]]) -> Iterator[Hypothesis]:
+def _combined(groups: Sequence[tuple[Mistake, ...]]) -> list[Hypothesis]:
     every = itertools.product(*((None, *group) for group in groups))
     found = [Hypothesis(tuple(own for own in chosen if own is not None)) for chosen in every]
-    yield from sorted(found, key=lambda own: own.cost)
+    return sorted(found, key=lambda own: own.cost)
 
 
 def restore_absolute(
@@ -214,7 +195,6 @@ def restore_absolute(
     ----------
     quats : float64 (N, 4), unit length, in the order of the file's columns.
     translations : float64 (N, 3), as in the file.
-    world : of the workspace.
     """
     if "xyzw" in hypothesis:
         quats = np.roll(quats, 1, axis=1)
@@ -255,7 +235,7 @@ def restore_relative(
     if "wxyz" not in hypothesis:
         quats = np.roll(quats, 1, axis=1)
     if "absolute" in hypothesis:
-        axes = Hypothesis(_AXES if "axes" in hypothesis else ())
+        axes = Hypothesis((_AXES,) if "axes" in hypothesis else ())
         return restore_absolute(axes, quats, translations, world)
     if "axes" in hypothesis:
         quats = multiply_quats(multiply_quats(_OPENGL_QUAT, quats), _OPENGL_QUAT)
@@ -273,14 +253,8 @@ def restore_relative(
 
 @dataclass(frozen=True)
 class Explanation:
-    """A hypothesis of mistakes that explains the file.
-
-    Parameters
-    ----------
-    best : its index.
-    as_good : indices of others that explain the file as well.
-    fitting, fitting_as_is : share of poses that fit the map under it, and when read rightly.
-    """
+    """A hypothesis that explains the file: its index ``best``, and those of others that do as well;
+    the share of poses that fit the map under it, and when read rightly."""
 
     best: int
     as_good: tuple[int, ...]

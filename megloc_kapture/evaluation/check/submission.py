@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
+from itertools import compress
 from pathlib import Path, PurePosixPath
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.check.comparison import compare_poses, compare_relative
-from megloc_kapture.evaluation.check.findings import CheckReport, Finding, Severity, plural, some
-from megloc_kapture.evaluation.check.reading import Reference, Rows, read_rows
+from megloc_kapture.evaluation.check.reading import (
+    CheckReport,
+    Finding,
+    Reference,
+    Rows,
+    Severity,
+    plural,
+    read_rows,
+    some,
+)
 from megloc_kapture.io.dataset_tables import ImageGroup, RelocalizationPair
 
 _MLAD_DATASETS = ("4seasons",)
@@ -48,10 +58,11 @@ def check_submission(
     if reference is not None:
         mlad = reference.protocol.pose_file == "mlad"
     poses, expected, findings = (_check_mlad if mlad else _check_file)(path, dataset, reference)
+    folder = "" if reference is None else reference.folder
     return CheckReport(
         dataset=dataset,
         file=str(path),
-        reference="" if reference is None else reference.folder,
+        reference=folder,
         poses=poses,
         expected=expected,
         findings=tuple(findings),
@@ -97,12 +108,10 @@ def _check_mlad(
         absent = [name for name in wanted if name not in there]
         others = [name for name in there if name not in files]
         if absent:
-            message = f"{plural(len(absent), 'file')} missing: {some(absent)}"
-            findings.append(Finding("error", "missing-file", message, names=tuple(absent)))
+            findings.append(_about("error", "missing-file", absent, "file", "missing"))
         if others:
-            message = f"{plural(len(others), 'file')} that no relocalization file asks for"
-            message += f": {some(others)}"
-            findings.append(Finding("warning", "unknown-file", message, names=tuple(others)))
+            said = "that no relocalization file asks for"
+            findings.append(_about("warning", "unknown-file", others, "file", said))
         if not files and not absent:
             raise DataError("there is no pose file (*.txt) in the folder", path=path)
     else:
@@ -129,39 +138,35 @@ def _check_pairs(
     rows: Rows, pairs: Sequence[RelocalizationPair] | None, reference: Reference | None
 ) -> list[Finding]:
     findings: list[Finding] = []
-    images: dict[str, tuple[str, str | None]] = {}
+    images: dict[str, tuple[str, str | None]] = {
+        " ".join(map(_stem, (pair.reference, pair.query))): (pair.reference, pair.query)
+        for pair in pairs or ()
+    }
     swapped = False
     if pairs is not None:
-        for pair in pairs:
-            stems = (PurePosixPath(image).stem for image in (pair.reference, pair.query))
-            images[" ".join(stems)] = (pair.reference, pair.query)
         swapped, findings = match_pairs(rows.named, images)
     # a dummy is no pose, and says nothing about how the others are meant
     is_dummy = (abs(abs(rows.quats) - [0, 0, 0, 1]).max(axis=1) < 1e-12) & ~rows.translations.any(1)
     if is_dummy.any():
-        dummies = tuple(key for key, dummy in zip(rows.keys, is_dummy, strict=True) if dummy)
-        message = f"{plural(len(dummies), 'row')} hold the identity, a dummy that is no pose"
-        findings.append(Finding("note", "dummies", f"{message}: {some(dummies)}", names=dummies))
+        dummies = list(compress(rows.keys, is_dummy))
+        said = "hold the identity, a dummy that is no pose"
+        findings.append(_about("note", "dummies", dummies, "row", said))
     if reference is None or reference.cameras is None or swapped:
         return findings
-    by_stem = {PurePosixPath(image).stem: image for image in reference.cameras.images}
-    keys = [key for key, dummy in zip(rows.keys, is_dummy, strict=True) if not dummy]
+    by_stem = {_stem(image): image for image in reference.cameras.images}
+    keys = list(compress(rows.keys, ~is_dummy))
     named = [images.get(key, (by_stem.get(key.split(" ")[0], ""), None)) for key in keys]
     poses = rows.quats[~is_dummy], rows.translations[~is_dummy]
     return findings + compare_relative(keys, *poses, named, reference)
 
 
 def match_pairs(named: Mapping[str, int], expected: Collection[str]) -> tuple[bool, list[Finding]]:
-    """Compare the rows of an MLAD file with the pairs that are asked for.
+    """Whether the two timestamps of an MLAD file's rows are swapped, and what is wrong with them.
 
     Parameters
     ----------
     named : keys (two timestamps with a blank between) -> line.
     expected : the keys of the relocalization file, in its order.
-
-    Returns
-    -------
-    Whether the two timestamps are swapped, and what is wrong.
     """
     wanted = dict.fromkeys(expected)
     unknown = [key for key in named if key not in wanted]
@@ -189,12 +194,7 @@ def match_pairs(named: Mapping[str, int], expected: Collection[str]) -> tuple[bo
 def match_names(
     named: Mapping[str, int], reference: Reference, dataset: str
 ) -> tuple[Mapping[str, str], list[Finding]]:
-    """Find the query that each name of a file stands for.
-
-    Parameters
-    ----------
-    named : names of the file -> line.
-    reference : its ``expected`` names, and the queries that are not scored.
+    """Find the query that each name of a file (-> line) stands for.
 
     Returns
     -------
@@ -232,11 +232,8 @@ def match_names(
             message += "; the server finds none of them, and every figure is zero"
         findings.append(Finding(severity, kind, message, names=tuple(name for name, _ in pairs)))
     if not_scored:
-        message = (
-            f"{plural(len(not_scored), 'row')} of images that are not scored and will be ignored: "
-            f"{some(not_scored)}"
-        )
-        findings.append(Finding("note", "not-scored", message, names=tuple(not_scored)))
+        said = "of images that are not scored and will be ignored"
+        findings.append(_about("note", "not-scored", not_scored, "row", said))
     first: dict[str, str] = {}
     for name, image in images.items():
         other = first.setdefault(image, name)
@@ -267,9 +264,8 @@ def check_shape(named: Iterable[str], dataset: str) -> list[Finding]:
         findings.append(Finding("error", kind, message, names=flat))
     others = tuple(name for name in named if not name.endswith(endings))
     if others:
-        names = plural(len(others), "name")
-        message = f"{names} not ending in {' or '.join(endings)}: {some(others)}"
-        findings.append(Finding("error", "name-ending", message, names=others))
+        said = f"not ending in {' or '.join(endings)}"
+        findings.append(_about("error", "name-ending", others, "name", said))
     return findings
 
 
@@ -283,8 +279,10 @@ def _missing_names(
     if len(missing) == len(expected):
         message = f"none of the {plural(len(expected), 'name')} of the list is in the file"
         return [Finding("error", "missing", message, names=missing)]
-    conditions = {groups.get(image, ImageGroup()).condition for image in expected.values()}
-    there = {groups.get(image, ImageGroup()).condition for image in given}
+    conditions, there = (
+        {groups.get(image, ImageGroup()).condition for image in images}
+        for images in (expected.values(), given)
+    )
     message = (
         f"{len(missing)} of {len(expected)} queries have no row, and count as not localized: "
         f"{some(missing)}"
@@ -337,24 +335,29 @@ def _difference(name: str, right: str) -> tuple[str, str]:
 
 def _ends_alike(name: str, images: Iterable[str]) -> bool:
     """True where ``name`` is the last parts of one of ``images``, whatever its ending."""
-    own = _without_ending(name)
-    return any(_without_ending(image)[-len(own) :] == own for image in images)
 
+    def parts(path: PurePosixPath) -> tuple[str, ...]:
+        return (*path.parts[:-1], path.stem)
 
-def _without_ending(name: str) -> tuple[str, ...]:
-    path = PurePosixPath(name)
-    return (*path.parts[:-1], path.stem)
+    own = parts(PurePosixPath(name))
+    return any(parts(PurePosixPath(image))[-len(own) :] == own for image in images)
 
 
 def _by_stem(names: Iterable[str]) -> dict[str, list[str]]:
-    found: dict[str, list[str]] = {}
+    found: dict[str, list[str]] = defaultdict(list)
     for name in names:
-        found.setdefault(_stem(name), []).append(name)
+        found[_stem(name)].append(name)
     return found
 
 
 def _stem(name: str) -> str:
     return PurePosixPath(name).stem.lower()
+
+
+def _about(severity: Severity, kind: str, names: Sequence[str], noun: str, said: str) -> Finding:
+    """What is said of so many names, the first of them told."""
+    message = f"{plural(len(names), noun)} {said}: {some(names)}"
+    return Finding(severity, kind, message, names=tuple(names))
 
 
 def _empty(rows: Rows) -> list[Finding]:

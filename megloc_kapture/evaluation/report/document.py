@@ -1,19 +1,34 @@
-"""The document model of reports: sections of paragraphs, lists, tables, figures and pictures.
+"""The document model of reports, and its renderers: plain text, JSON, CSV and HTML.
 
 A :class:`Document` holds the sections of its text form and of its page, the data of its JSON file
-and the tables of its CSV files. Tables and paragraphs may stand in both forms; the
-renderers (:mod:`.renderers`) know nothing of results.
+and the tables of its CSV files. Tables and paragraphs may stand in both forms; nothing here knows
+of results.
 """
 
 from __future__ import annotations
 
+import json
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal, TypeVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
+import numpy as np
 from markupsafe import Markup
+from pydantic import BaseModel
+
+from megloc_kapture.evaluation.provenance import package_versions
+from megloc_kapture.io.csv_table import write_csv_table
+from megloc_kapture.io.files import write_bytes, write_json
+
+if TYPE_CHECKING:
+    from jinja2 import Template
 
 Row = TypeVar("Row")
+Medium = Literal["text", "page"]
+REPORT_HTML = "report.html"
+_WIDTH = 92
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,8 +86,19 @@ def column(
     )
 
 
+class Block:
+    """A part of a section; its template and its text form go by the name of its class."""
+
+    __slots__ = ()
+
+    @property
+    def block(self) -> str:
+        """``paragraph``, ``table`` ..."""
+        return type(self).__name__.lower()
+
+
 @dataclass(frozen=True, slots=True)
-class Table:
+class Table(Block):
     """Columns of equally many cells.
 
     Parameters
@@ -90,16 +116,15 @@ class Table:
     headed: bool = True
     tall: bool = False
     footnote: str = ""
-    block: ClassVar[str] = "table"
 
-    def rows(self, medium: Literal["text", "page"]) -> list[list[tuple[Column, Cell]]]:
-        """The cells of one medium by row, each with its column."""
-        columns = [c for c in self.columns if c.medium in ("both", medium)]
-        return [[(own, own.cells[i]) for own in columns] for i in range(len(self.columns[0].cells))]
-
-    def headings(self, medium: Literal["text", "page"]) -> list[Column]:
+    def headings(self, medium: Medium) -> list[Column]:
         """The columns of one medium."""
         return [own for own in self.columns if own.medium in ("both", medium)]
+
+    def rows(self, medium: Medium) -> list[list[tuple[Column, Cell]]]:
+        """The cells of one medium by row, each with its column."""
+        columns = self.headings(medium)
+        return [[(own, own.cells[i]) for own in columns] for i in range(len(self.columns[0].cells))]
 
     def style(self, row: int) -> str:
         """CSS class of a row."""
@@ -107,46 +132,41 @@ class Table:
 
 
 @dataclass(frozen=True, slots=True)
-class Paragraph:
+class Paragraph(Block):
     """A sentence or several; ``style`` is its CSS class, ``wrap`` whether text lines are broken."""
 
     text: str | Markup
     style: str = "soft"
     wrap: bool = True
-    block: ClassVar[str] = "paragraph"
 
 
 @dataclass(frozen=True, slots=True)
-class Items:
+class Items(Block):
     """Sentences, each with whether it stands out."""
 
     items: tuple[tuple[str, bool], ...]
-    block: ClassVar[str] = "items"
 
 
 @dataclass(frozen=True, slots=True)
-class Heading:
+class Heading(Block):
     """A heading within a section; on the page only."""
 
     text: str
-    block: ClassVar[str] = "heading"
 
 
 @dataclass(frozen=True, slots=True)
-class Figure:
+class Figure(Block):
     """A drawing as an ``<svg>`` element, ``narrow`` or as wide as the page; on the page only."""
 
     svg: Markup
     narrow: bool = False
-    block: ClassVar[str] = "figure"
 
 
 @dataclass(frozen=True, slots=True)
-class Numbers:
+class Numbers(Block):
     """Large figures with their units and the lines below each; on the page only."""
 
     numbers: tuple[tuple[str, str, tuple[str, ...]], ...]
-    block: ClassVar[str] = "numbers"
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +178,7 @@ class Picture:
 
 
 @dataclass(frozen=True, slots=True)
-class Pictures:
+class Pictures(Block):
     """An image in several pictures; on the page only.
 
     Parameters
@@ -174,7 +194,6 @@ class Pictures:
     others: tuple[Picture, ...] = ()
     note: str = ""
     panels: tuple[Picture, ...] = ()
-    block: ClassVar[str] = "pictures"
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,11 +219,10 @@ class Card:
 
 
 @dataclass(frozen=True, slots=True)
-class Cards:
+class Cards(Block):
     """Pictures side by side, which a script can filter and sort; on the page only."""
 
     cards: tuple[Card, ...]
-    block: ClassVar[str] = "cards"
 
     def values(self, attribute: Literal["condition", "outcome"]) -> list[str]:
         """What the cards can be filtered by; empty where all are the same."""
@@ -215,9 +233,6 @@ class Cards:
         """Names of the orders that at least two cards have a value for."""
         names = dict.fromkeys(name for card in self.cards for name in card.sort)
         return [name for name in names if sum(name in card.sort for card in self.cards) > 1]
-
-
-Block = Paragraph | Items | Table | Heading | Figure | Numbers | Pictures | Cards
 
 
 @dataclass(frozen=True, slots=True)
@@ -261,3 +276,124 @@ class Document:
     tables: Mapping[str, Mapping[str, Sequence[object]]]
     provenance: Mapping[str, Any] = field(default_factory=dict)
     beside: Mapping[str, str] = field(default_factory=dict)
+
+
+def write_document(folder: Path | str, document: Document) -> dict[str, Path]:
+    """Write all files of a report into ``folder``, each atomically; returns name -> path.
+
+    Raises
+    ------
+    OutputError : a file cannot be written.
+    """
+    # whatever is wrong with the page is found before anything is written
+    texts = {**document.beside, REPORT_HTML: render_html(document)}
+    json_name, text_name = f"{document.name}.json", f"{document.name}.txt"
+    names = (json_name, text_name, *document.tables, *texts)
+    paths = {name: Path(folder) / name for name in names}
+    write_json(paths[json_name], plain(document.data))
+    write_bytes(paths[text_name], render_text(document.text).encode("utf-8"))
+    for name, columns in document.tables.items():
+        rows = zip(*([_csv_cell(v) for v in values] for values in columns.values()), strict=True)
+        write_csv_table(paths[name], list(columns), list(rows))
+    for name, text in texts.items():
+        write_bytes(paths[name], text.encode("utf-8"))
+    return paths
+
+
+def plain(data: Any) -> Any:
+    """Data for JSON: models as mappings, and None for numbers that are not finite."""
+    if isinstance(data, BaseModel):
+        return data.model_dump(mode="json")
+    if isinstance(data, Mapping):
+        return {key: plain(value) for key, value in data.items()}
+    if isinstance(data, list | tuple):
+        return [plain(value) for value in data]
+    return None if isinstance(data, float) and not np.isfinite(data) else data
+
+
+def _csv_cell(value: object) -> str:
+    """Text of a value: of a float the shortest that reads back to it; empty for none, infinite."""
+    if isinstance(value, float):
+        return repr(float(value)) if np.isfinite(value) else ""
+    return "" if value is None else str(value)
+
+
+def render_text(sections: Sequence[Section]) -> str:
+    """The sections with blank lines between them, ended by a newline."""
+    parts = ["\n".join(line for block in s.blocks for line in _lines(block)) for s in sections]
+    return "\n\n".join(parts) + "\n"
+
+
+def _lines(block: Block) -> list[str]:
+    if isinstance(block, Paragraph):
+        return _wrapped(block.text) if block.wrap else [block.text]
+    if isinstance(block, Items):
+        return [line for text, _ in block.items for line in _wrapped(text)]
+    if isinstance(block, Table):
+        return _table_lines(block)
+    raise TypeError(f"{block.block} has no text form")
+
+
+def _table_lines(table: Table) -> list[str]:
+    columns = table.headings("text")
+    body = [[cell.text for _, cell in row] for row in table.rows("text")]
+    head = [
+        c.heading.replace("\n", " ") if c.text_heading is None else c.text_heading for c in columns
+    ]
+    sized = [head, *body] if table.headed else body
+    widths = [max(len(line[i]) for line in sized) for i in range(len(columns))]
+
+    def aligned(cells: Sequence[str]) -> str:
+        # a heading above the others may reach over the next column
+        padded = [
+            (own.before if i else "")
+            + (cell.rjust(width) if own.kind == "count" else cell.ljust(width))
+            for i, (own, cell, width) in enumerate(zip(columns, cells, widths, strict=True))
+        ]
+        return "".join(padded).rstrip()
+
+    lines = []
+    if table.headed:
+        above = [own.above for own in columns]
+        lines = [aligned(above)] if any(above) else []
+        lines.append(aligned(head))
+    rule = "-" * (sum(widths) + 2 * (len(widths) - 1))
+    for number, cells in enumerate(body):
+        if table.headed and number in table.rules:
+            lines.append(rule)
+        lines.append(aligned(cells))
+    return lines + ([table.footnote] if table.footnote else [])
+
+
+def _wrapped(text: str) -> list[str]:
+    """A sentence as lines that fit the tables."""
+    return textwrap.wrap(text, width=_WIDTH, break_long_words=False, break_on_hyphens=False)
+
+
+def template(name: str) -> Template:
+    """A template of pages; what is put in is escaped, and what is forgotten an error."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined  # only a page waits for it
+
+    environment = Environment(
+        loader=PackageLoader("megloc_kapture.evaluation.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    return environment.get_template(name)
+
+
+def render_html(document: Document) -> str:
+    """The page of a document; the same document gives the same text.
+
+    It is self-contained: no link to the outside, no date, and no script but the gallery's own.
+    """
+    provenance = dict(document.provenance)
+    return template("report.html").render(
+        document=document,
+        versions=package_versions(),
+        steps=provenance.pop("steps", []),
+        provenance=json.dumps(provenance, indent=2, ensure_ascii=False) if provenance else "",
+    )

@@ -13,6 +13,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 from cycler import cycler
+from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -74,7 +75,7 @@ def styled_figure(width: float, height: float) -> Iterator[Figure]:
         yield figure
 
 
-def to_svg(figure: Figure, prefix: str) -> str:
+def to_svg(figure: Figure, prefix: str) -> Markup:
     """The figure as an ``<svg>`` element; call inside :func:`styled_figure`.
 
     ``prefix`` goes before every id, since several figures share one HTML page. The same figure
@@ -88,27 +89,27 @@ def to_svg(figure: Figure, prefix: str) -> str:
     svg = buffer.getvalue()
     svg = svg[svg.index("<svg") :]
     # inside tags only: the text of a label may look like anything
-    return re.sub(r"<[^>]*>", lambda tag: _prefix_ids(tag[0], prefix), svg)
+    ids = re.compile(r'(\sid="|href="#|url\(#)')
+    return Markup(re.sub(r"<[^>]*>", lambda tag: ids.sub(rf"\g<1>{prefix}-", tag[0]), svg))
 
 
-def _prefix_ids(tag: str, prefix: str) -> str:
-    return re.sub(r'(\sid="|href="#|url\(#)', rf"\g<1>{prefix}-", tag)
-
-
-def legend_label(name: str) -> str:
+def _legend_label(name: str) -> str:
     """``name`` as matplotlib shows it: one that starts with an underscore would be left out."""
     return f" {name}" if name.startswith("_") else name
 
 
-def plain_ticks(axis: Axis) -> None:
+def _plain_ticks(axis: Axis) -> None:
     """Numbers as people write them (0.01, 100) on a logarithmic axis, at its powers of ten only."""
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
 
 
-def legend_below(axes: Axes, columns: int = 4) -> None:
-    """A legend under the axes, where it hides no data."""
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=columns, fontsize=8)
+def _legend(figure: Figure, axes: Axes) -> None:
+    """One legend below all panels; none of a single curve."""
+    handles, labels = axes.get_legend_handles_labels()
+    if len(labels) > 1:
+        columns = 8 if sum(map(len, labels)) < 90 else 3
+        figure.legend(handles, labels, loc="outside lower center", ncols=columns, fontsize=8)
 
 
 # errors below these are drawn at them: a logarithmic axis has no zero
@@ -126,7 +127,7 @@ class Series:
     style: str | tuple[int, tuple[int, int]] = "-"
 
 
-def recall_curves(evaluation: Evaluation) -> str:
+def recall_curves(evaluation: Evaluation) -> Markup:
     """Share of all queries at or below an error, against that error, per condition.
 
     Left the position error, right the angle; each ignores the other. The curves end below 1
@@ -145,20 +146,17 @@ def recall_curves(evaluation: Evaluation) -> str:
     return _two_panels(panels, evaluation.thresholds)
 
 
-def compared_curves(evaluations: Sequence[Evaluation]) -> str:
+def compared_curves(evaluations: Sequence[Evaluation]) -> Markup:
     """The curves of several results, over all queries; else as :func:`recall_curves`."""
     colors = colors_of([evaluation.label for evaluation in evaluations])
     panels = [
-        [Series(e.label, values, colors[e.label]) for e, values in errors]
-        for errors in (
-            [(e, e.errors.position_m) for e in evaluations],
-            [(e, e.errors.angle_deg) for e in evaluations],
-        )
+        [Series(e.label, getattr(e.errors, kind), colors[e.label]) for e in evaluations]
+        for kind in ("position_m", "angle_deg")
     ]
     return _two_panels(panels, evaluations[0].thresholds)
 
 
-def curves_by_row(evaluations: Sequence[Evaluation]) -> str | None:
+def curves_by_row(evaluations: Sequence[Evaluation]) -> Markup | None:
     """A small panel of position error per condition or pool, several results in each.
 
     None where there are no conditions.
@@ -180,7 +178,7 @@ def curves_by_row(evaluations: Sequence[Evaluation]) -> str | None:
                 Series(e.label, e.errors.position_m[e.members[name]], colors[e.label])
                 for e in evaluations
             ]
-            draw_curves(axes, series, bounds, _SMALLEST_POSITION_M, span=every)
+            _draw_curves(axes, series, bounds, _SMALLEST_POSITION_M, span=every)
             axes.set_title(display_name(name))
         for axes in panels[max(len(rows) - across, 0) : len(rows)]:
             axes.set_xlabel("position error (m)")
@@ -191,24 +189,21 @@ def curves_by_row(evaluations: Sequence[Evaluation]) -> str | None:
         return to_svg(figure, "rows")
 
 
-def _two_panels(panels: Sequence[Sequence[Series]], thresholds: Sequence[Threshold]) -> str:
+def _two_panels(panels: Sequence[Sequence[Series]], thresholds: Sequence[Threshold]) -> Markup:
     """Position errors on the left, angles on the right, one legend below both."""
     positions = [t.position_m for t in thresholds]
     angles = [t.angle_deg for t in thresholds if t.angle_deg is not None]
     with styled_figure(10.5, 3.9) as figure:
         left, right = figure.subplots(1, 2, sharey=True)
-        draw_curves(left, panels[0], positions, _SMALLEST_POSITION_M)
+        _draw_curves(left, panels[0], positions, _SMALLEST_POSITION_M)
         left.set(xlabel="position error (m)", ylabel="share of queries (%)")
-        draw_curves(right, panels[1], angles, _SMALLEST_ANGLE_DEG)
+        _draw_curves(right, panels[1], angles, _SMALLEST_ANGLE_DEG)
         right.set(xlabel="rotation error (deg)")
-        handles, labels = left.get_legend_handles_labels()
-        if len(labels) > 1:
-            columns = 8 if sum(map(len, labels)) < 90 else 3
-            figure.legend(handles, labels, loc="outside lower center", ncols=columns, fontsize=8)
+        _legend(figure, left)
         return to_svg(figure, "curves")
 
 
-def draw_curves(
+def _draw_curves(
     axes: Axes,
     series: Sequence[Series],
     bounds: Sequence[float],
@@ -226,21 +221,15 @@ def draw_curves(
     for one in series:
         within = np.searchsorted(np.sort(one.errors), grid, side="right")
         share = 100.0 * within / max(len(one.errors), 1)
-        axes.step(
-            grid,
-            share,
-            where="post",
-            color=one.color,
-            linestyle=one.style,
-            label=legend_label(one.name),
-        )
+        (line,) = axes.step(grid, share, where="post", color=one.color, linestyle=one.style)
+        line.set_label(_legend_label(one.name))
     for bound in sorted(set(bounds)):
         axes.axvline(bound, color=MUTED, linewidth=0.9, linestyle=":", zorder=0)
     axes.set(xscale="log", xlim=(low, high), ylim=(0, 102))
-    plain_ticks(axes.xaxis)
+    _plain_ticks(axes.xaxis)
 
 
-def recall_intervals(evaluations: Sequence[Evaluation]) -> str:
+def recall_intervals(evaluations: Sequence[Evaluation]) -> Markup:
     """Recall of several results with its confidence interval: a panel per threshold, a line per
     condition, pool and ``all``."""
     colors = colors_of([evaluation.label for evaluation in evaluations])
@@ -261,20 +250,17 @@ def recall_intervals(evaluations: Sequence[Evaluation]) -> str:
                 y = np.arange(len(rows)) + (order - (number - 1) / 2) * 0.7 / number
                 color = colors[evaluation.label]
                 axes.hlines(y, ends[:, 0], ends[:, 1], color=color, linewidth=1.6, alpha=0.55)
-                label = legend_label(evaluation.label)
+                label = _legend_label(evaluation.label)
                 axes.plot(recall, y, "o", color=color, markersize=4.5, label=label)
             axes.set(title=str(threshold), xlim=(left - 2, 102), xlabel="recall (%)")
             axes.grid(False, axis="y")
         panels[0].set_yticks(range(len(rows)), [display_name(name) for name in rows])
         panels[0].set_ylim(len(rows) - 0.5, -0.5)
-        handles, labels = panels[0].get_legend_handles_labels()
-        if number > 1:
-            columns = 8 if sum(map(len, labels)) < 90 else 3
-            figure.legend(handles, labels, loc="outside lower center", ncols=columns, fontsize=8)
+        _legend(figure, panels[0])
         return to_svg(figure, "recall")
 
 
-def errors_against_inliers(evaluation: Evaluation, *, prefix: str = "inliers") -> str | None:
+def errors_against_inliers(evaluation: Evaluation, *, prefix: str = "inliers") -> Markup | None:
     """Position error of every pose against the inliers it was estimated from.
 
     A good solver's errors fall to the right: many inliers and a large error are a wrong place
@@ -295,7 +281,7 @@ def errors_against_inliers(evaluation: Evaluation, *, prefix: str = "inliers") -
         axes = figure.subplots()
         for name, color in colors.items():
             mine = (conditions == name) & ~guessed
-            label = legend_label(display_name(name)) if len(colors) > 1 else "localized"
+            label = _legend_label(display_name(name)) if len(colors) > 1 else "localized"
             axes.scatter(
                 inliers[mine], errors[mine], s=14, c=color, alpha=0.65, linewidths=0,
                 label=label, rasterized=raster,
@@ -310,14 +296,15 @@ def errors_against_inliers(evaluation: Evaluation, *, prefix: str = "inliers") -
         axes.set(xlabel="inliers", ylabel="position error (m)", yscale="log")
         axes.set_xscale("symlog", linthresh=10, linscale=0.4)
         axes.set_xlim(left=0)
-        plain_ticks(axes.xaxis)
-        plain_ticks(axes.yaxis)
+        _plain_ticks(axes.xaxis)
+        _plain_ticks(axes.yaxis)
         if len(colors) > 1 or guessed.any():
-            legend_below(axes)
+            # under the axes, where it hides no data
+            axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=4, fontsize=8)
         return to_svg(figure, prefix)
 
 
-def confidence_curves(confidence: Confidence, *, prefix: str = "confidence") -> str:
+def confidence_curves(confidence: Confidence) -> Markup:
     """The reliability diagram, and the risk against the coverage."""
     with styled_figure(10.5, 4.0) as figure:
         reliability, curve = figure.subplots(1, 2)
@@ -340,7 +327,7 @@ def confidence_curves(confidence: Confidence, *, prefix: str = "confidence") -> 
             xlabel="queries answered (%)", ylabel="wrong among them (%)", xlim=(0, 102),
             ylim=(0, max(5.0, 1.1 * float(risk.max(initial=0.0)))),
         )  # fmt: skip
-        return to_svg(figure, prefix)
+        return to_svg(figure, "confidence")
 
 
 def _condition_colors(evaluation: Evaluation) -> dict[str, str]:

@@ -19,7 +19,7 @@ from megloc_kapture.evaluation.report.figures import (
     styled_figure,
     to_svg,
 )
-from megloc_kapture.evaluation.results import are_ranked
+from megloc_kapture.evaluation.results import Poses, are_ranked
 from megloc_kapture.evaluation.scoring import Evaluation
 from megloc_kapture.evaluation.without_truth import ResultWithoutTruth
 from megloc_kapture.geometry.poses import camera_centers, invert_quats, rotate, stack_poses
@@ -94,9 +94,6 @@ def _along_axes(vertical: int, *, positive: bool) -> TopView:
     return TopView(world[first], world[second], (names[first], names[second]))
 
 
-Poses = Mapping[str, RigidTransform]
-
-
 @dataclass(frozen=True, slots=True)
 class DrawnQuery:
     """One query in the view.
@@ -113,50 +110,34 @@ class DrawnQuery:
     guessed: bool = False
 
 
-def views_of_evaluation(
-    evaluation: Evaluation,
-    map_poses: Poses | None = None,
-    frames: Mapping[str, str] | None = None,
-    *,
-    prefix: str = "above",
-) -> list[Block]:
-    """The views of a result, one per coordinate frame; see :func:`views_from_above`."""
-    drawn = {
-        query.image: DrawnQuery(
-            evaluation.truth[query.image],
-            evaluation.estimated.get(query.image),
-            query.outcome == "fallback",
-        )
-        for query in evaluation.queries
-    }
-    of_query = {
-        query.image: (frames or {}).get(evaluation.image(query.image), query.condition)
-        for query in evaluation.queries
-    }
-    return views_from_above(drawn, map_poses or {}, {**(frames or {}), **of_query}, prefix=prefix)
-
-
-def views_without_truth(
-    result: ResultWithoutTruth,
+def views_of(
+    result: Evaluation | ResultWithoutTruth,
     map_poses: Poses,
-    frames: Mapping[str, str] | None = None,
+    frames: Mapping[str, str],
     *,
     prefix: str = "above",
 ) -> list[Block]:
-    """The views of a result without truth; lines lead from the first candidate to the pose,
-    where candidates were ranked."""
-    drawn, of_query = {}, dict(frames or {})
+    """The views of a result, one per coordinate frame; see :func:`views_from_above`.
+
+    Without truth lines lead from the first candidate to the pose, where candidates were ranked,
+    and there is no view without poses.
+    """
+    drawn, of_query = {}, dict(frames)
+    if isinstance(result, Evaluation):
+        for query in result.queries:
+            name, guessed = query.image, query.outcome == "fallback"
+            drawn[name] = DrawnQuery(result.truth[name], result.estimated.get(name), guessed)
+            of_query[name] = frames.get(result.image(name), query.condition)
+        return views_from_above(drawn, map_poses, of_query, prefix=prefix)
     ranked = are_ranked(query.candidates for query in result.queries)
     for query in result.queries:
+        name, guessed = query.image, query.outcome == "fallback"
         first = next((c for c in query.candidates if c in map_poses), "")
-        drawn[query.image] = DrawnQuery(
-            map_poses.get(first) if ranked else None,
-            result.poses.get(query.image),
-            query.outcome == "fallback",
-        )
+        anchor = map_poses.get(first) if ranked else None
+        drawn[name] = DrawnQuery(anchor, result.poses.get(name), guessed)
         # a pose stands in the frame of the images it was estimated from
         if first in of_query:
-            of_query[query.image] = of_query[first]
+            of_query[name] = of_query[first]
     if not any(one.estimate for one in drawn.values()):
         return []
     unit = result.context.unit
@@ -197,7 +178,7 @@ def views_from_above(
         if num_outside:
             lie = "estimate lies" if num_outside == 1 else "estimates lie"
             blocks.append(Paragraph(f"{num_outside} {lie} outside the page."))
-        blocks.append(Figure(Markup(svg)))
+        blocks.append(Figure(svg))
     return blocks
 
 
@@ -208,7 +189,7 @@ def _draw(
     *,
     with_truth: bool,
     unit: str,
-) -> tuple[str, int]:
+) -> tuple[Markup, int]:
     """The figure, and how many estimates lie outside its page.
 
     The page spans the map and the truth (without truth, and without a map, the estimates).

@@ -1,9 +1,8 @@
-"""Pictures in a page: small images as data addresses, points on them, matches between them."""
+"""Small images as data addresses in a page, dots on them, lines between two of them."""
 
 from __future__ import annotations
 
 import base64
-import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,17 +10,10 @@ import numpy as np
 from markupsafe import Markup, escape
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError
-from megloc_kapture.evaluation.results import ResultContext
-from megloc_kapture.geometry.cameras import bearing_rays, focal_px
 from megloc_kapture.io.images import read_image_rgb
-from megloc_kapture.io.kapture import FeatureReader, MatchesReader
-from megloc_kapture.matching.guided_pyramid import base_type
-from megloc_kapture.values import Camera, RigidTransform
 
 _QUALITY = 72
 _GAP = 6
-AGREES, DISAGREES, UNKNOWN = "#12a150", "#e02424", "#f2b705"
 
 
 @dataclass(frozen=True)
@@ -41,23 +33,16 @@ class SmallImage:
     address: str
 
 
-def read_small(path: Path, *, width: int, height: int) -> SmallImage:
-    """An image that fits into ``width`` x ``height`` pixels; never made larger.
-
-    Raises
-    ------
-    DataError : the image is missing or broken.
-    """
-    return encoded(*shrunk(read_image_rgb(path), width=width, height=height))
+def read_small(path: Path, box: tuple[int, int]) -> SmallImage:
+    """An image as :func:`shrunk`; DataError: it is missing or broken."""
+    return encoded(*shrunk(read_image_rgb(path), box))
 
 
-def shrunk(
-    pixels: NDArray[np.uint8], *, width: int, height: int
-) -> tuple[NDArray[np.uint8], float]:
-    """Pixels (H, W, 3) made to fit into ``width`` x ``height``, never larger; and the scale."""
+def shrunk(pixels: NDArray[np.uint8], box: tuple[int, int]) -> tuple[NDArray[np.uint8], float]:
+    """Pixels (H, W, 3) made to fit into a width and height, never larger; and the scale."""
     import cv2  # only a report with images waits for it
 
-    scale = min(width / pixels.shape[1], height / pixels.shape[0], 1.0)
+    scale = min(box[0] / pixels.shape[1], box[1] / pixels.shape[0], 1.0)
     size = (max(round(pixels.shape[1] * scale), 1), max(round(pixels.shape[0] * scale), 1))
     return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8), scale
 
@@ -136,91 +121,3 @@ def _placed(picture: SmallImage, x: int) -> str:
         f'<image x="{x}" y="0" width="{picture.width}" height="{picture.height}" '
         f'href="{picture.address}"/>'
     )
-
-
-# how far a match may lie beside its epipolar line and still fit
-_MAX_ERROR_PX = 8.0
-
-
-@dataclass(frozen=True, eq=False)
-class MatchLines:
-    """Matched pixels of two images.
-
-    Attributes
-    ----------
-    query_px, map_px : float64 (M, 2).
-    """
-
-    query_px: NDArray[np.float64]
-    map_px: NDArray[np.float64]
-
-
-class StoredMatches:
-    """Reads the matches that a run left in its workspace; knows none where there are none.
-
-    Of several types of keypoints the first one counts that has matches, and keypoints on both
-    sides. Broken files are as good as none: a report without some matches is better than none.
-    """
-
-    def __init__(self, context: ResultContext) -> None:
-        self._matches: MatchesReader | None = None
-        self._keypoints: tuple[FeatureReader, FeatureReader] | None = None
-        queries, mapping = context.queries, context.mapping
-        if queries is None or mapping is None:
-            return
-        with contextlib.suppress(DataError):
-            drawn = set(queries.types("keypoints")) & set(mapping.types("keypoints"))
-            known = [name for name in queries.types("matches") if name in drawn]
-            if known:
-                # those of a guided pyramid hold the others
-                chosen = min(known, key=lambda name: (base_type(name) == name, name))
-                keypoints = queries.keypoints(chosen), mapping.keypoints(chosen)
-                self._matches, self._keypoints = queries.matches(chosen), keypoints
-
-    def count(self, query: str, image: str) -> int | None:
-        """Matches of a pair; None where nothing is known of it."""
-        found = self._indices(query, image)
-        return None if found is None else len(found)
-
-    def lines(self, query: str, image: str) -> MatchLines | None:
-        """Matches of a pair as pixels; None where nothing is known of it."""
-        indices = self._indices(query, image)
-        if indices is None or self._keypoints is None:
-            return None
-        pixels = []
-        with contextlib.suppress(DataError):
-            for reader, name, own in zip(self._keypoints, (query, image), indices.T, strict=True):
-                if name not in reader:
-                    return None
-                keypoints = reader.read(name)
-                if len(keypoints) <= own.max(initial=-1):
-                    return None
-                pixels.append(np.asarray(keypoints[own, :2], dtype=np.float64))
-        return MatchLines(*pixels) if len(pixels) == 2 else None
-
-    def _indices(self, query: str, image: str) -> NDArray[np.int64] | None:
-        with contextlib.suppress(DataError):
-            if self._matches is not None and (query, image) in self._matches:
-                return self._matches.read(query, image)[0]
-        return None
-
-
-def fits_poses(
-    lines: MatchLines,
-    query_camera: Camera,
-    map_camera: Camera,
-    map_from_query: RigidTransform,
-) -> NDArray[np.bool_]:
-    """(M,) whether each match lies within 8 pixels of its epipolar line in the query.
-
-    Where the two cameras stand in one place every match fits.
-    """
-    rays = bearing_rays(query_camera, lines.query_px)
-    map_rays = bearing_rays(map_camera, lines.map_px)
-    t = np.array(map_from_query.translation)
-    # x_map^T [t] R x_query = 0: the plane of both centres and the map's ray, seen by the query
-    normals = np.cross(map_rays, t) @ map_from_query.rotation_matrix()
-    length = np.linalg.norm(normals[:, :2], axis=1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        beside = np.abs(np.einsum("ij,ij->i", normals, rays)) / length
-    return np.asarray(~(beside * focal_px(query_camera) > _MAX_ERROR_PX))

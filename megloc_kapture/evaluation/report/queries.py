@@ -1,59 +1,138 @@
-"""Queries that a page shows: the worst, the disputed, the doubtful, with images and matches."""
+"""Queries that reports show: which, in what order, what is said of each, and its stored inliers."""
 
 from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from functools import cached_property
 
 import numpy as np
-from markupsafe import Markup
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.evaluation.metrics import within
-from megloc_kapture.evaluation.report.document import Picture, Pictures
-from megloc_kapture.evaluation.report.pictures import (
-    AGREES,
-    DISAGREES,
-    UNKNOWN,
-    MatchLines,
-    SmallImage,
-    StoredMatches,
-    encoded,
-    fits_poses,
-    image_tag,
-    read_small,
-    side_by_side,
-)
-from megloc_kapture.evaluation.report.shown_queries import query_facts
-from megloc_kapture.evaluation.report.wording import counted, format_metres
-from megloc_kapture.evaluation.results import ResultContext, are_ranked
+from megloc_kapture.evaluation.metrics import PoseErrors, Threshold, within
+from megloc_kapture.evaluation.report.wording import format_degrees, format_metres
+from megloc_kapture.evaluation.results import ResultContext
 from megloc_kapture.evaluation.scoring import Evaluation, QueryResult
-from megloc_kapture.evaluation.without_truth import QueryWithoutTruth, ResultWithoutTruth
-from megloc_kapture.geometry.poses import camera_centers, invert_quats, rotate, stack_poses
-from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.evaluation.without_truth import ResultWithoutTruth
+from megloc_kapture.geometry.cameras import project
+from megloc_kapture.io.kapture import FeatureReader, MatchesReader
+from megloc_kapture.localization.map_index import MapIndex, observed_matches
+from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.values import RigidTransform
 
 NUM_SHOWN = 10
-_LARGE = (400, 300)
-_SMALL = (190, 143)
-_CLUSTERS_TOLD = 4
-_ALIGNED_SHOWN = 2
-_NOT_SEEN = 255  # grey level of what no map image shows
-_CANDIDATES_SHOWN = 4
-# of the candidates, those looked at for the one with most matches
-_CANDIDATES_COMPARED = 50
-_MAX_LINES = 120
-_FORWARD = np.array([0.0, 0.0, 1.0])
-# viewing directions within 60 degrees may see the same
-_FACING_COSINE = 0.5
+# a match is an inlier within so many pixels of its point, as when a pose is estimated
+INLIER_PX = 12.0
+_NOTHING = np.zeros((0, 2)), np.zeros((0, 3))
+# from right to wrong, told apart with any colour vision; then without a pose, and unknown
+_SCALE = ("#4cc3f0", "#7fd17f", "#f4d35e", "#ff9f45", "#ff4d4d")
+NO_POSE_COLOR, UNKNOWN_COLOR = "#9aa5b1", "#c9a7ff"
+# least confidences of the colours
+_SURE = (0.95, 0.8, 0.6)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShownQuery(QueryResult):
+    """A query as the view and the gallery show it; ``image`` is its image in any case.
+
+    Attributes
+    ----------
+    name : what it is called.
+    estimated, truth : ``cam_from_world``; None where there is none.
+    color, meaning : of its error where the truth is known, else of its confidence.
+    """
+
+    name: str
+    estimated: RigidTransform | None
+    truth: RigidTransform | None
+    color: str
+    meaning: str
+
+    def rank(self) -> tuple[float, float, float, str]:
+        """Sorts the worst first: without a pose, then by falling error, or rising confidence, or
+        rising number of inliers; then by name."""
+        error = 0.0 if math.isnan(self.position_m) else self.position_m
+        sure = self.confidence if self.confidence is not None else 1.0
+        lost = math.inf if self.estimated is None else error
+        return -lost, sure, float(self.num_inliers or 0), self.name
+
+
+def query_facts(query: QueryResult) -> list[str]:
+    """The outcome of a query in words, in order."""
+    said = []
+    if query.outcome == "missing":
+        said.append(f"no pose ({query.reason})" if query.reason else "no pose")
+    elif not math.isnan(query.position_m):
+        error = f"{format_metres(query.position_m)} m, {format_degrees(query.angle_deg)} deg"
+        said.append(f"{error} off")
+    if query.outcome == "fallback":
+        said.append(f"fallback pose ({query.reason})")
+    if query.num_inliers is not None:
+        said.append(f"{query.num_inliers} inliers of {query.num_matches}")
+    if query.confidence is not None:
+        said.append(f"confidence {query.confidence:.2f}")
+    return said
+
+
+def shown_queries(result: Evaluation | ResultWithoutTruth) -> list[ShownQuery]:
+    """The queries of a result, the worst first."""
+    evaluation = result if isinstance(result, Evaluation) else None
+    poses = result.estimated if isinstance(result, Evaluation) else result.poses
+    shown = []
+    for query in result.queries:
+        name = query.image
+        known = {own.name: getattr(query, own.name) for own in fields(query)}
+        if evaluation is not None:
+            known["image"] = evaluation.image(name)
+        if name not in poses:
+            color, meaning = NO_POSE_COLOR, "no pose"
+        else:
+            color, meaning = _color(query, () if evaluation is None else evaluation.thresholds)
+        shown.append(
+            ShownQuery(
+                **known,
+                name=name,
+                estimated=poses.get(name),
+                truth=None if evaluation is None else evaluation.truth.get(name),
+                color=color,
+                meaning=meaning,
+            )
+        )
+    return sorted(shown, key=ShownQuery.rank)
+
+
+def _color(query: QueryResult, thresholds: Sequence[Threshold]) -> tuple[str, str]:
+    """Colour of a query with a pose, and its meaning."""
+    if thresholds:
+        error = PoseErrors(
+            (query.image,), np.array([query.position_m]), np.array([query.angle_deg])
+        )
+        shown = thresholds[: len(_SCALE) - 1]
+        for color, threshold in zip(_SCALE, shown, strict=False):
+            if within(error, threshold)[0]:
+                return color, f"within {threshold}"
+        return _SCALE[-1], f"beyond {shown[-1]}"
+    if query.confidence is None:
+        return UNKNOWN_COLOR, "pose, confidence not known"
+    for color, least in zip(_SCALE, _SURE, strict=False):
+        if query.confidence >= least:
+            return color, f"confidence {least:g} or more"
+    return _SCALE[-1], f"confidence below {_SURE[-1]:g}"
+
+
+def legend(queries: Sequence[ShownQuery]) -> list[tuple[str, str]]:
+    """The colours of queries and their meaning, from right to wrong, those in use alone."""
+    used = {query.meaning: query.color for query in queries}
+    order = [*_SCALE, UNKNOWN_COLOR, NO_POSE_COLOR]
+    return [(used[m], m) for m in sorted(used, key=lambda m: order.index(used[m]))]
 
 
 @dataclass(frozen=True)
 class Chosen:
-    """A query to show.
+    """A query to show beside what it matches.
 
     Attributes
     ----------
@@ -73,12 +152,20 @@ class Chosen:
     pose_name: str
 
 
+def _chosen(evaluation: Evaluation, query: QueryResult, *facts: str) -> Chosen:
+    """Its candidates are those its pose comes from; where nothing says so, its pair's reference."""
+    name, pair = query.image, evaluation.pairs.get(query.image)
+    candidates = query.candidates or (() if pair is None else (pair.reference,))
+    image = evaluation.image(name)
+    return Chosen(name, image, facts, candidates, evaluation.truth[name], "true")
+
+
 def order_of_badness(query: QueryResult) -> tuple[float, float, str]:
     """Sorts queries the worst first: those without a pose, then by falling error, then by name."""
     return -query.position_m, -query.angle_deg, query.image
 
 
-def worst_queries(evaluation: Evaluation, number: int = NUM_SHOWN) -> list[Chosen]:
+def worst_queries(evaluation: Evaluation) -> list[Chosen]:
     """The worst queries of a result; at most half of them without a pose, where others are left.
 
     Of those without a pose the ones with most inliers come first: they failed most narrowly.
@@ -87,23 +174,12 @@ def worst_queries(evaluation: Evaluation, number: int = NUM_SHOWN) -> list[Chose
     lost = [query for query in ranked if query.outcome == "missing"]
     lost.sort(key=lambda query: (-(query.num_inliers or 0), query.image))
     posed = [query for query in ranked if query.outcome != "missing"]
-    num_posed = min(len(posed), max(number - len(lost), (number + 1) // 2))
-    return [
-        Chosen(
-            name=query.image,
-            image=evaluation.image(query.image),
-            facts=("; ".join(query_facts(query)),),
-            candidates=_candidates(evaluation, query),
-            pose=evaluation.truth[query.image],
-            pose_name="true",
-        )
-        for query in posed[:num_posed] + lost[: number - num_posed]
-    ]
+    num_posed = min(len(posed), max(NUM_SHOWN - len(lost), (NUM_SHOWN + 1) // 2))
+    shown = posed[:num_posed] + lost[: NUM_SHOWN - num_posed]
+    return [_chosen(evaluation, query, "; ".join(query_facts(query))) for query in shown]
 
 
-def disputed_queries(
-    evaluations: Sequence[Evaluation], number: int = NUM_SHOWN
-) -> list[tuple[int, Chosen]]:
+def disputed_queries(evaluations: Sequence[Evaluation]) -> list[tuple[int, Chosen]]:
     """Queries that results disagree about most, then those that are worst in all of them.
 
     Returns
@@ -118,260 +194,117 @@ def disputed_queries(
     best = errors.min(axis=0)
     by_dispute = sorted(np.flatnonzero(dispute > 0).tolist(), key=lambda i: (-dispute[i], names[i]))
     by_error = sorted(range(len(names)), key=lambda i: (-best[i], -errors[:, i].max(), names[i]))
-    chosen = by_dispute[: number - number // 3]
-    chosen += [i for i in by_error if i not in set(chosen)][: number - len(chosen)]
+    chosen = by_dispute[: NUM_SHOWN - NUM_SHOWN // 3]
+    chosen += [i for i in by_error if i not in set(chosen)][: NUM_SHOWN - len(chosen)]
     found = []
     for index in chosen:
-        queries = [evaluation.queries[index] for evaluation in evaluations]
-        worst = max(range(len(queries)), key=lambda k: (errors[k, index], -k))
-        facts = tuple(
-            f"{evaluation.label}: {', '.join(query_facts(query))}"
-            for evaluation, query in zip(evaluations, queries, strict=True)
-        )
+        worst = int(np.argmax(errors[:, index]))
+        facts = (f"{e.label}: {', '.join(query_facts(e.queries[index]))}" for e in evaluations)
         of_worst = evaluations[worst]
-        found.append(
-            (
-                worst,
-                Chosen(
-                    name=names[index],
-                    image=of_worst.image(names[index]),
-                    facts=facts,
-                    candidates=_candidates(of_worst, queries[worst]),
-                    pose=of_worst.truth[names[index]],
-                    pose_name="true",
-                ),
-            )
-        )
+        found.append((worst, _chosen(of_worst, of_worst.queries[index], *facts)))
     return found
 
 
-def doubtful_queries(result: ResultWithoutTruth, number: int = NUM_SHOWN) -> list[Chosen]:
+def doubtful_queries(result: ResultWithoutTruth) -> list[Chosen]:
     """Localized queries that are least sure: far from every candidate, or of few inliers."""
     localized = [query for query in result.queries if query.outcome == "localized"]
     known = [q.num_inliers for q in localized if q.num_inliers is not None]
     few = float(np.quantile(known, 0.25)) if known else -math.inf
 
-    def doubt(query: QueryWithoutTruth) -> tuple[bool, float, str]:
+    def doubt(query: QueryResult) -> tuple[bool, float, str]:
         far = query.near is not None and query.near.nearest_m > 25.0
         count = math.inf if query.num_inliers is None else query.num_inliers
         return not (far and count <= few), count, query.image
 
+    def facts(query: QueryResult) -> list[str]:
+        said, near = [], query.near
+        if query.num_inliers is not None:
+            said.append(f"{query.num_inliers} inliers of {query.num_matches}")
+        if near is not None and math.isfinite(near.first_m):
+            said.append(f"{format_metres(near.first_m)} m from its first candidate")
+        if near is not None:
+            said.append(f"{format_metres(near.nearest_m)} m from the nearest candidate")
+        return said
+
     return [
         Chosen(
-            name=query.image,
-            image=query.image,
-            facts=("; ".join(_facts_without_truth(query)),),
-            candidates=query.candidates,
-            pose=result.poses[query.image],
-            pose_name="estimated",
+            *(q.image, q.image, ("; ".join(facts(q)),)),
+            *(q.candidates, result.poses[q.image], "estimated"),
         )
-        for query in sorted(localized, key=doubt)[:number]
+        for q in sorted(localized, key=doubt)[:NUM_SHOWN]
     ]
 
 
-def _candidates(evaluation: Evaluation, query: QueryResult) -> tuple[str, ...]:
-    """Map images the pose comes from; where nothing says so, its pair's reference."""
-    if query.candidates or query.image not in evaluation.pairs:
-        return query.candidates
-    return (evaluation.pairs[query.image].reference,)
+@dataclass(eq=False)
+class StoredInliers:
+    """The 2D-3D matches of queries that agree with their poses, from what a run left behind.
 
-
-def _facts_without_truth(query: QueryWithoutTruth) -> tuple[str, ...]:
-    facts = []
-    if query.num_inliers is not None:
-        facts.append(f"{query.num_inliers} inliers of {query.num_matches}")
-    if query.near is not None:
-        if math.isfinite(query.near.first_m):
-            facts.append(f"{format_metres(query.near.first_m)} m from its first candidate")
-        facts.append(f"{format_metres(query.near.nearest_m)} m from the nearest candidate")
-    return tuple(facts)
-
-
-class QueryPictures:
-    """Pictures of queries, from what a run left in its workspace.
-
-    What is missing or cannot be read is left out: a report without it is better than none.
+    A workspace keeps the matches of a query with map images, and the map says which of their
+    keypoints observe a point; those whose point lies within 12 pixels of the keypoint under the
+    query's pose are inliers. Nothing is known where matches, keypoints or points are missing or
+    broken: a picture without some inliers is better than none. Poses in memory bring their own.
     """
 
-    def __init__(
-        self,
-        context: ResultContext,
-        map_poses: Mapping[str, RigidTransform],
-        *,
-        ranked: bool = True,
-    ) -> None:
-        """``ranked`` : whether the order of a query's candidates means anything."""
-        self._context, self._ranked = context, ranked
-        self._map_poses = map_poses
-        self._matches = StoredMatches(context)
-        quats, translations = stack_poses(map_poses.values())
-        self._centers = camera_centers(quats, translations)
-        self._forward = rotate(invert_quats(quats), _FORWARD)
+    context: ResultContext
+    _found: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]] = field(
+        init=False, default_factory=dict
+    )
 
-    def of(self, chosen: Chosen) -> Pictures:
-        """The query beside its best match, what else was a candidate, and its clusters' views."""
-        query = _small(self._context.queries, chosen.image, _LARGE)
-        candidates = list(chosen.candidates)
-        counts = {
-            c: self._matches.count(chosen.image, c) for c in candidates[:_CANDIDATES_COMPARED]
-        }
-        best = max(counts, key=lambda c: counts[c] or 0) if counts else ""
-        nearest = self._nearest(chosen.pose)
-        if not best:
-            best, nearest = nearest, ""
-        shown = [(c, counts.get(c)) for c in candidates if c != best][: _CANDIDATES_SHOWN - 1]
-        others = [
-            (image, self._facts(image, chosen, self._role(image, candidates), count))
-            for image, count in shown
-        ]
-        if nearest and nearest != best and nearest not in dict(shown):
-            role = f"nearest to the {chosen.pose_name} pose"
-            others.append((nearest, self._facts(nearest, chosen, role, None)))
-        small = [(i, facts, _small(self._context.mapping, i, _SMALL)) for i, facts in others]
-        panels = self._aligned(chosen.image)
-        return Pictures(
-            name=chosen.name,
-            facts=(*chosen.facts, *self._clusters(chosen.image)),
-            main=None if query is None else self._beside(chosen, query, best),
-            others=tuple(
-                Picture(image_tag(image, name), ", ".join(facts))
-                for name, facts, image in small
-                if image is not None
-            ),
-            note="The places it may be at, their images warped to the pose each gives; white: not "
-            "seen from there."
-            if panels
-            else "",
-            panels=panels,
-        )
+    @cached_property
+    def _sources(self) -> list[tuple[FeatureReader, MatchesReader, MapIndex]]:
+        # only those who draw inliers wait for what reads maps
+        from megloc_kapture.stages.query_poses import type_in_map
+        from megloc_kapture.stages.shared_index import index_map
 
-    def _aligned(self, query: str) -> tuple[Picture, ...]:
-        """The map images of the best two clusters, warped to the pose each gives the query.
-
-        Nothing where there is one cluster, or the map has no depth.
-        """
-        mapping, queries = self._context.mapping, self._context.queries
-        rows = [
-            (row, row.cam_from_world, row.score)
-            for row in self._context.clusters.get(query, ())
-            if row.cam_from_world is not None and row.score is not None
-        ]
-        rows.sort(key=lambda one: (one[0].chosen != "yes", -one[2], one[0].cluster))
-        if len(rows) < 2 or mapping is None or queries is None:
-            return ()
-        # only a report with such pictures waits for what warps them
-        from megloc_kapture.stages.perceptual_ranking import aligned_view
-        from megloc_kapture.stages.ranking_scene import KaptureScene
-
-        found: list[Picture] = []
+        sources: list[tuple[FeatureReader, MatchesReader, MapIndex]] = []
+        queries, mapping = self.context.queries, self.context.mapping
+        if queries is None or mapping is None or not mapping.has_points():
+            return sources
         with contextlib.suppress(DataError):
-            scene = KaptureScene(mapping, queries)
-            camera = queries.read().camera_of(query)
-            for row, pose, score in rows[:_ALIGNED_SHOWN]:
-                view = aligned_view(camera, pose, row.images, scene)
-                if not view.valid.any():
+            kept = set(queries.types("matches"))
+            # those of a guided pyramid hold the others
+            kept -= {base_type(name) for name in kept if base_type(name) != name}
+            for name in sorted(kept & set(queries.types("keypoints"))):
+                index = index_map(mapping, type_in_map(mapping, name))
+                sources.append((queries.keypoints(name), queries.matches(name), index))
+        return sources
+
+    @property
+    def known(self) -> bool:
+        """Whether matches and points are there at all."""
+        return bool(self._sources or self.context.localized)
+
+    def of(self, query: ShownQuery) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Pixels (K, 2) of the inliers of a query's pose, and their points (K, 3) in the world."""
+        if query.image not in self._found:
+            self._found[query.image] = self._read(query)
+        return self._found[query.image]
+
+    def _read(self, query: ShownQuery) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        here, queries = self.context.localized.get(query.image), self.context.queries
+        if here is not None and here.inlier_points_world is not None:
+            px, xyz = here.inlier_points_px, here.inlier_points_world
+            return (np.zeros((len(xyz), 2)) if px is None else px), xyz
+        if query.estimated is None or query.outcome != "localized" or queries is None:
+            return _NOTHING
+        found = [_NOTHING]
+        with contextlib.suppress(DataError):
+            for keypoints, matches, index in self._sources:
+                camera = queries.read().camera_of(query.image)
+                pairs = [(query.image, image) for image in query.candidates]
+                read = [(pair[1], *matches.read(*pair)) for pair in pairs if pair in matches]
+                if not read or query.image not in keypoints:
                     continue
-                pixels = np.where(view.valid[..., None], view.image, np.uint8(_NOT_SEEN))
-                facts = (
-                    f"cluster {row.cluster}, {'chosen' if row.chosen == 'yes' else 'not chosen'}",
-                    f"score {score:.3g}",
-                    counted(row.num_inliers, "inlier", "inliers"),
-                    f"{100 * view.valid.mean():.0f} % of the view is shown",
-                )
-                image = encoded(pixels.astype(np.uint8), pixels.shape[1] / camera.width)
-                name = f"what place {len(found) + 1} shows of {query}"
-                found.append(Picture(image_tag(image, name), ", ".join(facts)))
-        return tuple(found)
-
-    def _clusters(self, query: str) -> tuple[str, ...]:
-        """One line on the clusters of candidates, the chosen one first; none where all are one."""
-        rows = self._context.clusters.get(query, ())
-        if len(rows) < 2:
-            return ()
-        ranked = sorted(rows, key=lambda row: (row.chosen != "yes", -row.num_inliers, row.cluster))
-        said = [
-            f"{counted(len(row.images), 'image', 'images')} ({row.images[0]} first), "
-            f"{row.num_inliers} inliers of {row.num_matches}"
-            for row in ranked[:_CLUSTERS_TOLD]
-        ]
-        more = f"; and {len(rows) - _CLUSTERS_TOLD} more" if len(rows) > _CLUSTERS_TOLD else ""
-        return (f"{len(rows)} clusters of candidates: {'; '.join(said)}{more}",)
-
-    def _beside(self, chosen: Chosen, query: SmallImage, best: str) -> Picture:
-        """The query beside the map image ``best``, and what is said of the two."""
-        other = _small(self._context.mapping, best, _LARGE) if best else None
-        if other is None:
-            return Picture(image_tag(query, chosen.image))
-        role = f"nearest to the {chosen.pose_name} pose"
-        if best in chosen.candidates:
-            role = self._role(best, chosen.candidates)
-        lines = self._matches.lines(chosen.image, best)
-        facts = list(self._facts(best, chosen, role, None))
-        points = (np.zeros((0, 2)), np.zeros((0, 2)))
-        colors: list[str] = []
-        if lines is not None:
-            number = len(lines.query_px)
-            fits = self._fits(lines, chosen, best)
-            facts.append(counted(number, "match", "matches"))
-            if fits is not None and number:
-                facts.append(f"{int(fits.sum())} of them agree with the {chosen.pose_name} pose")
-            drawn = np.linspace(0, number - 1, min(number, _MAX_LINES)).round().astype(np.int64)
-            drawn = np.unique(drawn)
-            points = (lines.query_px[drawn], lines.map_px[drawn])
-            colors = [UNKNOWN] * len(drawn)
-            if fits is not None:
-                colors = [AGREES if fit else DISAGREES for fit in fits[drawn].tolist()]
-        element = side_by_side(query, other, points, colors, f"{chosen.image} and {best}")
-        caption = Markup('Right: <span class="name">{}</span>, {}').format(best, ", ".join(facts))
-        return Picture(element, caption)
-
-    def _facts(self, image: str, chosen: Chosen, role: str, count: int | None) -> tuple[str, ...]:
-        facts = [role]
-        if chosen.pose is not None and image in self._map_poses:
-            apart = float(np.linalg.norm(chosen.pose.center() - self._map_poses[image].center()))
-            facts.append(f"{apart:.1f} {self._context.unit} from the {chosen.pose_name} place")
-        if count is not None:
-            facts.append(counted(count, "match", "matches"))
-        return tuple(facts)
-
-    def _role(self, image: str, candidates: Sequence[str]) -> str:
-        """A candidate's rank, where candidates were ranked at all."""
-        return f"candidate {candidates.index(image) + 1}" if self._ranked else "candidate"
-
-    def _nearest(self, pose: RigidTransform | None) -> str:
-        """The map image nearest to a pose, of those that look its way where there are any."""
-        if pose is None or not self._map_poses:
-            return ""
-        distance = np.linalg.norm(self._centers - pose.center(), axis=1)
-        facing = self._forward @ pose.rotation_matrix()[2] > _FACING_COSINE
-        if facing.any():
-            distance = np.where(facing, distance, np.inf)
-        return list(self._map_poses)[int(np.argmin(distance))]
-
-    def _fits(self, lines: MatchLines, chosen: Chosen, image: str) -> NDArray[np.bool_] | None:
-        queries, mapping = self._context.queries, self._context.mapping
-        if queries is None or mapping is None or chosen.pose is None:
-            return None
-        if image not in self._map_poses:
-            return None
-        map_from_query = self._map_poses[image] @ chosen.pose.inverse()
-        with contextlib.suppress(DataError):
-            cameras = queries.read().camera_of(chosen.image), mapping.read().camera_of(image)
-            return fits_poses(lines, *cameras, map_from_query)
-        return None
+                one = observed_matches(index, read).resolve()
+                pixels = np.asarray(keypoints.read(query.image)[:, :2], np.float64)
+                if len(pixels) <= one.keypoint_ids.max(initial=-1):
+                    continue
+                px, xyz = pixels[one.keypoint_ids], index.xyz[one.point_ids]
+                apart = np.linalg.norm(project(camera, query.estimated, xyz) - px, axis=1)
+                found.append((px[apart <= INLIER_PX], xyz[apart <= INLIER_PX]))
+        return np.concatenate([px for px, _ in found]), np.concatenate([xyz for _, xyz in found])
 
 
-def _small(folder: KaptureFolder | None, image: str, box: tuple[int, int]) -> SmallImage | None:
-    with contextlib.suppress(DataError):
-        if folder is not None:
-            return read_small(folder.image_path(image), width=box[0], height=box[1])
-    return None
-
-
-def query_pictures(
-    chosen: Sequence[Chosen], context: ResultContext, map_poses: Mapping[str, RigidTransform]
-) -> list[Pictures]:
-    """Pictures of all chosen queries of one result."""
-    ranked = are_ranked(one.candidates for one in chosen)
-    pictures = QueryPictures(context, map_poses, ranked=ranked)
-    return [pictures.of(one) for one in chosen]
+def spread(number: int, most: int) -> NDArray[np.int64]:
+    """At most ``most`` of ``number`` positions, evenly spread; the same each time."""
+    return np.unique(np.linspace(0, number - 1, min(number, most)).round().astype(np.int64))

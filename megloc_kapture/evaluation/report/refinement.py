@@ -6,7 +6,6 @@ import contextlib
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cache, partial
 
 import numpy as np
@@ -30,12 +29,10 @@ from megloc_kapture.evaluation.report.wording import (
     format_metres,
     format_percent,
 )
-from megloc_kapture.evaluation.results import ResultContext
+from megloc_kapture.evaluation.results import Poses, ResultContext
 from megloc_kapture.io.tables import ConsistencyRow
 from megloc_kapture.plugins import RankingScene
 from megloc_kapture.values import Camera, RefinementRow, RigidTransform
-
-Poses = Mapping[str, RigidTransform]
 
 _REASONS_TOLD = 4
 _NUMBER = re.compile(r"-?\d+(\.\d+)?")
@@ -45,12 +42,8 @@ _TILES = 8  # along the longer side of a picture
 _LEAST_SHOWN = 0.2  # share of a query's pixels that map images must show
 
 
-@dataclass(frozen=True)
-class _Step:
-    """A row of ``refinement.csv`` and the pose it ended with."""
-
-    row: RefinementRow
-    after: RigidTransform
+# a row of ``refinement.csv`` and the pose it ended with
+_Step = tuple[RefinementRow, RigidTransform]
 
 
 def refinement_blocks(
@@ -76,11 +69,8 @@ def refinement_blocks(
     truth = truth or {}
     # the same refiners for every query, in one order; each step ends with what the next begins with
     chains = [
-        [
-            _Step(row, after)
-            for row, after in zip(rows, [*(r.before for r in rows[1:]), estimated[i]], strict=True)
-        ]
-        for i, rows in sorted(refinements.items())
+        list(zip(rows, [*(row.before for row in rows[1:]), estimated[image]], strict=True))
+        for image, rows in sorted(refinements.items())
     ]
     steps = [[c[k] for c in chains if k < len(c)] for k in range(max(map(len, chains)))]
     pictures = list(_looks(context, refinements, estimated, truth))
@@ -112,24 +102,27 @@ def consistency_sentence(row: ConsistencyRow) -> str:
 
 
 def _steps_table(steps: Sequence[Sequence[_Step]], truth: Poses) -> Table:
-    def accepted(own: Sequence[_Step]) -> list[_Step]:
-        return [step for step in own if step.row.accepted]
+    accepted = [[(row, after) for row, after in own if row.accepted] for own in steps]
 
     def moved(own: Sequence[_Step]) -> str:
-        rows = [step.row for step in accepted(own)]
-        return _medians([row.moved_m for row in rows], [row.turned_deg for row in rows])
+        return _medians([row.moved_m for row, _ in own], [row.turned_deg for row, _ in own])
 
     def kept(own: Sequence[_Step]) -> Cell:
-        reasons = [step.row.reason for step in own if not step.row.accepted]
-        return Cell("", page=_reasons(reasons), style="small")
+        """Counts of the reasons, numbers aside, the most frequent first; one a line."""
+        reasons = [_NUMBER.sub("…", row.reason) for row, _ in own if not row.accepted]
+        told = Counter(reasons).most_common(_REASONS_TOLD)
+        lines = [f"{count} x {reason}" for reason, count in told]
+        rest = len(reasons) - sum(count for _, count in told)
+        lines += [f"{rest} x something else"] if rest else []
+        return Cell("", page=Markup("<br>").join(lines), style="small")
 
     columns = [
-        column("step", steps, lambda own: own[0].row.method),
+        column("step", steps, lambda own: own[0][0].method),
         column("queries", steps, len, kind="count"),
-        column("accepted", steps, lambda own: len(accepted(own)), kind="count"),
-        column("moved by\n(median)", steps, moved, kind="count"),
+        column("accepted", accepted, len, kind="count"),
+        column("moved by\n(median)", accepted, moved, kind="count"),
     ]
-    known = [[step for step in accepted(own) if step.row.image in truth] for own in steps]
+    known = [[(row, after) for row, after in own if row.image in truth] for own in accepted]
     if any(known):
         errors = [_errors(own, truth) for own in known]
         columns += [
@@ -145,21 +138,12 @@ def _errors(steps: Sequence[_Step], truth: Poses) -> tuple[str, str, str]:
     """Median errors before and after, and how many came nearer to the truth."""
     if not steps:
         return "", "", ""
-    names = [step.row.image for step in steps]
-    old = pose_errors({step.row.image: step.row.before for step in steps}, truth, names)
-    new = pose_errors({step.row.image: step.after for step in steps}, truth, names)
+    names = [row.image for row, _ in steps]
+    old = pose_errors({row.image: row.before for row, _ in steps}, truth, names)
+    new = pose_errors({row.image: after for row, after in steps}, truth, names)
     nearer = f"{int((new.position_m < old.position_m).sum())} of {len(names)}"
     before, after = (_medians(each.position_m, each.angle_deg) for each in (old, new))
     return before, after, nearer
-
-
-def _reasons(reasons: Sequence[str]) -> Markup:
-    """Counts of the reasons, numbers aside, the most frequent first; one a line."""
-    counts = Counter(_NUMBER.sub("…", reason) for reason in reasons)
-    told = counts.most_common(_REASONS_TOLD)
-    rest = len(reasons) - sum(count for _, count in told)
-    lines = [f"{count} x {reason}" for reason, count in told]
-    return Markup("<br>").join(lines + ([f"{rest} x something else"] if rest else []))
 
 
 def _medians(
@@ -216,9 +200,9 @@ def _looks(
         for image in refined:
             rows = refinements[image]
             chosen = [row.images for row in context.clusters.get(image, ()) if row.chosen == "yes"]
-            poses = {"before": rows[0].before, "after": estimated[image]}
             if not chosen:
                 continue
+            poses = {"before": rows[0].before, "after": estimated[image]}
             camera = context.queries.read().camera_of(image)
             panels = _tiled(scene, image, camera, poses, chosen[0], truth)
             if not panels:

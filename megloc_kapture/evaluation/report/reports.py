@@ -19,9 +19,11 @@ from megloc_kapture.evaluation.report.document import (
     Items,
     Paragraph,
     Section,
+    render_html,
+    render_text,
+    write_document,
 )
-from megloc_kapture.evaluation.report.renderers import render_html, render_text, write_document
-from megloc_kapture.evaluation.report.shown_queries import StoredInliers, shown_queries
+from megloc_kapture.evaluation.report.queries import StoredInliers, shown_queries
 from megloc_kapture.evaluation.report.wording import (
     INTERVALS,
     agreement_sentence,
@@ -33,15 +35,10 @@ from megloc_kapture.evaluation.report.wording import (
     notes,
     retrieval_note,
 )
-from megloc_kapture.evaluation.results import ResultContext
+from megloc_kapture.evaluation.results import Poses
 from megloc_kapture.evaluation.scoring import Evaluation
 from megloc_kapture.evaluation.statistics import Comparison, MedianDifference, PairedTest, Seeds
-from megloc_kapture.evaluation.without_truth import (
-    CAUTION,
-    ResultWithoutTruth,
-    WithoutTruth,
-)
-from megloc_kapture.values import RigidTransform
+from megloc_kapture.evaluation.without_truth import CAUTION, ResultWithoutTruth, WithoutTruth
 
 RECALL_JSON, RECALL_TEXT = "recall.json", "recall.txt"
 VIEW_HTML = "view.html"
@@ -49,7 +46,6 @@ AGREEMENT_TEXT = "agreement.txt"
 PER_QUERY_CSV, DIFFERENCES_CSV = "per_query.csv", "differences.csv"
 
 AnyReported = Evaluation | Comparison | Seeds | WithoutTruth
-Poses = Mapping[str, RigidTransform]
 
 
 def report_text(reported: AnyReported) -> str:
@@ -62,7 +58,6 @@ def report_of(
     *,
     map_poses: Poses | None = None,
     provenance: Mapping[str, Any] | None = None,
-    contexts: Sequence[ResultContext] | None = None,
     view: bool = False,
 ) -> Document:
     """The report of one result, of several, of runs with seeds, or of results without truth.
@@ -70,9 +65,8 @@ def report_of(
     Parameters
     ----------
     map_poses : ``cam_from_world`` of the map's images, for the view from above; by default those
-        of the first context that has a map.
+        of the first result that has a map.
     provenance : options, preset, inputs: plain JSON data, shown at the end with the versions.
-    contexts : images, masks and matches of each result, by default those it brings along.
     view : add the 3D view of a single result, a file beside the page that leads to it.
 
     Raises
@@ -82,36 +76,38 @@ def report_of(
     # matplotlib loads with them, which those who want the text need not wait for
     from megloc_kapture.evaluation.report import pages
 
-    results = _results(reported)
-    labels = [result.label for result in results]
-    if contexts is None:
-        contexts = [result.context for result in results]
-    if map_poses is None:
-        map_poses = next((poses for context in contexts if (poses := context.map_poses())), {})
-    # the gallery and the view show the same inliers
-    stored = StoredInliers(contexts[0])
     if isinstance(reported, Evaluation):
-        title = reported.label or "Evaluation"
+        results: Sequence[Evaluation] | Sequence[ResultWithoutTruth] = (reported,)
+    else:
+        results = reported.results if isinstance(reported, WithoutTruth) else reported.evaluations
+    title = " and ".join(result.label for result in results)
+    if map_poses is None:
+        map_poses = next((poses for own in results if (poses := own.context.map_poses())), {})
+    # the gallery and the view show the same inliers
+    stored = StoredInliers(results[0].context)
+    if isinstance(reported, Evaluation):
+        title = title or "Evaluation"
         page = pages.evaluation_page(reported, map_poses, stored)
     elif isinstance(reported, Comparison):
-        title = " and ".join(labels)
-        page = pages.comparison_page(reported, map_poses, contexts)
+        page = pages.comparison_page(reported, map_poses)
     elif isinstance(reported, Seeds):
-        title = f"{len(labels)} runs of one method"
-        page = pages.seeds_page(reported, map_poses, contexts)
+        title = f"{len(results)} runs of one method"
+        page = pages.seeds_page(reported, map_poses)
     else:
-        title = " and ".join(labels) or "Without truth"
-        page = pages.without_truth_page(reported, map_poses, contexts, stored)
+        title = title or "Without truth"
+        page = pages.without_truth_page(reported, map_poses, stored)
     beside = _view(results[0], stored, title) if view and len(results) == 1 else {}
     if beside:
-        page = (*page[:1], _view_section(), *page[1:])
+        link = Markup('<a class="view" href="{}">See it in 3D</a>').format(VIEW_HTML)
+        told = " The map's points and cameras, and the queries: coloured by their error or "
+        page = (*page[:1], _lines(Paragraph(link + f"{told}confidence.")), *page[1:])
     csv_tables = {PER_QUERY_CSV: reported.per_query()}
     if isinstance(reported, Comparison):
         csv_tables[DIFFERENCES_CSV] = reported.differences()
     return Document(
         name="agreement" if isinstance(reported, WithoutTruth) else "recall",
         title=title,
-        text=_text_sections(reported),
+        text=tuple(_text_sections(reported)),
         page=page,
         data=report_data(reported),
         tables=csv_tables,
@@ -134,22 +130,13 @@ def _view(
     return {}
 
 
-def _view_section() -> Section:
-    link = Markup('<a class="view" href="{}">See it in 3D</a>').format(VIEW_HTML)
-    told = " The map's points and cameras, and the queries: coloured by their error or confidence."
-    return Section((Paragraph(link + told),))
-
-
 def write_report(folder: Path | str, reported: AnyReported, **options: Any) -> dict[str, Path]:
-    """Write the report's files, each atomically; returns name -> path.
+    """Write the report's files, each atomically; returns name -> path. ``options`` as of
+    :func:`report_of`.
 
     With truth these are recall.json, recall.txt, per_query.csv and report.html, of a comparison
     also differences.csv; without truth agreement.json and agreement.txt take the place of recall's.
     Of a single result the 3D view stands beside them, view.html.
-
-    Parameters
-    ----------
-    options : as of :func:`report_of`.
 
     Raises
     ------
@@ -169,37 +156,48 @@ def report_data(reported: AnyReported) -> dict[str, Any]:
     if isinstance(reported, Evaluation):
         return _recall_data(reported)
     if isinstance(reported, WithoutTruth):
-        return _without_truth_data(reported)
+        labels = [result.label for result in reported.results]
+        return {
+            "statement": reported.statement,
+            "caution": CAUTION,
+            "results": [
+                {"label": result.label, "rows": [asdict(row) for row in result.rows]}
+                for result in reported.results
+            ],
+            "agreement": [
+                {**asdict(row), "first": labels[row.first], "second": labels[row.second]}
+                for row in reported.agreement
+            ],
+        }
     results = [_recall_data(evaluation) for evaluation in reported.evaluations]
     if isinstance(reported, Seeds):
-        return {"results": results, "seeds": _seeds_data(reported)}
+        return {"results": results, "seeds": [asdict(row) for row in reported.rows]}
     return {"results": results, "comparison": _comparison_data(reported)}
 
 
-def _results(reported: AnyReported) -> Sequence[Evaluation] | Sequence[ResultWithoutTruth]:
-    if isinstance(reported, Evaluation):
-        return (reported,)
-    return reported.results if isinstance(reported, WithoutTruth) else reported.evaluations
-
-
-def _text_sections(reported: AnyReported) -> tuple[Section, ...]:
-    if isinstance(reported, Evaluation):
-        label = (_lines(_line(reported.label)),) if reported.label else ()
-        return (
-            *label,
-            *_recall_sections([reported]),
-            *_confidence_sections([reported]),
-            *_note_sections([reported]),
-        )
+def _text_sections(reported: AnyReported) -> list[Section]:
+    if isinstance(reported, Seeds):
+        return _seeds_text(reported)
+    if isinstance(reported, WithoutTruth):
+        return _without_truth_text(reported)
+    several = isinstance(reported, Comparison)
+    evaluations = reported.evaluations if isinstance(reported, Comparison) else (reported,)
+    sections = []
+    if not several and evaluations[0].label:
+        sections.append(_lines(_line(evaluations[0].label)))
+    sections += _recall_sections(evaluations)
+    for evaluation in evaluations:
+        if (confidence := evaluation.confidence) is not None:
+            whose = f" of {evaluation.label}" if several else ""
+            said = "; ".join(confidence_sentences(confidence, evaluation.thresholds[-1]))
+            sections.append(_lines(Paragraph(f"Confidence{whose}: {said}.")))
     if isinstance(reported, Comparison):
-        return (
-            *_recall_sections(reported.evaluations),
-            *_confidence_sections(reported.evaluations),
-            _lines(Items(tuple(comparison_sentences(reported)))),
-            _lines(Paragraph(method_sentence(reported))),
-            *_note_sections(reported.evaluations),
-        )
-    return _seeds_text(reported) if isinstance(reported, Seeds) else _without_truth_text(reported)
+        sections.append(_lines(Items(tuple(comparison_sentences(reported)))))
+        sections.append(_lines(Paragraph(method_sentence(reported))))
+    for evaluation in evaluations:
+        on = f" on {evaluation.label}" if several else ""
+        sections += [_lines(Paragraph(f"Note{on}: {note}.")) for note in notes(evaluation)]
+    return sections
 
 
 def _recall_sections(evaluations: Sequence[Evaluation]) -> list[Section]:
@@ -218,44 +216,21 @@ def _recall_sections(evaluations: Sequence[Evaluation]) -> list[Section]:
     return [*sections, _lines(_line(f"{INTERVALS}, (%)"), intervals)]
 
 
-def _confidence_sections(evaluations: Sequence[Evaluation]) -> list[Section]:
-    sections = []
-    for evaluation in evaluations:
-        if (confidence := evaluation.confidence) is not None:
-            whose = f" of {evaluation.label}" if evaluations[1:] else ""
-            told = "; ".join(confidence_sentences(confidence, evaluation.thresholds[-1]))
-            sections.append(_lines(Paragraph(f"Confidence{whose}: {told}.")))
-    return sections
-
-
-def _note_sections(evaluations: Sequence[Evaluation]) -> list[Section]:
+def _seeds_text(seeds: Seeds) -> list[Section]:
+    first = seeds.evaluations[0]
+    labels = ", ".join(evaluation.label for evaluation in seeds.evaluations)
+    told = f"recall (%) at {bounds(first.thresholds)}, mean +- standard deviation of a run"
+    found = "queries found by all / by some / by none of the runs"
     return [
-        _lines(Paragraph(f"Note{f' on {e.label}' if evaluations[1:] else ''}: {note}."))
-        for e in evaluations
-        for note in notes(e)
+        _lines(_line(f"{len(seeds.evaluations)} runs of one method: {labels}")),
+        _lines(_line(told), Paragraph(criterion(first))),
+        _lines(tables.seeds_table(seeds)),
+        _lines(_line("smallest and largest of the runs (%)"), tables.seed_ranges(seeds)),
+        _lines(_line(found), tables.found_table(seeds)),
     ]
 
 
-def _seeds_text(seeds: Seeds) -> tuple[Section, ...]:
-    first = seeds.evaluations[0]
-    labels = [evaluation.label for evaluation in seeds.evaluations]
-    at = bounds(first.thresholds)
-    return (
-        _lines(_line(f"{len(labels)} runs of one method: {', '.join(labels)}")),
-        _lines(
-            _line(f"recall (%) at {at}, mean +- standard deviation of a run"),
-            Paragraph(criterion(first)),
-        ),
-        _lines(tables.seeds_table(seeds)),
-        _lines(_line("smallest and largest of the runs (%)"), tables.seed_ranges(seeds)),
-        _lines(
-            _line("queries found by all / by some / by none of the runs"),
-            tables.found_table(seeds),
-        ),
-    )
-
-
-def _without_truth_text(found: WithoutTruth) -> tuple[Section, ...]:
+def _without_truth_text(found: WithoutTruth) -> list[Section]:
     sections = [_lines(Paragraph(f"No recall: {found.statement}"), Paragraph(CAUTION))]
     for result in found.results:
         sections.append(_lines(_line(result.label)))
@@ -268,13 +243,12 @@ def _without_truth_text(found: WithoutTruth) -> tuple[Section, ...]:
             "% of all queries where both have a pose and the two are at most "
             f"{bounds(found.thresholds)} apart"
         )
+        table = tables.agreement_table(found, rows)
         sections += [
             _lines(Paragraph(f"agreement of {first} and {second}"), Paragraph(told)),
-            _lines(
-                tables.agreement_table(found, rows), Paragraph(agreement_sentence(whole, found))
-            ),
+            _lines(table, Paragraph(agreement_sentence(whole, found))),
         ]
-    return tuple(sections)
+    return sections
 
 
 def _lines(*blocks: Block) -> Section:
@@ -286,18 +260,14 @@ def _line(text: str) -> Paragraph:
 
 
 def _recall_data(evaluation: Evaluation) -> dict[str, Any]:
-    by_center = evaluation.by_center
+    confidence, by_center = evaluation.confidence, evaluation.by_center
     return {
         "label": evaluation.label,
         "criterion": criterion(evaluation),
         "thresholds": evaluation.thresholds,
         "rows": evaluation.rows,
         "notes": notes(evaluation),
-        **(
-            {}
-            if (confidence := evaluation.confidence) is None
-            else {"confidence": asdict(confidence)}
-        ),
+        **({} if confidence is None else {"confidence": asdict(confidence)}),
         "without_truth": evaluation.without_truth,
         "not_scored": evaluation.not_scored,
         **({} if by_center is None else {"rows_by_center": by_center.rows}),
@@ -317,42 +287,4 @@ def _comparison_data(comparison: Comparison) -> dict[str, Any]:
         "tests": [named(test) for test in comparison.tests],
         "tests_by_condition": [named(test) for test in comparison.tests_by_row],
         "medians": [named(median) for median in comparison.medians],
-    }
-
-
-def _seeds_data(seeds: Seeds) -> list[dict[str, Any]]:
-    return [
-        {
-            "name": row.name,
-            "num_queries": row.num_queries,
-            "num_localized": asdict(row.num_localized),
-            "recall": [
-                {
-                    "threshold": at.threshold,
-                    **asdict(at.recall),
-                    "found_always": at.always,
-                    "found_sometimes": at.sometimes,
-                    "found_never": at.never,
-                }
-                for at in row.recall
-            ],
-            "median_position_m": asdict(row.median_position_m),
-        }
-        for row in seeds.rows
-    ]
-
-
-def _without_truth_data(found: WithoutTruth) -> dict[str, Any]:
-    labels = [result.label for result in found.results]
-    return {
-        "statement": found.statement,
-        "caution": CAUTION,
-        "results": [
-            {"label": result.label, "rows": [asdict(row) for row in result.rows]}
-            for result in found.results
-        ],
-        "agreement": [
-            {**asdict(row), "first": labels[row.first], "second": labels[row.second]}
-            for row in found.agreement
-        ],
     }

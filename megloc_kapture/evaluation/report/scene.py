@@ -19,13 +19,13 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
+from megloc_kapture.evaluation.report.document import plain, template
 from megloc_kapture.evaluation.report.map_view import top_view
-from megloc_kapture.evaluation.report.rendered import RenderedQuery
-from megloc_kapture.evaluation.report.renderers import plain, template
-from megloc_kapture.evaluation.report.shown_queries import (
+from megloc_kapture.evaluation.report.queries import (
     ShownQuery,
     StoredInliers,
     legend,
+    query_facts,
     spread,
 )
 from megloc_kapture.evaluation.results import ResultContext
@@ -74,7 +74,7 @@ class Scene:
     frames : names of the map's coordinate frames, which share no world and are shown one at a time;
         ``point_frames``, ``camera_frames``, ``query_frames`` uint8 (P,), (C,), (Q,) say which.
     notes : sentences on what is left out.
-    rendered : query -> what was rendered at its pose.
+    rendered : query -> caption and data address of each picture of what its pose shows.
     """
 
     title: str
@@ -96,7 +96,7 @@ class Scene:
     camera_frames: NDArray[np.uint8]
     query_frames: NDArray[np.uint8]
     notes: tuple[str, ...]
-    rendered: Mapping[str, RenderedQuery] = field(default_factory=dict)
+    rendered: Mapping[str, Sequence[tuple[str, str]]] = field(default_factory=dict)
 
 
 def scene_of(title: str, stored: StoredInliers, queries: Sequence[ShownQuery] = ()) -> Scene | None:
@@ -205,14 +205,14 @@ def render_view(scene: Scene) -> str:
             {
                 "name": query.name,
                 "condition": query.condition,
-                "facts": query.facts(),
+                "facts": query_facts(query),
                 "color": query.color,
                 "meaning": query.meaning,
                 "error": query.position_m,
                 "confidence": query.confidence,
                 "inliers": query.num_inliers,
                 "drawn": drawn,
-                "pictures": shown.panels() if (shown := scene.rendered.get(query.name)) else [],
+                "pictures": scene.rendered.get(query.name, []),
             }
             for query, drawn in zip(scene.queries, scene.num_inliers, strict=True)
         ],
@@ -227,7 +227,7 @@ def render_view(scene: Scene) -> str:
     return template("view.html").render(
         title=scene.title,
         data=_script_data(data),
-        legend=legend(list(scene.queries)),
+        legend=legend(scene.queries),
         counts={
             "points": len(scene.points) - scene.num_dense,
             "dense": scene.num_dense,

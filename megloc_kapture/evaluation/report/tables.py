@@ -19,7 +19,7 @@ from megloc_kapture.evaluation.report.wording import (
     shortened,
 )
 from megloc_kapture.evaluation.scoring import Evaluation
-from megloc_kapture.evaluation.statistics import Seeds, SeedsRow, Spread
+from megloc_kapture.evaluation.statistics import Seeds, SeedsAt, SeedsRow
 from megloc_kapture.evaluation.without_truth import (
     PRIOR_DISTANCES_M,
     AgreementRow,
@@ -39,12 +39,16 @@ PALETTE = (
 )
 
 
-class _Counted(Protocol):
+class _Named(Protocol):
+    @property
+    def name(self) -> str: ...
     @property
     def num_queries(self) -> int: ...
 
 
-Row = TypeVar("Row", bound=_Counted)
+Row = TypeVar("Row", bound=_Named)
+# a column whose cells stand to the right
+_count = partial(column, kind="count")
 
 
 def colors_of(names: Sequence[str]) -> dict[str, str]:
@@ -61,46 +65,38 @@ def recall_table(evaluations: Sequence[Evaluation]) -> Table:
     size, several = len(evaluations), len(evaluations) > 1
     groups = list(zip(*(evaluation.rows for evaluation in evaluations), strict=True))
     rows = [row for group in groups for row in group]
-    first = [index % size == 0 for index in range(len(rows))]
-    colors = colors_of([evaluation.label for evaluation in evaluations])
-    labels = [
-        Cell(shortened(label, _MAX_LABEL_WIDTH), page=label, color=color)
-        for label, color in colors.items()
-    ]
     fallbacks = any(row.num_fallback for row in rows)
 
+    def name(at: int) -> Cell:
+        return Cell("") if at % size else _name_cell(rows[at])
+
     def localized(row: RecallRow) -> Cell:
-        if not row.num_fallback:
-            return Cell(str(row.num_localized))
-        page = f"{row.num_localized} +{row.num_fallback}" if several else str(row.num_localized)
-        return Cell(f"{row.num_localized} (+{row.num_fallback})", page=page)
+        return _localized_cell(row, several=several)
+
+    def of_all(row: RecallRow) -> Cell:
+        return _median_cell(row.median_position_m, row.median_angle_deg)
 
     def of_localized(row: RecallRow) -> Cell:
         medians = row.median_localized_position_m, row.median_localized_angle_deg
         return _median_cell(*medians) if row.num_localized else Cell("-")
 
-    columns = [
-        Column(
-            "condition" if several or rows[1:] else "",
-            tuple(
-                _name_cell(row.name) if own else Cell("")
-                for row, own in zip(rows, first, strict=True)
-            ),
-        ),
-        *([Column("result", tuple(labels * len(groups)))] if several else []),
-        column("queries", rows, lambda row: row.num_queries, kind="count"),
-        column("localized", rows, localized, kind="count"),
-    ]
+    columns = [column("condition" if several or rows[1:] else "", range(len(rows)), name)]
+    if several:
+        labels = [
+            Cell(shortened(label, _MAX_LABEL_WIDTH), page=label, color=color)
+            for label, color in colors_of([e.label for e in evaluations]).items()
+        ]
+        columns.append(Column("result", tuple(labels * len(groups))))
+    columns += [_count("queries", rows, _queries), _count("localized", rows, localized)]
     if fallbacks and not several:
-        shown = column("fallback", rows, lambda row: row.num_fallback, kind="count", medium="page")
-        columns.append(shown)
+        columns.append(_count("fallback", rows, lambda row: row.num_fallback, medium="page"))
     columns += [
-        column("no\npose", rows, lambda row: row.num_missing, kind="count", medium="page"),
+        _count("no\npose", rows, lambda row: row.num_missing, medium="page"),
         *_recall_columns("recall (%)", rows, lambda row: row.recall),
         column(
             "median\nof all",
             rows,
-            lambda row: _median_cell(row.median_position_m, row.median_angle_deg),
+            of_all,
             kind="figures",
             text_heading="of all",
             above="median error (m, deg)",
@@ -151,34 +147,20 @@ def seeds_table(seeds: Seeds) -> Table:
         text = format_spread(row.median_position_m)
         return Cell(text, page=text.replace("+-", "±"))
 
-    def recalls(row: SeedsRow) -> list[str]:
-        return [format_spread(at.recall, percent=True) for at in row.recall]
+    def recalls(row: SeedsRow) -> str:
+        return " / ".join(format_spread(at, percent=True) for at in row.recall)
 
     def recall(row: SeedsRow, index: int) -> Cell:
-        return Cell(
-            recalls(row)[index].replace("+-", "±"), below=_range_text(row.recall[index].recall)
-        )
+        at = row.recall[index]
+        return Cell(format_spread(at, percent=True).replace("+-", "±"), below=_range_text(at))
 
+    heading = "condition" if rows[1:] else ""
     columns = (
-        column(
-            "condition" if rows[1:] else "",
-            rows,
-            lambda row: _name_cell(row.name),
-            text_heading="condition",
-        ),
-        column("queries", rows, lambda row: row.num_queries, kind="count"),
-        column("localized", rows, localized, kind="count"),
-        column("recall (%)", rows, lambda row: " / ".join(recalls(row)), medium="text"),
-        *(
-            column(
-                _threshold_heading(at.threshold),
-                rows,
-                partial(recall, index=index),
-                kind="count",
-                medium="page",
-            )
-            for index, at in enumerate(rows[0].recall)
-        ),
+        column(heading, rows, _name_cell, text_heading="condition"),
+        _count("queries", rows, _queries),
+        _count("localized", rows, localized),
+        column("recall (%)", rows, recalls, medium="text"),
+        *_by_threshold([at.threshold for at in rows[0].recall], rows, recall),
         column("median\nerror (m)", rows, median, kind="figures", text_heading="median error (m)"),
     )
     return Table(columns, styles=_total_last(rows))
@@ -186,16 +168,17 @@ def seeds_table(seeds: Seeds) -> Table:
 
 def seed_ranges(seeds: Seeds) -> Table:
     """Smallest and largest recall of the runs, as text."""
-    cells = [[_range_text(at.recall) for at in row.recall] for row in seeds.rows]
+    cells = [[_range_text(at) for at in row.recall] for row in seeds.rows]
     return _slashed([display_name(row.name) for row in seeds.rows], cells)
 
 
 def found_table(seeds: Seeds) -> Table:
     """Queries within each threshold in all, some or none of the runs."""
     every = seeds.rows[-1].recall
-    counts = [[str(n) for n in (at.always, at.sometimes, at.never)] for at in every]
+    counts = [(at.found_always, at.found_sometimes, at.found_never) for at in every]
     headings = ("threshold", "by every run", "by some runs", "by none")
-    return _slashed([str(at.threshold) for at in every], counts, headings)
+    cells = [[str(count) for count in of_threshold] for of_threshold in counts]
+    return _slashed([str(at.threshold) for at in every], cells, headings)
 
 
 def result_table(result: ResultWithoutTruth) -> Table:
@@ -204,9 +187,8 @@ def result_table(result: ResultWithoutTruth) -> Table:
     distances = " / ".join(f"{distance:g}" for distance in PRIOR_DISTANCES_M) + " m"
     fallbacks = rows[-1].num_fallback
 
-    def localized(row: RowWithoutTruth) -> Cell:
-        added = f" (+{row.num_fallback})" if row.num_fallback else ""
-        return Cell(f"{row.num_localized}{added}", page=str(row.num_localized))
+    def share(row: RowWithoutTruth) -> str:
+        return format_share(row.num_localized, row.num_queries)
 
     def quartiles(row: RowWithoutTruth) -> str:
         return " / ".join(f"{value:.0f}" for value in row.inliers_quartiles or ()) or "-"
@@ -215,44 +197,41 @@ def result_table(result: ResultWithoutTruth) -> Table:
         own = row.first_candidate
         return format_share(own.num_same_direction, own.num_compared) if own else "-"
 
-    def share(row: RowWithoutTruth) -> str:
-        return format_share(row.num_localized, row.num_queries)
+    def within(prior: PriorAgreement | None) -> str:
+        shares = () if prior is None else prior.within
+        return " / ".join(f"{100.0 * at.share:.0f}" for at in shares) or "-"
 
     columns = [
-        column("condition" if rows[1:] else "", rows, lambda row: _name_cell(row.name)),
-        column("queries", rows, lambda row: row.num_queries, kind="count"),
-        column("localized", rows, localized, kind="count"),
-        column("%", rows, share, kind="count"),
-        column("fallback", rows, lambda row: row.num_fallback, kind="count", medium="page"),
-        column(
-            "inliers,\nquartiles",
-            rows,
-            quartiles,
-            kind="figures",
-            text_heading="quartiles",
-            above="inliers",
-        ),
-        column(
-            f"% within {distances}\nof the first candidate",
-            rows,
-            lambda row: _within_text(row.first_candidate),
-            kind="figures",
-            text_heading="of first",
-            above=f"% within {distances}",
-        ),
-        column(
-            "of the\nnearest candidate",
-            rows,
-            lambda row: _within_text(row.nearest_candidate),
-            kind="figures",
-            text_heading="of nearest",
-        ),
-        column("% in its\ndirection", rows, facing, kind="count", text_heading="facing"),
+        column("condition" if rows[1:] else "", rows, _name_cell),
+        _count("queries", rows, _queries),
+        _count("localized", rows, _localized_cell),
+        _count("%", rows, share),
     ]
-    if result.context.unit != METRES:
-        columns = [own for own in columns if "candidate" not in own.heading]
+    if fallbacks:
+        columns.append(_count("fallback", rows, lambda row: row.num_fallback, medium="page"))
+    inliers = {"text_heading": "quartiles", "above": "inliers"}
+    columns.append(column("inliers,\nquartiles", rows, quartiles, kind="figures", **inliers))
+    if result.context.unit == METRES:
+        columns += [
+            column(
+                f"% within {distances}\nof the first candidate",
+                rows,
+                lambda row: within(row.first_candidate),
+                kind="figures",
+                text_heading="of first",
+                above=f"% within {distances}",
+            ),
+            column(
+                "of the\nnearest candidate",
+                rows,
+                lambda row: within(row.nearest_candidate),
+                kind="figures",
+                text_heading="of nearest",
+            ),
+        ]
+    columns.append(_count("% in its\ndirection", rows, facing, text_heading="facing"))
     return Table(
-        tuple(own for own in columns if fallbacks or own.heading != "fallback"),
+        tuple(columns),
         styles=_total_last(rows),
         rules=(0, len(rows) - 1),
         footnote="(+n): fallback poses; no figure but this one counts them" if fallbacks else "",
@@ -263,31 +242,21 @@ def agreement_table(found: WithoutTruth, rows: Sequence[AgreementRow]) -> Table:
     """Share of queries whose poses in two results agree, by condition."""
     labels = [result.label for result in found.results]
 
+    def pair(row: AgreementRow) -> str:
+        return f"{labels[row.first]}, {labels[row.second]}"
+
     def median(row: AgreementRow) -> str:
         return format_median(row.median_m, row.median_deg).replace("inf", "-")
 
+    text_heading = "condition" if rows[1:] else ""
+    median_heading = "median,\nwhere both have"
     columns = (
-        column(
-            "results", rows, lambda row: f"{labels[row.first]}, {labels[row.second]}", medium="page"
-        ),
-        column(
-            "condition",
-            rows,
-            lambda row: _name_cell(row.name),
-            text_heading="condition" if rows[1:] else "",
-        ),
-        column("queries", rows, lambda row: row.num_queries, kind="count"),
-        column(
-            "both have\na pose", rows, lambda row: row.num_both, kind="count", text_heading="both"
-        ),
+        column("results", rows, pair, medium="page"),
+        column("condition", rows, _name_cell, text_heading=text_heading),
+        _count("queries", rows, _queries),
+        _count("both have\na pose", rows, lambda row: row.num_both, text_heading="both"),
         *_recall_columns("agree (%)", rows, lambda row: row.within),
-        column(
-            "median,\nwhere both have",
-            rows,
-            median,
-            kind="figures",
-            text_heading="median (m, deg)",
-        ),
+        column(median_heading, rows, median, kind="figures", text_heading="median (m, deg)"),
     )
     return Table(columns, styles=tuple("total" if row.name == ALL else "" for row in rows))
 
@@ -297,7 +266,7 @@ def seconds_table(seconds: Mapping[str, float]) -> Table:
     rows = [*seconds.items(), (ALL, sum(seconds.values()))]
     columns = (
         column("stage", rows, lambda row: row[0]),
-        column("seconds", rows, lambda row: f"{row[1]:.1f}", kind="count"),
+        _count("seconds", rows, lambda row: f"{row[1]:.1f}"),
     )
     return Table(columns, styles=_total_last(rows))
 
@@ -316,19 +285,25 @@ def _recall_columns(
         title = f"{at.num_within} of {row.num_queries}"
         return Cell(format_percent(at.recall), below=format_interval(at), title=title)
 
-    return [
-        column(heading, rows, joined, medium="text"),
-        *(
-            column(
-                _threshold_heading(at.threshold),
-                rows,
-                partial(at_threshold, index=index),
-                kind="count",
-                medium="page",
-            )
-            for index, at in enumerate(recall_of(rows[0]))
-        ),
-    ]
+    thresholds = [at.threshold for at in recall_of(rows[0])]
+    shares = column(heading, rows, joined, medium="text")
+    return [shares, *_by_threshold(thresholds, rows, at_threshold)]
+
+
+def _by_threshold(
+    thresholds: Sequence[Threshold], rows: Sequence[Row], cell_of: Callable[[Row, int], Cell]
+) -> list[Column]:
+    """A column of the page per threshold."""
+
+    def cell(index: int, row: Row) -> Cell:
+        return cell_of(row, index)
+
+    columns = []
+    for index, threshold in enumerate(thresholds):
+        angle = "" if threshold.angle_deg is None else f"\n{threshold.angle_deg:g} deg"
+        heading = f"{threshold.position_m:g} m{angle}"
+        columns.append(_count(heading, rows, partial(cell, index), medium="page"))
+    return columns
 
 
 def _slashed(
@@ -343,18 +318,25 @@ def _slashed(
     return Table(tuple(columns), headed=False)
 
 
-def _name_cell(name: str) -> Cell:
+def _queries(row: _Named) -> int:
+    return row.num_queries
+
+
+def _name_cell(row: _Named) -> Cell:
     """The name of a row, cut short in text."""
-    return Cell(shortened(display_name(name)), page=display_name(name))
+    return Cell(shortened(display_name(row.name)), page=display_name(row.name))
+
+
+def _localized_cell(row: RecallRow | RowWithoutTruth, *, several: bool = False) -> Cell:
+    """A number of queries; with that of fallback poses, which otherwise have a column."""
+    number, added = row.num_localized, row.num_fallback
+    if not added:
+        return Cell(str(number))
+    return Cell(f"{number} (+{added})", page=f"{number} +{added}" if several else str(number))
 
 
 def _total_last(rows: Sequence[object]) -> tuple[str, ...]:
     return (*[""] * (len(rows) - 1), "total")
-
-
-def _threshold_heading(threshold: Threshold) -> str:
-    angle = threshold.angle_deg
-    return f"{threshold.position_m:g} m" + ("" if angle is None else f"\n{angle:g} deg")
 
 
 def _median_cell(position_m: float, angle_deg: float) -> Cell:
@@ -365,12 +347,5 @@ def _median_cell(position_m: float, angle_deg: float) -> Cell:
     return Cell(text, page=f"{metres} m", below=f"{degrees} deg")
 
 
-def _within_text(prior: PriorAgreement | None) -> str:
-    """Percent of the compared queries within each distance of their candidate."""
-    if prior is None:
-        return "-"
-    return " / ".join(f"{100.0 * at.share:.0f}" for at in prior.within)
-
-
-def _range_text(spread: Spread) -> str:
+def _range_text(spread: SeedsAt) -> str:
     return f"{format_percent(spread.smallest)}-{format_percent(spread.largest)}"

@@ -17,6 +17,7 @@ from megloc_kapture.evaluation.statistics import (
     Comparison,
     MedianDifference,
     PairedTest,
+    SeedsAt,
     Spread,
 )
 from megloc_kapture.evaluation.without_truth import (
@@ -76,7 +77,7 @@ def format_p(p_value: float) -> str:
     return "p < 0.001" if p_value < 0.001 else f"p = {p_value:.2g}"
 
 
-def format_spread(spread: Spread, *, percent: bool = False) -> str:
+def format_spread(spread: Spread | SeedsAt, *, percent: bool = False) -> str:
     """``89.8 +- 0.3``; ``inf`` where a run has no such figure."""
     if not math.isfinite(spread.mean):
         return "inf"
@@ -128,29 +129,27 @@ def notes(evaluation: Evaluation) -> list[str]:
     kinds = {query.fallback for query in evaluation.queries} - {"none"}
     if row.num_fallback:
         whose = " or the one ".join(_FALLBACK_POSES[kind] for kind in sorted(kinds))
+        bear = "queries could not be localized and bear"
+        given = counted(row.num_fallback, "query could not be localized and bears", bear)
         said.append(
-            f"{counted(row.num_fallback, 'query', 'queries')} could not be localized and "
-            f"{_verb(row.num_fallback, 'bears', 'bear')} the pose {whose} "
-            "instead; recall and the median of all count it as any pose"
+            f"{given} the pose {whose} instead; recall and the median of all count it as any pose"
         )
     if row.num_missing == row.num_queries:
         said.append("no query has a pose")
     missing = evaluation.without_truth
     if missing:
         shown = ", ".join(missing[:_NAMES_SHOWN]) + (", ..." if missing[_NAMES_SHOWN:] else "")
-        said.append(
-            f"{counted(len(missing), 'image has', 'images have')} no true pose and "
-            f"{_verb(len(missing), 'is', 'are')} not counted: {shown}"
-        )
+        lack = "images have no true pose and are"
+        told = counted(len(missing), "image has no true pose and is", lack)
+        said.append(f"{told} not counted: {shown}")
         if evaluation.truth_known_by:
             said.append(evaluation.truth_known_by.rstrip("."))
         if not evaluation.estimated and row.num_missing == row.num_queries:
             said.append("no estimated image is in the ground truth: do the names agree?")
     if evaluation.not_scored:
-        said.append(
-            f"{counted(len(evaluation.not_scored), 'image', 'images')} with a true pose "
-            f"{_verb(len(evaluation.not_scored), 'is', 'are')} not scored by this benchmark"
-        )
+        number = len(evaluation.not_scored)
+        told = counted(number, "image with a true pose is", "images with a true pose are")
+        said.append(f"{told} not scored by this benchmark")
     return said
 
 
@@ -161,8 +160,8 @@ def confidence_sentences(confidence: Confidence, coarsest: Threshold) -> list[st
         interval = f"{100 * confidence.wrong_low:.1f}-{100 * confidence.wrong_high:.1f}"
         said.append(
             f"of {counted(confidence.num_poses, 'pose', 'poses')} with a confidence "
-            f"{confidence.num_wrong} {_verb(confidence.num_wrong, 'is', 'are')} wrong (beyond "
-            f"{coarsest}): {format_share(confidence.num_wrong, confidence.num_poses)} % "
+            f"{counted(confidence.num_wrong, 'is', 'are')} wrong (beyond {coarsest}): "
+            f"{format_share(confidence.num_wrong, confidence.num_poses)} % "
             f"({interval})"
         )
     if confidence.num_wrong:
@@ -181,16 +180,23 @@ def confidence_sentences(confidence: Confidence, coarsest: Threshold) -> list[st
     return said
 
 
-def retrieval_note(result: ResultWithoutTruth) -> str:
-    """The legend of :func:`result_table`, or that there is no retrieval to agree with."""
-    first = result.rows[-1].first_candidate
+def no_retrieval(result: ResultWithoutTruth) -> str:
+    """The reason why nothing is said about agreement with retrieval; empty where it is said."""
     if result.context.unit != METRES:
         return f"the map is in {result.context.unit} of its own, so nothing is said about distances"
-    if first is None:
+    if result.rows[-1].first_candidate is None:
         return (
             "no map or no ranked candidates are known, so nothing is said about agreement with "
             "retrieval"
         )
+    return ""
+
+
+def retrieval_note(result: ResultWithoutTruth) -> str:
+    """The legend of :func:`result_table`, or that there is no retrieval to agree with."""
+    first = result.rows[-1].first_candidate
+    if (unknown := no_retrieval(result)) or first is None:
+        return unknown
     return (
         "first, nearest: the candidate map image that is ranked first, or lies nearest to the "
         f"pose; facing: % that look within {PRIOR_ANGLE_DEG:g} degrees of the first; "
@@ -290,7 +296,3 @@ def _signed(metres: float) -> str:
     if math.isinf(metres):
         return "-inf" if metres < 0 else "+inf"
     return f"{'-' if metres < 0 else '+'}{format_metres(abs(metres))}"
-
-
-def _verb(number: int, one: str, many: str) -> str:
-    return one if number == 1 else many

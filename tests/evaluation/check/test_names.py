@@ -7,13 +7,8 @@ from typing import NamedTuple
 
 import pytest
 
-from megloc_kapture.evaluation.check.findings import Finding
-from megloc_kapture.evaluation.check.reading import Reference
-from megloc_kapture.evaluation.check.submission import (
-    check_shape,
-    match_names,
-    match_pairs,
-)
+from megloc_kapture.evaluation.check.reading import Finding, Reference
+from megloc_kapture.evaluation.check.submission import check_shape, match_names, match_pairs
 from megloc_kapture.io.dataset_tables import ImageGroup
 
 ROBOTCAR = {

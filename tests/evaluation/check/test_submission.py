@@ -14,11 +14,14 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.evaluation.check.findings import CheckReport, Finding
-from megloc_kapture.evaluation.check.reading import MapCameras, Reference, read_reference
-from megloc_kapture.evaluation.check.submission import (
-    check_submission,
+from megloc_kapture.evaluation.check.reading import (
+    CheckReport,
+    Finding,
+    MapCameras,
+    Reference,
+    read_reference,
 )
+from megloc_kapture.evaluation.check.submission import check_submission
 from megloc_kapture.io.dataset_tables import Protocol, RelocalizationPair
 
 START = 1_600_000_000_000_000_000

@@ -15,7 +15,7 @@ from megloc_kapture.evaluation.report.map_view import (
     DrawnQuery,
     top_view,
     views_from_above,
-    views_of_evaluation,
+    views_of,
 )
 from megloc_kapture.evaluation.scoring import evaluate_poses
 from megloc_kapture.geometry.poses import camera_centers, stack_poses
@@ -107,7 +107,7 @@ def test_frames_are_drawn_apart() -> None:
         conditions={"a.jpg": "DUC1", "b.jpg": "DUC2", "c.jpg": "DUC2"},
     )
     # on one page the two would be a kilometre apart; that nothing lies outside is not worth a word
-    blocks = views_of_evaluation(evaluation, mapped, frames)
+    blocks = views_of(evaluation, mapped, frames)
     one, first, other, second = blocks
     assert (one, other) == (Heading("DUC1"), Heading("DUC2"))
     assert dots(first.svg) < dots(second.svg) + 20
@@ -118,9 +118,9 @@ def test_frames_are_drawn_apart() -> None:
 
 def test_one_frame_needs_no_name(world: Any) -> None:
     evaluation = evaluate_poses(world.estimated, world.truth, conditions=world.conditions)
-    (view,) = views_of_evaluation(evaluation, world.mapped)
+    (view,) = views_of(evaluation, world.mapped, {})
     # a frame that all images share is one page too
-    (again,) = views_of_evaluation(evaluation, world.mapped, dict.fromkeys(world.mapped, "town"))
+    (again,) = views_of(evaluation, world.mapped, dict.fromkeys(world.mapped, "town"))
     assert again.svg == view.svg
 
 

@@ -275,7 +275,7 @@ def test_seeds_files(
 
 
 def test_disputed_queries_come_first(results: list[Evaluation]) -> None:
-    found = disputed_queries(results, number=10)
+    found = disputed_queries(results)
     assert len({chosen.name for _, chosen in found}) == 10
     lost = set(compare(results).tests[-1].only_first)
     # two thirds of the places are for what the results disagree about
@@ -289,7 +289,7 @@ def test_worst_queries_are_not_all_without_a_pose(worlds: Callable[..., Any]) ->
     world = worlds(num_queries=40)
     posed = dict(sorted(world.estimated.items())[:12])
     evaluation = evaluate_poses(posed, world.truth, statuses=world.statuses)
-    chosen = worst_queries(evaluation, number=10)
+    chosen = worst_queries(evaluation)
     with_pose = [one.name for one in chosen if one.name in posed]
     assert len(chosen) == 10 and len(with_pose) == 5
     worst = sorted(
@@ -298,9 +298,9 @@ def test_worst_queries_are_not_all_without_a_pose(worlds: Callable[..., Any]) ->
     assert with_pose == worst[:5]
     # where nothing is lost, all places are for errors
     whole = evaluate_poses(world.truth, world.truth)
-    assert len(worst_queries(whole, number=10)) == 10
+    assert len(worst_queries(whole)) == 10
     few = evaluate_poses({}, dict(list(world.truth.items())[:3]))
-    assert len(worst_queries(few, number=10)) == 3
+    assert len(worst_queries(few)) == 3
 
 
 def test_medians_stand_in_the_comparison(results: list[Evaluation]) -> None:

@@ -18,8 +18,8 @@ import pytest
 from kapture.io.csv import kapture_from_dir
 
 from megloc_kapture.evaluation.report import scene as scenes
+from megloc_kapture.evaluation.report.queries import StoredInliers, legend, shown_queries
 from megloc_kapture.evaluation.report.scene import corner_rays, render_view, scene_of
-from megloc_kapture.evaluation.report.shown_queries import StoredInliers, legend, shown_queries
 from megloc_kapture.evaluation.results import ResultContext
 from megloc_kapture.evaluation.scoring import evaluate_poses
 from megloc_kapture.geometry.cameras import project

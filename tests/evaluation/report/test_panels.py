@@ -6,6 +6,7 @@ import base64
 import json
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 
 from megloc_kapture.evaluation.report.document import Paragraph, Pictures
-from megloc_kapture.evaluation.report.masks import SegmentedClasses, class_colors, mask_blocks
+from megloc_kapture.evaluation.report.panels import SegmentedClasses, class_colors, mask_blocks
 from megloc_kapture.evaluation.report.reports import render_report
 from megloc_kapture.evaluation.results import ResultContext, context_of
 from megloc_kapture.evaluation.scoring import evaluate_poses
@@ -207,18 +208,21 @@ def test_the_report_shows_them(
 ) -> None:
     evaluation = evaluate_poses(world.estimated, world.truth, conditions=world.conditions)
     context = context_of(workspace / "localized")
-    html = render_report(evaluation, contexts=[context])
+    masked = replace(evaluation, context=context)
+    html = render_report(masked)
     page = page_of(html)
     assert "What masks hide" in page.text
     assert "50 keypoints of x kept, 17 removed" in page.text
     # dots are nothing but round ends, and the figures' style is for every element of the page
     assert "stroke-linecap: butt" in html
     assert 'style="stroke-linecap:round"' in html
-    assert html == render_report(evaluation, contexts=[context])
+    assert html == render_report(masked)
     assert len(html) < len(render_report(evaluation)) + 200_000
     assert "What masks hide" not in page_of(render_report(evaluation)).text
     without = ResultContext(masked=[KaptureFolder(kaptures(workspace / "plain", ["a.jpg"], {}))])
-    assert "What masks hide" not in page_of(render_report(evaluation, contexts=[without])).text
+    assert (
+        "What masks hide" not in page_of(render_report(replace(evaluation, context=without))).text
+    )
 
 
 def test_a_report_without_truth_shows_them_too(
@@ -232,5 +236,6 @@ def test_a_report_without_truth_shows_them_too(
         [workspace / "localized"], benchmark_of(workspace / "megloc"), labels=["mine"]
     )
     assert "mine: what masks hide" in page_of(render_report(found)).text
-    other = render_report(found, contexts=[ResultContext()])
-    assert "masks hide" not in page_of(other).text
+    (result,) = found.results
+    other = replace(found, results=(replace(result, context=ResultContext()),))
+    assert "masks hide" not in page_of(render_report(other)).text
