@@ -10,12 +10,7 @@ import numpy as np
 import pytest
 from kapture.io.csv import kapture_from_dir
 from kapture.io.features import get_keypoints_fullpath, image_keypoints_from_file
-from megloc_twins.aachen import (
-    AachenFrames,
-    AachenTwin,
-    AachenTwinOptions,
-    build_aachen_frames,
-)
+from megloc_twins.aachen import AachenFrames, AachenTwin, AachenTwinOptions, build_aachen_frames
 
 from megloc_kapture.datasets.aachen.adapter import Aachen, AachenOptions
 from megloc_kapture.datasets.official import write_official

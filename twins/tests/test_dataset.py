@@ -13,7 +13,7 @@ import kapture
 import numpy as np
 import pytest
 from kapture.io.csv import kapture_from_dir
-from megloc_twins.dataset import SyntheticDataset
+from megloc_twins.options import SyntheticDataset
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.datasets.official import write_official

@@ -7,12 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from megloc_twins.fourseasons import (
-    DUSK,
-    REFERENCE,
-    WINTER,
-    FourSeasonsTwinOptions,
-)
+from megloc_twins.fourseasons import DUSK, REFERENCE, WINTER, FourSeasonsTwinOptions
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 

@@ -12,14 +12,9 @@ import numpy as np
 import pytest
 from kapture.algo.pose_operations import world_pose_transform_distance
 from kapture.io.csv import kapture_from_dir
-from kapture.io.features import (
-    get_keypoints_fullpath,
-    image_keypoints_from_file,
-)
-from megloc_twins.lighting import WEATHERS, road_lighting
-from megloc_twins.robotcar import (
-    OFFICIAL_FROM_WORLD,
-)
+from kapture.io.features import get_keypoints_fullpath, image_keypoints_from_file
+from megloc_twins.frames import WEATHERS, road_lighting
+from megloc_twins.robotcar import OFFICIAL_FROM_WORLD
 
 from megloc_kapture.datasets.official import write_official
 from megloc_kapture.datasets.robotcar.adapter import RobotCar, RobotCarOptions
@@ -295,7 +290,8 @@ def test_looks_differ() -> None:
     assert len(kinds) > 5
     for condition, weather in WEATHERS.items():
         lighting = lightings[condition]
-        assert weather.is_night == (lighting.condition == "night") == any(lighting.lamps)
+        is_night = weather.elevation_deg is None
+        assert is_night == (lighting.condition == "night") == any(lighting.lamps)
         np.testing.assert_allclose(np.linalg.norm(lighting.sun_direction), 1.0)
     assert lightings["dawn"].sun_direction[2] < lightings["sun"].sun_direction[2]
     assert lightings["dawn"].sun[2] < 0.6 * lightings["dawn"].sun[0]  # warm
