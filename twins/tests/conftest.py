@@ -95,3 +95,9 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
         return root
 
     return render
+
+
+@pytest.fixture(scope="module")
+def root(request: pytest.FixtureRequest, rendered: Callable[[str], Path]) -> Path:
+    """Folder of the small dataset that a test file is about, its ``LAYOUT``."""
+    return rendered(request.module.LAYOUT)

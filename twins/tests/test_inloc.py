@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
 from itertools import permutations
 from pathlib import Path
 
@@ -40,10 +39,7 @@ from megloc_kapture.io.dataset_tables import read_groups
 from megloc_kapture.io.images import read_depth_map, read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
 
-
-@pytest.fixture(scope="module")
-def root(rendered: Callable[[str], Path]) -> Path:
-    return rendered("inloc")
+LAYOUT = "inloc"
 
 
 @pytest.fixture(scope="module")
