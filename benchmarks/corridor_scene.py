@@ -13,8 +13,7 @@ from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
-from megloc_twins.frames import Frame, looking_at, noise_seed, reduced
-from megloc_twins.indoor_floors import lamp_lighting, phone_camera
+from megloc_twins.frames import Frame, lamp_lighting, looking_at, noise_seed, reduced
 from megloc_twins.indoor_rooms import (
     CORRIDOR_M,
     MODULE_M,
@@ -24,6 +23,7 @@ from megloc_twins.indoor_rooms import (
     build_module,
     build_room,
 )
+from megloc_twins.inloc import phone_camera
 from megloc_twins.moving_objects import FloorPlan, moving_object_recipes
 from megloc_twins.options import SyntheticWorldOptions, stream
 from megloc_twins.rasterization import (
@@ -218,7 +218,7 @@ def _shot(
     look = lamp_lighting(
         rng,
         noise=3.0 if query else 1.0,
-        noise_seed=noise_seed(_world(seed), name),
+        noise_seed=noise_seed(seed, name),
         spread=0.15 if query else 0.05,
     )
     return Frame(
@@ -231,8 +231,6 @@ def _shot(
         camera=_CAMERA,
         cam_from_world=cam_from_place @ room.place.place_from_world,
         lighting=look,
-        moving_objects=(),
-        bonnet=False,
     )
 
 

@@ -106,7 +106,9 @@ def _stepped(world: SyntheticWorld, steps: int) -> SyntheticWorld:
                     name=name,
                     timestamp=timestamp,
                     cam_from_world=world.sensor_from_rig[shot.sensor_id] @ pose,
-                    lighting=replace(shot.lighting, noise_seed=noise_seed(world.options, name)),
+                    lighting=replace(
+                        shot.lighting, noise_seed=noise_seed(world.options.seed, name)
+                    ),
                 )
             )
     return replace(world, mapping=tuple(mapping), rig_from_world=rig_from_world)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from megloc_twins.frames import Frame, looking_at
-from megloc_twins.indoor_floors import FloorBuilder, lamp_lighting
+from megloc_twins.frames import Frame, lamp_lighting, looking_at
+from megloc_twins.indoor_rooms import build_floor
 from megloc_twins.render import PlaceRenderer
 from numpy.typing import NDArray
 
@@ -338,7 +338,7 @@ def test_what_does_not_fit_is_refused() -> None:
 @pytest.fixture(scope="module")
 def room() -> Callable[[float, float, float, int], WarpSource]:
     """Draws an office from a spot (x, y), metres, along a direction, with noise of a seed."""
-    floor = FloorBuilder(1).floor(0, 0)
+    floor = build_floor(0, 0, 1)
     office = floor.zones[0].place_from_zone.inverse()
     painter = PlaceRenderer(floor.place, seed=0, supersampling=2)
     camera = Camera("SIMPLE_PINHOLE", 200, 150, (155.0, 100.0, 75.0))

@@ -13,7 +13,7 @@ from megloc_twins.frames import Frame
 from megloc_twins.render import on_bonnet, on_moving_objects
 from megloc_twins.robotcar import (
     RobotCarTwinOptions,
-    build_robotcar_moments,
+    build_robotcar_frames,
 )
 from megloc_twins.squares import build_place
 
@@ -53,8 +53,8 @@ def localized(folder: Path, changes: Sequence[str]) -> Workspace:
 
 def shots_of(workspace: Workspace) -> dict[str, Frame]:
     """Image of the workspace to what was drawn."""
-    moments = build_robotcar_moments(OPTIONS)
-    drawn = {shot.name: shot for shot in (*moments.mapping_frames(), *moments.query_frames())}
+    frames = build_robotcar_frames(OPTIONS)
+    drawn = {shot.name: shot for shot in (*frames.mapping, *frames.queries)}
     images = [
         name
         for part in ("mapping", "query")

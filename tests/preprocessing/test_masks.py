@@ -12,7 +12,10 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from matplotlib.path import Path as Outline
 from megloc_twins.render import PlaceRenderer
-from megloc_twins.robotcar import RobotCarTwinOptions, build_robotcar_moments
+from megloc_twins.robotcar import (
+    RobotCarTwinOptions,
+    build_robotcar_frames,
+)
 from megloc_twins.squares import build_place
 from numpy.typing import NDArray
 from pydantic import ValidationError
@@ -124,12 +127,10 @@ def drive() -> dict[str, list[tuple[Image, NDArray[np.bool_]]]]:
     world = options.world()
     painter = PlaceRenderer(build_place(world, 0), seed=world.seed, supersampling=1)
     drawn: dict[str, list[tuple[Image, NDArray[np.bool_]]]] = {"rear": [], "right": []}
-    for moment in build_robotcar_moments(options).reference:
-        for shot in moment.frames:
-            camera = shot.name.split("/")[-2]
-            if camera in drawn:
-                view = painter.render(shot)
-                drawn[camera].append((view.image, view.mask))
+    for shot in build_robotcar_frames(options).mapping:
+        if shot.sensor_id in drawn:
+            view = painter.render(shot)
+            drawn[shot.sensor_id].append((view.image, view.mask))
     return drawn
 
 

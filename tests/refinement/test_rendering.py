@@ -9,8 +9,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import pytest
-from megloc_twins.frames import Frame
-from megloc_twins.lighting import Lighting
+from megloc_twins.frames import Frame, Lighting
 from megloc_twins.options import SyntheticWorldOptions
 from megloc_twins.render import PlaceRenderer, RenderedFrame
 from megloc_twins.synthetic_kapture import SyntheticWorld, build_world

@@ -18,19 +18,34 @@ from pydantic import Field, field_validator
 
 from megloc_kapture.datasets.aachen.layout import Layout
 from megloc_kapture.datasets.formats.colmap_model import ColmapImage, ColmapModel
-from megloc_kapture.datasets.formats.nvm import NvmModel
-from megloc_kapture.datasets.official import GROUND_TRUTH
-from megloc_kapture.io.kapture import write_sensors
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera
-from megloc_twins.dataset import ModelTwinOptions, SyntheticDataset, shuffled, write_lines
-from megloc_twins.frames import Frame, in_frame, kapture_records, looking_at, noise_seed
-from megloc_twins.lighting import Condition, day_lighting
+from megloc_twins.frames import (
+    Condition,
+    Frame,
+    day_lighting,
+    in_frame,
+    looking_at,
+    noise_seed,
+    write_truth,
+)
 from megloc_twins.model_files import write_colmap_binary, write_nvm, write_query_list
 from megloc_twins.moving_objects import place_moving_objects
-from megloc_twins.options import SyntheticWorldOptions, stream
+from megloc_twins.options import (
+    ModelTwinOptions,
+    SyntheticDataset,
+    SyntheticWorldOptions,
+    shuffled,
+    stream,
+    write_lines,
+)
 from megloc_twins.portable import settled_pose
-from megloc_twins.sparse_models import MapFrames, render_map_and_queries, write_sift_database
+from megloc_twins.sparse_models import (
+    MapFrames,
+    nvm_model,
+    render_map_and_queries,
+    write_sift_database,
+)
 from megloc_twins.squares import Place, build_place
 from megloc_twins.viewpoints import query_frames
 
@@ -42,8 +57,6 @@ NUM_UNLISTED = 2  # query images on disk that no list names
 _PORTRAIT_SHARE = 1 / 6
 _YAWS_DEG = (0.0, 62.0, -62.0)  # photographs taken from about the same spot
 _DEVICES = ("nexus4", "milestone", "nexus4", "milestone", "nexus5x")
-_IMAGES = "images_upright"
-_MODELS = "3D-models"
 _WRONG_IMAGE = 1228  # db/1228.jpg has a wrong pose in the published model; ours have none
 
 
@@ -97,6 +110,7 @@ class AachenTwin(SyntheticDataset[AachenTwinOptions]):
 
     def write(self, root: Path, work: Work = HERE) -> dict[str, int]:
         root, options = Path(root), self.options
+        models = root / "3D-models"
         frames = build_aachen_frames(options)
         mapping = in_frame(frames.mapping(), OFFICIAL_FROM_WORLD)
         database = mapping[: len(frames.database)]
@@ -104,22 +118,24 @@ class AachenTwin(SyntheticDataset[AachenTwinOptions]):
             options.world(),
             frames.mapping(),
             [*frames.queries(), *frames.unlisted],
-            root / _IMAGES,
+            root / "images_upright",
             model_features=options.model_features,
             work=work,
         )
-        _write_nvm_model(root / _MODELS, options, database, drawn)
+        _write_nvm_model(models, options, database, drawn)
         if options.model_features:
             by_name = {frame.name: frame for frame in sorted(database, key=attrgetter("name"))}
             write_sift_database(Layout(root).feature_database, by_name, drawn.features)
         if options.version == "1.1":
-            _write_colmap_model(root / _MODELS / "aachen_v_1_1", options, mapping, drawn)
+            _write_colmap_model(models / "aachen_v_1_1", options, mapping, drawn)
         _write_lists(root / "queries", frames)
         queries = in_frame(frames.queries(), OFFICIAL_FROM_WORLD)
-        for role, some in (("mapping", mapping), ("query", queries)):
-            # nothing was taken at the same time
-            timed = [replace(frame, timestamp=time) for time, frame in enumerate(some)]
-            write_sensors(root / GROUND_TRUTH / role, kapture_records(timed, named=False))
+        # nothing was taken at the same time
+        timed = (
+            [replace(frame, timestamp=time) for time, frame in enumerate(some)]
+            for some in (mapping, queries)
+        )
+        write_truth(root, *timed, named=False)
         return {
             "places": options.num_places,
             "mapping images": len(mapping),
@@ -129,22 +145,14 @@ class AachenTwin(SyntheticDataset[AachenTwinOptions]):
 
 @dataclass(frozen=True, eq=False)
 class AachenFrames:
-    """All images of the twin; poses in the world's frame.
+    """All images of the twin, queries in the order of the lists; poses in the world's frame."""
 
-    Parameters
-    ----------
-    database : map images with a camera each, in the order of the NVM.
-    sequences : map images of v1.1, those of a sequence with the same ``sensor_id`` and camera.
-    day, night, additional_night : queries in the order of the lists.
-    unlisted : images below ``query/`` that are in no list.
-    """
-
-    database: tuple[Frame, ...]
-    sequences: tuple[Frame, ...]
+    database: tuple[Frame, ...]  # map images with a camera each, in the order of the NVM
+    sequences: tuple[Frame, ...]  # map images of v1.1, those of a sequence with one sensor
     day: tuple[Frame, ...]
     night: tuple[Frame, ...]
     additional_night: tuple[Frame, ...]
-    unlisted: tuple[Frame, ...]
+    unlisted: tuple[Frame, ...]  # below ``query/``, but in no list
 
     def mapping(self) -> tuple[Frame, ...]:
         """All map images."""
@@ -158,32 +166,34 @@ class AachenFrames:
 def build_aachen_frames(options: AachenTwinOptions) -> AachenFrames:
     """Choose all images of the twin; the same options give the same images."""
     world = options.world()
-    places = [build_place(world, index) for index in range(options.num_places)]
     numbers = _database_numbers(options)
     added = options.version == "1.1"
     database: list[Frame] = []
     sequences: list[Frame] = []
     day: list[Frame] = []
     night: list[Frame] = []
+    num_day = options.day_queries
     num_night = options.night_queries + options.additional_night_queries * added
-    for place in places:
-        album = _photographs(options, world, place, numbers[len(database) :])
+    for index in range(options.num_places):
+        place = build_place(world, index)
+        album = _photographs(options, place, numbers[len(database) :])
         database += album
         if added:
-            sequences += _sequence(options, world, place)
-        day += query_frames(world, place, album, "day", options.day_queries + NUM_UNLISTED)
+            sequences += _sequence(options, place)
+        day += query_frames(world, place, album, "day", num_day + NUM_UNLISTED)
         night += query_frames(world, place, album, "night", num_night)
+
+    def ordered(frames: Sequence[Frame], label: str) -> tuple[Frame, ...]:
+        return tuple(shuffled(frames, options.seed, "aachen", "order", label))
+
     day, night = _as_telephones(day, "day", options), _as_telephones(night, "night", options)
-    last_day, last_night = options.day_queries, options.night_queries
     return AachenFrames(
-        database=_shuffled(database, options, "nvm"),
+        database=ordered(database, "nvm"),
         sequences=tuple(sequences),
-        day=_shuffled(day[:last_day], options, "day"),
-        night=_shuffled(night[:last_night], options, "night"),
-        additional_night=tuple(
-            shuffled(night[last_night:], options.seed, "aachen", "order", "additional")
-        ),
-        unlisted=tuple(day[last_day:]),
+        day=ordered(day[:num_day], "day"),
+        night=ordered(night[: options.night_queries], "night"),
+        additional_night=ordered(night[options.night_queries :], "additional"),
+        unlisted=tuple(day[num_day:]),
     )
 
 
@@ -195,10 +205,7 @@ def _database_numbers(options: AachenTwinOptions) -> NDArray[np.int64]:
 
 
 def _photographs(
-    options: AachenTwinOptions,
-    world: SyntheticWorldOptions,
-    place: Place,
-    numbers: NDArray[np.int64],
+    options: AachenTwinOptions, place: Place, numbers: NDArray[np.int64]
 ) -> list[Frame]:
     """Map images of a place, each with a camera of its own, taken on two sunny days."""
     rng = stream(options.seed, "aachen", "database", place.index)
@@ -209,28 +216,15 @@ def _photographs(
         sun = suns[2 * station // options.stations_per_place]
         for yaw_deg in _YAWS_DEG:
             number = int(numbers[len(frames)])
-            name = f"db/{number}.jpg"
             at = np.array([*spot + rng.normal(0, 0.15, 2), rng.uniform(1.5, 1.9)])
             yaw = heading + np.radians(yaw_deg) + float(rng.normal(0, 0.1))
-            frames.append(
-                _map_frame(
-                    world,
-                    place,
-                    name,
-                    sensor_id=f"db_{number}",
-                    camera=_photo_camera(options, rng),
-                    at=at,
-                    yaw=yaw,
-                    sun=sun,
-                    rng=rng,
-                )
-            )
+            camera = _photo_camera(options, rng)
+            names = f"db/{number}.jpg", f"db_{number}"
+            frames.append(_map_frame(options, place, names, camera, at, yaw, sun, rng))
     return frames
 
 
-def _sequence(
-    options: AachenTwinOptions, world: SyntheticWorldOptions, place: Place
-) -> list[Frame]:
+def _sequence(options: AachenTwinOptions, place: Place) -> list[Frame]:
     """A few steps through a place with one camera, looking to the left."""
     rng = stream(options.seed, "aachen", "sequence", place.index)
     sun = (float(rng.uniform(-np.pi, np.pi)), float(np.radians(rng.uniform(40, 60))))
@@ -244,55 +238,39 @@ def _sequence(
         camera = _photo_camera(options, rng, portraits=False)
     # steps of half the distance between the spots of the photographs
     steps = place.plan.stops(max(2 * options.stations_per_place, options.sequence_images))
-    return [
-        _map_frame(
-            world,
-            place,
-            f"{folder}/{file.format(30 * step + 1)}",
-            sensor_id=folder,
-            camera=camera,
-            at=np.array([*spot, 1.6 + rng.normal(0, 0.02)]),
-            yaw=heading + np.pi / 2 + float(rng.normal(0, 0.05)),
-            sun=sun,
-            rng=rng,
-        )
-        for step, (spot, heading) in enumerate(steps[: options.sequence_images])
-    ]
+    frames = []
+    for step, (spot, heading) in enumerate(steps[: options.sequence_images]):
+        at = np.array([*spot, 1.6 + rng.normal(0, 0.02)])
+        yaw = heading + np.pi / 2 + float(rng.normal(0, 0.05))
+        names = f"{folder}/{file.format(30 * step + 1)}", folder
+        frames.append(_map_frame(options, place, names, camera, at, yaw, sun, rng))
+    return frames
 
 
 def _map_frame(
-    world: SyntheticWorldOptions,
+    options: AachenTwinOptions,
     place: Place,
-    name: str,
-    *,
-    sensor_id: str,
+    names: tuple[str, str],
     camera: Camera,
     at: NDArray[np.float64],
     yaw: float,
     sun: tuple[float, float],
     rng: np.random.Generator,
 ) -> Frame:
-    """A map image taken by hand from ``at`` (place's frame, metres) with the sun at ``sun``."""
-    azimuth, elevation = sun
+    """An image, its and its sensor's name, taken by hand from ``at`` (place's frame, metres)."""
     pitch, roll = (float(a) for a in rng.normal(0.02, 0.03, 2))
+    seed = noise_seed(options.seed, names[0])
     return Frame(
-        name=name,
+        name=names[0],
         role="mapping",
         condition="day",
         place=place.index,
         timestamp=0,  # nothing was taken at the same time
-        sensor_id=sensor_id,
+        sensor_id=names[1],
         camera=camera,
         cam_from_world=looking_at(at, yaw, pitch, roll) @ place.place_from_world,
-        lighting=day_lighting(
-            rng,
-            azimuth=azimuth,
-            elevation=elevation,
-            overcast=0.15,
-            noise_seed=noise_seed(world, name),
-        ),
-        moving_objects=place_moving_objects(place.plan, rng, world.moving_objects, at, yaw=None),
-        bonnet=False,
+        lighting=day_lighting(rng, sun, overcast=0.15, noise_seed=seed),
+        moving_objects=place_moving_objects(place.plan, rng, options.world().moving_objects, at),
     )
 
 
@@ -321,8 +299,7 @@ def _as_telephones(
     for number, frame in enumerate(sorted(frames, key=lambda frame: frame.timestamp)):
         focal, _, _, k = frame.camera.params
         camera = _simple_radial(frame.camera.width, frame.camera.height, focal, k)
-        night = condition == "night"
-        name = _night_name(number, options) if night else _day_name(number)
+        name = _day_name(number) if condition == "day" else _night_name(number, options)
         renamed.append(replace(frame, name=name, camera=camera))
     return renamed
 
@@ -362,16 +339,8 @@ def _write_nvm_model(
         # as if the images had more features than see a point
         points = replace(points, feature_ids=3 * points.feature_ids + 1)
     cameras = {frame.name: frame.camera for frame in frames}
-    model = NvmModel(
-        names=tuple(cameras),
-        focal_px=np.array([camera.params[0] for camera in cameras.values()]),
-        quat_wxyz=np.array([frame.cam_from_world.quat_wxyz for frame in frames]),
-        centers=np.array([frame.cam_from_world.center() for frame in frames]),
-        k_colmap=np.array([camera.params[3] for camera in cameras.values()]),
-        points=points,
-    )
-    write_nvm(folder / "aachen_cvpr2018_db.nvm", model)
-    write_lines(folder / "aachen_cvpr2018_db.list.txt", model.names)
+    write_nvm(folder / "aachen_cvpr2018_db.nvm", nvm_model(list(cameras), frames, points))
+    write_lines(folder / "aachen_cvpr2018_db.list.txt", list(cameras))
     write_query_list(folder / "database_intrinsics.txt", dict(sorted(cameras.items())))
 
 
@@ -398,14 +367,8 @@ def _write_colmap_model(
 def _write_lists(folder: Path, frames: AachenFrames) -> None:
     night = frames.night + frames.additional_night
     for when, some in (("day", frames.day), ("night", night)):
-        write_query_list(
-            folder / f"{when}_time_queries_with_intrinsics.txt",
-            {frame.name: frame.camera for frame in some},
-            last_line_ends=False,
-        )
+        cameras = {frame.name: frame.camera for frame in some}
+        path = folder / f"{when}_time_queries_with_intrinsics.txt"
+        write_query_list(path, cameras, last_line_ends=False)
     names = [frame.name for frame in frames.day]
     write_lines(folder / "day_time_queries_without_intrinsics.txt", names)
-
-
-def _shuffled(frames: Sequence[Frame], options: AachenTwinOptions, label: str) -> tuple[Frame, ...]:
-    return tuple(shuffled(frames, options.seed, "aachen", "order", label))

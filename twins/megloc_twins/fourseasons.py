@@ -10,7 +10,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from functools import partial
+from functools import partial, reduce
+from operator import xor
 from pathlib import Path
 
 import numpy as np
@@ -18,25 +19,20 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.datasets.formats.sparse_points import SparsePoints
-from megloc_kapture.datasets.official import GROUND_TRUTH
 from megloc_kapture.geometry.poses import earth_from_enu, geodetic
-from megloc_kapture.io.files import write_bytes
 from megloc_kapture.io.images import write_image
-from megloc_kapture.io.kapture import write_sensors
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, Options, RigidTransform
-from megloc_twins.dataset import SyntheticDataset
 from megloc_twins.fourseasons_drive import (
     CAM1_FROM_CAM0,
-    CAMERAS,
     Drive,
     Moment,
     SeasonBuilder,
     drive_moments,
     stereo_camera,
 )
-from megloc_twins.frames import Frame, kapture_records
-from megloc_twins.options import SyntheticWorldOptions, stream
+from megloc_twins.frames import Frame, write_truth
+from megloc_twins.options import SyntheticDataset, SyntheticWorldOptions, stream, write_lines
 from megloc_twins.portable import settled, settled_pose
 from megloc_twins.render import RenderedFrame, render_frames
 from megloc_twins.sparse_models import exact_tracks
@@ -98,9 +94,9 @@ class FourSeasonsTwinOptions(Options):
     def drives(self) -> tuple[Drive, Drive, Drive]:
         """The recordings, the map's first."""
         return (
-            Drive(REFERENCE, "summer", start_of(REFERENCE), self.map_keyframes, "mapping", 0.1, 2),
-            Drive(WINTER, "winter", start_of(WINTER), self.winter_keyframes, "query", 0.6, 8),
-            Drive(DUSK, "dusk", start_of(DUSK), self.dusk_keyframes, "query", 0.9, 12),
+            Drive(REFERENCE, "summer", _start_of(REFERENCE), self.map_keyframes, "mapping", 0.1, 2),
+            Drive(WINTER, "winter", _start_of(WINTER), self.winter_keyframes, "query", 0.6, 8),
+            Drive(DUSK, "dusk", _start_of(DUSK), self.dusk_keyframes, "query", 0.9, 12),
         )
 
 
@@ -118,22 +114,20 @@ class FourSeasonsTwin(SyntheticDataset[FourSeasonsTwinOptions]):
         options, drives = self.options, self.options.drives()
         driven = {drive.name: drive_moments(options.world(), drive) for drive in drives}
         keyframes = {name: [m for m in moments if m.keyframe] for name, moments in driven.items()}
-        for name, text in calibration_texts(stereo_camera(options.width, options.height)).items():
-            _write_text(root / "calibration" / name, text)
+        _write_calibration(root / "calibration", stereo_camera(options.width, options.height))
         for drive in drives:
             _write_recording(root, options, drive, driven[drive.name], work)
             if drive.role == "query":
-                _write_text(
+                write_lines(
                     root / f"relocalizationFile_{REFERENCE}_to_{drive.name}.txt",
-                    relocalization_text(keyframes[REFERENCE], keyframes[drive.name]),
+                    _relocalization_lines(keyframes[REFERENCE], keyframes[drive.name]),
                 )
         asked = [*keyframes[WINTER], *keyframes[DUSK]]
-        for role, some in (("mapping", keyframes[REFERENCE]), ("query", asked)):
-            write_sensors(root / GROUND_TRUTH / role, kapture_records(_on_earth(some)))
+        write_truth(root, _on_earth(keyframes[REFERENCE]), _on_earth(asked))
         return {
             "places": options.num_places,
-            "mapping images": len(CAMERAS) * len(keyframes[REFERENCE]),
-            "query images": len(CAMERAS) * len(asked),
+            "mapping images": 2 * len(keyframes[REFERENCE]),
+            "query images": 2 * len(asked),
         }
 
 
@@ -155,14 +149,15 @@ def _write_recording(
         sky_seed=season.sky_seed(options.world()),
         work=work,
     )
-    _write_text(folder / "times.txt", times_text(moments, exposure_ms))
+    write_lines(folder / "times.txt", _times_lines(moments, exposure_ms))
     if not published:
         return
-    slam = SlamFrames.drawn(options.seed, drive.name, blank_lines=drive.name == REFERENCE)
-    _write_text(folder / "GNSSPoses.txt", gnss_poses_text(slam, keyframes))
-    _write_text(folder / "Transformations.txt", transformations_text(slam))
-    _write_text(folder / "result.txt", result_text(slam, moments))
-    _write_text(folder / "septentrio.nmea", nmea_text(keyframes))
+    slam = SlamFrames.drawn(options.seed, drive.name)
+    write_lines(folder / "GNSSPoses.txt", _gnss_lines(slam, keyframes))
+    blank_lines = drive.name == REFERENCE
+    write_lines(folder / "Transformations.txt", _transformation_lines(slam, blank_lines))
+    write_lines(folder / "result.txt", _result_lines(slam, moments))
+    write_lines(folder / "septentrio.nmea", _nmea_lines(keyframes))
     images = {name: result for name, result in drawn.items() if result is not None}
     tracks = exact_tracks(
         seeing,
@@ -172,9 +167,11 @@ def _write_recording(
     )
     for index, moment in enumerate(keyframes):
         left = moment.frames[0]
-        points = cloud_of(tracks, len(CAMERAS) * index, left.cam_from_world)
-        text = keyframe_text(slam, moment, left.camera, points, images[left.name][0], exposure_ms)
-        _write_text(folder / "KeyFrameData" / f"KeyFrame_{moment.timestamp}.txt", text)
+        points = _cloud_of(tracks, 2 * index, left.cam_from_world)
+        lines = _keyframe_lines(
+            slam, moment, left.camera, points, images[left.name][0], exposure_ms
+        )
+        write_lines(folder / "KeyFrameData" / f"KeyFrame_{moment.timestamp}.txt", lines)
 
 
 def _write_files(root: Path, frame: Frame, view: RenderedFrame) -> Drawn:
@@ -194,10 +191,6 @@ def _on_earth(moments: Iterable[Moment]) -> Iterator[Frame]:
             yield replace(frame, cam_from_world=pose)
 
 
-def _write_text(path: Path, text: str) -> None:
-    write_bytes(path, text.encode())
-
-
 @dataclass(frozen=True)
 class SlamFrames:
     """How a recording's frames lie to one another; all as its files have them.
@@ -207,7 +200,6 @@ class SlamFrames:
     s_from_as, w_from_gpsw, e_from_gpsw : as in ``Transformations.txt``.
     scale : metres per unit of the SLAM world.
     odometry_from_as : the world of the keyframe files and ``result.txt``.
-    blank_lines : whether ``Transformations.txt`` has them between its blocks.
     """
 
     s_from_as: RigidTransform
@@ -215,10 +207,9 @@ class SlamFrames:
     e_from_gpsw: RigidTransform
     scale: float
     odometry_from_as: RigidTransform
-    blank_lines: bool
 
     @classmethod
-    def drawn(cls, seed: int, recording: str, *, blank_lines: bool) -> SlamFrames:
+    def drawn(cls, seed: int, recording: str) -> SlamFrames:
         """The frames of a recording, at random."""
         rng = stream(seed, "frames", recording)
         # each scene has its own origin, some hundred metres away
@@ -231,7 +222,6 @@ class SlamFrames:
             e_from_gpsw=_as_written(_settled_earth_from_enu(*place)),
             scale=round(float(rng.uniform(0.96, 0.97)), 6),
             odometry_from_as=_random_transform(rng, np.pi, 0.1, 0.3),
-            blank_lines=blank_lines,
         )
 
     def slam_from_cam(self, cam_from_world: RigidTransform) -> RigidTransform:
@@ -242,27 +232,24 @@ class SlamFrames:
         return RigidTransform(metric.quat_wxyz, (x, y, z))
 
 
-def transformations_text(slam: SlamFrames) -> str:
-    """``Transformations.txt``."""
+def _transformation_lines(slam: SlamFrames, blank_lines: bool) -> list[str]:
     cam_from_imu = RigidTransform(
         (-0.002350, -0.007202, 0.708623, -0.705546), (0.175412, 0.003689, -0.058106)
     )
-    blocks = [
-        f"# {name}: {_TAGS}\n{_pose_fields(transform, ',', 6)}\n"
-        for name, transform in (
-            ("transform_S_AS", slam.s_from_as),
-            ("TS_cam_imu", cam_from_imu),
-            ("transform_w_gpsw", slam.w_from_gpsw),
-            ("transform_gps_imu", RigidTransform.identity()),
-            ("transform_e_gpsw", slam.e_from_gpsw),
-        )
-    ]
-    blocks.append(f"# GNSS scale\n{slam.scale:.6f}\n")
-    return ("\n" if slam.blank_lines else "").join(blocks)
+    lines = []
+    for name, transform in (
+        ("transform_S_AS", slam.s_from_as),
+        ("TS_cam_imu", cam_from_imu),
+        ("transform_w_gpsw", slam.w_from_gpsw),
+        ("transform_gps_imu", RigidTransform.identity()),
+        ("transform_e_gpsw", slam.e_from_gpsw),
+    ):
+        lines += [f"# {name}: {_TAGS}", _pose_fields(transform, ",", 6), *[""] * blank_lines]
+    return [*lines, "# GNSS scale", f"{slam.scale:.6f}"]
 
 
-def gnss_poses_text(slam: SlamFrames, keyframes: Iterable[Moment]) -> str:
-    """``GNSSPoses.txt``; its header announces a column more than its rows have."""
+def _gnss_lines(slam: SlamFrames, keyframes: Iterable[Moment]) -> list[str]:
+    """Poses, below a header that announces a column more than the rows have."""
     lines = [
         "# timestamp_ns, tran_x, tran_y, tran_z, quat_x, quat_y, quat_z, quat_w, scale, "
         "fusion_quality, v3"
@@ -270,41 +257,36 @@ def gnss_poses_text(slam: SlamFrames, keyframes: Iterable[Moment]) -> str:
     for moment in keyframes:
         pose = _pose_fields(slam.slam_from_cam(moment.cam0_from_world), ",", 12)
         lines.append(f"{moment.timestamp},{pose},{slam.scale:.6f},2")
-    return "\n".join(lines) + "\n"
+    return lines
 
 
-def times_text(moments: Iterable[Moment], exposure_ms: float) -> str:
-    """``times.txt``, all frames, most without images."""
-    return "".join(f"{f.timestamp} {f.timestamp / 1e9:.10f} {exposure_ms:.10f}\n" for f in moments)
+def _times_lines(moments: Iterable[Moment], exposure_ms: float) -> list[str]:
+    """All frames, most without images."""
+    times = (moment.timestamp for moment in moments)
+    return [f"{time} {time / 1e9:.10f} {exposure_ms:.10f}" for time in times]
 
 
-def result_text(slam: SlamFrames, moments: Iterable[Moment]) -> str:
-    """``result.txt``: the odometry's poses of all slam, level, of the unrectified camera."""
+def _result_lines(slam: SlamFrames, moments: Iterable[Moment]) -> list[str]:
+    """The odometry's poses of all slam, level, of the unrectified camera."""
     half = np.radians(_RECTIFICATION_DEG) / 2
     w, y = settled((np.cos(half), np.sin(half))).tolist()
     rectification = RigidTransform((w, 0.0, y, 0.0), (0.0, 0.0, 0.0))
     lines = []
     for moment in moments:
         pose = slam.s_from_as @ _odometry_pose(slam, moment) @ rectification
-        lines.append(f"{moment.timestamp / 1e9:.5f}   {_pose_fields(pose, ' ', 15)}\n")
-    return "".join(lines)
+        lines.append(f"{moment.timestamp / 1e9:.5f}   {_pose_fields(pose, ' ', 15)}")
+    return lines
 
 
-def keyframe_text(
+def _keyframe_lines(
     slam: SlamFrames,
     moment: Moment,
     camera: Camera,
     points: NDArray[np.float64],
     image: NDArray[np.uint8],
     exposure_ms: float,
-) -> str:
-    """``KeyFrame_<timestamp>.txt``.
-
-    Parameters
-    ----------
-    points : float64 (P, 3): u and v in pixels, depth in metres.
-    image : grey, uint8 (H, W).
-    """
+) -> list[str]:
+    """Of points float64 (P, 3): u and v in pixels, depth in metres; of a grey image (H, W)."""
     fx, fy, cx, cy = camera.params
     lines = [
         "# timestamp",
@@ -323,14 +305,19 @@ def keyframe_text(
         "# u,v,idepth_scaled,idepth_hessian,maxRelBaseline,numGoodRes,status ",
         "# color information ",
     ]
+    bottom, right = (size - 1 for size in image.shape)
     for u, v, depth_m in points.tolist():
         inverse_depth = slam.scale / depth_m
         lines.append(f"{u:.9f},{v:.9f},{inverse_depth:.12f},900000000.000000,0.050000,0,1")
-        lines.append("".join(f"{grey}," for grey in _patch(image, u, v)))
-    return "\n".join(lines) + "\n\n"
+        patch = [
+            image[min(max(int(v) + dy, 0), bottom), min(max(int(u) + dx, 0), right)]
+            for dx, dy in _PATTERN
+        ]
+        lines.append("".join(f"{grey}," for grey in patch))
+    return [*lines, ""]
 
 
-def cloud_of(
+def _cloud_of(
     tracks: SparsePoints, image: int, cam_from_world: RigidTransform
 ) -> NDArray[np.float64]:
     """Points of the tracks in one image: u and v in pixels, depth in metres, float64 (P, 3)."""
@@ -339,8 +326,8 @@ def cloud_of(
     return np.column_stack([tracks.xy_px[seen].astype(np.float64), depth])
 
 
-def nmea_text(keyframes: Sequence[Moment]) -> str:
-    """``septentrio.nmea``: a fix for each keyframe behind the rest of a line."""
+def _nmea_lines(keyframes: Sequence[Moment]) -> list[str]:
+    """A fix for each keyframe, behind the rest of a line."""
     lines = [",D*1C"]
     for moment in keyframes:
         clock = datetime.fromtimestamp(moment.timestamp // 10**9, UTC)
@@ -353,40 +340,33 @@ def nmea_text(keyframes: Sequence[Moment]) -> str:
             f"GPRMC,{time},A,{place},7.0,251.7,{clock:%d%m%y},3.5,W,D",
             f"GPGGA,{time},{place},4,09,1.1,{height:.4f},M,0.0000,M,0.6,3119",
         ):
-            checksum = 0
-            for byte in content.encode():
-                checksum ^= byte
+            checksum = reduce(xor, content.encode())
             lines.append(f"${content}*{checksum:02X}")
-    return "\n".join(lines) + "\n"
+    return lines
 
 
-def calibration_texts(camera: Camera) -> dict[str, str]:
-    """The files of ``calibration/`` that undistorted images need, by name."""
-    fx, fy, cx, cy = camera.params
+def _write_calibration(folder: Path, camera: Camera) -> None:
+    """The files that undistorted images need."""
+    params = " ".join(map(repr, camera.params))
     size = f"{camera.width} {camera.height}"
-    pinhole = f"Pinhole {fx!r} {fy!r} {cx!r} {cy!r} 0.0 0.0 0.0 0.0\n{size}\ncrop\n{size}\n"
-    matrix = np.eye(4)
-    matrix[:3, :3] = CAM1_FROM_CAM0.rotation_matrix()
-    matrix[:3, 3] = CAM1_FROM_CAM0.translation
-    rows = (" ".join(map(repr, row)) for row in matrix.tolist())
-    return {
-        "undistorted_calib_0.txt": pinhole,
-        "undistorted_calib_1.txt": pinhole,
-        "undistorted_calib_stereo.txt": "\n".join(rows) + "\n",
-    }
+    for number in (0, 1):
+        lines = [f"Pinhole {params} 0.0 0.0 0.0 0.0", size, "crop", size]
+        write_lines(folder / f"undistorted_calib_{number}.txt", lines)
+    rows = [" ".join(map(repr, row)) for row in CAM1_FROM_CAM0.matrix().tolist()]
+    write_lines(folder / "undistorted_calib_stereo.txt", rows)
 
 
-def relocalization_text(reference: Sequence[Moment], queries: Sequence[Moment]) -> str:
+def _relocalization_lines(reference: Sequence[Moment], queries: Sequence[Moment]) -> list[str]:
     """Pairs of the challenge: each query behind the keyframe of the map that is nearest to it."""
     centers = np.array([moment.cam0_from_world.center() for moment in reference])
     lines = []
     for moment in queries:
         distances = np.linalg.norm(centers - moment.cam0_from_world.center(), axis=1)
-        lines.append(f"{reference[int(distances.argmin())].timestamp} {moment.timestamp}\n")
-    return "".join(lines)
+        lines.append(f"{reference[int(distances.argmin())].timestamp} {moment.timestamp}")
+    return lines
 
 
-def start_of(recording: str) -> int:
+def _start_of(recording: str) -> int:
     """The time in a recording's name, nanoseconds."""
     moment = datetime.strptime(recording, "recording_%Y-%m-%d_%H-%M-%S").replace(tzinfo=UTC)
     return int(moment.timestamp()) * 10**9
@@ -396,15 +376,6 @@ def _odometry_pose(slam: SlamFrames, moment: Moment) -> RigidTransform:
     return slam.odometry_from_as @ slam.slam_from_cam(moment.cam0_from_world)
 
 
-def _patch(image: NDArray[np.uint8], u: float, v: float) -> list[int]:
-    height, width = image.shape
-    column, row = int(u), int(v)
-    return [
-        int(image[min(max(row + dy, 0), height - 1), min(max(column + dx, 0), width - 1)])
-        for dx, dy in _PATTERN
-    ]
-
-
 def _random_transform(
     rng: np.random.Generator, yaw: float, tilt: float, reach_m: float
 ) -> RigidTransform:
@@ -412,14 +383,13 @@ def _random_transform(
     ax, ay, az = (float(a) / 2 for a in rng.uniform(-1, 1, 3) * (tilt, tilt, yaw))
     cos_x, cos_y, cos_z = settled(np.cos((ax, ay, az))).tolist()
     sin_x, sin_y, sin_z = settled(np.sin((ax, ay, az))).tolist()
-    turns = (
-        RigidTransform((cos_z, 0.0, 0.0, sin_z), (0.0, 0.0, 0.0)),
-        RigidTransform((cos_y, 0.0, sin_y, 0.0), (0.0, 0.0, 0.0)),
-        RigidTransform((cos_x, sin_x, 0.0, 0.0), (0.0, 0.0, 0.0)),
-    )
+    still = (0.0, 0.0, 0.0)
+    about_z = RigidTransform((cos_z, 0.0, 0.0, sin_z), still)
+    about_y = RigidTransform((cos_y, 0.0, sin_y, 0.0), still)
+    about_x = RigidTransform((cos_x, sin_x, 0.0, 0.0), still)
     x, y, z = (float(v) for v in rng.uniform(-1, 1, 3) * reach_m)
     shift = RigidTransform((1.0, 0.0, 0.0, 0.0), (x, y, z))
-    return shift @ turns[0] @ turns[1] @ turns[2]
+    return shift @ about_z @ about_y @ about_x
 
 
 def _as_written(transform: RigidTransform) -> RigidTransform:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
@@ -10,13 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.values import Camera, RigidTransform
-from megloc_twins.frames import Frame, looking_at, noise_seed
-from megloc_twins.lighting import Lighting, day_lighting, night_lighting
+from megloc_twins.frames import (
+    Frame,
+    Lighting,
+    Role,
+    day_lighting,
+    looking_at,
+    night_lighting,
+    noise_seed,
+)
 from megloc_twins.moving_objects import place_moving_objects
 from megloc_twins.options import SyntheticWorldOptions, stream
 from megloc_twins.squares import Place, build_place
-
-CAMERAS = ("cam0", "cam1")
 
 # of the published recordings: pixels of an image 800 wide and 400 high, metres
 _FOCAL_PX, _CENTRE_PX = 501.4757919305817, (421.7953735163109, 167.65799492501083)
@@ -27,7 +31,8 @@ _CAMERA_HEIGHT_M = 1.6
 _LOOK_AHEAD_M = 2.0  # the car turns into a corner before it
 _STEP_M = 0.17  # between frames that follow one another
 _FRAME_NS = 33_333_337
-FRAMES_PER_KEYFRAME = 3  # the keyframe, and those that follow it
+_FRAMES_PER_KEYFRAME = 3  # the keyframe, and those that follow it
+_EXTRA_EVERY = 8  # keyframes; of one frame that follows the images are kept too
 _MARGIN_M = 0.35
 
 Season = Literal["summer", "winter", "dusk"]
@@ -39,47 +44,28 @@ _DUSK_EXPOSURE = 0.65
 
 @dataclass(frozen=True)
 class Moment:
-    """The car at one moment.
+    """The car at one moment, a keyframe of the odometry or not; ``timestamp`` in nanoseconds.
 
-    Parameters
-    ----------
-    timestamp : nanoseconds.
-    cam0_from_world : of its left camera.
-    place : index of the place it is in.
-    keyframe : whether the odometry made it a keyframe.
-    frames : what its cameras took; none where the images were not kept.
+    ``frames`` are what its cameras took, none where the images were not kept.
     """
 
     timestamp: int
     cam0_from_world: RigidTransform
-    place: int
     keyframe: bool
     frames: tuple[Frame, ...]
 
 
 @dataclass(frozen=True)
 class Drive:
-    """A recording as it is driven: where, when, and how it looks.
-
-    Parameters
-    ----------
-    name : of the recording.
-    season : light, and what lies on the ground.
-    start_ns : time of its first frame.
-    keyframes_per_place : at equal distances along a place's path.
-    role : of its images.
-    lateral_m, turn_deg : deviations from the path and its direction, up to these.
-    extra_every : every so many keyframes the images of the frame that follows are kept too.
-    """
+    """A recording as it is driven: where, when, and how it looks."""
 
     name: str
-    season: Season
-    start_ns: int
-    keyframes_per_place: int
-    role: Literal["mapping", "query"]
-    lateral_m: float
-    turn_deg: float
-    extra_every: int = 8
+    season: Season  # light, and what lies on the ground
+    start_ns: int  # time of its first frame
+    keyframes_per_place: int  # at equal distances along a place's path
+    role: Role  # of its images
+    lateral_m: float  # deviation from the path, up to this
+    turn_deg: float  # deviation from its direction, up to this
 
 
 def stereo_camera(width: int, height: int) -> Camera:
@@ -87,11 +73,6 @@ def stereo_camera(width: int, height: int) -> Camera:
     sx, sy = width / _PUBLISHED_SIZE[0], height / _PUBLISHED_SIZE[1]
     params = (_FOCAL_PX * sx, _FOCAL_PX * sx, _CENTRE_PX[0] * sx, _CENTRE_PX[1] * sy)
     return Camera("PINHOLE", width, height, params)
-
-
-def image_name(recording: str, timestamp: int, camera: str) -> str:
-    """Name of an image below the dataset's root."""
-    return f"{recording}/undistorted_images/{camera}/{timestamp}.png"
 
 
 def drive_moments(options: SyntheticWorldOptions, drive: Drive) -> list[Moment]:
@@ -109,22 +90,18 @@ def drive_moments(options: SyntheticWorldOptions, drive: Drive) -> list[Moment]:
             lateral = _free_offset(place, path, along, drive.lateral_m, rng)
             turn = float(np.radians(rng.uniform(-drive.turn_deg, drive.turn_deg)))
             pitch, roll = (float(a) for a in rng.normal(0, 0.012, 2))
-            for step in range(FRAMES_PER_KEYFRAME):
-                keyframe = step == 0
+            for step in range(_FRAMES_PER_KEYFRAME):
                 clock += _FRAME_NS + int(rng.integers(-40_000, 40_000))
                 # the published times have been floats of seconds
                 timestamp = int(clock / 1e9 * 1e9)
-                spot, heading = path.at(along + step * _STEP_M)
-                left = np.array([-np.sin(heading), np.cos(heading)])
-                position = np.array([*spot + lateral * left, _CAMERA_HEIGHT_M])
+                spot, heading = path.beside(along + step * _STEP_M, lateral)
+                position = np.array([*spot, _CAMERA_HEIGHT_M])
                 cam_from_place = looking_at(position, heading + turn, pitch, roll)
-                cam0_from_world = cam_from_place @ place.place_from_world
+                pose = cam_from_place @ place.place_from_world
                 frames: tuple[Frame, ...] = ()
-                if keyframe or (step == 1 and stop % drive.extra_every == 1):
-                    frames = _frames(
-                        options, drive, place, timestamp, cam0_from_world, position, sun, rng
-                    )
-                moments.append(Moment(timestamp, cam0_from_world, index, keyframe, frames))
+                if step == 0 or (step == 1 and stop % _EXTRA_EVERY == 1):
+                    frames = _frames(options, drive, place, timestamp, pose, position, sun, rng)
+                moments.append(Moment(timestamp, pose, step == 0, frames))
         clock += 20_000_000_000  # the way to the next place was not recorded
     return moments
 
@@ -142,12 +119,13 @@ class SeasonBuilder:
         place = build_place(options, index)
         if self.season != "winter":
             return place
-        recipes = list(place.recipes)
-        for number, recipe in enumerate(recipes):
+        seed = int(stream(options.seed, "winter", index).integers(2**31))
+        recipes = []
+        for recipe in place.recipes:
             if recipe.painter == "ground":
-                seed = int(stream(options.seed, "winter", index).integers(2**31))
                 params = dict(recipe.params) | {"material": "asphalt"}
-                recipes[number] = replace(recipe, seed=seed, params=tuple(sorted(params.items())))
+                recipe = replace(recipe, seed=seed, params=tuple(sorted(params.items())))
+            recipes.append(recipe)
         return replace(place, recipes=tuple(recipes))
 
     def sky_seed(self, options: SyntheticWorldOptions) -> int:
@@ -158,17 +136,15 @@ class SeasonBuilder:
         return options.seed + (get_args(Season).index(self.season) << 32)
 
 
-def _lighting(
-    season: Season, rng: np.random.Generator, sun: tuple[float, float], seed: int
-) -> Lighting:
+def _lighting(season: Season, rng: np.random.Generator, sun: tuple[float, float]) -> Lighting:
     if season == "dusk":
-        night = night_lighting(rng, exposure=_DUSK_EXPOSURE, noise_seed=seed)
+        night = night_lighting(rng, exposure=_DUSK_EXPOSURE, noise_seed=0)
         # lamps are on, and the sky still gives a little light
         light = float(rng.uniform(*_DUSK_SKY))
         sky = (0.85 * light, 0.95 * light, 1.25 * light)
         return replace(night, sky=sky, sky_colour=sky)
     overcast = 0.15 if season == "summer" else float(rng.choice([0.3, 0.7, 1.0]))
-    return day_lighting(rng, azimuth=sun[0], elevation=sun[1], overcast=overcast, noise_seed=seed)
+    return day_lighting(rng, sun, overcast=overcast, noise_seed=0)
 
 
 def _frames(
@@ -181,29 +157,28 @@ def _frames(
     sun: tuple[float, float],
     rng: np.random.Generator,
 ) -> tuple[Frame, ...]:
-    moving_objects = place_moving_objects(
-        place.plan, rng, options.moving_objects, position, yaw=None
-    )
-    lighting = _lighting(drive.season, rng, sun, 0)
-    camera = stereo_camera(options.width, options.height)
-    poses = (cam0_from_world, CAM1_FROM_CAM0 @ cam0_from_world)
-    names = [image_name(drive.name, timestamp, name) for name in CAMERAS]
-    return tuple(
-        Frame(
-            name=image,
-            role=drive.role,
-            condition=drive.name,
-            place=place.index,
-            timestamp=timestamp,
-            sensor_id=name,
-            camera=camera,
-            cam_from_world=pose,
-            lighting=replace(lighting, noise_seed=noise_seed(options, image)),
-            moving_objects=moving_objects,
-            bonnet=options.bonnet,
+    moving_objects = place_moving_objects(place.plan, rng, options.moving_objects, position)
+    lighting = _lighting(drive.season, rng, sun)
+    poses = {"cam0": cam0_from_world, "cam1": CAM1_FROM_CAM0 @ cam0_from_world}
+    frames = []
+    for sensor_id, pose in poses.items():
+        name = f"{drive.name}/undistorted_images/{sensor_id}/{timestamp}.png"
+        frames.append(
+            Frame(
+                name=name,
+                role=drive.role,
+                condition=drive.name,
+                place=place.index,
+                timestamp=timestamp,
+                sensor_id=sensor_id,
+                camera=stereo_camera(options.width, options.height),
+                cam_from_world=pose,
+                lighting=replace(lighting, noise_seed=noise_seed(options.seed, name)),
+                moving_objects=moving_objects,
+                bonnet=options.bonnet,
+            )
         )
-        for name, image, pose in zip(CAMERAS, names, poses, strict=True)
-    )
+    return tuple(frames)
 
 
 def _free_offset(
@@ -212,16 +187,12 @@ def _free_offset(
     """A deviation to the left of the path, metres, that leads into nothing."""
     for _ in range(50):
         offset = float(rng.uniform(-most, most))
-        if all(place.plan.is_free(x, y, _MARGIN_M) for x, y in _track(path, along, offset)):
+        track = [
+            path.beside(along + step * _STEP_M, offset)[0] for step in range(_FRAMES_PER_KEYFRAME)
+        ]
+        if all(place.plan.is_free(float(x), float(y), _MARGIN_M) for x, y in track):
             return offset
     return 0.0
-
-
-def _track(path: _Path, along: float, offset: float) -> Iterable[tuple[float, float]]:
-    for step in range(FRAMES_PER_KEYFRAME):
-        spot, heading = path.at(along + step * _STEP_M)
-        x, y = spot + offset * np.array([-np.sin(heading), np.cos(heading)])
-        yield float(x), float(y)
 
 
 class _Path:
@@ -231,15 +202,15 @@ class _Path:
         self._corners = corners
         self._legs = np.roll(corners, -1, axis=0) - corners
         self._ends = np.cumsum(np.hypot(*self._legs.T))
+        self.length = float(self._ends[-1])
 
-    @property
-    def length(self) -> float:
-        return float(self._ends[-1])
-
-    def at(self, along: float) -> tuple[NDArray[np.float64], float]:
-        """Position (2,) and direction (radians) of a car there, which looks ahead."""
+    def beside(self, along: float, offset: float) -> tuple[NDArray[np.float64], float]:
+        """Position (2,), ``offset`` to the left, and direction (radians) of a car, which looks
+        ahead."""
         ahead = self._spot(along + _LOOK_AHEAD_M) - self._spot(along - 0.5)
-        return self._spot(along), float(np.arctan2(ahead[1], ahead[0]))
+        heading = float(np.arctan2(ahead[1], ahead[0]))
+        left = np.array([-np.sin(heading), np.cos(heading)])
+        return self._spot(along) + offset * left, heading
 
     def _spot(self, along: float) -> NDArray[np.float64]:
         along = along % self.length

@@ -1,20 +1,184 @@
-"""A frame: one image of the world before it is rendered, its camera and its pose."""
+"""A frame: one image of the world before it is rendered, its camera, its pose and its light."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.io.kapture import KaptureData, Sensor
+from megloc_kapture.datasets.official import GROUND_TRUTH
+from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
 from megloc_kapture.values import Camera, RigidTransform
-from megloc_twins.lighting import Lighting
 from megloc_twins.moving_objects import MovingObject
-from megloc_twins.options import SyntheticWorldOptions, stream
-from megloc_twins.portable import product, settled_pose
+from megloc_twins.options import stream
+from megloc_twins.portable import exp, product, settled, settled_pose
+
+Triple = tuple[float, float, float]
+Condition = Literal["day", "night"]
+Role = Literal["mapping", "query"]
+
+_DARK: Triple = (0.0, 0.0, 0.0)
+_UP: Triple = (0.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lighting:
+    """Light and sensor of one image; colours are RGB, directions in the place's frame."""
+
+    condition: Condition = "day"
+    sun_direction: Triple = _UP  # unit vector towards the sun
+    sun: Triple = _DARK  # on a surface that faces it
+    sky: Triple  # from above; surfaces that look down get less
+    lamps: Triple = _DARK  # at one metre of a lamp; zero by day
+    glow: Triple = _DARK  # of surfaces that glow themselves
+    sky_colour: Triple = _DARK  # radiance
+    cloud_shift: float = 0.0  # turn of the clouds, radians
+    exposure: float  # factor between radiance and the sensor's signal, where 1 saturates
+    white_balance: Triple  # gain, the colour cast
+    shot_noise: float = 4e-5  # variance of the signal per signal
+    read_noise: float = 0.002  # deviation of the signal in the dark
+    blur_px: float = 0.5  # deviation of the Gaussian blur of lens and hand
+    vignetting: float  # loss of light in the corner, 0..1
+    noise_seed: int  # of the sensor's noise
+
+
+def _triple(values: NDArray[np.float64]) -> Triple:
+    r, g, b = settled(values).tolist()
+    return r, g, b
+
+
+def day_lighting(
+    rng: np.random.Generator, sun: tuple[float, float], *, overcast: float, noise_seed: int
+) -> Lighting:
+    """Daylight; exposure and white balance vary a little from image to image.
+
+    Parameters
+    ----------
+    sun : azimuth and elevation, radians, in the place's frame.
+    overcast : 0..1, how much clouds dim the sun.
+    """
+    azimuth, elevation = sun
+    cos = np.cos(elevation)
+    direction = np.array([cos * np.cos(azimuth), cos * np.sin(azimuth), np.sin(elevation)])
+    return Lighting(
+        sun_direction=_triple(direction),
+        sun=_triple(np.array([1.0, 0.94, 0.84]) * 1.25 * (1 - overcast)),
+        sky=_triple(np.array([0.66, 0.70, 0.78]) * (0.85 + 0.45 * overcast)),
+        sky_colour=_triple(np.array([0.45, 0.62, 0.95]) * (1 - overcast) + 0.85 * overcast),
+        cloud_shift=float(rng.uniform(0, 2 * np.pi)),
+        exposure=float(0.85 * exp(rng.normal(0, 0.12))),
+        white_balance=_triple(np.exp(rng.normal(0, 0.03, 3))),
+        vignetting=0.12,
+        noise_seed=noise_seed,
+    )
+
+
+def night_lighting(rng: np.random.Generator, *, exposure: float, noise_seed: int) -> Lighting:
+    """Night: warm lamps, a little blue from the sky, a slow and noisy sensor."""
+    return Lighting(
+        condition="night",
+        lamps=_triple(np.array([1.0, 0.74, 0.42]) * rng.uniform(0.8, 1.2)),
+        sky=_triple(np.array([0.014, 0.016, 0.022]) * rng.uniform(0.7, 1.3)),
+        glow=(1.0, 0.85, 0.6),
+        sky_colour=(0.006, 0.008, 0.016),
+        cloud_shift=float(rng.uniform(0, 2 * np.pi)),
+        exposure=float(exposure * 0.65 * exp(rng.normal(0, 0.25))),
+        white_balance=_triple(np.array([1.0, 0.92, 0.86]) * np.exp(rng.normal(0, 0.05, 3))),
+        shot_noise=2.2e-3,
+        read_noise=0.006,
+        blur_px=float(rng.uniform(0.7, 1.1)),
+        vignetting=0.3,
+        noise_seed=noise_seed,
+    )
+
+
+def lamp_lighting(
+    rng: np.random.Generator, *, noise: float, noise_seed: int, spread: float = 0.0
+) -> Lighting:
+    """Light of ceiling lamps; ``spread`` is how much light and colour vary between images."""
+    light = float(exp(rng.normal(0, spread)))
+    red, green, blue = np.exp(rng.normal(0, 0.35 * spread, 3)).tolist()
+    return Lighting(
+        sky=(0.62 * light, 0.60 * light, 0.57 * light),
+        lamps=(1.9, 1.8, 1.6),
+        glow=(3.0, 2.9, 2.7),
+        exposure=float(exp(rng.normal(0, spread))),
+        white_balance=(red, green, blue),
+        shot_noise=4e-5 * noise,
+        read_noise=0.002 * noise,
+        vignetting=0.1 if spread else 0.0,
+        noise_seed=noise_seed,
+    )
+
+
+@dataclass(frozen=True)
+class Weather:
+    """A traversal's light and lens."""
+
+    elevation_deg: float | None  # of the sun above the horizon; None at night
+    overcast: float = 0.0  # 0..1, how much clouds dim the sun
+    tint: Triple = (1.0, 1.0, 1.0)  # on the sun's light by day, on the white balance at night
+    cast: Triple = (1.0, 1.0, 1.0)  # on the white balance by day
+    brightness: float = 1.0  # factor on the exposure
+    blur_px: float | None = None  # deviation, of lens, drops and motion; None: the lighting's own
+    noise: float = 1.0  # factor on the variance of the sensor's noise
+
+
+WEATHERS: dict[str, Weather] = {
+    "overcast-reference": Weather(50.0, overcast=0.8),
+    "dawn": Weather(14.0, tint=(1.0, 0.7, 0.45), cast=(1.06, 0.98, 0.95), brightness=1.15),
+    "overcast-winter": Weather(20.0, overcast=1.0, cast=(0.95, 0.99, 1.07), brightness=0.85),
+    "rain": Weather(
+        35.0, overcast=1.0, cast=(0.97, 1.0, 1.04), brightness=0.75, blur_px=0.8, noise=4.0
+    ),
+    "sun": Weather(42.0, overcast=0.05),
+    "night": Weather(None),
+    "night-rain": Weather(None, brightness=0.8, blur_px=1.1, noise=1.5),
+}
+
+
+def road_lighting(
+    condition: str,
+    rng: np.random.Generator,
+    *,
+    azimuth: float,
+    noise_seed: int,
+    night_exposure: float = 1.0,
+) -> Lighting:
+    """The lighting of one image of a traversal.
+
+    Parameters
+    ----------
+    condition : a name in :data:`WEATHERS`, else KeyError.
+    rng : exposure and white balance vary a little from image to image.
+    azimuth : of the sun, radians, in the place's frame.
+    night_exposure : light that reaches the sensor at night, relative.
+    """
+    weather = WEATHERS[condition]
+    if weather.elevation_deg is None:
+        lighting = night_lighting(rng, exposure=night_exposure, noise_seed=noise_seed)
+        cast = weather.tint
+    else:
+        sun = azimuth, float(np.radians(weather.elevation_deg))
+        lighting = day_lighting(rng, sun, overcast=weather.overcast, noise_seed=noise_seed)
+        lighting = replace(lighting, sun=_product(lighting.sun, weather.tint))
+        cast = weather.cast
+    return replace(
+        lighting,
+        white_balance=_product(lighting.white_balance, cast),
+        exposure=lighting.exposure * weather.brightness,
+        blur_px=lighting.blur_px if weather.blur_px is None else weather.blur_px,
+        shot_noise=lighting.shot_noise * weather.noise,
+        read_noise=lighting.read_noise * weather.noise**0.5,
+    )
+
+
+def _product(a: Triple, b: Triple) -> Triple:
+    return a[0] * b[0], a[1] * b[1], a[2] * b[2]
 
 
 def looking_at(
@@ -33,9 +197,7 @@ def looking_at(
     return settled_pose(rotation, -product(rotation, position))
 
 
-def cam_from_rig(
-    right_deg: float, up_deg: float, position: tuple[float, float, float]
-) -> RigidTransform:
+def cam_from_rig(right_deg: float, up_deg: float, position: Triple) -> RigidTransform:
     """Pose of a camera on a rig whose frame has x to the right, y down and z ahead, metres.
 
     It looks ``right_deg`` to the right of ahead and ``up_deg`` up, from ``position``.
@@ -59,38 +221,24 @@ def reduced(camera: Camera, factor: int) -> Camera:
 
 @dataclass(frozen=True)
 class Frame:
-    """One image of the world, before it is drawn.
+    """One image of the world, before it is drawn."""
 
-    Parameters
-    ----------
-    name : path of the image below ``records_data``.
-    role : whether it belongs to the map or asks where it is.
-    condition : what it is reported under: day, night, or a name of the dataset's own.
-    place : index of the place it shows.
-    timestamp, sensor_id : its record; frames of one stop of the rig share the timestamp.
-    camera : intrinsics.
-    cam_from_world : its pose, metres.
-    lighting : light and sensor.
-    moving objects : people and cars at that moment, in the place's frame.
-    bonnet : whether the car's bonnet is in view.
-    """
-
-    name: str
-    role: Literal["mapping", "query"]
-    condition: str
-    place: int
-    timestamp: int
+    name: str  # path below ``records_data``
+    role: Role
+    condition: str  # what it is reported under: day, night, or a name of the dataset's own
+    place: int  # index of the place it shows
+    timestamp: int  # frames of one stop of a rig share it
     sensor_id: str
     camera: Camera
-    cam_from_world: RigidTransform
+    cam_from_world: RigidTransform  # metres
     lighting: Lighting
-    moving_objects: tuple[MovingObject, ...]
-    bonnet: bool
+    moving_objects: tuple[MovingObject, ...] = ()  # in the place's frame
+    bonnet: bool = False  # the car's, in view
 
 
-def noise_seed(options: SyntheticWorldOptions, image: str) -> int:
-    """Seed of the sensor's noise in an image."""
-    return int(stream(options.seed, "noise", image.rsplit(".", 1)[0]).integers(2**31))
+def noise_seed(seed: int, image: str) -> int:
+    """Seed of the sensor's noise in an image of the world of ``seed``."""
+    return int(stream(seed, "noise", image.rsplit(".", 1)[0]).integers(2**31))
 
 
 def in_frame(frames: Iterable[Frame], official_from_world: RigidTransform) -> list[Frame]:
@@ -115,3 +263,18 @@ def kapture_records(
         if poses:
             data.trajectories[record] = frame.cam_from_world
     return data
+
+
+def write_truth(
+    root: Path,
+    mapping: Iterable[Frame],
+    queries: Iterable[Frame],
+    *,
+    named: bool = True,
+    rigs: Mapping[str, dict[str, RigidTransform]] | None = None,
+) -> None:
+    """Write the true poses of all images as kapture below ``root``; raises OutputError."""
+    for role, frames in (("mapping", mapping), ("query", queries)):
+        data = kapture_records(frames, named=named)
+        data.rigs.update(rigs or {})
+        write_sensors(root / GROUND_TRUTH / role, data)

@@ -1,30 +1,40 @@
-"""Rooms of two kinds, and pieces of corridor: those of a kind are alike but for a few things.
+"""Floors of an office building: rooms of two kinds along a corridor; those of a kind are alike.
 
 A room has its door in the wall y = 0 and its windows opposite. Only posters, a rug, a cupboard and
 the sign at its door are a room's own; all else, dirt included, every room of its kind has, on
-every floor.
+every floor. Each floor has a coordinate frame of its own, and the coordinates of one mean something
+else on the other.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_twins.facades import PASSAGE, Opening, Wall
-from megloc_twins.moving_objects import Obstacle
-from megloc_twins.options import stream
-from megloc_twins.surfaces import SurfaceBuilder, Surfaces
-from megloc_twins.textures import TextureRecipe
+from megloc_kapture.values import RigidTransform
+from megloc_twins.moving_objects import FloorPlan, Obstacle, moving_object_recipes
+from megloc_twins.options import SyntheticWorldOptions, stream
+from megloc_twins.portable import product, settled_pose
+from megloc_twins.squares import Place, about_z
+from megloc_twins.surfaces import PASSAGE, Opening, SurfaceBuilder, Surfaces, Vector, Wall
+from megloc_twins.textures import TextureRecipe, index_of, texels
 
-HEIGHT_M = 2.8
+Point = tuple[float, float]
+
+ROOM_M = (6.0, 5.0)  # along the corridor, away from it
+MODULE_M = 7.0  # of corridor, with one room on each side
+CORRIDOR_M = 2.4
 WALL_THICKNESS_M = 0.15
-DOOR_M = (1.0, 2.1)  # width, height
-TEXELS_PER_M = 100
-GLASS = "window"  # a laser gets nothing back from what this painter paints
 
+_HEIGHT_M = 2.8
+_DOOR_M = (1.0, 2.1)  # width, height
+_DOOR_X = 0.7  # of a room's door
+_POSTER_M = (0.9, 1.26)
+_TEXELS_PER_M = 100
+_GLASS = "window"  # a laser gets nothing back from what this painter paints
 _DIRT = 0.8  # of walls, floors and ceilings; rooms of a kind have it in common
 _INDIRECT = 0.12  # of the lamps' glow, what a ceiling receives from below
 _SIZES = {  # width, height in texels
@@ -38,66 +48,39 @@ _SIZES = {  # width, height in texels
     "glow": (8, 8),
 }
 
-Vector = NDArray[np.float64]
-
-ROOM_M = (6.0, 5.0)  # along the corridor, away from it
-MODULE_M = 7.0  # of corridor, with one room on each side
-CORRIDOR_M = 2.4
-_DOOR_X = 0.7  # of a room's door
-_POSTER_M = (0.9, 1.26)
-_RUG_M = (2.0, 1.4)
+_SCAN_SHIFT_M = 0.35  # how far from the middle of a zone its scanner stands, at most
+_SCAN_HEIGHT_M = 1.5
+_SCAN_TILT = 0.01  # radians; a tripod stands nearly upright
 
 
 @dataclass
 class Recipes:
-    """The textures of a floor.
-
-    Parameters
-    ----------
-    seed : of the world; what is shared looks the same wherever the label is the same.
-    items : the recipes so far; surfaces count in them.
-    """
+    """The textures of a floor of the world of ``seed``; surfaces count in ``items``."""
 
     seed: int
     items: list[TextureRecipe] = field(default_factory=list)
 
     def thing(self, painter: str, *label: str | int) -> int:
         """A texture of a kind, the same for the same label."""
-        width, height = _SIZES[painter]
         number = int(stream(self.seed, "indoor", painter, *label).integers(2**31))
-        return self._index(TextureRecipe(painter, width, height, number))
+        return index_of(TextureRecipe(painter, *_SIZES[painter], number), self.items)
 
     def material(self, kind: str, size_m: tuple[float, float], *label: str | int) -> int:
         """A wall's, floor's or ceiling's texture, the same for the same label and size."""
-        width, height = (max(8, int(round(side * TEXELS_PER_M))) for side in size_m)
         number = int(stream(self.seed, "indoor", kind, *label).integers(2**31))
-        params: dict[str, str | float] = {
-            "material": kind,
-            "material_seed": int(stream(self.seed, "indoor", label[0]).integers(2**31)),
-            "dirt": _DIRT,
-        }
-        return self._index(TextureRecipe("wall", width, height, number, tuple(params.items())))
-
-    def _index(self, recipe: TextureRecipe) -> int:
-        if recipe not in self.items:
-            self.items.append(recipe)
-        return self.items.index(recipe)
+        material_seed = int(stream(self.seed, "indoor", label[0]).integers(2**31))
+        params = (("material", kind), ("material_seed", material_seed), ("dirt", _DIRT))
+        recipe = TextureRecipe("wall", *texels(size_m, _TEXELS_PER_M), number, params)
+        return index_of(recipe, self.items)
 
 
 @dataclass
 class Parts:
-    """A room or a piece of corridor while it is built, in a frame of its own (metres, z up).
+    """A room or a piece of corridor while it is built, in a frame of its own (metres, z up)."""
 
-    Parameters
-    ----------
-    shared : what every one of its kind has.
-    own : what only this one has.
-    lamps : (x, y, z) of each.
-    obstacles : what stands in it.
-    """
-
-    shared: SurfaceBuilder = field(default_factory=SurfaceBuilder)
-    own: SurfaceBuilder = field(default_factory=SurfaceBuilder)
+    recipes: Recipes
+    shared: SurfaceBuilder = field(default_factory=SurfaceBuilder)  # what all of its kind have
+    own: SurfaceBuilder = field(default_factory=SurfaceBuilder)  # what only this one has
     lamps: list[Vector] = field(default_factory=list)
     obstacles: list[Obstacle] = field(default_factory=list)
 
@@ -106,127 +89,157 @@ class Parts:
         shared, own = self.shared.build(), self.own.build()
         return shared.joined(own), np.arange(len(shared) + len(own)) >= len(shared)
 
-    def lamp(self, recipes: Recipes, x: float, y: float, size: tuple[float, float]) -> None:
-        """A lamp under the ceiling, ``size`` along x and y."""
-        glow, plain = recipes.thing("glow", "lamp"), recipes.thing("plain", "lamp")
-        low = HEIGHT_M - 0.08
+    def lamp(self, x: float, y: float) -> None:
+        """Add a lamp under the ceiling."""
+        glow, plain = self.recipes.thing("glow", "lamp"), self.recipes.thing("plain", "lamp")
+        low = _HEIGHT_M - 0.08
         self.shared.add_box(
-            (x, y), (*size, 0.08), 0.0, (plain,) * 4, plain, base=low, bottom=glow, glow=1.0
+            (x, y), (1.2, 0.3, 0.08), 0.0, plain, plain, base=low, bottom=glow, glow=1.0
         )
         self.lamps.append(np.array([x, y, low - 0.1]))
 
-    def floor_and_ceiling(
-        self, low: tuple[float, float], high: tuple[float, float], floor: int, ceiling: int
-    ) -> None:
+    def floor_and_ceiling(self, low: Point, high: Point, kind: str) -> None:
         """Add floor and ceiling between two corners."""
-        width, depth = high[0] - low[0], high[1] - low[1]
-        along, across = np.array([width, 0.0, 0.0]), np.array([0.0, depth, 0.0])
+        size_m = high[0] - low[0], high[1] - low[1]
+        along, across = np.array([size_m[0], 0.0, 0.0]), np.array([0.0, size_m[1], 0.0])
+        floor = self.recipes.material("asphalt", size_m, kind, "floor")
+        ceiling = self.recipes.material("paving", size_m, kind, "ceiling")
         self.shared.add(np.array([low[0], high[1], 0.0]), along, -across, floor)
-        corner = np.array([*low, HEIGHT_M])
-        self.shared.add(corner, along, across, ceiling, glow=_INDIRECT)
+        self.shared.add(np.array([*low, _HEIGHT_M]), along, across, ceiling, glow=_INDIRECT)
+
+    def poster(
+        self,
+        on: Wall,
+        at: Point,
+        *label: str | int,
+        own: bool = True,
+        size: tuple[float, float] = _POSTER_M,
+        painter: str = "poster",
+    ) -> None:
+        """Add something flat to a wall: ``at`` its lower left corner, along and above ground."""
+        span, height = (at[0], at[0] + size[0]), (at[1], at[1] + size[1])
+        texture = self.recipes.thing(painter, *label)
+        builder = self.own if own else self.shared
+        on.block(builder, span, height, 0.03, front=texture, other=on.trim)
+
+    def rug(self, at: Point, size: tuple[float, float], *label: str | int) -> None:
+        """Add a thing of its own that lies on the ground, ``at`` its middle."""
+        corner = np.array([at[0] - 0.5 * size[0], at[1] + 0.5 * size[1], 0.01])
+        along, across = np.array([size[0], 0.0, 0.0]), np.array([0.0, size[1], 0.0])
+        self.own.add(corner, along, -across, self.recipes.thing("poster", *label))
+
+    def box(self, at: Point, size: tuple[float, float, float], side: int, top: int) -> None:
+        """Add a piece of furniture that every room of the kind has."""
+        self.shared.add_box(at, size, 0.0, side, top)
+        self.obstacles.append(Obstacle(*at, 0.5 * max(size[:2])))
+
+    def table(self, at: Point, size: tuple[float, float], wood: int, plain: int) -> None:
+        """Add a table top on two solid ends."""
+        x, y = at
+        for side in (-1, 1):
+            spot = (x + side * (0.5 * size[0] - 0.1), y)
+            self.shared.add_box(spot, (0.08, size[1] - 0.1, 0.7), 0.0, wood, plain)
+            self.obstacles.append(Obstacle(x + side * 0.25 * size[0], y, 0.5 * size[1]))
+        self.shared.add_box(at, (*size, 0.05), 0.0, wood, wood, base=0.7, bottom=plain)
+
+    def chair(self, x: float, y: float, cloth: int) -> None:
+        """Add a chair that faces the +y direction."""
+        self.shared.add_box((x, y), (0.45, 0.45, 0.45), 0.0, cloth, cloth)
+        self.shared.add_box((x, y - 0.2), (0.45, 0.06, 0.45), 0.0, cloth, cloth, base=0.45)
+        self.obstacles.append(Obstacle(x, y, 0.3))
 
 
-def wall(start: tuple[float, float], end: tuple[float, float], texture: int, trim: int) -> Wall:
+def _wall(start: Point, end: Point, texture: int, trim: int) -> Wall:
     """The wall whose foot runs from ``start`` to ``end``, to the right of who looks at it."""
-    return Wall.between(np.array(start), np.array(end), texture, trim, HEIGHT_M)
+    return Wall.between(np.array(start), np.array(end), texture, trim, _HEIGHT_M)
 
 
-def poster(
-    builder: SurfaceBuilder,
-    on: Wall,
-    at: tuple[float, float],
-    size: tuple[float, float],
-    texture: int,
-) -> None:
-    """Something flat on a wall: ``at`` its lower left corner, along the wall and above ground."""
-    span = (at[0], at[0] + size[0])
-    on.block(builder, span, (at[1], at[1] + size[1]), 0.03, front=texture, other=on.trim)
+@dataclass(frozen=True)
+class _RoomKind:
+    """Of the walls opposite the door, to its right, of the door and to its left: materials, and
+    where a room's own posters hang. Windows: their left ends, width, height above the floor."""
+
+    materials: tuple[str, str, str, str]
+    windows: tuple[tuple[float, ...], float, float, float]
+    posters: tuple[tuple[Point, ...], ...]
+    cupboard: Point
 
 
-RoomBuilder = Callable[[Parts, Recipes, str], None]
+_KINDS = {
+    "office": _RoomKind(
+        ("plaster", "plaster", "plaster", "plaster"),
+        ((0.6, 4.0), 1.4, 0.95, 2.25),
+        (((2.55, 1.0),), ((0.4, 1.0), (1.7, 0.9)), ((3.05, 1.0),), ((0.5, 0.9), (3.6, 0.9))),
+        (4.2, 0.25),
+    ),
+    "seminar": _RoomKind(
+        ("plaster", "brick", "plaster", "stone"),
+        ((0.4, 2.45, 4.5), 1.1, 0.9, 2.3),
+        (
+            ((1.53, 1.0), (3.58, 1.1)),
+            ((0.5, 0.9), (3.6, 1.0)),
+            ((0.5, 1.0),),
+            ((0.3, 1.0), (3.8, 0.9)),
+        ),
+        (3.0, 0.25),
+    ),
+}
+ROOM_KINDS = tuple(_KINDS)
+_ORDER = (0, 3, 1, 2)  # of the walls whose posters are counted
 
 
 def build_room(recipes: Recipes, kind: str, owner: str) -> Parts:
     """A room of a kind in its own frame: x and y from 0 to ROOM_M; ``owner`` names what is its."""
-    parts = Parts()
+    parts, built = Parts(recipes), _KINDS[kind]
     width, depth = ROOM_M
-    floor = recipes.material("asphalt", ROOM_M, kind, "floor")
-    ceiling = recipes.material("paving", ROOM_M, kind, "ceiling")
-    parts.floor_and_ceiling((0.0, 0.0), (width, depth), floor, ceiling)
-    _BUILDERS[kind](parts, recipes, owner)
-    parts.lamp(recipes, 0.5 * width, 0.5 * depth, (1.2, 0.3))
+    parts.floor_and_ceiling((0.0, 0.0), ROOM_M, kind)
+    corners = ((0.0, depth), (width, depth), (width, 0.0), (0.0, 0.0), (0.0, depth))
+    trim = recipes.thing("plain", kind, "trim")
+    walls = []
+    for number, material in enumerate(built.materials):
+        size_m = (depth if number % 2 else width, _HEIGHT_M)
+        texture = recipes.material(material, size_m, kind, number)
+        walls.append(_wall(corners[number], corners[number + 1], texture, trim))
+    back, right, front, left = walls
+    lefts, across, low, high = built.windows
+    glass = recipes.thing("window", kind)
+    windows = [Opening(x, x + across, low, high, 0.12, glass) for x in lefts]
+    back.storey(parts.shared, (0, _HEIGHT_M), windows)
+    x = width - _DOOR_X - _DOOR_M[0]
+    door = Opening(x, x + _DOOR_M[0], 0.0, _DOOR_M[1], WALL_THICKNESS_M, PASSAGE)
+    front.storey(parts.shared, (0, _HEIGHT_M), [door])
+    for side in (right, left):
+        side.storey(parts.shared, (0, _HEIGHT_M))
+    wood, plain = recipes.thing("wood", kind), recipes.thing("plain", kind)
+    if kind == "office":
+        screen, cloth = recipes.thing("window", "screen"), recipes.thing("plain", "chair")
+        for x in (1.2, 4.7):
+            parts.table((x, 4.45), (1.6, 0.8), wood, plain)
+            sides = (screen, plain, plain, plain)
+            parts.shared.add_box((x, 4.6), (0.56, 0.06, 0.36), 0.0, sides, plain, base=0.8)
+            parts.chair(x, 3.7, cloth)
+        parts.box((5.8, 1.2), (0.4, 1.4, 1.9), recipes.thing("shutter", "shelf"), plain)
+        parts.box((0.25, 2.6), (0.5, 0.9, 1.1), recipes.thing("door", "cabinet"), plain)
+        parts.poster(left, (2.25, 1.3), "office", 0, own=False)
+        parts.poster(front, (0.3, 0.9), "office", 1, own=False)
+    else:
+        cloth = recipes.thing("plain", "seminar chair")
+        for x in (1.6, 4.7):
+            for y in (1.5, 4.2):
+                parts.table((x, y), (1.6, 0.6), wood, plain)
+                parts.chair(x, y - 0.6, cloth)
+        board = recipes.thing("shutter", "board")
+        left.block(parts.shared, (1.3, 3.5), (0.9, 2.1), 0.05, front=board, other=plain)
+        parts.poster(right, (2.1, 0.9), "seminar", 0, own=False)
+    spots = [(walls[number], at) for number in _ORDER for at in built.posters[number]]
+    for number, (on, at) in enumerate(spots):
+        parts.poster(on, at, owner, number)
+    a, b = recipes.thing("wood", owner, 0), recipes.thing("wood", owner, 1)
+    parts.own.add_box(built.cupboard, (0.9, 0.42, 1.1), 0.0, (b, a, a, b), b)
+    parts.obstacles.append(Obstacle(*built.cupboard, 0.5))
+    parts.rug((0.5 * width, 0.5 * depth), (2.0, 1.4), owner, "rug")
+    parts.lamp(0.5 * width, 0.5 * depth)
     return parts
-
-
-def _office(parts: Parts, recipes: Recipes, owner: str) -> None:
-    back, right, front, left = _walls(recipes, "office", ("plaster",) * 4)
-    shared = parts.shared
-    glass = recipes.thing("window", "office")
-    back.storey(
-        shared, (0, HEIGHT_M), [Opening(x, x + 1.4, 0.95, 2.25, 0.12, glass) for x in (0.6, 4.0)]
-    )
-    _front_wall(parts, front)
-    for side in (right, left):
-        side.storey(shared, (0, HEIGHT_M), [])
-    wood, plain = recipes.thing("wood", "office"), recipes.thing("plain", "office")
-    screen, cloth = recipes.thing("window", "screen"), recipes.thing("plain", "chair")
-    for x in (1.2, 4.7):
-        _table(parts, (x, 4.45), (1.6, 0.8), wood, plain)
-        shared.add_box((x, 4.6), (0.56, 0.06, 0.36), 0.0, (screen, *(plain,) * 3), plain, base=0.8)
-        _chair(parts, (x, 3.7), cloth)
-    shelf = recipes.thing("shutter", "shelf")
-    _box(parts, (5.8, 1.2), (0.4, 1.4, 1.9), shelf, plain)
-    _box(parts, (0.25, 2.6), (0.5, 0.9, 1.1), recipes.thing("door", "cabinet"), plain)
-    poster(shared, left, (2.25, 1.3), _POSTER_M, recipes.thing("poster", "office", 0))
-    poster(shared, front, (0.3, 0.9), _POSTER_M, recipes.thing("poster", "office", 1))
-    spots = (
-        (back, (2.55, 1.0)),
-        (left, (0.5, 0.9)),
-        (left, (3.6, 0.9)),
-        (right, (0.4, 1.0)),
-        (right, (1.7, 0.9)),
-        (front, (3.05, 1.0)),
-    )
-    _own_posters(parts, recipes, owner, spots)
-    _own_furniture(parts, recipes, owner, (4.2, 0.25))
-
-
-def _seminar(parts: Parts, recipes: Recipes, owner: str) -> None:
-    back, right, front, left = _walls(recipes, "seminar", ("plaster", "brick", "plaster", "stone"))
-    shared = parts.shared
-    glass = recipes.thing("window", "seminar")
-    back.storey(
-        shared,
-        (0, HEIGHT_M),
-        [Opening(x, x + 1.1, 0.9, 2.3, 0.12, glass) for x in (0.4, 2.45, 4.5)],
-    )
-    _front_wall(parts, front)
-    for side in (right, left):
-        side.storey(shared, (0, HEIGHT_M), [])
-    wood, plain = recipes.thing("wood", "seminar"), recipes.thing("plain", "seminar")
-    cloth = recipes.thing("plain", "seminar chair")
-    for x in (1.6, 4.7):
-        for y in (1.5, 4.2):
-            _table(parts, (x, y), (1.6, 0.6), wood, plain)
-            _chair(parts, (x, y - 0.6), cloth)
-    board = recipes.thing("shutter", "board")
-    left.block(shared, (1.3, 3.5), (0.9, 2.1), 0.05, front=board, other=plain)
-    poster(shared, right, (2.1, 0.9), _POSTER_M, recipes.thing("poster", "seminar", 0))
-    spots = (
-        (back, (1.53, 1.0)),
-        (back, (3.58, 1.1)),
-        (left, (0.3, 1.0)),
-        (left, (3.8, 0.9)),
-        (right, (0.5, 0.9)),
-        (right, (3.6, 1.0)),
-        (front, (0.5, 1.0)),
-    )
-    _own_posters(parts, recipes, owner, spots)
-    _own_furniture(parts, recipes, owner, (3.0, 0.25))
-
-
-_BUILDERS: dict[str, RoomBuilder] = {"office": _office, "seminar": _seminar}
-ROOM_KINDS = tuple(_BUILDERS)
 
 
 def build_module(recipes: Recipes, owner: str) -> Parts:
@@ -235,132 +248,166 @@ def build_module(recipes: Recipes, owner: str) -> Parts:
     Both its sides are alike, one the other turned by half a turn. Each has the door of a room and
     one that is closed.
     """
-    parts, half = Parts(), CORRIDOR_M / 2
-    floor = recipes.material("asphalt", (MODULE_M, CORRIDOR_M), "corridor", "floor")
-    ceiling = recipes.material("paving", (MODULE_M, CORRIDOR_M), "corridor", "ceiling")
-    parts.floor_and_ceiling((0.0, -half), (MODULE_M, half), floor, ceiling)
-    parts.lamp(recipes, 0.5 * MODULE_M, 0.0, (1.2, 0.3))
+    parts, half = Parts(recipes), CORRIDOR_M / 2
+    parts.floor_and_ceiling((0.0, -half), (MODULE_M, half), "corridor")
+    parts.lamp(0.5 * MODULE_M, 0.0)
     trim = recipes.thing("plain", "corridor")
-    texture = recipes.material("plaster", (MODULE_M, HEIGHT_M), "corridor", "wall")
+    texture = recipes.material("plaster", (MODULE_M, _HEIGHT_M), "corridor", "wall")
     door = recipes.thing("door", "corridor")
     to_room = 0.5 * (MODULE_M - ROOM_M[0]) + _DOOR_X
-    for number, side in enumerate(
-        (
-            wall((0.0, half), (MODULE_M, half), texture, trim),
-            wall((MODULE_M, -half), (0.0, -half), texture, trim),
-        )
-    ):
-        passage = Opening(to_room, to_room + DOOR_M[0], 0.0, DOOR_M[1], 0.0, PASSAGE)
-        closed = Opening(4.3, 5.2, 0.0, DOOR_M[1], 0.08, door)
-        side.storey(parts.shared, (0, HEIGHT_M), [passage, closed])
-        poster(parts.shared, side, (5.9, 0.9), _POSTER_M, recipes.thing("poster", "corridor"))
-        mat = recipes.thing("poster", owner, number, "mat")
-        door_x = to_room + 0.5 * DOOR_M[0]
-        at = (door_x, half - 0.4) if number == 0 else (MODULE_M - door_x, 0.4 - half)
-        _rug(parts, at, (0.9, 0.6), mat)
-        for x, size, painter in (
-            (0.2, _POSTER_M, "poster"),
-            (3.2, _POSTER_M, "poster"),
-            (2.35, (0.5, 0.17), "sign"),
-            (5.3, (0.5, 0.17), "sign"),
-        ):
-            texture_of_own = recipes.thing(painter, owner, number, str(x))
-            height = 0.9 if painter == "poster" else 1.6
-            poster(parts.own, side, (x, height), size, texture_of_own)
+    door_x = to_room + 0.5 * _DOOR_M[0]
+    sides = (
+        (_wall((0.0, half), (MODULE_M, half), texture, trim), (door_x, half - 0.4)),
+        (_wall((MODULE_M, -half), (0.0, -half), texture, trim), (MODULE_M - door_x, 0.4 - half)),
+    )
+    for number, (side, mat) in enumerate(sides):
+        passage = Opening(to_room, to_room + _DOOR_M[0], 0.0, _DOOR_M[1], 0.0, PASSAGE)
+        closed = Opening(4.3, 5.2, 0.0, _DOOR_M[1], 0.08, door)
+        side.storey(parts.shared, (0, _HEIGHT_M), [passage, closed])
+        parts.poster(side, (5.9, 0.9), "corridor", own=False)
+        parts.rug(mat, (0.9, 0.6), owner, number, "mat")
+        for x in (0.2, 3.2):
+            parts.poster(side, (x, 0.9), owner, number, str(x))
+        for x in (2.35, 5.3):
+            label = (owner, number, str(x))
+            parts.poster(side, (x, 1.6), *label, size=(0.5, 0.17), painter="sign")
     # a sign that hangs across the corridor, to be seen from its ends
-    faces = tuple(recipes.thing("sign", owner, "hanging", end) for end in range(2))
-    size_m = (0.06, 0.9, 0.3)
-    spot = (0.25 * MODULE_M, 0.0)
-    parts.own.add_box(
-        spot, size_m, 0.0, (trim, faces[0], trim, faces[1]), trim, base=2.3, bottom=trim
-    )
+    a, b = recipes.thing("sign", owner, "hanging", 0), recipes.thing("sign", owner, "hanging", 1)
+    spot, size_m = (0.25 * MODULE_M, 0.0), (0.06, 0.9, 0.3)
+    parts.own.add_box(spot, size_m, 0.0, (trim, a, trim, b), trim, base=2.3, bottom=trim)
     return parts
 
 
-def build_end(recipes: Recipes, owner: str) -> Parts:
+def _build_end(recipes: Recipes, owner: str) -> Parts:
     """The wall at an end of the corridor, seen by who looks along +x; at x = 0."""
-    parts, half = Parts(), CORRIDOR_M / 2
-    texture = recipes.material("plaster", (CORRIDOR_M, HEIGHT_M), "corridor", "end")
-    end = wall((0.0, half), (0.0, -half), texture, recipes.thing("plain", "corridor"))
-    glass = recipes.thing("window", "corridor")
-    end.storey(parts.shared, (0, HEIGHT_M), [Opening(0.2, 1.1, 0.9, 2.3, 0.12, glass)])
-    poster(parts.own, end, (1.35, 0.9), _POSTER_M, recipes.thing("poster", owner))
+    parts, half = Parts(recipes), CORRIDOR_M / 2
+    texture = recipes.material("plaster", (CORRIDOR_M, _HEIGHT_M), "corridor", "end")
+    end = _wall((0.0, half), (0.0, -half), texture, recipes.thing("plain", "corridor"))
+    window = Opening(0.2, 1.1, 0.9, 2.3, 0.12, recipes.thing("window", "corridor"))
+    end.storey(parts.shared, (0, _HEIGHT_M), [window])
+    parts.poster(end, (1.35, 0.9), owner)
     return parts
 
 
-def _walls(
-    recipes: Recipes, kind: str, materials: tuple[str, str, str, str]
-) -> tuple[Wall, Wall, Wall, Wall]:
-    """The walls opposite the door, to its right, of the door, to its left; seen from inside."""
-    width, depth = ROOM_M
-    feet = (
-        ((0.0, depth), (width, depth)),
-        ((width, depth), (width, 0.0)),
-        ((width, 0.0), (0.0, 0.0)),
-        ((0.0, 0.0), (0.0, depth)),
+@dataclass(frozen=True, eq=False)
+class Zone:
+    """A room or a piece of corridor of a floor."""
+
+    name: str  # unique on its floor
+    kind: str  # a room's kind, or ``corridor``
+    plan: FloorPlan  # where one can stand, in the place's frame
+    place_from_zone: RigidTransform  # those of a kind are alike in their own frames
+    scan_from_place: RigidTransform  # of the scanner in its middle
+
+
+@dataclass(frozen=True, eq=False)
+class Floor:
+    """A floor, drawn as a place whose world is the floor's official frame."""
+
+    place: Place
+    zones: tuple[Zone, ...]  # rooms first, then pieces of corridor
+    own: NDArray[np.bool_]  # (N,), the surfaces that no other room or piece of corridor has
+    glass: NDArray[np.bool_]  # (N,), the surfaces that give a laser nothing back
+
+
+@dataclass(frozen=True)
+class FloorBuilder:
+    """Lays out floors of a number of modules, for :func:`render.render_frames`."""
+
+    modules: int
+
+    def floors(self, seed: int, count: int) -> list[Floor]:
+        """The first floors of a building."""
+        return [build_floor(seed, index, self.modules) for index in range(count)]
+
+    def __call__(self, options: SyntheticWorldOptions, index: int) -> Place:
+        return build_floor(options.seed, index, self.modules).place
+
+
+@lru_cache(maxsize=4)
+def build_floor(seed: int, index: int, modules: int) -> Floor:
+    """Floor ``index`` of a building; the same object each time."""
+    recipes = Recipes(seed, list(moving_object_recipes(seed)))
+    placed: list[tuple[Parts, RigidTransform]] = []
+    rooms: list[Zone] = []
+    corridor: list[Zone] = []
+    half = CORRIDOR_M / 2
+    for module in range(modules):
+        name = f"module{module}"
+        at = _placed(MODULE_M * (module - 0.5 * modules), 0.0, turned=False)
+        placed.append((build_module(recipes, f"floor{index}/{name}"), at))
+        zone = _zone(seed, index, (name, "corridor"), *placed[-1], (0, -half), (MODULE_M, half))
+        corridor.append(zone)
+        for turned, kind in zip((False, True), ROOM_KINDS, strict=True):
+            name = f"{kind}{module}"
+            pose = at @ _beside_corridor(turned)
+            placed.append((build_room(recipes, kind, f"floor{index}/{name}"), pose))
+            rooms.append(_zone(seed, index, (name, kind), *placed[-1], (0, 0), ROOM_M))
+    for turned in (False, True):
+        pose = _placed((-0.5 if turned else 0.5) * MODULE_M * modules, 0.0, turned=turned)
+        placed.append((_build_end(recipes, f"floor{index}/end{turned:d}"), pose))
+    surfaces, own = Parts(recipes).surfaces()
+    lamps: list[Vector] = []
+    for parts, pose in placed:  # place_from_part
+        new, new_own = parts.surfaces()
+        moved = new.moved(pose.rotation_matrix(), np.array(pose.translation))
+        surfaces, own = surfaces.joined(moved), np.concatenate([own, new_own])
+        lamps += [pose.apply(lamp[None])[0] for lamp in parts.lamps]
+    zones = (*sorted(rooms, key=lambda zone: (zone.kind, zone.name)), *corridor)
+    place = Place(
+        index=index,
+        recipes=tuple(recipes.items),
+        surfaces=surfaces,
+        lamps=np.array(lamps),
+        plan=zones[-1].plan,
+        place_from_world=_official_frame(seed, index).inverse(),
     )
-    trim = recipes.thing("plain", kind, "trim")
-    found = []
-    for number, ((start, end), material) in enumerate(zip(feet, materials, strict=True)):
-        length = abs(end[0] - start[0]) + abs(end[1] - start[1])
-        texture = recipes.material(material, (length, HEIGHT_M), kind, number)
-        found.append(wall(start, end, texture, trim))
-    back, right, front, left = found
-    return back, right, front, left
+    painters = np.array([recipe.painter for recipe in recipes.items])
+    return Floor(place, zones, own, painters[surfaces.texture] == _GLASS)
 
 
-def _front_wall(parts: Parts, front: Wall) -> None:
-    x = ROOM_M[0] - _DOOR_X - DOOR_M[0]
-    door = Opening(x, x + DOOR_M[0], 0.0, DOOR_M[1], WALL_THICKNESS_M, PASSAGE)
-    front.storey(parts.shared, (0, HEIGHT_M), [door])
+def _beside_corridor(turned: bool) -> RigidTransform:
+    """module_from_room: on the left of who walks along x, or turned and on the right."""
+    x, y = 0.5 * (MODULE_M - ROOM_M[0]), 0.5 * CORRIDOR_M + WALL_THICKNESS_M
+    return _placed(MODULE_M - x, -y, turned=True) if turned else _placed(x, y, turned=False)
 
 
-def _own_posters(
-    parts: Parts, recipes: Recipes, owner: str, spots: tuple[tuple[Wall, tuple[float, float]], ...]
-) -> None:
-    for number, (on, at) in enumerate(spots):
-        poster(parts.own, on, at, _POSTER_M, recipes.thing("poster", owner, number))
+def _placed(x: float, y: float, *, turned: bool) -> RigidTransform:
+    sign = -1.0 if turned else 1.0
+    return settled_pose(np.diag([sign, sign, 1.0]), np.array([x, y, 0.0]))
 
 
-def _own_furniture(parts: Parts, recipes: Recipes, owner: str, at: tuple[float, float]) -> None:
-    """A cupboard at ``at``, and a rug in the middle."""
-    sides = tuple(recipes.thing("wood", owner, side) for side in range(2))
-    faces = (sides[1], sides[0], sides[0], sides[1])
-    parts.own.add_box(at, (0.9, 0.42, 1.1), 0.0, faces, sides[1])
-    parts.obstacles.append(Obstacle(*at, 0.5))
-    _rug(parts, (0.5 * ROOM_M[0], 0.5 * ROOM_M[1]), _RUG_M, recipes.thing("poster", owner, "rug"))
+def _official_frame(seed: int, index: int) -> RigidTransform:
+    """world_from_place: every floor has its own, and their coordinates overlap."""
+    rng = stream(seed, "indoor", "frame", index)
+    translation = np.array([*rng.uniform(-6, 6, 2), rng.uniform(-0.5, 0.5)])
+    return settled_pose(about_z(rng.uniform(-np.pi, np.pi)), translation)
 
 
-def _rug(parts: Parts, at: tuple[float, float], size: tuple[float, float], texture: int) -> None:
-    """Add a thing that lies on the ground, ``at`` its middle."""
-    corner = np.array([at[0] - 0.5 * size[0], at[1] + 0.5 * size[1], 0.01])
-    along, across = np.array([size[0], 0.0, 0.0]), np.array([0.0, size[1], 0.0])
-    parts.own.add(corner, along, -across, texture)
-
-
-def _table(
-    parts: Parts, at: tuple[float, float], size: tuple[float, float], wood: int, plain: int
-) -> None:
-    """A table top on two solid ends."""
-    for side in (-1, 1):
-        spot = (at[0] + side * (0.5 * size[0] - 0.1), at[1])
-        parts.shared.add_box(spot, (0.08, size[1] - 0.1, 0.7), 0.0, (wood,) * 4, plain)
-    top = (*size, 0.05)
-    parts.shared.add_box(at, top, 0.0, (wood,) * 4, wood, base=0.7, bottom=plain)
-    parts.obstacles += [
-        Obstacle(at[0] + side * 0.25 * size[0], at[1], 0.5 * size[1]) for side in (-1, 1)
-    ]
-
-
-def _chair(parts: Parts, at: tuple[float, float], cloth: int) -> None:
-    parts.shared.add_box(at, (0.45, 0.45, 0.45), 0.0, (cloth,) * 4, cloth)
-    back = (at[0], at[1] - 0.2)
-    parts.shared.add_box(back, (0.45, 0.06, 0.45), 0.0, (cloth,) * 4, cloth, base=0.45)
-    parts.obstacles.append(Obstacle(*at, 0.3))
-
-
-def _box(
-    parts: Parts, at: tuple[float, float], size: tuple[float, float, float], side: int, top: int
-) -> None:
-    parts.shared.add_box(at, size, 0.0, (side,) * 4, top)
-    parts.obstacles.append(Obstacle(*at, 0.5 * max(size[:2])))
+def _zone(
+    seed: int,
+    index: int,
+    names: tuple[str, str],
+    parts: Parts,
+    place_from_part: RigidTransform,
+    low: Point,
+    high: Point,
+) -> Zone:
+    """The zone of a part that reaches from ``low`` to ``high`` in its own frame."""
+    corners = np.array([low, (high[0], low[1]), high, (low[0], high[1])], np.float64)
+    outline = place_from_part.apply(np.column_stack([corners, np.zeros(4)]))[:, :2]
+    obstacles = []
+    for obstacle in parts.obstacles:
+        x, y, _ = place_from_part.apply(np.array([[obstacle.x, obstacle.y, 0.0]]))[0].tolist()
+        obstacles.append(Obstacle(x, y, obstacle.radius))
+    plan = FloorPlan(outline, outline, tuple(obstacles))
+    rng = stream(seed, "indoor", "scan", index, names[0])
+    shift = rng.uniform(-_SCAN_SHIFT_M, _SCAN_SHIFT_M, 2)
+    spot = np.array([*(outline.mean(axis=0) + shift), _SCAN_HEIGHT_M])
+    spot[2] += rng.normal(0, 0.03)
+    turn = about_z(rng.uniform(-np.pi, np.pi))
+    lean_x, lean_y = (float(a) / 2 for a in (rng.normal(0, _SCAN_TILT), rng.normal(0, _SCAN_TILT)))
+    about_x = RigidTransform((float(np.cos(lean_x)), float(np.sin(lean_x)), 0.0, 0.0), (0, 0, 0))
+    about_y = RigidTransform((float(np.cos(lean_y)), 0.0, float(np.sin(lean_y)), 0.0), (0, 0, 0))
+    rotation = product((about_x @ about_y).rotation_matrix(), turn)
+    return Zone(*names, plan, place_from_part, settled_pose(rotation, spot).inverse())

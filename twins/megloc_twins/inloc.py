@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -14,27 +15,28 @@ from megloc_kapture.datasets.inloc.layout import COLOURS, POINTS
 from megloc_kapture.datasets.official import GROUND_TRUTH
 from megloc_kapture.io.dataset_tables import SIDE_TABLES, ImageGroup, write_groups
 from megloc_kapture.io.images import write_image
-from megloc_kapture.io.kapture import write_sensors
 from megloc_kapture.io.mat_file import write_mat_arrays
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, Options, RigidTransform
-from megloc_twins.dataset import SyntheticDataset
-from megloc_twins.frames import Frame, kapture_records, noise_seed
-from megloc_twins.indoor_floors import (
-    PITCHES_DEG,
-    YAWS_DEG,
-    Floor,
-    FloorBuilder,
-    cam_from_scan,
-    cutout_camera,
+from megloc_twins.frames import (
+    Frame,
     lamp_lighting,
-    query_views,
+    looking_at,
+    noise_seed,
+    reduced,
+    write_truth,
 )
+from megloc_twins.indoor_rooms import MODULE_M, Floor, FloorBuilder, Zone, build_floor
 from megloc_twins.model_files import write_transformation
-from megloc_twins.options import SyntheticWorldOptions, stream
+from megloc_twins.moving_objects import NUM_PEOPLE, MovingObject
+from megloc_twins.options import SyntheticDataset, SyntheticWorldOptions, stream
 from megloc_twins.portable import product, settled
-from megloc_twins.rasterization import NO_SURFACE, sample_grid, visible_surfaces
+from megloc_twins.rasterization import NO_SURFACE, depth_map, sample_grid, visible_surfaces
 from megloc_twins.render import RenderedFrame, render_frames
+from megloc_twins.viewpoints import CoarseView, coarse_view, visible
+
+YAWS_DEG = tuple(range(0, 360, 30))
+PITCHES_DEG = (-30, 0, 30)
 
 _RANGE_M = 18.0
 _RANGE_NOISE_M = 0.001
@@ -47,42 +49,21 @@ _BUILDING = "DUC"
 _FIRST_QUERY = 801  # of the numbers the telephone gave its images
 _JPEG_QUALITY = 92
 
+_REDUCTION = 20  # of a glance, px per px
+_ATTEMPTS = 400
+_WALL_DISTANCE_M = 0.7
+_NEAREST_M, _MEDIAN_M = 0.7, 1.6  # of what a query sees: 10th percentile, median
+# share of a query's view that the scans of its floor have seen from about there; how much more
+# that must be than what scans of other rooms of the kind have seen of theirs, which is alike
+_MIN_SEEN, _MIN_MARGIN = 0.6, 0.2
+# 90 degrees wide, 106 high
+_QUARTER = Camera("SIMPLE_PINHOLE", 240, 320, (120.0, 120.0, 160.0))
+_MAX_ANGLE_DEG, _MAX_DISTANCE_RATIO = 35.0, 2.0
 
-def scanned_points(
-    floor: Floor,
-    camera: Camera,
-    cam_from_place: RigidTransform,
-    cam_from_scan: RigidTransform,
-    image: NDArray[np.uint8],
-    rng: np.random.Generator,
-) -> NDArray[np.float64]:
-    """The point in each pixel of a cutout, float64 (H, W, 3), metres in the scan's frame.
-
-    NaN where nothing came back: from glass and dark things, from far away, at grazing angles and
-    now and then. The scanner is off by a millimetre, along its beam; numbers are rounded to what
-    a float32 can hold, as in its own files.
-
-    Parameters
-    ----------
-    image : uint8 (H, W, 3), what the camera saw.
-    """
-    grid = sample_grid(camera, 1)
-    seen = visible_surfaces(floor.place.surfaces, cam_from_place, grid)
-    surface = np.maximum(seen.surface, 0)
-    rays = np.stack(np.broadcast_arrays(grid.x, grid.y, 1.0), axis=-1)
-    inverse = np.einsum("hwk,hwk->hw", seen.planes[:, 0][surface], rays)
-    hit = (seen.surface != NO_SURFACE) & (inverse > 0)
-    points = rays / np.where(hit, inverse, np.nan)[..., None]
-    distance = np.linalg.norm(points, axis=-1)
-    normals = product(floor.place.surfaces.normals(), cam_from_place.rotation_matrix().T)
-    cosine = -np.einsum("hwk,hwk->hw", normals[surface], points) / distance
-    back = hit & ~floor.glass[surface] & (distance < _RANGE_M) & (cosine > _MIN_COSINE)
-    back &= image.mean(axis=2) >= _DARK
-    back &= rng.random(back.shape) >= _DROPOUTS
-    noise = 1 + _RANGE_NOISE_M * rng.standard_normal(back.shape) / distance
-    in_scan = product(points * noise[..., None], cam_from_scan.rotation_matrix())
-    in_scan[~back] = np.nan
-    return in_scan.astype(np.float32).astype(np.float64)
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+# where a scanner stands, and views all around, as high and low as its cutouts reach
+ScanViews = tuple[Floats, list[CoarseView]]
 
 
 class InLocTwinOptions(Options):
@@ -101,15 +82,9 @@ class InLocTwinOptions(Options):
         default=2, ge=1, le=4, description="samples of queries per px and axis; of cutouts one"
     )
 
-    def world(self, supersampling: int = 1) -> SyntheticWorldOptions:
-        """The options that the renderer and random streams know."""
-        return SyntheticWorldOptions(
-            seed=self.seed, num_places=len(_FLOORS), supersampling=supersampling
-        )
-
-    def builder(self) -> FloorBuilder:
-        """The builder of the floors."""
-        return FloorBuilder(self.modules)
+    def floors(self) -> list[Floor]:
+        """The building."""
+        return FloorBuilder(self.modules).floors(self.seed, len(_FLOORS))
 
 
 class InLocTwin(SyntheticDataset[InLocTwinOptions]):
@@ -123,26 +98,30 @@ class InLocTwin(SyntheticDataset[InLocTwinOptions]):
 
     def write(self, root: Path, work: Work = HERE) -> dict[str, int]:
         root, options = Path(root), self.options
-        scans = _scans(options)
+        scans = [
+            _Scan(index, f"{number:03d}", zone.scan_from_place @ floor.place.place_from_world)
+            for index, floor in enumerate(options.floors())
+            for number, zone in enumerate(floor.zones)
+        ]
         mapping = [frame for scan in scans for frame in _cutouts(options, scan)]
         queries = _queries(options)
         for frames, samples in ((mapping, 1), (queries, options.supersampling)):
             render_frames(
-                options.world(samples),
+                SyntheticWorldOptions(
+                    seed=options.seed, num_places=len(_FLOORS), supersampling=samples
+                ),
                 frames,
                 partial(_write_files, root, options),
-                build=options.builder(),
+                build=FloorBuilder(options.modules),
                 work=work,
             )
         for scan in scans:
             after = scan.scan_from_floor.inverse()
             rng = stream(options.seed, "inloc", "before", scan.transformation)
             write_transformation(root / scan.transformation, _displaced(after, rng), after)
-        truth = root / GROUND_TRUTH
-        write_sensors(truth / "mapping", kapture_records(mapping))
-        write_sensors(truth / "query", kapture_records(queries))
+        write_truth(root, mapping, queries)
         groups = {frame.name: ImageGroup(condition=frame.condition) for frame in queries}
-        write_groups(truth / SIDE_TABLES, groups)
+        write_groups(root / GROUND_TRUTH / SIDE_TABLES, groups)
         return {
             "floors": len(_FLOORS),
             "scans": len(scans),
@@ -161,28 +140,15 @@ class _Scan:
 
     @property
     def transformation(self) -> str:
-        return (
-            f"database/alignments/{_FLOORS[self.floor]}/transformations/"
-            f"{_BUILDING}_trans_{self.number}.txt"
-        )
+        folder = f"database/alignments/{_FLOORS[self.floor]}/transformations"
+        return f"{folder}/{_BUILDING}_trans_{self.number}.txt"
 
     def image(self, yaw_deg: int, pitch_deg: int) -> str:
         name = f"{_BUILDING}_cutout_{self.number}_{yaw_deg}_{pitch_deg}.jpg"
         return f"database/cutouts/{_FLOORS[self.floor]}/{self.number}/{name}"
 
 
-def _scans(options: InLocTwinOptions) -> list[_Scan]:
-    scans = []
-    for index in range(len(_FLOORS)):
-        floor = options.builder().floor(options.seed, index)
-        for number, zone in enumerate(floor.zones):
-            pose = zone.scan_from_place @ floor.place.place_from_world
-            scans.append(_Scan(index, f"{number:03d}", pose))
-    return scans
-
-
 def _cutouts(options: InLocTwinOptions, scan: _Scan) -> list[Frame]:
-    world = options.world()
     frames: list[Frame] = []
     camera = cutout_camera(options.cutout_width, options.cutout_height)
     for yaw in YAWS_DEG:
@@ -190,6 +156,7 @@ def _cutouts(options: InLocTwinOptions, scan: _Scan) -> list[Frame]:
             name = scan.image(yaw, pitch)
             # one exposure for the whole panorama
             rng = stream(options.seed, "inloc", "light", scan.transformation)
+            seed = noise_seed(options.seed, name)
             frames.append(
                 Frame(
                     name=name,
@@ -200,24 +167,20 @@ def _cutouts(options: InLocTwinOptions, scan: _Scan) -> list[Frame]:
                     sensor_id="cutout",
                     camera=camera,
                     cam_from_world=cam_from_scan(yaw, pitch) @ scan.scan_from_floor,
-                    lighting=lamp_lighting(rng, noise=1.0, noise_seed=noise_seed(world, name)),
-                    moving_objects=(),
-                    bonnet=False,
+                    lighting=lamp_lighting(rng, noise=1.0, noise_seed=seed),
                 )
             )
     return frames
 
 
 def _queries(options: InLocTwinOptions) -> list[Frame]:
-    world = options.world()
-    floors = options.builder().floors(options.seed, len(_FLOORS))
+    floors = options.floors()
     size = options.query_width, options.query_height
     frames = []
     for number, view in enumerate(query_views(floors, options.seed, options.queries, size)):
         name = f"query/iphone7/IMG_{_FIRST_QUERY + number:04d}.JPG"
         rng = stream(options.seed, "inloc", "light", name)
-        seed = noise_seed(world, name)
-        place_from_world = floors[view.floor].place.place_from_world
+        seed = noise_seed(options.seed, name)
         frames.append(
             Frame(
                 name=name,
@@ -227,10 +190,9 @@ def _queries(options: InLocTwinOptions) -> list[Frame]:
                 timestamp=number,
                 sensor_id="upright" if view.camera.height > view.camera.width else "iphone7",
                 camera=view.camera,
-                cam_from_world=view.cam_from_place @ place_from_world,
+                cam_from_world=view.cam_from_place @ floors[view.floor].place.place_from_world,
                 lighting=lamp_lighting(rng, noise=3.0, noise_seed=seed, spread=0.15),
                 moving_objects=view.people,
-                bonnet=False,
             )
         )
     return frames
@@ -250,14 +212,199 @@ def _write_files(root: Path, options: InLocTwinOptions, frame: Frame, view: Rend
     write_image(root / frame.name, view.image, jpeg_quality=_JPEG_QUALITY)
     if frame.role == "query":
         return
-    floor = options.builder().floor(options.seed, frame.place)
+    floor = build_floor(options.seed, frame.place, options.modules)
     yaw, pitch = (int(text) for text in PurePosixPath(frame.name).stem.split("_")[-2:])
-    points = scanned_points(
-        floor,
-        frame.camera,
-        frame.cam_from_world @ floor.place.place_from_world.inverse(),
-        cam_from_scan(yaw, pitch),
-        view.image,
-        stream(options.seed, "inloc", "laser", frame.name),
-    )
+    poses = floor.place.cam_from_place(frame), cam_from_scan(yaw, pitch)
+    rng = stream(options.seed, "inloc", "laser", frame.name)
+    points = scanned_points(floor, frame.camera, *poses, view.image, rng)
     write_mat_arrays(root / f"{frame.name}.mat", {COLOURS: view.image, POINTS: points})
+
+
+def scanned_points(
+    floor: Floor,
+    camera: Camera,
+    cam_from_place: RigidTransform,
+    cam_from_scan: RigidTransform,
+    image: NDArray[np.uint8],
+    rng: np.random.Generator,
+) -> Floats:
+    """The point in each pixel of a cutout, float64 (H, W, 3), metres in the scan's frame.
+
+    NaN where nothing came back: from glass and what is dark in ``image``, uint8 (H, W, 3), from far
+    away, at grazing angles and now and then. The scanner is off by a millimetre, along its beam;
+    numbers are rounded to what a float32 can hold, as in its own files.
+    """
+    grid = sample_grid(camera, 1)
+    seen = visible_surfaces(floor.place.surfaces, cam_from_place, grid)
+    surface, rays = np.maximum(seen.surface, 0), grid.rays()
+    inverse = np.einsum("hwk,hwk->hw", seen.planes[:, 0][surface], rays)
+    hit = (seen.surface != NO_SURFACE) & (inverse > 0)
+    points = rays / np.where(hit, inverse, np.nan)[..., None]
+    distance = np.linalg.norm(points, axis=-1)
+    normals = product(floor.place.surfaces.normals(), cam_from_place.rotation_matrix().T)
+    cosine = -np.einsum("hwk,hwk->hw", normals[surface], points) / distance
+    back = hit & ~floor.glass[surface] & (distance < _RANGE_M) & (cosine > _MIN_COSINE)
+    back &= image.mean(axis=2) >= _DARK
+    back &= rng.random(back.shape) >= _DROPOUTS
+    noise = 1 + _RANGE_NOISE_M * rng.standard_normal(back.shape) / distance
+    in_scan = product(points * noise[..., None], cam_from_scan.rotation_matrix())
+    in_scan[~back] = np.nan
+    return in_scan.astype(np.float32).astype(np.float64)
+
+
+def cam_from_scan(yaw_deg: float, pitch_deg: float) -> RigidTransform:
+    """A cutout's pose in its scan (z up): at yaw 0 it looks along -x, then turns to the right."""
+    return looking_at(np.zeros(3), np.pi - np.radians(yaw_deg), np.radians(pitch_deg), 0.0)
+
+
+def cutout_camera(width: int, height: int) -> Camera:
+    """A cutout's camera, 60 degrees wide."""
+    return Camera.pinhole(width, height, float(width / 2 / np.tan(np.radians(30.0))))
+
+
+def phone_camera(width: int, height: int) -> Camera:
+    """A telephone's camera with a 28 mm lens (on 36 mm of film)."""
+    return Camera.pinhole(width, height, max(width, height) * 28 / 36)
+
+
+@dataclass(frozen=True)
+class QueryView:
+    """A telephone's pose, and the people in front of it; in the place's frame."""
+
+    floor: int
+    zone: str
+    camera: Camera
+    cam_from_place: RigidTransform
+    people: tuple[MovingObject, ...]
+
+
+def query_views(
+    floors: Sequence[Floor], seed: int, count: int, size: tuple[int, int]
+) -> list[QueryView]:
+    """Views of floors, the first floor's first, zone by zone; about every third held upright.
+
+    Of some hundred random poses in the zone the first of which the scans of the floor have seen
+    enough, and more than those of other rooms of what looks the same; else the nearest to that.
+    """
+    scans = [[_scan_views(floor, zone) for zone in floor.zones] for floor in floors]
+    views = []
+    for index, floor in enumerate(floors):
+        first, last = (count * number // len(floors) for number in (index, index + 1))
+        for position in range(last - first):
+            zone = floor.zones[position % len(floor.zones)]
+            rng = stream(seed, "indoor", "query", index, position)
+            upright = (position + position // len(floor.zones)) % 3 == 2
+            camera = phone_camera(*(size[::-1] if upright else size))
+            pose, yaw = _query_pose(floors, (index, zone), camera, scans, rng)
+            views.append(QueryView(index, zone.name, camera, pose, _people(zone, pose, yaw, rng)))
+    return views
+
+
+def _query_pose(
+    floors: Sequence[Floor],
+    where: tuple[int, Zone],
+    camera: Camera,
+    scans: Sequence[Sequence[ScanViews]],
+    rng: np.random.Generator,
+) -> tuple[RigidTransform, float]:
+    index, zone = where
+    floor, plan = floors[index], zone.plan
+    copies = list(_copies(floors, index, zone))
+    best: tuple[float, RigidTransform, float] | None = None
+    for _ in range(_ATTEMPTS):
+        x, y = (float(v) for v in rng.uniform(plan.outline.min(axis=0), plan.outline.max(axis=0)))
+        yaw = float(rng.uniform(-np.pi, np.pi))
+        pitch, roll = float(rng.normal(-0.05, 0.1)), float(rng.normal(0, 0.05))
+        position = np.array([x, y, rng.uniform(1.4, 1.75)])
+        if not plan.is_free(x, y, _WALL_DISTANCE_M):
+            continue
+        pose = looking_at(position, yaw, pitch, roll)
+        depth, points, surface = _glance(floor, camera, pose)
+        if np.percentile(depth, 10) < _NEAREST_M or np.median(depth) < _MEDIAN_M:
+            continue
+        matt = ~floor.glass[surface]
+        seen = float((_have_seen(scans[index], points, position) & matt).mean())
+        miss = max(0.0, _MIN_SEEN - seen)
+        if best is not None and miss >= best[0]:
+            continue
+        common = ~floor.own[surface] & matt
+        for other, moved in copies:
+            again = _have_seen(scans[other], moved.apply(points), moved.apply(position))
+            alike = float((again & common).mean())
+            miss = max(miss, _MIN_MARGIN - (seen - alike))
+        if best is None or miss < best[0]:
+            best = (miss, pose, yaw)
+        if miss == 0.0:
+            break
+    if best is None:  # every zone has room for a query
+        raise RuntimeError(f"no free view in {zone.name}")
+    return best[1:]
+
+
+def _copies(
+    floors: Sequence[Floor], index: int, zone: Zone
+) -> Iterator[tuple[int, RigidTransform]]:
+    """Floors and transforms that take the zone to others of its kind; a corridor's also turned."""
+    half_turn = RigidTransform((0.0, 0.0, 0.0, 1.0), (MODULE_M, 0.0, 0.0))
+    for other_index, floor in enumerate(floors):
+        for other in floor.zones:
+            if other.kind != zone.kind:
+                continue
+            if (other_index, other.name) != (index, zone.name):
+                yield other_index, other.place_from_zone @ zone.place_from_zone.inverse()
+            if zone.kind == "corridor":
+                turned = other.place_from_zone @ half_turn @ zone.place_from_zone.inverse()
+                yield other_index, turned
+
+
+def _glance(
+    floor: Floor, camera: Camera, cam_from_place: RigidTransform
+) -> tuple[Floats, Floats, NDArray[np.int16]]:
+    """Of each point of a coarse view: depth (P,), where it is (P, 3), and its surface (P,)."""
+    grid = sample_grid(reduced(camera, _REDUCTION), 1)
+    seen = visible_surfaces(floor.place.surfaces, cam_from_place, grid)
+    hit = seen.surface != NO_SURFACE
+    z = depth_map(seen).astype(np.float64)[hit]
+    points = cam_from_place.inverse().apply(grid.rays()[hit] * z[:, None])
+    return z, points, seen.surface[hit]
+
+
+def _scan_views(floor: Floor, zone: Zone) -> ScanViews:
+    poses = [cam_from_scan(yaw, 0) @ zone.scan_from_place for yaw in (0, 90, 180, 270)]
+    views = [coarse_view(floor.place.surfaces, _QUARTER, pose) for pose in poses]
+    return zone.scan_from_place.center(), views
+
+
+def _have_seen(scans: Sequence[ScanViews], points: Floats, position: Floats) -> Bools:
+    """Points (P, 3) that a scan has seen about as one sees them from ``position`` (3,)."""
+    found = np.zeros(len(points), bool)
+    here = points - position
+    distance = np.linalg.norm(here, axis=1)
+    for center, views in scans:
+        there = points - center
+        other = np.linalg.norm(there, axis=1)
+        cosine = (here * there).sum(axis=1) / (distance * other)
+        alike = cosine > np.cos(np.radians(_MAX_ANGLE_DEG))
+        alike &= np.abs(np.log(distance / other)) < np.log(_MAX_DISTANCE_RATIO)
+        alike &= ~found
+        if alike.any():
+            found[alike] = np.any([visible(points[alike], view) for view in views], axis=0)
+    return found
+
+
+def _people(
+    zone: Zone, pose: RigidTransform, yaw: float, rng: np.random.Generator
+) -> tuple[MovingObject, ...]:
+    """Up to two people in front of every second telephone."""
+    people: list[MovingObject] = []
+    wanted = int(rng.integers(0, 4)) - 1
+    x0, y0, _ = pose.center()
+    for _ in range(20):
+        if len(people) >= wanted:
+            break
+        distance, angle = rng.uniform(1.8, 3.5), yaw + rng.uniform(-0.5, 0.5)
+        x, y = float(x0 + distance * np.cos(angle)), float(y0 + distance * np.sin(angle))
+        if zone.plan.is_free(x, y, 0.3):
+            turn = float(rng.uniform(-np.pi, np.pi))
+            people.append(MovingObject("person", int(rng.integers(NUM_PEOPLE)), (x, y), turn))
+    return tuple(people)

@@ -13,6 +13,7 @@ from megloc_twins.surfaces import SurfaceBuilder, Surfaces
 from megloc_twins.textures import TextureRecipe
 
 Floats = NDArray[np.float64]
+Kind = Literal["person", "car"]
 
 # outlines (counter-clockwise) and the closed path of the mapping rig, metres
 _SHAPES: tuple[tuple[tuple[tuple[float, float], ...], tuple[tuple[float, float], ...]], ...] = (
@@ -52,11 +53,8 @@ class Obstacle:
 class FloorPlan:
     """A place seen from above, in its own frame, metres.
 
-    Parameters
-    ----------
-    outline : float64 (N, 2), its walls' feet, counter-clockwise.
-    path : float64 (M, 2), the closed path of the mapping rig.
-    obstacles : what stands inside.
+    ``outline``, float64 (N, 2), are its walls' feet, counter-clockwise; ``path``, float64 (M, 2),
+    is the closed path of the mapping rig.
     """
 
     outline: Floats
@@ -65,9 +63,11 @@ class FloorPlan:
 
     def is_free(self, x: float, y: float, margin: float) -> bool:
         """A circle of radius ``margin`` around (x, y) meets no wall and no obstacle."""
-        if not self._is_inside(x, y) or _distance_to_ring(x, y, self.outline) < margin:
-            return False
-        return all(np.hypot(x - o.x, y - o.y) >= o.radius + margin for o in self.obstacles)
+        return (
+            self._is_inside(x, y)
+            and _distance_to_ring(x, y, self.outline) >= margin
+            and all(np.hypot(x - o.x, y - o.y) >= o.radius + margin for o in self.obstacles)
+        )
 
     def distance_to_path(self, x: float, y: float) -> float:
         """Distance of (x, y) from the mapping rig's path."""
@@ -109,24 +109,19 @@ def _distance_to_ring(x: float, y: float, ring: Floats) -> float:
 
 @dataclass(frozen=True)
 class MovingObject:
-    """A person or car at one moment.
+    """A person or car at one moment: x, y (metres) and yaw (radians) in the place's frame.
 
-    Parameters
-    ----------
-    kind : what it is.
-    variant : which of the kind, from 0.
-    position : x, y in the place's frame, metres.
-    yaw : radians in the place's frame.
+    ``variant`` counts those of a kind from 0.
     """
 
-    kind: Literal["person", "car"]
+    kind: Kind
     variant: int
     position: tuple[float, float]
     yaw: float
 
     @property
     def radius_m(self) -> float:
-        """Radius of the circle on the ground that holds it."""
+        """Of the circle on the ground that holds it."""
         return 0.4 if self.kind == "person" else 2.2
 
 
@@ -145,9 +140,8 @@ def place_moving_objects(
     plan: FloorPlan,
     rng: np.random.Generator,
     count: int,
-    position: NDArray[np.float64],
-    *,
-    yaw: float | None,
+    position: Floats,
+    yaw: float | None = None,
 ) -> tuple[MovingObject, ...]:
     """At most ``count`` people and cars near a position (x, y first; metres, place's frame).
 
@@ -157,7 +151,7 @@ def place_moving_objects(
     for _ in range(60):
         if len(moving_objects) >= count:
             break
-        kind: Literal["person", "car"] = "car" if rng.random() < 0.3 else "person"
+        kind: Kind = "car" if rng.random() < 0.3 else "person"
         distance = rng.uniform(4.5, 8.0) if kind == "car" else rng.uniform(2.5, 7.0)
         angle = rng.uniform(-np.pi, np.pi) if yaw is None else yaw + rng.uniform(-0.5, 0.5)
         x = float(position[0] + distance * np.cos(angle))
@@ -177,22 +171,15 @@ def moving_object_surfaces(moving_objects: tuple[MovingObject, ...]) -> Surfaces
     """Their surfaces in the place's frame; textures as in :func:`moving_object_recipes`."""
     builder = SurfaceBuilder()
     for item in moving_objects:
+        at, yaw = item.position, item.yaw
         if item.kind == "person":
             cloth = item.variant % NUM_PEOPLE
-            sides = (cloth,) * 4
             body, head = (0.0, _HEAD, 1.0, 1.0), (0.3, 0.0, 0.7, _HEAD)
-            builder.add_box(item.position, (0.5, 0.32, 1.5), item.yaw, sides, cloth, uv=body)
-            builder.add_box(
-                item.position, (0.2, 0.24, 0.26), item.yaw, sides, cloth, base=1.5, uv=head
-            )
+            builder.add_box(at, (0.5, 0.32, 1.5), yaw, cloth, cloth, uv=body)
+            builder.add_box(at, (0.2, 0.24, 0.26), yaw, cloth, cloth, base=1.5, uv=head)
         else:
             side = NUM_PEOPLE + 2 * (item.variant % NUM_CARS)
-            glass = NUM_PEOPLE + 2 * NUM_CARS
-            body_sides = (side, side + 1, side, side + 1)
-            builder.add_box(
-                item.position, (4.2, 1.75, 0.8), item.yaw, body_sides, side + 1, base=0.1
-            )
-            builder.add_box(
-                item.position, (2.3, 1.5, 0.55), item.yaw, (glass,) * 4, side + 1, base=0.9
-            )
+            glass, end = NUM_PEOPLE + 2 * NUM_CARS, side + 1
+            builder.add_box(at, (4.2, 1.75, 0.8), yaw, (side, end, side, end), end, base=0.1)
+            builder.add_box(at, (2.3, 1.5, 0.55), yaw, glass, end, base=0.9)
     return builder.build()

@@ -2,14 +2,14 @@
 
 Sums, products, quotients and square roots are exact to the last bit (IEEE 754). Matrix products of
 BLAS, filters of OpenCV and elementary functions are not: they take what instructions the processor
-has, fused ones among them, and a grey level that lies between two may fall to either. So products
-are sums written out here, filters are too, and elementary functions are computed in float64 and
-rounded where their last bits are gone.
+has, fused ones among them, and a grey level between two may fall to either. So products and filters
+are sums written out here; elementary functions are computed in float64 and rounded.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -40,25 +40,18 @@ def settled_pose(rotation: Float64, translation: Float64) -> RigidTransform:
     return RigidTransform((w, x, y, z), (tx, ty, tz))
 
 
-def exp(values: ArrayLike) -> Float32:
-    """Exponential function, float32."""
-    return np.exp(np.asarray(values, np.float64)).astype(np.float32)
+def _rounded(function: np.ufunc) -> Callable[..., Float32]:
+    """The function computed in float64 and rounded to float32; angles are radians."""
+
+    def rounded(*arguments: ArrayLike) -> Float32:
+        exact = function(*(np.asarray(values, np.float64) for values in arguments))
+        found: Float32 = exact.astype(np.float32)
+        return found
+
+    return rounded
 
 
-def sin(angles: ArrayLike) -> Float32:
-    """Sine of angles in radians, float32."""
-    return np.sin(np.asarray(angles, np.float64)).astype(np.float32)
-
-
-def log2(values: ArrayLike) -> Float32:
-    """Binary logarithm, float32."""
-    return np.log2(np.asarray(values, np.float64)).astype(np.float32)
-
-
-def arctan2(y: ArrayLike, x: ArrayLike) -> Float32:
-    """Angle of (x, y) in radians, float32."""
-    angles = np.arctan2(np.asarray(y, np.float64), np.asarray(x, np.float64))
-    return np.asarray(angles, np.float32)
+exp, sin, log2, arctan2 = (_rounded(f) for f in (np.exp, np.sin, np.log2, np.arctan2))
 
 
 def product(left: Float64, right: Float64) -> Float64:

@@ -16,26 +16,19 @@ from numpy.typing import NDArray
 from megloc_kapture.compiling import compiled_loop
 from megloc_kapture.errors import DataError
 from megloc_kapture.values import Camera, RigidTransform
-from megloc_twins.portable import log2
+from megloc_twins.portable import Float32, Float64, log2
 from megloc_twins.surfaces import NUM_LEVELS, Atlas, Surfaces
 
 NEAR_M = 0.05
 NO_SURFACE = -1
 
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-
 
 @dataclass(frozen=True, eq=False)
 class SampleGrid:
-    """The rays of a camera's samples, ``supersampling`` per pixel and axis.
+    """The rays of a camera's samples, at the centres of ``supersampling``² cells per pixel.
 
-    Parameters
-    ----------
-    camera : PINHOLE, SIMPLE_PINHOLE or SIMPLE_RADIAL.
-    supersampling : samples per pixel along each axis, at the centres of equal cells.
-    x, y : float64, broadcasting to (H * supersampling, W * supersampling): normalised coordinates
-        of the rays. For cameras without distortion, (1, columns) and (rows, 1).
+    ``x`` and ``y`` are normalised coordinates, float64, broadcasting to (H * supersampling,
+    W * supersampling); of cameras without distortion (1, columns) and (rows, 1).
     """
 
     camera: Camera
@@ -46,44 +39,37 @@ class SampleGrid:
     @property
     def shape(self) -> tuple[int, int]:
         """Rows and columns of samples."""
-        ss = self.supersampling
-        return self.camera.height * ss, self.camera.width * ss
+        return self.camera.height * self.supersampling, self.camera.width * self.supersampling
+
+    def rays(self) -> Float64:
+        """(x, y, 1) of each, float64 (rows, columns, 3)."""
+        return np.stack(np.broadcast_arrays(self.x, self.y, 1.0), axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
 class Visibility:
     """The nearest surface along each sample's ray.
 
-    Parameters
-    ----------
-    grid : the samples.
-    surface : int16 (rows, columns), index of the surface or NO_SURFACE.
-    inverse_depth : float32 (rows, columns), 1/m, 0 where there is no surface.
-    planes : float64 (N, 3, 3): per surface the linear forms, in the ray (x_n, y_n, 1), of 1/z and
-        of its two coordinates (0..1 inside the surface) over z.
+    ``planes``, (N, 3, 3), are per surface the linear forms, in the ray (x_n, y_n, 1), of 1/z and of
+    its two coordinates (0..1 inside the surface) over z.
     """
 
     grid: SampleGrid
-    surface: NDArray[np.int16]
-    inverse_depth: Float32
+    surface: NDArray[np.int16]  # (rows, columns), its index or NO_SURFACE
+    inverse_depth: Float32  # (rows, columns), 1/m, 0 where there is no surface
     planes: Float64
 
 
 def intrinsics(camera: Camera) -> tuple[float, float, float, float, float]:
     """(fx, fy, cx, cy, k) of a camera; k is SIMPLE_RADIAL's distortion, else 0.
 
-    Raises
-    ------
-    DataError : the renderer has no such camera model.
+    Raises DataError where the renderer has no such camera model.
     """
+    if camera.model not in ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL"):
+        raise DataError(f"the renderer has no camera model {camera.model}")
     p = camera.params
-    if camera.model == "PINHOLE":
-        return p[0], p[1], p[2], p[3], 0.0
-    if camera.model == "SIMPLE_PINHOLE":
-        return p[0], p[0], p[1], p[2], 0.0
-    if camera.model == "SIMPLE_RADIAL":
-        return p[0], p[0], p[1], p[2], p[3]
-    raise DataError(f"the renderer has no camera model {camera.model}")
+    fx, fy, cx, cy = p if camera.model == "PINHOLE" else (p[0], *p[:3])
+    return fx, fy, cx, cy, p[3] if camera.model == "SIMPLE_RADIAL" else 0.0
 
 
 def sample_grid(camera: Camera, supersampling: int) -> SampleGrid:
@@ -122,10 +108,9 @@ def visible_surfaces(
     seen_from = surfaces.moved(rotation, np.array(cam_from_world.translation))
     origin, edge_u, edge_v = seen_from.origin, seen_from.edge_u, seen_from.edge_v
     planes, facing = _planes(origin, edge_u, edge_v)
-    boxes = _bounding_boxes(origin, edge_u, edge_v, grid)
-    rows, columns = grid.shape
-    nearest = np.zeros((rows, columns), np.float32)
-    surface = np.full((rows, columns), NO_SURFACE, np.int16)
+    boxes = _bounding_boxes(seen_from.corners(), grid)
+    nearest = np.zeros(grid.shape, np.float32)
+    surface = np.full(grid.shape, NO_SURFACE, np.int16)
     forms = planes.astype(np.float32)
     gx, gy = grid.x.astype(np.float32), grid.y.astype(np.float32)
     candidates = np.flatnonzero(facing & (boxes[:, 0] < boxes[:, 1]) & (boxes[:, 2] < boxes[:, 3]))
@@ -163,11 +148,8 @@ def _planes(origin: Float64, edge_u: Float64, edge_v: Float64) -> tuple[Float64,
     return np.stack([inverse_depth, u, v], axis=1), facing
 
 
-def _bounding_boxes(
-    origin: Float64, edge_u: Float64, edge_v: Float64, grid: SampleGrid
-) -> NDArray[np.int64]:
+def _bounding_boxes(corners: Float64, grid: SampleGrid) -> NDArray[np.int64]:
     """Sample ranges (N, 4): left, right, top, bottom (ends exclusive) that hold each surface."""
-    corners = np.stack([origin, origin + edge_u, origin + edge_u + edge_v, origin + edge_v], 1)
     following = np.roll(corners, -1, axis=1)
     z, z_next = corners[..., 2], following[..., 2]
     crosses = (z < NEAR_M) != (z_next < NEAR_M)
@@ -176,17 +158,16 @@ def _bounding_boxes(
     points = np.concatenate([corners, crossing], axis=1)  # (N, 8, 3)
     valid = np.concatenate([z >= NEAR_M, crosses], axis=1)
     depth = np.where(valid, points[..., 2], 1.0)
-    result = np.zeros((len(origin), 4), np.int64)
-    for first, rays in ((0, grid.x), (2, grid.y)):
-        axis = first // 2
+    result = np.zeros((len(corners), 4), np.int64)
+    for axis, rays in enumerate((grid.x, grid.y)):
         along = points[..., axis] / depth
         low, high = (np.where(valid, along, end).T for end in (np.inf, -np.inf))
         # a ray's coordinate grows along its row or column, whatever the distortion; a sample on
         # the edge of the range may be lost to rounding: one more on each side
         least, most = rays.min(axis), rays.max(axis)
-        result[:, first] = np.searchsorted(most, low.min(0)) - 1
-        result[:, first + 1] = np.searchsorted(least, high.max(0), side="right") + 1
-        result[:, first : first + 2] = result[:, first : first + 2].clip(0, len(least))
+        first = np.searchsorted(most, low.min(0)) - 1
+        last = np.searchsorted(least, high.max(0), side="right") + 1
+        result[:, 2 * axis : 2 * axis + 2] = np.stack([first, last], 1).clip(0, len(least))
     result[~valid.any(1)] = 0
     return result
 
@@ -196,8 +177,7 @@ def depth_map(seen: Visibility) -> Float32:
 
     Computed in float64 from the surface's plane; exact at the samples' centres.
     """
-    flat = np.maximum(seen.surface, 0)
-    form = seen.planes[:, 0][flat]
+    form = seen.planes[:, 0][np.maximum(seen.surface, 0)]
     inverse = form[..., 0] * seen.grid.x + form[..., 1] * seen.grid.y + form[..., 2]
     hit = seen.surface != NO_SURFACE
     return np.where(hit, 1.0 / np.where(hit, inverse, 1.0), 0.0).astype(np.float32)
@@ -223,8 +203,12 @@ def sample_colour(seen: Visibility, surfaces: Surfaces, atlas: Atlas) -> Float32
     low = np.minimum(level.astype(np.int32), NUM_LEVELS - 2)
     weight = (level - low.astype(np.float32))[..., None]
     table = _lookup_table(surfaces, atlas)
-    fine = _lookup(atlas, table, index * NUM_LEVELS + low, u, v)
-    coarse = _lookup(atlas, table, index * NUM_LEVELS + low + 1, u, v)
+    levels = []
+    for row in (index * NUM_LEVELS + low, index * NUM_LEVELS + low + 1):
+        affine = np.take(table, row, axis=0)
+        x, y = affine[..., 0] + affine[..., 1] * u, affine[..., 2] + affine[..., 3] * v
+        levels.append(bilinear(atlas.image, x, y))
+    fine, coarse = levels
     colour = fine + weight * (coarse - fine)
     colour[~hit] = 0
     return np.asarray(colour, np.float32)
@@ -247,23 +231,12 @@ def _level(
 
 
 def _lookup_table(surfaces: Surfaces, atlas: Atlas) -> Float32:
-    """(N * NUM_LEVELS, 4): atlas x = t0 + u t1, y = t2 + v t3 for OpenCV's pixel centres."""
+    """(N * NUM_LEVELS, 4): atlas x = t0 + u t1, y = t2 + v t3, the first pixel's centre at 0."""
     corner, size = atlas.corner[surfaces.texture], atlas.size[surfaces.texture]
-    start, part = surfaces.uv[:, None, :2], (surfaces.uv[:, 2:] - surfaces.uv[:, :2])[:, None]
-    base = corner + start * size - 0.5
-    step = part * size
+    start, end = surfaces.uv[:, None, :2], surfaces.uv[:, None, 2:]
+    base, step = corner + start * size - 0.5, (end - start) * size
     table = np.stack([base[..., 0], step[..., 0], base[..., 1], step[..., 1]], axis=-1)
     return np.ascontiguousarray(table.reshape(-1, 4), np.float32)
-
-
-def _lookup(
-    atlas: Atlas, table: Float32, row: NDArray[np.int32], u: Float32, v: Float32
-) -> Float32:
-    affine = np.take(table, row, axis=0)
-    x = affine[..., 0] + affine[..., 1] * u
-    y = affine[..., 2] + affine[..., 3] * v
-    texels: Float32 = bilinear(atlas.image, x, y)
-    return texels
 
 
 @compiled_loop

@@ -1,55 +1,291 @@
-"""Rendering of frames to images, depth and masks, on any executor."""
+"""Rendering of frames to images, depth and masks, on any executor.
+
+From what samples see to pixels: sun, shadows, sky, lamps, bonnet, lens and sensor.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import TypeVar
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.stages.work import HERE, Work, ordered_map
-from megloc_twins.frames import Frame
+from megloc_kapture.values import RigidTransform
+from megloc_twins.drawing import periodic_noise
+from megloc_twins.frames import Frame, Lighting, Triple
 from megloc_twins.moving_objects import moving_object_surfaces
-from megloc_twins.options import SyntheticWorldOptions
-from megloc_twins.rasterization import depth_map, sample_colour, sample_grid, visible_surfaces
-from megloc_twins.shading import (
-    ShadowMap,
-    add_shadows,
-    bonnet,
-    cast_shadows,
-    cloud_texture,
-    develop,
-    radiance,
+from megloc_twins.options import SyntheticWorldOptions, stream
+from megloc_twins.portable import Float32, arctan2, averaged, blurred, exp, product, resized
+from megloc_twins.rasterization import (
+    NO_SURFACE,
+    Visibility,
+    bilinear,
+    depth_map,
+    sample_colour,
+    sample_grid,
+    visible_surfaces,
 )
 from megloc_twins.squares import Place, build_place
-from megloc_twins.surfaces import Atlas, build_atlas
-
-_BONNET_COVERS = 0.5  # share of a pixel from which the mask and the depth leave it out
+from megloc_twins.surfaces import Surfaces, build_atlas
 
 Result = TypeVar("Result")
 PlaceBuilder = Callable[[SyntheticWorldOptions, int], Place]
+Mask = NDArray[np.bool_]
+
 _FRAMES_PER_BATCH = 13  # painting a place's textures costs about as much as four images
-_NOTHING = 1e-6  # of a pixel covered
+_BONNET_COVERS = 0.5  # share of a pixel from which the mask and the depth leave it out
+_BONNET_TOUCHES = 1e-6  # share of a pixel
+
+_SHADOW_SIZE = 1024
+_BIAS_M = 0.05  # surfaces must not shade themselves
+_NOTHING = np.float32(-1e9)
+_LAMP_RANGE_M = 14.0
+_CLOUD_SIZE = 512
+
+
+@dataclass(frozen=True, eq=False)
+class ShadowMap:
+    """Greatest height along the sun's direction over a grid of lines parallel to it."""
+
+    axes: NDArray[np.float64]  # (3, 3), rows: the grid's x and y directions and the sun's
+    low: NDArray[np.float64]  # (2,), the grid's corner
+    step: float  # metres between its lines
+    height: Float32  # (_SHADOW_SIZE, _SHADOW_SIZE), metres along the sun's direction
+
+    def lit(self, x: Float32, y: Float32, z: Float32) -> Float32:
+        """1 where the sun reaches a point, else 0; arrays of one shape, metres."""
+        a = self.axes.astype(np.float32)
+        gx, gy, up = (row[0] * x + row[1] * y + row[2] * z for row in a)
+        gx = (gx - np.float32(self.low[0])) / np.float32(self.step) - np.float32(0.5)
+        gy = (gy - np.float32(self.low[1])) / np.float32(self.step) - np.float32(0.5)
+        beyond = cv2.BORDER_CONSTANT, float(_NOTHING)
+        top = cv2.remap(self.height, gx, gy, cv2.INTER_NEAREST, None, *beyond)
+        return (up + np.float32(_BIAS_M) > top).astype(np.float32)
+
+
+def cast_shadows(surfaces: Surfaces, sun_direction: Triple) -> ShadowMap:
+    """The shadow map of the surfaces (both sides cast shadows)."""
+    sun = np.array(sun_direction)
+    side = np.cross([0.0, 0.0, 1.0] if abs(sun[2]) < 0.99 else [1.0, 0.0, 0.0], sun)
+    side /= np.sqrt((side * side).sum())
+    axes = np.stack([side, np.cross(sun, side), sun])
+    flat = product(surfaces.corners(), axes.T)[..., :2]
+    low, high = flat.min((0, 1)) - 0.1, flat.max((0, 1)) + 0.1
+    step = float((high - low).max() / _SHADOW_SIZE)
+    nothing = ShadowMap(
+        axes, low, step, np.full((_SHADOW_SIZE, _SHADOW_SIZE), _NOTHING, np.float32)
+    )
+    return add_shadows(nothing, surfaces)
+
+
+def add_shadows(shadows: ShadowMap, surfaces: Surfaces) -> ShadowMap:
+    """The map with the shadows of more surfaces, where they lie on its grid."""
+    axes, low, step, height = shadows.axes, shadows.low, shadows.step, shadows.height.copy()
+    outline = (product(surfaces.corners(), axes.T)[..., :2] - low) / step
+    first = np.clip(np.floor(outline.min(1)) - 1, 0, _SHADOW_SIZE).astype(int)
+    last = np.clip(np.ceil(outline.max(1)) + 1, 0, _SHADOW_SIZE).astype(int)
+    along = surfaces.moved(axes, np.zeros(3))
+    origin, edge_u, edge_v = along.origin, along.edge_u, along.edge_v
+    across = edge_u[:, 0] * edge_v[:, 1] - edge_u[:, 1] * edge_v[:, 0]
+    for index in np.flatnonzero((np.abs(across) > 1e-6) & (first < last).all(1)):
+        (left, top), (right, bottom) = first[index], last[index]
+        x = (low[0] + (np.arange(left, right) + 0.5) * step - origin[index, 0]).astype(np.float32)
+        y = (low[1] + (np.arange(top, bottom) + 0.5) * step - origin[index, 1]).astype(np.float32)
+        x, y = x[None], y[:, None]
+        eu, ev = edge_u[index].astype(np.float32), edge_v[index].astype(np.float32)
+        area = np.float32(across[index])
+        u = x * (ev[1] / area) - y * (ev[0] / area)
+        v = y * (eu[0] / area) - x * (eu[1] / area)
+        up = np.float32(origin[index, 2]) + u * eu[2] + v * ev[2]
+        window = height[top:bottom, left:right]
+        inside = (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1) & (up > window)
+        np.copyto(window, up, where=inside)
+    return replace(shadows, height=height)
+
+
+def cloud_texture(seed: int) -> Float32:
+    """Clouds, float32 (_CLOUD_SIZE, _CLOUD_SIZE) 0..1, seamless from left to right."""
+    noise = periodic_noise(stream(seed, "clouds"), _CLOUD_SIZE, cell=160, octaves=5)
+    return np.clip(0.5 + 0.5 * noise, 0, 1).astype(np.float32)
+
+
+def _rgb(values: Triple) -> Float32:
+    return np.array(values, np.float32)
+
+
+def radiance(
+    seen: Visibility,
+    surfaces: Surfaces,
+    colour: Float32,
+    lighting: Lighting,
+    *,
+    cam_from_place: RigidTransform,
+    lamps: NDArray[np.float64],
+    shadows: ShadowMap | None,
+    clouds: Float32,
+) -> Float32:
+    """Light that each sample receives, float32 (rows, columns, 3), linear.
+
+    ``colour``, float32 (rows, columns, 3), is 0..255 with gamma 2, as a texture is painted;
+    surfaces and ``lamps``, float64 (L, 3), are in the place's frame, metres. Without ``shadows``
+    the sun lights all that faces it.
+    """
+    index = np.maximum(seen.surface, 0).astype(np.int32)
+    albedo = (colour * np.float32(1 / 255)) ** 2
+    normals = surfaces.normals()
+    ambient = 0.62 + 0.38 * normals[:, 2]
+    light = np.take(ambient.astype(np.float32), index)[..., None] * _rgb(lighting.sky)
+    has_sun, has_lamps = any(lighting.sun), any(lighting.lamps) and len(lamps) > 0
+    if has_sun or has_lamps:
+        x, y, z = _positions(seen, cam_from_place)
+    if has_sun:
+        facing = np.clip(product(normals, np.array(lighting.sun_direction)), 0, None)
+        sun = np.take(facing.astype(np.float32), index)
+        if shadows is not None:
+            sun = sun * shadows.lit(x, y, z)
+        light += sun[..., None] * _rgb(lighting.sun)
+    if has_lamps:
+        normal = np.take(normals.astype(np.float32), index, axis=0)
+        lamp_lighting = _lamp_light((x, y, z), normal, lamps.astype(np.float32))
+        light += lamp_lighting[..., None] * _rgb(lighting.lamps)
+    light += np.take(surfaces.glow, index)[..., None] * _rgb(lighting.glow)
+    result = albedo * light
+    sky = seen.surface == NO_SURFACE
+    if sky.any():
+        result[sky] = _sky(seen, sky, lighting, cam_from_place, clouds)
+    return result
+
+
+def _positions(seen: Visibility, cam_from_place: RigidTransform) -> tuple[Float32, ...]:
+    """x, y, z of what each sample sees, place's frame, metres; the camera where it sees nothing."""
+    rotation = cam_from_place.rotation_matrix().astype(np.float32)
+    center = cam_from_place.center().astype(np.float32)
+    hit = seen.inverse_depth > 0
+    depth = np.where(hit, 1 / np.where(hit, seen.inverse_depth, 1), 0).astype(np.float32)
+    gx, gy = seen.grid.x.astype(np.float32), seen.grid.y.astype(np.float32)
+    return tuple(
+        center[i] + depth * (rotation[0, i] * gx + rotation[1, i] * gy + rotation[2, i])
+        for i in range(3)
+    )
+
+
+def _lamp_light(position: tuple[Float32, ...], normal: Float32, lamps: Float32) -> Float32:
+    """Sum over lamps of cosine over squared distance, cut off smoothly at _LAMP_RANGE_M."""
+    total = np.zeros_like(position[0])
+    for lamp in lamps:
+        dx, dy, dz = (lamp[i] - position[i] for i in range(3))
+        squared = dx * dx + dy * dy + dz * dz
+        facing = dx * normal[..., 0] + dy * normal[..., 1] + dz * normal[..., 2]
+        fade = np.clip(1 - squared * np.float32(_LAMP_RANGE_M**-2), 0, None)
+        total += np.clip(facing, 0, None) * fade / (squared * np.sqrt(squared) + np.float32(0.3))
+    return total
+
+
+def _sky(
+    seen: Visibility,
+    where: Mask,
+    lighting: Lighting,
+    cam_from_place: RigidTransform,
+    clouds: Float32,
+) -> Float32:
+    rotation = cam_from_place.rotation_matrix().astype(np.float32)
+    gx = np.broadcast_to(seen.grid.x, where.shape)[where].astype(np.float32)
+    gy = np.broadcast_to(seen.grid.y, where.shape)[where].astype(np.float32)
+    rays = gx[:, None] * rotation[0] + gy[:, None] * rotation[1] + rotation[2]
+    azimuth = arctan2(rays[:, 1], rays[:, 0]) + np.float32(lighting.cloud_shift)
+    rise = rays[:, 2] / np.sqrt(rays[:, 0] * rays[:, 0] + rays[:, 1] * rays[:, 1])
+    u = np.mod(azimuth * np.float32(_CLOUD_SIZE / (2 * np.pi)), _CLOUD_SIZE)
+    v = np.clip(rise, 0, 3) * np.float32(_CLOUD_SIZE / 3.2)
+    seamless = np.concatenate([clouds, clouds[:, :1]], axis=1)[..., None]
+    cover = bilinear(seamless, u[None], v[None])[0]
+    base = _rgb(lighting.sky_colour)
+    haze = exp(-3 * np.clip(rise, 0, None))[:, None] * base.mean() * np.float32(0.5)
+    return base * (1 - 0.5 * cover) + cover * base.mean() * np.float32(1.1) + haze
+
+
+def develop(
+    light: Float32, lighting: Lighting, supersampling: int, *, bonnet_seed: int | None
+) -> NDArray[np.uint8]:
+    """Image uint8 (H, W, 3) RGB of the samples' light (H * ss, W * ss, 3).
+
+    ``bonnet_seed`` puts a car's bonnet in front; None leaves it out.
+    """
+    height, width = light.shape[0] // supersampling, light.shape[1] // supersampling
+    if supersampling > 1:
+        light = averaged(light, supersampling)
+    if bonnet_seed is not None:
+        cover, paint = bonnet(width, height, bonnet_seed)
+        lit = _rgb(lighting.sky) + np.float32(0.4) * _rgb(lighting.sun)
+        lit = lit + np.float32(0.04) * _rgb(lighting.lamps)
+        light = light * (1 - cover[..., None]) + paint * cover[..., None] * lit
+    signal = light * (_rgb(lighting.white_balance) * np.float32(lighting.exposure))
+    signal *= (1 - np.float32(lighting.vignetting) * _corner_distance(width, height))[..., None]
+    if lighting.condition == "night":  # light that strays around lamps
+        haze = resized(blurred(averaged(np.minimum(signal, 4.0), 8), 3.0), width, height)
+        signal = signal + np.float32(0.06) * haze
+    signal = blurred(signal, lighting.blur_px)
+    rng = np.random.default_rng(lighting.noise_seed)
+    deviation = np.sqrt(lighting.shot_noise * signal + lighting.read_noise**2)
+    signal = signal + deviation * rng.standard_normal(signal.shape, dtype=np.float32)
+    # a shoulder instead of a hard limit, then gamma 2
+    signal = np.clip(signal, 0, None)
+    signal = np.where(signal > 0.7, 1 - 0.3 * exp(-(signal - 0.7) / 0.3), signal)
+    return np.clip(np.sqrt(signal) * 255 + 0.5, 0, 255).astype(np.uint8)
+
+
+@lru_cache(maxsize=8)
+def _corner_distance(width: int, height: int) -> Float32:
+    """Squared distance from the image's middle, 1 in the corners, float32 (height, width)."""
+    x = (np.arange(width, dtype=np.float32) + 0.5) / width * 2 - 1
+    y = (np.arange(height, dtype=np.float32) + 0.5) / height * 2 - 1
+    return ((x[None] ** 2 + y[:, None] ** 2) / 2).astype(np.float32)
+
+
+@lru_cache(maxsize=4)
+def bonnet(width: int, height: int, seed: int) -> tuple[Float32, Float32]:
+    """The bonnet as the front camera sees it: cover (H, W) 0..1 and paint (H, W, 3) linear; always
+    in the same part of the image, with its seams, dirt and emblem."""
+    x = (np.arange(width, dtype=np.float32) + 0.5) / width * 2 - 1
+    y = (np.arange(height, dtype=np.float32) + 0.5) / height
+    edge = 0.86 + 0.11 * x**2
+    below = y[:, None] - edge[None]
+    cover = np.clip(below * height + 0.5, 0, 1).astype(np.float32)
+    rng = stream(seed, "bonnet")
+    colour = rng.uniform(0.05, 0.35, 3).astype(np.float32)
+    gloss = exp(-(((below - 0.035) / 0.02) ** 2)) * 0.5 + 0.6 + 1.5 * np.clip(below, 0, None)
+    canvas = np.clip(colour * gloss[..., None], 0, 1).astype(np.float32)
+    for side in (-0.42, 0.42):
+        start = (int((0.5 + side * 0.6) * width), int(0.86 * height))
+        stop = (int((0.5 + side) * width), height)
+        cv2.line(canvas, start, stop, (0.02, 0.02, 0.02), max(1, height // 200), cv2.LINE_AA)
+    for _ in range(40):
+        spot = (int(rng.uniform(0, width)), int(rng.uniform(0.86, 1.0) * height))
+        tone = float(rng.uniform(0.2, 0.5))
+        cv2.circle(canvas, spot, int(rng.integers(1, 4)), (tone, tone, tone), -1, cv2.LINE_AA)
+    emblem = (width // 2, int(0.9 * height))
+    cv2.circle(canvas, emblem, height // 48, (0.7, 0.7, 0.7), -1, cv2.LINE_AA)
+    cv2.circle(canvas, emblem, height // 80, (0.1, 0.1, 0.3), -1, cv2.LINE_AA)
+    cover.setflags(write=False)
+    canvas.setflags(write=False)
+    return cover, canvas
 
 
 @dataclass(frozen=True, eq=False)
 class RenderedFrame:
     """A drawn frame.
 
-    Parameters
-    ----------
-    image : uint8 (H, W, 3), RGB.
-    depth_m : float32 (H, W), along the optical axis at the pixels' centres, 0 where nothing is
-        seen or the bonnet hides it; moving objects count. None where not asked for.
-    mask : bool (H, W), False on the bonnet.
+    Depth is along the optical axis at the pixels' centres, 0 where nothing is seen or the bonnet
+    hides it; moving objects count. None where not asked for.
     """
 
-    image: NDArray[np.uint8]
-    depth_m: NDArray[np.float32] | None
-    mask: NDArray[np.bool_]
+    image: NDArray[np.uint8]  # (H, W, 3), RGB
+    depth_m: Float32 | None  # (H, W)
+    mask: Mask  # (H, W), False on the bonnet
 
 
 class PlaceRenderer:
@@ -59,40 +295,34 @@ class PlaceRenderer:
         self._place = place
         self._seed = seed
         self._supersampling = supersampling
-        self._atlas: Atlas = build_atlas([recipe.paint() for recipe in place.recipes])
+        self._atlas = build_atlas([recipe.paint() for recipe in place.recipes])
         self._clouds = cloud_texture(seed)
-        self._shadows: tuple[tuple[float, float, float], ShadowMap] | None = None
+        self._shadows: tuple[Triple, ShadowMap] | None = None
 
     def render(self, frame: Frame, *, depth: bool = False) -> RenderedFrame:
         """Draw one frame, with its depth if asked."""
-        place = self._place
+        place, lighting = self._place, frame.lighting
         moving_objects = moving_object_surfaces(frame.moving_objects)
         surfaces = place.surfaces.joined(moving_objects)
-        cam_from_place = frame.cam_from_world @ place.place_from_world.inverse()
-        seen = visible_surfaces(
-            surfaces, cam_from_place, sample_grid(frame.camera, self._supersampling)
-        )
+        cam_from_place = place.cam_from_place(frame)
+        grid = sample_grid(frame.camera, self._supersampling)
+        seen = visible_surfaces(surfaces, cam_from_place, grid)
         shadows = None
-        if any(frame.lighting.sun):
-            shadows = add_shadows(
-                self._static_shadows(frame.lighting.sun_direction), moving_objects
-            )
+        if any(lighting.sun):
+            shadows = add_shadows(self._static_shadows(lighting.sun_direction), moving_objects)
         light = radiance(
             seen,
             surfaces,
             sample_colour(seen, surfaces, self._atlas),
-            frame.lighting,
+            lighting,
             cam_from_place=cam_from_place,
             lamps=place.lamps,
             shadows=shadows,
             clouds=self._clouds,
         )
         bonnet_seed = self._seed if frame.bonnet else None
-        image = develop(light, frame.lighting, self._supersampling, bonnet_seed=bonnet_seed)
-        width, height = frame.camera.width, frame.camera.height
-        mask = np.ones((height, width), bool)
-        if bonnet_seed is not None:
-            mask = bonnet(width, height, bonnet_seed)[0] < _BONNET_COVERS
+        image = develop(light, lighting, self._supersampling, bonnet_seed=bonnet_seed)
+        mask = _bonnet_cover(frame, self._seed) < _BONNET_COVERS
         depth_m = None
         if depth:
             exact = visible_surfaces(surfaces, cam_from_place, sample_grid(frame.camera, 1))
@@ -100,7 +330,7 @@ class PlaceRenderer:
             depth_m[~mask] = 0
         return RenderedFrame(image, depth_m, mask)
 
-    def _static_shadows(self, sun: tuple[float, float, float]) -> ShadowMap:
+    def _static_shadows(self, sun: Triple) -> ShadowMap:
         """Shadows of what does not move; the last are kept, as frames often share their sun."""
         if self._shadows is None or self._shadows[0] != sun:
             self._shadows = (sun, cast_shadows(self._place.surfaces, sun))
@@ -122,8 +352,7 @@ def render_frames(
     Parameters
     ----------
     finish : called as ``finish(frame, rendered)``, in another process where there is an executor:
-        a function of a module, or a ``functools.partial`` of one. It writes the files and returns
-        what little the caller needs.
+        a function of a module, or a ``functools.partial`` of one. It writes the files.
     with_depth : names of the frames that need ``depth_m``.
     build : lays out a place of these options by its index, the same in every process.
     sky_seed : of clouds and the dirt on the bonnet; the world's unless given.
@@ -166,23 +395,21 @@ def _render(
     ]
 
 
-def on_bonnet(frame: Frame, seed: int) -> NDArray[np.bool_]:
-    """Pixels (H, W) that the car's bonnet covers in part or whole, of the world of ``seed``."""
-    size = (frame.camera.width, frame.camera.height)
+def _bonnet_cover(frame: Frame, seed: int) -> Float32:
+    width, height = frame.camera.width, frame.camera.height
     if not frame.bonnet:
-        return np.zeros(size[::-1], bool)
-    return bonnet(*size, seed)[0] > _NOTHING
+        return np.zeros((height, width), np.float32)
+    return bonnet(width, height, seed)[0]
 
 
-def on_moving_objects(frame: Frame, place: Place) -> NDArray[np.bool_]:
+def on_bonnet(frame: Frame, seed: int) -> Mask:
+    """Pixels (H, W) that the car's bonnet covers in part or whole, of the world of ``seed``."""
+    return _bonnet_cover(frame, seed) > _BONNET_TOUCHES
+
+
+def on_moving_objects(frame: Frame, place: Place) -> Mask:
     """Pixels (H, W) whose centre shows a person or a car; the bonnet is not looked at."""
     # the moving objects' surfaces come behind the place's own
     surfaces = place.surfaces.joined(moving_object_surfaces(frame.moving_objects))
-    cam_from_place = frame.cam_from_world @ place.place_from_world.inverse()
-    seen = visible_surfaces(surfaces, cam_from_place, sample_grid(frame.camera, 1))
+    seen = visible_surfaces(surfaces, place.cam_from_place(frame), sample_grid(frame.camera, 1))
     return seen.surface >= len(place.surfaces)
-
-
-def stands_still(frame: Frame, place: Place, seed: int) -> NDArray[np.bool_]:
-    """Mask (H, W), True where neither the bonnet nor a moving thing is seen."""
-    return ~(on_bonnet(frame, seed) | on_moving_objects(frame, place))

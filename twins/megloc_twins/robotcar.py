@@ -15,31 +15,39 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.datasets.formats.colmap_model import ColmapImage, ColmapModel
-from megloc_kapture.datasets.formats.nvm import NvmModel
 from megloc_kapture.datasets.formats.sparse_points import SparsePoints
-from megloc_kapture.datasets.official import GROUND_TRUTH
 from megloc_kapture.datasets.robotcar.images import RIG_ID
 from megloc_kapture.datasets.robotcar.layout import Layout
-from megloc_kapture.io.kapture import write_sensors
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, RigidTransform
-from megloc_twins.dataset import ModelTwinOptions, SyntheticDataset, shuffled, write_lines
 from megloc_twins.frames import (
     Frame,
     cam_from_rig,
     in_frame,
-    kapture_records,
     looking_at,
     noise_seed,
+    road_lighting,
+    write_truth,
 )
-from megloc_twins.lighting import road_lighting
 from megloc_twins.model_files import write_colmap_text, write_nvm
 from megloc_twins.moving_objects import place_moving_objects
-from megloc_twins.options import SyntheticWorldOptions, stream
+from megloc_twins.options import (
+    ModelTwinOptions,
+    SyntheticDataset,
+    SyntheticWorldOptions,
+    shuffled,
+    stream,
+    write_lines,
+)
 from megloc_twins.portable import settled_pose
-from megloc_twins.sparse_models import MapFrames, render_map_and_queries, write_sift_database
+from megloc_twins.sparse_models import (
+    MapFrames,
+    nvm_model,
+    render_map_and_queries,
+    write_sift_database,
+)
 from megloc_twins.squares import Place, build_place
-from megloc_twins.viewpoints import CoarseView, coarse_view, first_fitting, misfit
+from megloc_twins.viewpoints import CoarseView, coarse_view, first_fitting, misfit, views_of
 
 REFERENCE_CONDITION = "overcast-reference"
 CONDITIONS = ("dawn", "overcast-winter", "rain", "sun", "night", "night-rain")
@@ -65,10 +73,10 @@ _PLACE_US, _STOP_US = 60_000_000, 1_062_501
 _CAMERA_HEIGHT_M = 1.6
 # where the cameras look, degrees to the right of the driver and up, and where they are on the
 # car, metres to the right, down and ahead of its origin
-_ON_CAR = {
-    "left": (-84.0, 3.0, (-0.35, 0.02, -0.1)),
-    "rear": (179.2, -4.0, (0.06, 0.15, -1.1)),
-    "right": (86.0, 2.0, (0.34, 0.03, -0.1)),
+CAM_FROM_CAR = {
+    "left": cam_from_rig(-84.0, 3.0, (-0.35, 0.02, -0.1)),
+    "rear": cam_from_rig(179.2, -4.0, (0.06, 0.15, -1.1)),
+    "right": cam_from_rig(86.0, 2.0, (0.34, 0.03, -0.1)),
 }
 _CENTRES = {"left": (0.4884, 0.4995), "rear": (0.4963, 0.4865), "right": (0.4907, 0.4788)}
 _FOCAL = 0.6  # of the width
@@ -112,33 +120,27 @@ class RobotCarTwin(SyntheticDataset[RobotCarTwinOptions]):
 
     def write(self, root: Path, work: Work = HERE) -> dict[str, int]:
         layout, options = Layout(Path(root)), self.options
-        moments = build_robotcar_moments(options)
-        mapping, queries = moments.mapping_frames(), moments.query_frames()
+        frames = build_robotcar_frames(options)
         drawn = render_map_and_queries(
             options.world(),
-            mapping,
-            queries,
+            frames.mapping,
+            frames.queries,
             layout.images,
             model_features=options.model_features,
             work=work,
         )
-        registered = in_frame(_registered(moments), OFFICIAL_FROM_WORLD)
+        registered = in_frame(_registered(frames.mapping), OFFICIAL_FROM_WORLD)
+        queries = in_frame(frames.queries, OFFICIAL_FROM_WORLD)
         _write_models(layout, options, registered, drawn)
         if options.model_features:
-            named = {_png(frame.name): frame for frame in mapping}
+            named = {_png(frame.name): frame for frame in frames.mapping}
             write_sift_database(
                 layout.feature_database, dict(sorted(named.items())), drawn.features
             )
         _write_car(layout, options)
         _write_query_lists(layout, queries)
-        _write_version_2(layout, options, moments)
-        for role, some in (
-            ("mapping", registered),
-            ("query", in_frame(queries, OFFICIAL_FROM_WORLD)),
-        ):
-            truth = kapture_records(some)
-            truth.rigs[RIG_ID] = cam_from_car()
-            write_sensors(layout.root / GROUND_TRUTH / role, truth)
+        _write_version_2(layout, options, queries)
+        write_truth(layout.root, registered, queries, rigs={RIG_ID: CAM_FROM_CAR})
         return {
             "places": options.num_locations,
             "mapping images": len(registered),
@@ -147,132 +149,80 @@ class RobotCarTwin(SyntheticDataset[RobotCarTwinOptions]):
 
 
 @dataclass(frozen=True, eq=False)
-class Moment:
-    """One moment of a traversal: what its three cameras take, in the order of CAMERAS."""
+class RobotCarFrames:
+    """All images of the twin, three of each moment; poses in the world's frame.
 
-    condition: str
-    place: int
-    timestamp: int
-    frames: tuple[Frame, ...]
-
-    @property
-    def scored(self) -> Frame:
-        """The image of the camera that the challenge asks for."""
-        return self.frames[CAMERAS.index(SCORED_CAMERA)]
-
-
-@dataclass(frozen=True, eq=False)
-class RobotCarMoments:
-    """All moments of the twin; poses in the world's frame.
-
-    Parameters
-    ----------
-    reference : of the map, by location, then time.
-    queries : by condition, then time.
+    ``mapping`` are sorted by location, then time, ``queries`` by condition, then time.
     """
 
-    reference: tuple[Moment, ...]
-    queries: tuple[Moment, ...]
-
-    def mapping_frames(self) -> list[Frame]:
-        """The reference images."""
-        return [frame for moment in self.reference for frame in moment.frames]
-
-    def query_frames(self) -> list[Frame]:
-        """The queries."""
-        return [frame for moment in self.queries for frame in moment.frames]
+    mapping: tuple[Frame, ...]
+    queries: tuple[Frame, ...]
 
 
-def build_robotcar_moments(options: RobotCarTwinOptions) -> RobotCarMoments:
+def build_robotcar_frames(options: RobotCarTwinOptions) -> RobotCarFrames:
     """Choose all images of the twin; the same options give the same images."""
-    world = options.world()
-    reference: list[Moment] = []
-    queries: list[Moment] = []
+    mapping: list[Frame] = []
+    queries: list[Frame] = []
     for index in range(options.num_locations):
-        place = build_place(world, index)
-        here = _reference_moments(options, world, place)
-        world_from_place = place.place_from_world.inverse()
-        views = [
-            coarse_view(place.surfaces, frame.camera, frame.cam_from_world @ world_from_place)
-            for moment in here
-            for frame in moment.frames
-        ]
+        place = build_place(options.world(), index)
+        here = _reference_frames(options, place)
+        views = views_of(place, here)
         for condition in CONDITIONS:
-            queries += _query_moments(options, world, place, views, condition)
-        reference += here
-    return RobotCarMoments(
-        tuple(reference),
-        tuple(sorted(queries, key=lambda moment: (moment.condition, moment.timestamp))),
-    )
+            queries += _query_frames(options, place, views, condition)
+        mapping += here
+    queries.sort(key=lambda frame: (frame.condition, frame.timestamp))
+    return RobotCarFrames(tuple(mapping), tuple(queries))
 
 
 def car_cameras(size_px: int) -> dict[str, Camera]:
     """The cameras by name, PINHOLE with the six decimals of the published files."""
     focal = round(_FOCAL * size_px, 6)
-    return {
-        name: Camera(
-            "PINHOLE",
-            size_px,
-            size_px,
-            (focal, focal, round(cx * size_px, 6), round(cy * size_px, 6)),
-        )
-        for name, (cx, cy) in _CENTRES.items()
-    }
+    cameras = {}
+    for name, centre in _CENTRES.items():
+        cx, cy = (round(share * size_px, 6) for share in centre)
+        cameras[name] = Camera("PINHOLE", size_px, size_px, (focal, focal, cx, cy))
+    return cameras
 
 
-def cam_from_car() -> dict[str, RigidTransform]:
-    """Poses of the cameras; the car's frame has x to the right, y down and z ahead, metres."""
-    return {name: cam_from_rig(*on_car) for name, on_car in _ON_CAR.items()}
-
-
-def _reference_moments(
-    options: RobotCarTwinOptions, world: SyntheticWorldOptions, place: Place
-) -> list[Moment]:
+def _reference_frames(options: RobotCarTwinOptions, place: Place) -> list[Frame]:
     rng = stream(options.seed, "robotcar", REFERENCE_CONDITION, place.index)
     azimuth = float(rng.uniform(-np.pi, np.pi))
-    moments = []
+    frames = []
     for number, (spot, heading) in enumerate(place.plan.stops(options.stops_per_location)):
         pose = _car_from_place(spot + rng.normal(0, 0.15, 2), heading + rng.normal(0, 0.1), rng)
-        moments.append(
-            _moment(options, world, place, REFERENCE_CONDITION, number, pose, azimuth, rng)
-        )
-    return moments
+        frames += _moment(options, place, REFERENCE_CONDITION, number, pose, azimuth, rng)
+    return frames
 
 
-def _query_moments(
-    options: RobotCarTwinOptions,
-    world: SyntheticWorldOptions,
-    place: Place,
-    map_views: list[CoarseView],
-    condition: str,
-) -> list[Moment]:
+def _query_frames(
+    options: RobotCarTwinOptions, place: Place, map_views: list[CoarseView], condition: str
+) -> list[Frame]:
     """This location's share of a traversal's moments."""
     azimuth = float(stream(options.seed, "robotcar", condition, place.index).uniform(-np.pi, np.pi))
-    moments = []
+    frames = []
     for number in range(place.index, options.moments_per_condition, options.num_locations):
         rng = stream(options.seed, "robotcar", condition, place.index, number)
         pose = first_fitting(_query_poses(options, place, map_views, rng), place.name)
-        moments.append(_moment(options, world, place, condition, number, pose, azimuth, rng))
-    return moments
+        frames += _moment(options, place, condition, number, pose, azimuth, rng)
+    return frames
 
 
 def _moment(
     options: RobotCarTwinOptions,
-    world: SyntheticWorldOptions,
     place: Place,
     condition: str,
     number: int,
     car_from_place: RigidTransform,
     azimuth: float,
     rng: np.random.Generator,
-) -> Moment:
+) -> list[Frame]:
+    """What the three cameras take at a moment of a traversal, in the order of CAMERAS."""
     jitter = int(rng.integers(0, 1000))
     timestamp = _STARTS_US[condition] + place.index * _PLACE_US + number * _STOP_US + jitter
     car_from_world = car_from_place @ place.place_from_world
     moving_objects = place_moving_objects(
-        place.plan, rng, world.moving_objects, car_from_place.center(), yaw=None
+        place.plan, rng, options.world().moving_objects, car_from_place.center()
     )
-    on_car = cam_from_car()
     frames = []
     for camera, intrinsics in car_cameras(options.size_px).items():
         name = f"{condition}/{camera}/{timestamp}.jpg"
@@ -280,7 +230,7 @@ def _moment(
             condition,
             rng,
             azimuth=azimuth,
-            noise_seed=noise_seed(world, name),
+            noise_seed=noise_seed(options.seed, name),
             night_exposure=options.night_exposure,
         )
         frames.append(
@@ -292,13 +242,13 @@ def _moment(
                 timestamp=timestamp,
                 sensor_id=camera,
                 camera=intrinsics,
-                cam_from_world=on_car[camera] @ car_from_world,
+                cam_from_world=CAM_FROM_CAR[camera] @ car_from_world,
                 lighting=lighting,
                 moving_objects=moving_objects,
                 bonnet=camera == SCORED_CAMERA,
             )
         )
-    return Moment(condition, place.index, timestamp, tuple(frames))
+    return frames
 
 
 def _query_poses(
@@ -309,7 +259,7 @@ def _query_poses(
 ) -> Iterator[tuple[float, RigidTransform]]:
     """``car_from_place`` on the reference traversal's way, a little beside it, each with the
     misfit of what the scored camera sees."""
-    camera, cam_on_car = car_cameras(options.size_px)[SCORED_CAMERA], cam_from_car()[SCORED_CAMERA]
+    camera, cam_on_car = car_cameras(options.size_px)[SCORED_CAMERA], CAM_FROM_CAR[SCORED_CAMERA]
     path = place.plan.stops(_STEPS)
     for _ in range(_ATTEMPTS):
         spot, heading = path[int(rng.integers(_STEPS))]
@@ -331,12 +281,12 @@ def _car_from_place(
     return looking_at(np.array([*spot, height]), float(yaw), pitch, roll)
 
 
-def _registered(moments: RobotCarMoments) -> list[Frame]:
+def _registered(frames: Sequence[Frame]) -> list[Frame]:
     """The reference images that the models have: of each location one is left out."""
-    last = {moment.place: moment.timestamp for moment in moments.reference}
+    last = {frame.place: frame.timestamp for frame in frames}
     return [
         frame
-        for frame in moments.mapping_frames()
+        for frame in frames
         if (frame.sensor_id, frame.timestamp) != ("right", last[frame.place])
     ]
 
@@ -355,15 +305,8 @@ def _write_models(
         write_colmap_text(layout.individual_model(_location(place)), _colmap_model(here, points))
         own = np.array(positions, np.int32)
         parts.append(replace(points, image_ids=own[points.image_ids]))
-    merged = NvmModel(
-        names=tuple(f"./{_png(frame.name)}" for frame in frames),
-        focal_px=np.array([frame.camera.params[0] for frame in frames]),
-        quat_wxyz=np.array([frame.cam_from_world.quat_wxyz for frame in frames]),
-        centers=np.array([frame.cam_from_world.center() for frame in frames]),
-        k_colmap=np.zeros(len(frames)),
-        points=SparsePoints.joined(parts),
-    )
-    write_nvm(layout.merged_model, merged)
+    names = [f"./{_png(frame.name)}" for frame in frames]
+    write_nvm(layout.merged_model, nvm_model(names, frames, SparsePoints.joined(parts)))
 
 
 def _colmap_model(frames: Sequence[Frame], points: SparsePoints) -> ColmapModel:
@@ -388,8 +331,8 @@ def _write_car(layout: Layout, options: RobotCarTwinOptions) -> None:
             for key, value in zip(("fx", "fy", "cx", "cy"), camera.params, strict=True)
         ]
         write_lines(layout.intrinsics(name), lines)
-    for name, pose in cam_from_car().items():
-        rows = [",".join(map(repr, row)) for row in _matrix(pose.inverse()).tolist()]
+    for name, pose in CAM_FROM_CAR.items():
+        rows = [",".join(map(repr, row)) for row in pose.inverse().matrix().tolist()]
         write_lines(layout.extrinsics(name), rows)
 
 
@@ -407,32 +350,25 @@ def _write_query_lists(layout: Layout, queries: Sequence[Frame]) -> None:
 
 
 def _write_version_2(
-    layout: Layout, options: RobotCarTwinOptions, moments: RobotCarMoments
+    layout: Layout, options: RobotCarTwinOptions, queries: Sequence[Frame]
 ) -> None:
     """Half of each traversal's moments with poses, half without; a few in neither list."""
     train: list[Frame] = []
     test: list[Frame] = []
-    for condition in dict.fromkeys(moment.condition for moment in moments.queries):
-        here = [moment.scored for moment in moments.queries if moment.condition == condition]
+    scored = [frame for frame in queries if frame.sensor_id == SCORED_CAMERA]
+    for condition in dict.fromkeys(frame.condition for frame in scored):
+        here = [frame for frame in scored if frame.condition == condition]
         # by turns, so that both lists have moments of all locations
         listed = here[:-1] if condition in _UNLISTED_CONDITIONS else here
         train += listed[::2]
         test += listed[1::2]
     rows = []
     for frame in shuffled(train, options.seed, "robotcar", "order", "train"):
-        (frame,) = in_frame([frame], OFFICIAL_FROM_WORLD)
-        matrix = _matrix(frame.cam_from_world.inverse()).ravel().tolist()
+        matrix = frame.cam_from_world.inverse().matrix().ravel().tolist()
         rows.append(" ".join([_png(frame.name), *map(repr, matrix)]))
     write_lines(layout.train_list, rows)
     names = [f"{frame.sensor_id}/{frame.timestamp}.png" for frame in test]
     write_lines(layout.test_list, shuffled(names, options.seed, "robotcar", "order", "test"))
-
-
-def _matrix(pose: RigidTransform) -> NDArray[np.float64]:
-    """float64 (4, 4)."""
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = pose.rotation_matrix(), pose.translation
-    return matrix
 
 
 def _location(place: int) -> str:

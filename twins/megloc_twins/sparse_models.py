@@ -9,25 +9,28 @@ have the errors of real ones.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from megloc_kapture.datasets.formats.nvm import NvmModel
 from megloc_kapture.datasets.formats.sparse_points import SparsePoints
 from megloc_kapture.features.colmap_sift import ColmapSift
+from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.io.colmap import DatabaseFeatures, MapImage, triangulate, write_feature_database
-from megloc_kapture.io.colmap_cameras import normalized_from_px, px_from_cam
+from megloc_kapture.io.colmap_cameras import px_from_cam
 from megloc_kapture.io.images import read_image_rgb, write_image
 from megloc_kapture.matching.nearest_neighbours import NearestNeighbourOptions, match_nearest
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera, LocalFeatures
 from megloc_twins.frames import Frame
 from megloc_twins.options import SyntheticWorldOptions
-from megloc_twins.rasterization import project, sample_grid
+from megloc_twins.rasterization import intrinsics, project, sample_grid
 from megloc_twins.render import RenderedFrame, render_frames
 
 _BORDER_PX = 2.0  # no feature nearer to the border
@@ -35,23 +38,19 @@ _BORDER_PX = 2.0  # no feature nearer to the border
 _DEPTH_TOLERANCE = 0.01
 _DEPTH_TOLERANCE_M = 0.02
 _GREY = 128  # the depth knows no colour
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-
 _MATCHING = NearestNeighbourOptions(max_ratio=0.8)  # as COLMAP's matcher
 _MAX_ERROR_PX = 2.0
 _MIN_SHARED = 20  # features of one image that have one of the other at the same place
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Depth = NDArray[np.float32]
 Features = Mapping[str, LocalFeatures]
-Depths = Mapping[str, NDArray[np.float32]]
+Depths = Mapping[str, Depth]
 
 
 def exact_tracks(
-    frames: Sequence[Frame],
-    depths_m: Mapping[str, NDArray[np.float32]],
-    *,
-    points_per_frame: int,
-    rng: np.random.Generator,
+    frames: Sequence[Frame], depths_m: Depths, *, points_per_frame: int, rng: np.random.Generator
 ) -> SparsePoints:
     """Sparse points that at least two of the frames see, with exact observations.
 
@@ -64,7 +63,6 @@ def exact_tracks(
     depths_m : float32 (H, W) along the optical axis by image name, one for each frame, 0 where
         nothing is seen.
     points_per_frame : pixels drawn in each frame; those that no other frame sees give no point.
-    rng : draws the pixels.
 
     Returns
     -------
@@ -72,49 +70,55 @@ def exact_tracks(
     ``image_ids`` count in ``frames``, ``feature_ids`` from 0 in each image; ``xy_px`` are the
     projections rounded to float32.
     """
-    xyz: list[Floats] = [np.zeros((0, 3))]
-    point_ids: list[NDArray[np.int64]] = [np.zeros(0, np.int64)]
-    image_ids: list[NDArray[np.int64]] = [np.zeros(0, np.int64)]
-    xy_px: list[Floats] = [np.zeros((0, 2))]
-    num_points = 0
+    parts = [(SparsePoints.none(), np.zeros(0, np.int32))]
     for frame in frames:
         # those of other places stand behind walls
         here = [index for index, other in enumerate(frames) if other.place == frame.place]
         points = _lifted(frame, depths_m[frame.name], points_per_frame, rng)
         seen, px = _observations([frames[index] for index in here], depths_m, points)
-        seen, px, points = _kept(seen, px, points)
-        of_point, of_image = np.nonzero(seen)
-        xyz.append(points)
-        point_ids.append(of_point + num_points)
-        image_ids.append(np.array(here, np.int64)[of_image])
-        xy_px.append(px[of_point, of_image])
-        num_points += len(points)
-    images = np.concatenate(image_ids)
+        enough = seen.sum(1) >= 2
+        of_point, of_image = np.nonzero(seen[enough])
+        found = _grey_points(
+            points[enough], of_point, of_image, of_image, px[enough][of_point, of_image]
+        )
+        parts.append((found, np.array(here, np.int32)))
+    joined = SparsePoints.joined(parts)
+    feature_ids = np.empty_like(joined.image_ids)
+    for image in np.unique(joined.image_ids):
+        of_image = joined.image_ids == image
+        feature_ids[of_image] = np.arange(np.count_nonzero(of_image))
+    return replace(joined, feature_ids=feature_ids)
+
+
+def _grey_points(
+    xyz: Floats,
+    point_ids: NDArray[np.int64],
+    image_ids: NDArray[np.int64],
+    feature_ids: NDArray[np.int64],
+    xy_px: NDArray[np.floating[Any]],
+) -> SparsePoints:
     return SparsePoints(
-        xyz=np.concatenate(xyz),
-        rgb=np.full((num_points, 3), _GREY, np.uint8),
-        point_ids=np.concatenate(point_ids),
-        image_ids=images.astype(np.int32),
-        feature_ids=_ranks(images),
-        xy_px=np.concatenate(xy_px).astype(np.float32),
+        xyz=xyz,
+        rgb=np.full((len(xyz), 3), _GREY, np.uint8),
+        point_ids=point_ids,
+        image_ids=image_ids.astype(np.int32),
+        feature_ids=feature_ids.astype(np.int32),
+        xy_px=xy_px.astype(np.float32),
     )
 
 
-def _lifted(
-    frame: Frame, depth_m: NDArray[np.float32], count: int, rng: np.random.Generator
-) -> Floats:
+def _lifted(frame: Frame, depth_m: Depth, count: int, rng: np.random.Generator) -> Floats:
     """World points (P, 3), P <= count, of random pixels that have depth."""
     rows, columns = np.nonzero(depth_m > 0)
     drawn = rng.permutation(len(rows))[:count]
     rows, columns = rows[drawn], columns[drawn]
-    x, y = _rays(frame.camera)
     z = depth_m[rows, columns].astype(np.float64)
-    in_camera = np.stack([x[rows, columns] * z, y[rows, columns] * z, z], axis=1)
+    in_camera = sample_grid(frame.camera, 1).rays()[rows, columns] * z[:, None]
     return frame.cam_from_world.inverse().apply(in_camera)
 
 
 def _observations(
-    frames: Sequence[Frame], depths_m: Mapping[str, NDArray[np.float32]], points: Floats
+    frames: Sequence[Frame], depths_m: Depths, points: Floats
 ) -> tuple[Bools, Floats]:
     """Visibility bool (P, S) of points (P, 3) in frames, and their pixels, float64 (P, S, 2)."""
     seen = np.zeros((len(points), len(frames)), bool)
@@ -138,32 +142,10 @@ def _in_field(camera: Camera, in_camera: Floats) -> Bools:
 
     Farther out the distortion need not be monotonous and may fold a point back into the image.
     """
-    x, y = _rays(camera)
-    limit = float((x**2 + y**2).max())
+    grid = sample_grid(camera, 1)
+    limit = float((grid.x**2 + grid.y**2).max())
     z = in_camera[:, 2]
     return np.asarray((z > 0) & ((in_camera[:, :2] ** 2).sum(1) <= limit * z**2), np.bool_)
-
-
-def _rays(camera: Camera) -> tuple[Floats, Floats]:
-    """Normalised coordinates of the pixels' centres, two of float64 (H, W)."""
-    grid = sample_grid(camera, 1)
-    return np.broadcast_to(grid.x, grid.shape), np.broadcast_to(grid.y, grid.shape)
-
-
-def _kept(seen: Bools, pixels: Floats, points: Floats) -> tuple[Bools, Floats, Floats]:
-    """The points that at least two images see."""
-    enough = seen.sum(1) >= 2
-    return seen[enough], pixels[enough], points[enough]
-
-
-def _ranks(images: NDArray[np.int64]) -> NDArray[np.int32]:
-    """For each observation how many of its image precede it."""
-    order = np.argsort(images, kind="stable")
-    ordered = images[order]
-    first = np.searchsorted(ordered, ordered)
-    ranks = np.empty(len(images), np.int32)
-    ranks[order] = np.arange(len(images)) - first
-    return ranks
 
 
 def sift_points(frames: Sequence[Frame], features: Features, depths_m: Depths) -> SparsePoints:
@@ -171,7 +153,6 @@ def sift_points(frames: Sequence[Frame], features: Features, depths_m: Depths) -
 
     Parameters
     ----------
-    frames : of cameras that COLMAP knows; poses in any frame in metres.
     features, depths_m : of each frame by image name; depth float32 (H, W) along the optical axis, 0
         where nothing is seen.
 
@@ -189,63 +170,52 @@ def sift_points(frames: Sequence[Frame], features: Features, depths_m: Depths) -
     for i, j in combinations(range(len(frames)), 2):
         # other places stand behind walls
         if frames[i].place == frames[j].place:
-            found = _matches(
-                frames[j], features[frames[i].name], features[frames[j].name], world[i]
-            )
-            agree = _near(frames[i], features[frames[i].name], world[j], found[:, ::-1])
+            mine, others = features[frames[i].name], features[frames[j].name]
+            found = _matches(frames[j], mine, others, world[i])
+            agree = _near(frames[i], mine, world[j], found[:, ::-1])
             matches[i, j] = found[agree]
     points = triangulate(images, matches)
-    keypoints = [image.keypoints_px for image in images]
     rows = zip(points.image_ids.tolist(), points.keypoint_ids.tolist(), strict=True)
-    xy_px = [keypoints[image][keypoint] for image, keypoint in rows]
-    return SparsePoints(
-        xyz=points.xyz,
-        rgb=np.full((len(points.xyz), 3), _GREY, np.uint8),
-        point_ids=points.point_ids,
-        image_ids=points.image_ids.astype(np.int32),
-        feature_ids=points.keypoint_ids.astype(np.int32),
-        xy_px=np.array(xy_px, np.float32).reshape(-1, 2),
-    )
+    xy_px = np.array([images[image].keypoints_px[row] for image, row in rows]).reshape(-1, 2)
+    return _grey_points(points.xyz, points.point_ids, points.image_ids, points.keypoint_ids, xy_px)
 
 
 def write_sift_database(path: Path, frames: Mapping[str, Frame], features: Features) -> None:
     """Write COLMAP's database of the frames' features, under the names given, in their order.
 
-    Raises
-    ------
-    OutputError : cannot be written.
+    Raises OutputError where it cannot be written.
     """
+    found = ((name, frame.camera, features[frame.name]) for name, frame in frames.items())
     write_feature_database(
-        path,
-        (
-            DatabaseFeatures(
-                name,
-                frame.camera,
-                features[frame.name].keypoints_px,
-                features[frame.name].descriptors,
-            )
-            for name, frame in frames.items()
-        ),
+        path, (DatabaseFeatures(n, cam, f.keypoints_px, f.descriptors) for n, cam, f in found)
     )
 
 
-def _world_points(
-    frame: Frame, features: LocalFeatures, depth_m: NDArray[np.float32]
-) -> NDArray[np.float64]:
+def nvm_model(names: Sequence[str], frames: Sequence[Frame], points: SparsePoints) -> NvmModel:
+    """What an NVM file says of the frames, under the names given."""
+    lenses = np.array([intrinsics(frame.camera) for frame in frames])
+    return NvmModel(
+        names=tuple(names),
+        focal_px=lenses[:, 0],
+        quat_wxyz=np.array([frame.cam_from_world.quat_wxyz for frame in frames]),
+        centers=np.array([frame.cam_from_world.center() for frame in frames]),
+        k_colmap=lenses[:, 4],
+        points=points,
+    )
+
+
+def _world_points(frame: Frame, features: LocalFeatures, depth_m: Depth) -> Floats:
     """World point of each feature, float64 (N, 3); NaN where there is no depth."""
     xy = features.keypoints_px
     last = np.array(depth_m.shape[::-1]) - 1
     column, row = np.clip(xy.astype(np.int64), 0, last).T
     z = depth_m[row, column].astype(np.float64)
     z[z <= 0] = np.nan
-    rays = normalized_from_px(frame.camera, xy)
-    return frame.cam_from_world.inverse().apply(
-        np.column_stack([rays, np.ones(len(z))]) * z[:, None]
-    )
+    return frame.cam_from_world.inverse().apply(bearing_rays(frame.camera, xy) * z[:, None])
 
 
 def _matches(
-    frame: Frame, features: LocalFeatures, others: LocalFeatures, world: NDArray[np.float64]
+    frame: Frame, features: LocalFeatures, others: LocalFeatures, world: Floats
 ) -> NDArray[np.int64]:
     """Matches (K, 2) of ``features``, which show ``world``, with those of another frame."""
     px = px_from_cam(frame.camera, frame.cam_from_world.apply(world))
@@ -257,8 +227,8 @@ def _matches(
 
 
 def _near(
-    frame: Frame, features: LocalFeatures, world: NDArray[np.float64], matches: NDArray[np.int64]
-) -> NDArray[np.bool_]:
+    frame: Frame, features: LocalFeatures, world: Floats, matches: NDArray[np.int64]
+) -> Bools:
     """Matches whose first feature's point is projected to the second, one of the frame."""
     px = px_from_cam(frame.camera, frame.cam_from_world.apply(world[matches[:, 0]]))
     error = np.linalg.norm(px - features.keypoints_px[matches[:, 1]], axis=1)
@@ -269,14 +239,12 @@ def _near(
 class MapFrames:
     """Depth and features of the rendered map images, by image name.
 
-    Parameters
-    ----------
-    depths_m : float32 (H, W) along the optical axis, 0 where nothing is seen.
-    features : COLMAP's SIFT; empty where the models' points are to be exact.
+    ``depths_m`` are float32 (H, W) along the optical axis, 0 where nothing is seen; ``features``
+    COLMAP's SIFT, none where the models' points are to be exact.
     """
 
-    depths_m: Mapping[str, NDArray[np.float32]]
-    features: Mapping[str, LocalFeatures]
+    depths_m: Depths
+    features: Features
 
     def points(
         self, frames: Sequence[Frame], *, points_per_frame: int, rng: np.random.Generator
@@ -298,11 +266,7 @@ def render_map_and_queries(
 ) -> MapFrames:
     """Draw all frames and write them below ``images`` under their names.
 
-    Parameters
-    ----------
-    mapping : frames whose depth is returned, with ``model_features`` their SIFT as well.
-    others : frames that are drawn only.
-    work : its processes have to see the same file system.
+    The depth of ``mapping`` is returned, with ``model_features`` their SIFT as well.
     """
     names = frozenset(frame.name for frame in mapping)
     finish = partial(_write, images, world.jpeg_quality, names if model_features else frozenset())
@@ -319,7 +283,7 @@ def _write(
     with_features: frozenset[str],
     frame: Frame,
     view: RenderedFrame,
-) -> tuple[NDArray[np.float32] | None, LocalFeatures | None]:
+) -> tuple[Depth | None, LocalFeatures | None]:
     path = images / frame.name
     write_image(path, view.image, jpeg_quality=jpeg_quality)
     # of the image as it was written

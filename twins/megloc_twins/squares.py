@@ -7,43 +7,56 @@ in common, which is what makes retrieval and matching err.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.values import RigidTransform
-from megloc_twins.facades import WALL_HEIGHT_M, Facade, TexturePicker, Wall
+from megloc_twins.frames import Frame
 from megloc_twins.moving_objects import FloorPlan, Obstacle, draw_floor_plan, moving_object_recipes
 from megloc_twins.options import SyntheticWorldOptions, stream
 from megloc_twins.portable import settled_pose
-from megloc_twins.surfaces import SurfaceBuilder, Surfaces
-from megloc_twins.textures import TextureRecipe
+from megloc_twins.surfaces import Opening, Span, SurfaceBuilder, Surfaces, Vector, Wall
+from megloc_twins.textures import GROUND_TEXELS_PER_M, TextureRecipe, index_of, texels
 
 Point = tuple[float, float]
+TexturePicker = Callable[[str], int]
 
-# radius of the circle each kind needs, metres, and how often it is chosen
-RADIUS_M = {"crates": 0.9, "pillar": 0.65, "kiosk": 1.2, "planter": 0.9}
-SHARE = {"crates": 0.35, "pillar": 0.25, "kiosk": 0.15, "planter": 0.25}
-
-PLACE_DISTANCE_M = 90.0  # between the middles of neighbours, before each is moved a little
-WALL_TEXELS_PER_M = 100
-GROUND_TEXELS_PER_M = 80
-MAX_FURNITURE = 8
-_MATERIALS = ("brick", "stone", "plaster")
-_SIZES = {  # width, height in texels
-    "window": (156, 192),
-    "door": (132, 270),
-    "shutter": (240, 300),
-    "poster": (180, 252),
-    "sign": (300, 80),
-    "wood": (160, 160),
-    "plain": (128, 128),
-    "glow": (8, 8),
+# furniture: radius of the circle a kind needs, metres, and how often it is chosen
+_FURNITURE = {
+    "crates": (0.9, 0.35),
+    "pillar": (0.65, 0.25),
+    "kiosk": (1.2, 0.15),
+    "planter": (0.9, 0.25),
 }
-# how many of a kind all places share, and how many a place has of its own
-_SHARED = {"window": 3, "door": 2, "shutter": 1, "poster": 5, "sign": 2, "wood": 2, "plain": 3}
-_OWN = {"window": 3, "door": 3, "shutter": 2, "poster": 9, "sign": 6, "wood": 3, "plain": 2}
+_MAX_FURNITURE = 8
+
+_PLACE_DISTANCE_M = 90.0  # between the middles of neighbours, before each is moved a little
+_WALL_TEXELS_PER_M = 100
+_MATERIALS = ("brick", "stone", "plaster")
+_TEXTURES = {  # width, height in texels; how many all places share, how many a place has of its own
+    "window": (156, 192, 3, 3),
+    "door": (132, 270, 2, 3),
+    "shutter": (240, 300, 1, 2),
+    "poster": (180, 252, 5, 9),
+    "sign": (300, 80, 2, 6),
+    "wood": (160, 160, 2, 3),
+    "plain": (128, 128, 3, 2),
+    "glow": (8, 8, 1, 1),
+}
+
+_GROUND_STOREY_M, _UPPER_STOREY_M, _CORNICE_M = 3.3, 2.9, 0.35
+_EAVES_M = _GROUND_STOREY_M + _UPPER_STOREY_M
+_WALL_HEIGHT_M = _EAVES_M + _CORNICE_M
+# what is in a bay of the ground floor: how often, half its width, from where to where it reaches
+_BAYS = {
+    "window": (0.3, 0.65, 0.95, 2.45),
+    "door": (0.2, 0.55, 0.0, 2.25),
+    "shutter": (0.15, 1.0, 0.0, 2.5),
+    "posters": (0.35, 0.0, 0.0, 0.0),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,16 +71,10 @@ class Furniture:
         base = 0.0
         for _ in range(int(self.rng.integers(1, 4))):
             size = self.rng.uniform(0.6, 0.95)
-            sides = tuple(self.pick("wood") for _ in range(4))
+            sides = self.pick("wood"), self.pick("wood"), self.pick("wood"), self.pick("wood")
             spot = (at[0] + self.rng.uniform(-0.1, 0.1), at[1] + self.rng.uniform(-0.1, 0.1))
-            self.builder.add_box(
-                spot,
-                (size, size, size),
-                self.rng.uniform(0, np.pi),
-                (sides[0], sides[1], sides[2], sides[3]),
-                sides[0],
-                base=base,
-            )
+            yaw = self.rng.uniform(0, np.pi)
+            self.builder.add_box(spot, (size, size, size), yaw, sides, sides[0], base=base)
             base += size
 
     def pillar(self, at: Point) -> None:
@@ -83,55 +90,143 @@ class Furniture:
                 texture = self.pick("poster")
                 self.builder.add(left + top, right - left, np.array([0.0, 0.0, -1.2]), texture)
         plain = self.pick("plain")
-        self.builder.add_box(at, (1.0, 1.0, 0.3), turn, (plain,) * 4, plain)
-        self.builder.add_box(at, (1.2, 1.2, 0.2), turn, (plain,) * 4, plain, base=2.7, bottom=plain)
+        self.builder.add_box(at, (1.0, 1.0, 0.3), turn, plain, plain)
+        self.builder.add_box(at, (1.2, 1.2, 0.2), turn, plain, plain, base=2.7, bottom=plain)
 
     def kiosk(self, at: Point) -> None:
         yaw = self.rng.uniform(0, np.pi)
         sides = (self.pick("window"), self.pick("poster"), self.pick("door"), self.pick("poster"))
         roof = self.pick("plain")
         self.builder.add_box(at, (1.5, 1.3, 2.1), yaw, sides, roof)
-        self.builder.add_box(at, (1.8, 1.6, 0.14), yaw, (roof,) * 4, roof, base=2.1, bottom=roof)
-        signs = (self.pick("sign"), self.pick("sign"))
-        self.builder.add_box(
-            at, (1.3, 1.1, 0.4), yaw, (signs[0], signs[1], signs[0], signs[1]), roof, base=2.24
-        )
+        self.builder.add_box(at, (1.8, 1.6, 0.14), yaw, roof, roof, base=2.1, bottom=roof)
+        a, b = self.pick("sign"), self.pick("sign")
+        self.builder.add_box(at, (1.3, 1.1, 0.4), yaw, (a, b, a, b), roof, base=2.24)
 
     def planter(self, at: Point) -> None:
         yaw = self.rng.uniform(0, np.pi)
         side, plain = self.pick("wood"), self.pick("plain")
-        self.builder.add_box(at, (1.3, 0.6, 0.55), yaw, (side,) * 4, plain)
+        self.builder.add_box(at, (1.3, 0.6, 0.55), yaw, side, plain)
         board = self.pick("poster")
-        self.builder.add_box(
-            at, (0.75, 0.1, 1.05), yaw, (board, plain, board, plain), plain, base=0.55
-        )
+        sides = (board, plain, board, plain)
+        self.builder.add_box(at, (0.75, 0.1, 1.05), yaw, sides, plain, base=0.55)
+
+
+@dataclass(frozen=True, eq=False)
+class Facade:
+    """The front of a house: a wall with windows, doors, and what sticks out of it."""
+
+    builder: SurfaceBuilder
+    wall: Wall
+    rng: np.random.Generator
+    pick: TexturePicker
+
+    def build(self) -> list[Vector]:
+        """Furnish the wall; returns the positions of its lamps, float64 (3,) each, metres."""
+        wall, rng = self.wall, self.rng
+        num_bays = max(1, int(round(wall.length / rng.uniform(2.3, 3.0))))
+        edges = np.linspace(0, wall.length, num_bays + 1)
+        ground: list[Opening] = []
+        upper: list[Opening] = []
+        window = self.pick("window")
+        for left, right in zip(edges[:-1], edges[1:], strict=True):
+            self._ground_bay(left, right, ground)
+            if rng.random() < 0.85:
+                self._upper_window(left, right, window, upper)
+        wall.storey(self.builder, (0.0, _GROUND_STOREY_M), ground)
+        wall.storey(self.builder, (_GROUND_STOREY_M, _EAVES_M), upper)
+        self._block((0.0, wall.length), (_EAVES_M, _WALL_HEIGHT_M), 0.25, wall.trim, wall.trim)
+        for edge in edges[1:-1]:
+            draw = rng.random()
+            if draw < 0.35:  # pilaster
+                span = (float(edge) - 0.18, float(edge) + 0.18)
+                self._block(span, (0.0, _EAVES_M), 0.16, wall.texture, wall.trim)
+            elif draw < 0.5:  # drain pipe
+                span = (float(edge) - 0.05, float(edge) + 0.05)
+                pipe = self.pick("plain")
+                self._block(span, (0.0, _EAVES_M), 0.1, pipe, pipe)
+        lamps = []
+        for x in np.arange(rng.uniform(1.5, 3.5), wall.length - 1, rng.uniform(4.5, 7.0)).tolist():
+            glow = self.pick("glow")
+            span = (x - 0.13, x + 0.13)
+            wall.block(self.builder, span, (2.95, 3.25), 0.24, front=glow, other=glow, glow=4.0)
+            lamps.append(wall.point(x, 3.1, 0.45))
+        return lamps
+
+    def _ground_bay(self, left: float, right: float, openings: list[Opening]) -> None:
+        rng = self.rng
+        kind = str(rng.choice(list(_BAYS), p=[share for share, *_ in _BAYS.values()]))
+        if kind == "posters":
+            self._posters(left + 0.25, right - 0.25)
+            return
+        middle, width = (left + right) / 2, right - left
+        _, half, y0, y1 = _BAYS[kind]
+        half = min(half, width / 2 - 0.2)
+        shift = rng.uniform(-0.2, 0.2)
+        x0, x1 = middle + shift - half, middle + shift + half
+        recess, texture = rng.uniform(0.15, 0.35), self.pick(kind)
+        openings.append(Opening(x0, x1, y0, y1, recess, texture, 0.25 * float(rng.random() < 0.2)))
+        if kind == "window":
+            self._ledge(openings[-1])
+        if rng.random() < 0.5:  # a sign
+            half = min(0.95, (right - left) / 2 - 0.1)
+            depth = rng.uniform(0.06, 0.2)
+            span = (middle - half, middle + half)
+            self._block(span, (2.62, 2.62 + 0.5), depth, self.pick("sign"), self.wall.trim)
+
+    def _upper_window(
+        self, left: float, right: float, common: int, openings: list[Opening]
+    ) -> None:
+        rng, middle, half = self.rng, (left + right) / 2, min(0.6, (right - left) / 2 - 0.25)
+        window = common if rng.random() < 0.6 else self.pick("window")
+        y0, y1 = _GROUND_STOREY_M + 0.75, _GROUND_STOREY_M + 2.3
+        glow = 0.6 * float(rng.random() < 0.25)
+        hole = Opening(middle - half, middle + half, y0, y1, 0.22, window, glow)
+        openings.append(hole)
+        if rng.random() < 0.3:  # a balcony
+            span = (max(0.0, hole.x0 - 0.25), min(self.wall.length, hole.x1 + 0.25))
+            self._block(span, (y0 - 0.55, y0 + 0.2), 0.6, self.pick("wood"), self.pick("plain"))
+        else:
+            self._ledge(hole)
+
+    def _block(self, x: Span, y: Span, depth: float, front: int, other: int) -> None:
+        self.wall.block(self.builder, x, y, depth, front=front, other=other)
+
+    def _ledge(self, hole: Opening) -> None:
+        trim = self.wall.trim
+        self._block((hole.x0 - 0.1, hole.x1 + 0.1), (hole.y0 - 0.1, hole.y0), 0.14, trim, trim)
+
+    def _posters(self, x: float, end: float) -> None:
+        rng = self.rng
+        while x + 0.7 <= end:
+            width = float(rng.choice([0.7, 0.9]))
+            if x + width > end:
+                width = 0.7
+            base = rng.uniform(0.6, 1.2)
+            height = (base, base + width * 1.4)
+            depth = rng.uniform(0.02, 0.08)
+            self._block((x, x + width), height, depth, self.pick("poster"), self.wall.trim)
+            x += width + rng.uniform(0.08, 0.3)
 
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """One place, in its own frame.
+    """One place, in its own frame."""
 
-    Parameters
-    ----------
-    index : number of the place in its world.
-    recipes : its textures, the moving objects' first.
-    surfaces : its geometry; ``texture`` counts in ``recipes``.
-    lamps : float64 (L, 3), sources of light at night.
-    plan : where one can stand.
-    place_from_world : from the world's frame to the place's.
-    """
-
-    index: int
-    recipes: tuple[TextureRecipe, ...]
-    surfaces: Surfaces
-    lamps: NDArray[np.float64]
-    plan: FloorPlan
+    index: int  # in its world
+    recipes: tuple[TextureRecipe, ...]  # its textures, the moving objects' first
+    surfaces: Surfaces  # ``texture`` counts in ``recipes``
+    lamps: NDArray[np.float64]  # (L, 3), sources of light at night
+    plan: FloorPlan  # where one can stand
     place_from_world: RigidTransform
 
     @property
     def name(self) -> str:
         """Name of the place in image paths and tables."""
         return f"place{self.index}"
+
+    def cam_from_place(self, frame: Frame) -> RigidTransform:
+        """The pose of a frame that shows the place."""
+        return frame.cam_from_world @ self.place_from_world.inverse()
 
     def surfaces_in_world(self) -> Surfaces:
         """Its geometry in the world's frame."""
@@ -150,23 +245,16 @@ class _TextureStore:
     rng: np.random.Generator
     recipes: list[TextureRecipe] = field(default_factory=list)
 
-    def index(self, recipe: TextureRecipe) -> int:
-        if recipe not in self.recipes:
-            self.recipes.append(recipe)
-        return self.recipes.index(recipe)
-
     def pick(self, kind: str) -> int:
-        width, height = _SIZES[kind]
+        width, height, num_shared, num_own = _TEXTURES[kind]
         shared = self.rng.random() < self.options.repetition
-        count = (_SHARED if shared else _OWN).get(kind, 1)
         owner = "shared" if shared else f"place{self.place}"
-        number = int(self.rng.integers(count))
-        seed = stream(self.options.seed, owner, kind, number).integers(2**31)
-        return self.index(TextureRecipe(kind, width, height, int(seed)))
+        number = int(self.rng.integers(num_shared if shared else num_own))
+        seed = int(stream(self.options.seed, owner, kind, number).integers(2**31))
+        return index_of(TextureRecipe(kind, width, height, seed), self.recipes)
 
     def material(self, painter: str, kind: str, size_m: tuple[float, float], label: str) -> int:
-        density = WALL_TEXELS_PER_M if painter == "wall" else GROUND_TEXELS_PER_M
-        width, height = (max(8, int(round(side * density))) for side in size_m)
+        density = _WALL_TEXELS_PER_M if painter == "wall" else GROUND_TEXELS_PER_M
         seed = int(stream(self.options.seed, self.place, label).integers(2**31))
         shared_seed = int(stream(self.options.seed, "material").integers(2**31))
         params: dict[str, str | float] = {
@@ -176,9 +264,10 @@ class _TextureStore:
         }
         if painter == "wall":
             params["graffiti"] = float(self.rng.integers(0, 3))
-        return self.index(
-            TextureRecipe(painter, width, height, seed, tuple(sorted(params.items())))
+        recipe = TextureRecipe(
+            painter, *texels(size_m, density), seed, tuple(sorted(params.items()))
         )
+        return index_of(recipe, self.recipes)
 
 
 def build_place(options: SyntheticWorldOptions, index: int) -> Place:
@@ -188,20 +277,27 @@ def build_place(options: SyntheticWorldOptions, index: int) -> Place:
     store = _TextureStore(options, index, stream(options.seed, "textures", index))
     store.recipes += moving_object_recipes(options.seed)
     builder = SurfaceBuilder()
-    lamps: list[NDArray[np.float64]] = []
+    lamps: list[Vector] = []
     ends = np.roll(plan.outline, -1, axis=0)
-    for number, (start, end) in enumerate(zip(plan.outline, ends, strict=True)):
-        # seen from inside, a counter-clockwise outline runs to the left
-        wall = _wall(store, rng, end, start, number)
+    # seen from inside, a counter-clockwise outline runs to the left
+    for number, (end, start) in enumerate(zip(plan.outline, ends, strict=True)):
+        size_m = (float(np.hypot(*(end - start))), _WALL_HEIGHT_M)
+        material = _MATERIALS[int(rng.integers(len(_MATERIALS)))]
+        texture = store.material("wall", material, size_m, f"wall{number}")
+        wall = Wall.between(start, end, texture, store.pick("plain"), _WALL_HEIGHT_M)
         lamps += Facade(builder, wall, rng, store.pick).build()
-    _ground(builder, store, rng, plan)
-    plan = _furnish(builder, store, rng, plan)
+    low, high = plan.outline.min(0) - 0.5, plan.outline.max(0) + 0.5
+    width, depth = (high - low).tolist()
+    kind = str(rng.choice(["paving", "asphalt"], p=[0.65, 0.35]))
+    texture = store.material("ground", kind, (width, depth), "ground")
+    corner = np.array([low[0], high[1], 0.0])
+    builder.add(corner, np.array([width, 0.0, 0.0]), np.array([0.0, -depth, 0.0]), texture)
     return Place(
         index=index,
+        plan=_furnished(plan, Furniture(builder, rng, store.pick)),
         recipes=tuple(store.recipes),
         surfaces=builder.build(),
         lamps=np.array(lamps).reshape(-1, 3),
-        plan=plan,
         place_from_world=_place_from_world(rng, index, options.num_places),
     )
 
@@ -209,50 +305,28 @@ def build_place(options: SyntheticWorldOptions, index: int) -> Place:
 def _place_from_world(rng: np.random.Generator, index: int, num_places: int) -> RigidTransform:
     """Places lie on a loose grid, each turned at random."""
     columns = int(np.ceil(np.sqrt(num_places)))
-    middle = np.array([index % columns, index // columns, 0.0]) * PLACE_DISTANCE_M
+    middle = np.array([index % columns, index // columns, 0.0]) * _PLACE_DISTANCE_M
     middle += np.array([*rng.uniform(-8, 8, 2), rng.uniform(-1, 1)])
-    yaw = rng.uniform(-np.pi, np.pi)
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    rotation = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-    return settled_pose(rotation, middle).inverse()
+    return settled_pose(about_z(rng.uniform(-np.pi, np.pi)), middle).inverse()
 
 
-def _wall(
-    store: _TextureStore,
-    rng: np.random.Generator,
-    start: NDArray[np.float64],
-    end: NDArray[np.float64],
-    number: int,
-) -> Wall:
-    length = float(np.hypot(*(end - start)))
-    material = _MATERIALS[int(rng.integers(len(_MATERIALS)))]
-    texture = store.material("wall", material, (length, WALL_HEIGHT_M), f"wall{number}")
-    return Wall.between(start, end, texture, store.pick("plain"))
+def about_z(angle: float) -> NDArray[np.float64]:
+    """The matrix (3, 3) of a turn about z, radians."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
 
-def _ground(
-    builder: SurfaceBuilder, store: _TextureStore, rng: np.random.Generator, plan: FloorPlan
-) -> None:
-    low, high = plan.outline.min(0) - 0.5, plan.outline.max(0) + 0.5
-    width, depth = (float(side) for side in high - low)
-    kind = str(rng.choice(["paving", "asphalt"], p=[0.65, 0.35]))
-    texture = store.material("ground", kind, (width, depth), "ground")
-    corner = np.array([low[0], high[1], 0.0])
-    builder.add(corner, np.array([width, 0.0, 0.0]), np.array([0.0, -depth, 0.0]), texture)
-
-
-def _furnish(
-    builder: SurfaceBuilder, store: _TextureStore, rng: np.random.Generator, plan: FloorPlan
-) -> FloorPlan:
-    """Put furniture clear of the walls, the rig's path and each other; the plan with it."""
+def _furnished(plan: FloorPlan, furniture: Furniture) -> FloorPlan:
+    """The plan with furniture clear of the walls, the rig's path and each other."""
+    rng = furniture.rng
     placed: list[Obstacle] = []
-    furniture = Furniture(builder, rng, store.pick)
     low, high = plan.outline.min(0), plan.outline.max(0)
+    shares = [share for _, share in _FURNITURE.values()]
     for _ in range(400):
-        if len(placed) >= MAX_FURNITURE:
+        if len(placed) >= _MAX_FURNITURE:
             break
-        kind = str(rng.choice(list(SHARE), p=list(SHARE.values())))
-        radius = RADIUS_M[kind]
+        kind = str(rng.choice(list(_FURNITURE), p=shares))
+        radius, _ = _FURNITURE[kind]
         x, y = (float(v) for v in rng.uniform(low, high))
         apart = all(np.hypot(x - o.x, y - o.y) > radius + o.radius + 0.5 for o in placed)
         off_path = plan.distance_to_path(x, y) > radius + 0.9

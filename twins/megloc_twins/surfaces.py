@@ -1,8 +1,8 @@
-"""Textured parallelograms, seen from their front only, and the atlas of their textures."""
+"""Textured parallelograms, seen from their front only: boxes and walls; their textures' atlas."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 
 import cv2
@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 from megloc_twins.portable import product, settled
 
 Vector = NDArray[np.float64]
+Span = tuple[float, float]
+Part = tuple[float, float, float, float]  # u0, v0, u1, v1 of a texture
+WHOLE: Part = (0.0, 0.0, 1.0, 1.0)
 
 NUM_LEVELS = 7  # each half the size of the one before
 ATLAS_WIDTH = 4096
@@ -23,23 +26,15 @@ class Surfaces:
     """N textured parallelograms.
 
     Seen from its front, ``edge_u`` runs along the texture's rows and ``edge_v`` down its columns;
-    ``edge_u x edge_v`` points away from the viewer.
-
-    Parameters
-    ----------
-    origin : float64 (N, 3), metres, the corner where the texture begins.
-    edge_u, edge_v : float64 (N, 3), metres.
-    texture : int32 (N,), index of the texture.
-    uv : float64 (N, 4): the part (u0, v0, u1, v1) of the texture shown, 0..1.
-    glow : float32 (N,), light that the surface itself gives off at night, relative to its colour.
+    ``edge_u x edge_v`` points away from the viewer. Metres.
     """
 
-    origin: Vector
-    edge_u: Vector
-    edge_v: Vector
-    texture: NDArray[np.int32]
-    uv: Vector
-    glow: NDArray[np.float32]
+    origin: Vector  # (N, 3), the corner where the texture begins
+    edge_u: Vector  # (N, 3)
+    edge_v: Vector  # (N, 3)
+    texture: NDArray[np.int32]  # (N,), index of the texture
+    uv: Vector  # (N, 4): the part (u0, v0, u1, v1) of the texture shown, 0..1
+    glow: NDArray[np.float32]  # (N,), light of its own at night, relative to its colour
 
     def __len__(self) -> int:
         return len(self.texture)
@@ -73,9 +68,7 @@ class Surfaces:
 class SurfaceBuilder:
     """Collects parallelograms and boxes."""
 
-    _rows: list[tuple[Vector, Vector, Vector, int, tuple[float, ...], float]] = field(
-        default_factory=list
-    )
+    _rows: list[tuple[Vector, Vector, Vector, int, Part, float]] = field(default_factory=list)
 
     def add(
         self,
@@ -84,7 +77,7 @@ class SurfaceBuilder:
         edge_v: Vector,
         texture: int,
         *,
-        uv: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0),
+        uv: Part = WHOLE,
         glow: float = 0.0,
     ) -> None:
         """One parallelogram; see :class:`Surfaces`."""
@@ -95,12 +88,12 @@ class SurfaceBuilder:
         center: tuple[float, float],
         size: tuple[float, float, float],
         yaw: float,
-        sides: tuple[int, int, int, int],
+        sides: int | tuple[int, int, int, int],
         top: int,
         *,
         base: float = 0.0,
         bottom: int | None = None,
-        uv: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0),
+        uv: Part = WHOLE,
         glow: float = 0.0,
     ) -> None:
         """An upright box: ``size`` is (along x, along y, height) in metres before the turn by
@@ -111,16 +104,12 @@ class SurfaceBuilder:
         along = np.array([cos, sin, 0.0])
         across = np.array([-sin, cos, 0.0])
         up = np.array([0.0, 0.0, 1.0])
-        middle = np.array([center[0], center[1], base])
-        frames = [
-            (along, -across, half_x, half_y),
-            (across, along, half_y, half_x),
-            (-along, across, half_x, half_y),
-            (-across, -along, half_y, half_x),
-        ]
-        for texture, (right, outward, half_width, distance) in zip(sides, frames, strict=True):
+        middle = np.array([*center, base])
+        right, outward, half_width, distance = along, -across, half_x, half_y
+        for texture in (sides,) * 4 if isinstance(sides, int) else sides:
             corner = middle + distance * outward - half_width * right + height * up
             self.add(corner, 2 * half_width * right, -height * up, texture, uv=uv, glow=glow)
+            right, outward, half_width, distance = -outward, right, distance, half_width
         # from above, with the texture's columns running towards -y
         corner = middle - half_x * along + half_y * across + height * up
         self.add(corner, 2 * half_x * along, -2 * half_y * across, top, glow=glow)
@@ -131,46 +120,145 @@ class SurfaceBuilder:
     def build(self) -> Surfaces:
         """All that was added, in order."""
         count = len(self._rows)
+        columns = list(zip(*self._rows, strict=True)) or [()] * 6
+        origin, edge_u, edge_v = (settled(column).reshape(count, 3) for column in columns[:3])
         return Surfaces(
-            settled([r[0] for r in self._rows]).reshape(count, 3),
-            settled([r[1] for r in self._rows]).reshape(count, 3),
-            settled([r[2] for r in self._rows]).reshape(count, 3),
-            np.array([r[3] for r in self._rows], np.int32),
-            settled([r[4] for r in self._rows]).reshape(count, 4),
-            np.array([r[5] for r in self._rows], np.float32),
+            origin,
+            edge_u,
+            edge_v,
+            np.array(columns[3], np.int32),
+            settled(columns[4]).reshape(count, 4),
+            np.array(columns[5], np.float32),
         )
+
+
+PASSAGE = -1  # the texture of an opening one can go through
+
+
+@dataclass(frozen=True)
+class Opening:
+    """A window or door in a wall: x0, x1 along the wall, y0, y1 above the ground, metres."""
+
+    x0: float
+    x1: float
+    y0: float
+    y1: float
+    recess: float
+    texture: int
+    glow: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Wall:
+    """A wall's frame: seen from inside the place it begins at ``start`` and runs to the right."""
+
+    start: Vector  # (3,), foot of its left end, metres
+    right: Vector  # (3,), a unit vector
+    inward: Vector  # (3,), a unit vector, points to the viewer
+    length: float  # metres
+    texture: int  # of the wall itself, stretched over its length and height
+    trim: int  # texture of ledges, reveals and pilasters
+    height: float  # metres
+
+    @classmethod
+    def between(cls, start: Vector, end: Vector, texture: int, trim: int, height: float) -> Wall:
+        """The wall whose foot runs from ``start`` to ``end``, (2,) each, metres."""
+        length = float(np.hypot(*(end - start)))
+        right = np.array([*(end - start) / length, 0.0])
+        inward = np.array([right[1], -right[0], 0.0])
+        return cls(np.array([*start, 0.0]), right, inward, length, texture, trim, height)
+
+    def point(self, x: float, y: float, out: float = 0.0) -> Vector:
+        """World position of ``x`` along, ``y`` up, ``out`` of the wall, metres."""
+        return self.start + x * self.right + out * self.inward + np.array([0.0, 0.0, y])
+
+    def rectangle(
+        self,
+        builder: SurfaceBuilder,
+        x: Span,
+        y: Span,
+        texture: int,
+        *,
+        out: float = 0.0,
+        glow: float = 0.0,
+    ) -> None:
+        """Add a rectangle parallel to the wall, ``out`` metres in front of it."""
+        uv = WHOLE
+        if texture == self.texture:
+            across, down = self.length, self.height
+            uv = (x[0] / across, 1 - y[1] / down, x[1] / across, 1 - y[0] / down)
+        edge_u = (x[1] - x[0]) * self.right
+        edge_v = np.array([0.0, 0.0, y[0] - y[1]])
+        builder.add(self.point(x[0], y[1], out), edge_u, edge_v, texture, uv=uv, glow=glow)
+
+    def block(
+        self,
+        builder: SurfaceBuilder,
+        x: Span,
+        y: Span,
+        depth: float,
+        *,
+        front: int,
+        other: int,
+        glow: float = 0.0,
+    ) -> None:
+        """Add a box on the wall, ``depth`` metres thick."""
+        self.rectangle(builder, x, y, front, out=depth, glow=glow)
+        self._frame(builder, x, y, depth, other, glow)
+
+    def _frame(
+        self, builder: SurfaceBuilder, x: Span, y: Span, out: float, texture: int, glow: float = 0.0
+    ) -> None:
+        """The four sides between the wall and a rectangle ``out`` in front of it or behind."""
+        width, outward = (x[1] - x[0]) * self.right, out * self.inward
+        down = -(y[1] - y[0]) * np.array([0.0, 0.0, 1.0])
+        builder.add(self.point(x[0], y[1]), outward, down, texture, glow=glow)
+        builder.add(self.point(x[1], y[1], out), -outward, down, texture, glow=glow)
+        builder.add(self.point(x[0], y[1]), width, outward, texture, glow=glow)
+        builder.add(self.point(x[0], y[0], out), width, -outward, texture, glow=glow)
+
+    def storey(self, builder: SurfaceBuilder, y: Span, openings: Iterable[Opening] = ()) -> None:
+        """Add the wall between two heights, with openings that do not overlap.
+
+        An opening has the window or door at its back, and reveals. Through a passage one looks, and
+        its reveals belong to one of its sides.
+        """
+        x = 0.0
+        for hole in sorted(openings, key=lambda o: o.x0):
+            across, up = (hole.x0, hole.x1), (hole.y0, hole.y1)
+            if hole.x0 > x:
+                self.rectangle(builder, (x, hole.x0), y, self.texture)
+            if hole.y0 > y[0]:
+                self.rectangle(builder, across, (y[0], hole.y0), self.texture)
+            if hole.y1 < y[1]:
+                self.rectangle(builder, across, (hole.y1, y[1]), self.texture)
+            if hole.texture != PASSAGE:
+                self.rectangle(builder, across, up, hole.texture, out=-hole.recess, glow=hole.glow)
+            if hole.recess:
+                self._frame(builder, across, up, -hole.recess, self.trim)
+            x = hole.x1
+        if x < self.length:
+            self.rectangle(builder, (x, self.length), y, self.texture)
 
 
 @dataclass(frozen=True, eq=False)
 class Atlas:
-    """Textures packed with their levels.
+    """Textures packed with their levels."""
 
-    Parameters
-    ----------
-    image : uint8 (H, ATLAS_WIDTH, 3), RGB.
-    corner : float32 (T, NUM_LEVELS, 2): x, y of each level's upper left corner in ``image``.
-    size : float32 (T, NUM_LEVELS, 2): width and height of each level, texels.
-    """
-
-    image: NDArray[np.uint8]
-    corner: NDArray[np.float32]
-    size: NDArray[np.float32]
-
-
-def _half(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    size = (image.shape[1] + 1) // 2, (image.shape[0] + 1) // 2
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+    image: NDArray[np.uint8]  # (H, ATLAS_WIDTH, 3), RGB
+    corner: NDArray[np.float32]  # (T, NUM_LEVELS, 2): x, y of a level's upper left corner in it
+    size: NDArray[np.float32]  # (T, NUM_LEVELS, 2): width and height of a level, texels
 
 
 def build_atlas(textures: Sequence[NDArray[np.uint8]]) -> Atlas:
     """Pack textures, uint8 (h, w, 3) each, at most ATLAS_WIDTH - 4 wide."""
     levels: list[NDArray[np.uint8]] = []
     for texture in textures:
-        current = texture
-        for level in range(NUM_LEVELS):
-            if level:
-                current = _half(current)
-            levels.append(current)
+        levels.append(texture)
+        for _ in range(NUM_LEVELS - 1):
+            size = [(side + 1) // 2 for side in levels[-1].shape[1::-1]]
+            half = cv2.resize(levels[-1], size, interpolation=cv2.INTER_AREA)
+            levels.append(np.asarray(half, np.uint8))
     heights = np.array([piece.shape[0] for piece in levels]) + 2 * _BORDER
     widths = np.array([piece.shape[1] for piece in levels]) + 2 * _BORDER
     corner = np.zeros((len(levels), 2), np.int64)
@@ -185,6 +273,6 @@ def build_atlas(textures: Sequence[NDArray[np.uint8]]) -> Atlas:
     for (left, top), piece in zip(corner - _BORDER, levels, strict=True):
         padded = cv2.copyMakeBorder(piece, _BORDER, _BORDER, _BORDER, _BORDER, cv2.BORDER_REPLICATE)
         image[top : top + padded.shape[0], left : left + padded.shape[1]] = padded
-    size = np.array([(piece.shape[1], piece.shape[0]) for piece in levels], np.float32)
     shape = (len(textures), NUM_LEVELS, 2)
-    return Atlas(image, corner.astype(np.float32).reshape(shape), size.reshape(shape))
+    sizes = np.array([piece.shape[1::-1] for piece in levels], np.float32).reshape(shape)
+    return Atlas(image, corner.astype(np.float32).reshape(shape), sizes)

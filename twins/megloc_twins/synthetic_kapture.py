@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from operator import attrgetter
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -20,90 +21,70 @@ from megloc_kapture.io.images import write_depth_map, write_image
 from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, RigidTransform
-from megloc_twins.dataset import SyntheticDataset
-from megloc_twins.frames import Frame, cam_from_rig, kapture_records, looking_at, noise_seed
-from megloc_twins.lighting import day_lighting
+from megloc_twins.frames import (
+    Frame,
+    cam_from_rig,
+    day_lighting,
+    kapture_records,
+    looking_at,
+    noise_seed,
+)
 from megloc_twins.moving_objects import place_moving_objects
-from megloc_twins.options import SyntheticWorldOptions, stream
+from megloc_twins.options import SyntheticDataset, SyntheticWorldOptions, stream
 from megloc_twins.render import RenderedFrame, render_frames
 from megloc_twins.squares import Place, build_place
 from megloc_twins.viewpoints import CoarseView, coarse_view, query_frames
 
-RIG_ID = "rig"
-BONNET_CAMERA = "front"
 RIG_HEIGHT_M = 1.9
-
-
-@dataclass(frozen=True)
-class RigStop:
-    """The rig at one moment: its pose, and what its cameras take."""
-
-    timestamp: int
-    rig_from_world: RigidTransform
-    frames: tuple[Frame, ...]
-
-
-def rig_sensor_id(camera: str) -> str:
-    """Id of one of the rig's cameras."""
-    return f"{RIG_ID}_{camera}"
+_RIG_ID = "rig"
+_BONNET_SENSOR = "rig_front"
 
 
 def rig_cameras(options: SyntheticWorldOptions) -> dict[str, Camera]:
-    """Cameras of the mapping rig by name, PINHOLE."""
+    """Cameras of the mapping rig by sensor id, PINHOLE."""
     width, height = options.width, options.height
-    focal = {"front": 0.76, "left": 0.73, "right": 0.73}
-    centre = {"front": (0.5, 0.5), "left": (0.506, 0.493), "right": (0.494, 0.507)}
+    shares = {  # of the width and height: focal length, principal point
+        "rig_front": (0.76, 0.5, 0.5),
+        "rig_left": (0.73, 0.506, 0.493),
+        "rig_right": (0.73, 0.494, 0.507),
+    }
     return {
-        name: Camera(
-            "PINHOLE",
-            width,
-            height,
-            (
-                focal[name] * width,
-                focal[name] * width * 1.004,
-                centre[name][0] * width,
-                centre[name][1] * height,
-            ),
+        sensor_id: Camera(
+            "PINHOLE", width, height, (f * width, f * width * 1.004, cx * width, cy * height)
         )
-        for name in focal
+        for sensor_id, (f, cx, cy) in shares.items()
     }
 
 
 def rig_geometry() -> dict[str, RigidTransform]:
     """``sensor_from_rig`` of the rig's cameras; the rig looks along z, y down, metres."""
     return {
-        "front": cam_from_rig(0.0, -2.0, (0.0, -0.05, 0.45)),
-        "left": cam_from_rig(-62.0, 3.0, (-0.35, 0.0, 0.05)),
-        "right": cam_from_rig(62.0, 3.0, (0.35, 0.0, 0.05)),
+        "rig_front": cam_from_rig(0.0, -2.0, (0.0, -0.05, 0.45)),
+        "rig_left": cam_from_rig(-62.0, 3.0, (-0.35, 0.0, 0.05)),
+        "rig_right": cam_from_rig(62.0, 3.0, (0.35, 0.0, 0.05)),
     }
 
 
-def mapping_stops(options: SyntheticWorldOptions, place: Place) -> list[RigStop]:
-    """The rig's stops in a place, in order of time."""
+def _mapping_frames(
+    options: SyntheticWorldOptions, place: Place, rig_from_world: dict[int, RigidTransform]
+) -> list[Frame]:
+    """What the rig takes at its stops in a place, in order of time; adds its poses there."""
     rng = stream(options.seed, "mapping", place.index)
-    azimuth = float(rng.uniform(-np.pi, np.pi))
-    elevation = float(np.radians(rng.uniform(40, 60)))
-    cameras, geometry = rig_cameras(options), rig_geometry()
-    stops = []
+    sun = float(rng.uniform(-np.pi, np.pi)), float(np.radians(rng.uniform(40, 60)))
+    geometry = rig_geometry()
+    frames = []
     for station, (spot, heading) in enumerate(place.plan.stops(options.stations_per_place)):
         timestamp = 1000 * (place.index + 1) + station
         position = np.array([*spot + rng.normal(0, 0.15, 2), RIG_HEIGHT_M + rng.normal(0, 0.03)])
         yaw = heading + float(rng.normal(0, 0.12))
         pitch, roll = (float(a) for a in rng.normal(0, 0.015, 2))
-        rig_from_world = looking_at(position, yaw, pitch, roll) @ place.place_from_world
-        moving_objects = place_moving_objects(
-            place.plan, rng, options.moving_objects, position, yaw=None
-        )
-        frames = []
-        for name, camera in cameras.items():
-            image = f"db/{place.name}/{name}/{station:05d}.{options.image_format}"
-            lighting = day_lighting(
-                rng,
-                azimuth=azimuth,
-                elevation=elevation,
-                overcast=0.15,
-                noise_seed=noise_seed(options, image),
-            )
+        pose = looking_at(position, yaw, pitch, roll) @ place.place_from_world
+        rig_from_world[timestamp] = pose
+        moving_objects = place_moving_objects(place.plan, rng, options.moving_objects, position)
+        for sensor_id, camera in rig_cameras(options).items():
+            folder = sensor_id.removeprefix("rig_")
+            image = f"db/{place.name}/{folder}/{station:05d}.{options.image_format}"
+            seed = noise_seed(options.seed, image)
             frames.append(
                 Frame(
                     name=image,
@@ -111,39 +92,27 @@ def mapping_stops(options: SyntheticWorldOptions, place: Place) -> list[RigStop]
                     condition="day",
                     place=place.index,
                     timestamp=timestamp,
-                    sensor_id=rig_sensor_id(name),
+                    sensor_id=sensor_id,
                     camera=camera,
-                    cam_from_world=geometry[name] @ rig_from_world,
-                    lighting=lighting,
+                    cam_from_world=geometry[sensor_id] @ pose,
+                    lighting=day_lighting(rng, sun, overcast=0.15, noise_seed=seed),
                     moving_objects=moving_objects,
-                    bonnet=options.bonnet and name == BONNET_CAMERA,
+                    bonnet=options.bonnet and sensor_id == _BONNET_SENSOR,
                 )
             )
-        stops.append(RigStop(timestamp, rig_from_world, tuple(frames)))
-    return stops
+    return frames
 
 
 @dataclass(frozen=True, eq=False)
 class SyntheticWorld:
-    """Everything there is, in one world frame (metres, z up).
-
-    Parameters
-    ----------
-    options : that the world was built from.
-    places : by index.
-    rig_cameras : the mapping rig's cameras by sensor id.
-    sensor_from_rig : their places on the rig.
-    rig_from_world : the rig's poses by timestamp.
-    mapping, queries : all images, sorted by name.
-    """
+    """Everything there is, in one world frame (metres, z up)."""
 
     options: SyntheticWorldOptions
-    places: tuple[Place, ...]
-    rig_cameras: dict[str, Camera]
-    sensor_from_rig: dict[str, RigidTransform]
-    rig_from_world: dict[int, RigidTransform]
-    mapping: tuple[Frame, ...]
-    queries: tuple[Frame, ...]
+    places: tuple[Place, ...]  # by index
+    sensor_from_rig: dict[str, RigidTransform]  # of the mapping rig's cameras, by sensor id
+    rig_from_world: dict[int, RigidTransform]  # by timestamp
+    mapping: tuple[Frame, ...]  # sorted by name
+    queries: tuple[Frame, ...]  # sorted by name
 
     def frames(self) -> tuple[Frame, ...]:
         """All images, those of the map first."""
@@ -152,8 +121,7 @@ class SyntheticWorld:
     def coarse_views(self) -> dict[str, CoarseView]:
         """Coarse view of every frame, without moving objects, by image name; world frame.
 
-        With :func:`covisibility.overlap` this tells which map images a query really shares
-        anything with.
+        :func:`overlap` of two tells whether a query shares anything with a map image.
         """
         surfaces = [place.surfaces_in_world() for place in self.places]
         return {
@@ -170,21 +138,17 @@ def build_world(options: SyntheticWorldOptions | None = None) -> SyntheticWorld:
     mapping: list[Frame] = []
     queries: list[Frame] = []
     for place in places:
-        seen: list[Frame] = []
-        for stop in mapping_stops(options, place):
-            rig_from_world[stop.timestamp] = stop.rig_from_world
-            seen += stop.frames
+        seen = _mapping_frames(options, place, rig_from_world)
         queries += query_frames(options, place, seen, "day", options.day_queries)
         queries += query_frames(options, place, seen, "night", options.night_queries)
         mapping += seen
     return SyntheticWorld(
         options=options,
         places=places,
-        rig_cameras={rig_sensor_id(k): camera for k, camera in rig_cameras(options).items()},
-        sensor_from_rig={rig_sensor_id(k): pose for k, pose in rig_geometry().items()},
+        sensor_from_rig=rig_geometry(),
         rig_from_world=rig_from_world,
-        mapping=tuple(sorted(mapping, key=lambda frame: frame.name)),
-        queries=tuple(sorted(queries, key=lambda frame: frame.name)),
+        mapping=tuple(sorted(mapping, key=attrgetter("name"))),
+        queries=tuple(sorted(queries, key=attrgetter("name"))),
     )
 
 
@@ -222,17 +186,16 @@ class SyntheticKapture(SyntheticDataset[SyntheticWorldOptions]):
 def mapping_data(world: SyntheticWorld) -> KaptureData:
     """The mapping images' records; their poses are those of the rig."""
     data = KaptureData()
-    members = {}
-    for sensor_id, camera in world.rig_cameras.items():
+    cameras, members = rig_cameras(world.options), dict(world.sensor_from_rig)
+    for sensor_id, camera in cameras.items():
         data.sensors[sensor_id] = Sensor.from_camera(camera, name=sensor_id)
-        members[sensor_id] = world.sensor_from_rig[sensor_id]
         if world.options.depth:
             depth_id = _depth_sensor(sensor_id)
             data.sensors[depth_id] = Sensor.from_camera(camera, name=depth_id, sensor_type="depth")
-            members[depth_id] = world.sensor_from_rig[sensor_id]
-    data.rigs[RIG_ID] = members
+            members[depth_id] = members[sensor_id]
+    data.rigs[_RIG_ID] = members
     for timestamp, pose in world.rig_from_world.items():
-        data.trajectories[timestamp, RIG_ID] = pose
+        data.trajectories[timestamp, _RIG_ID] = pose
     for frame in world.mapping:
         data.records_camera[frame.timestamp, frame.sensor_id] = frame.name
         if world.options.depth:
@@ -254,7 +217,7 @@ def write_side_tables(folder: Path, world: SyntheticWorld) -> None:
 
 def depth_name(image: str) -> str:
     """Path of an image's depth map below ``records_data``."""
-    return str(PurePosixPath("depth") / PurePosixPath(image).with_suffix(".depth"))
+    return f"depth/{PurePosixPath(image).with_suffix('.depth')}"
 
 
 def _depth_sensor(sensor_id: str) -> str:

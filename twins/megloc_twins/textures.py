@@ -1,8 +1,8 @@
 """Textures of houses, ground and things, painted from a seed.
 
 Every painter is a function ``(rng, height, width, **params) -> uint8 (height, width, 3)`` RGB.
-A :class:`TextureRecipe` names a painter with its size and seed, so that a world can be laid out
-without painting it, and two surfaces with the same recipe look the same.
+A :class:`TextureRecipe` names a painter with its size and seed, so that a world is laid out without
+painting it, and two surfaces with the same recipe look the same.
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
 
 from megloc_twins.drawing import (
     TILE,
@@ -29,9 +31,11 @@ from megloc_twins.drawing import (
 from megloc_twins.options import stream
 from megloc_twins.portable import resized, sin
 
+GROUND_TEXELS_PER_M = 80
+
 
 def paint_wall(
-    rng: np.random.Generator,
+    rng: Generator,
     height: int,
     width: int,
     *,
@@ -65,16 +69,16 @@ def paint_wall(
 
 
 def paint_ground(
-    rng: np.random.Generator,
+    rng: Generator,
     height: int,
     width: int,
     *,
     material: str,
     material_seed: float,
     dirt: float = 1.0,
-    density: float = 80.0,
 ) -> Rgb:
-    """Paving or asphalt with patches, lines, manholes and leaves; ``density`` texels per metre."""
+    """Paving or asphalt with patches, lines, manholes and leaves."""
+    density = GROUND_TEXELS_PER_M
     ground = tiled(material, int(material_seed), height, width, (0, 0))
     coarse = smooth_noise(rng, height, width, cell=200, octaves=4)
     fine = smooth_noise(rng, height, width, cell=32, octaves=2)
@@ -83,13 +87,10 @@ def paint_ground(
     area_m2 = height * width / density**2
     for _ in range(int(area_m2 / 14)):  # repaired patches
         w, h = rng.uniform(0.4, 1.8, 2) * density
-        centre = rng.uniform((0, 0), (width, height))
-        rect = (
-            centre.tolist(),
-            (float(w), float(h)),
-            float(rng.choice([0, 90, rng.uniform(0, 90)])),
-        )
-        box = np.round(cv2.boxPoints(rect) * 16).astype(np.int32)
+        centre = rng.uniform((0, 0), (width, height)).tolist()
+        turn = float(rng.choice([0, 90, rng.uniform(0, 90)]))
+        corners = cv2.boxPoints((centre, (float(w), float(h)), turn))
+        box = np.round(corners * 16).astype(np.int32)
         tone = float(rng.uniform(60, 130))
         cv2.fillPoly(image, [box], (tone, tone, tone + 3), cv2.LINE_AA, 4)
     for _ in range(2 + int(area_m2 / 60)):
@@ -101,64 +102,57 @@ def paint_ground(
         start = rng.uniform((0, 0), (width, height))
         angle = rng.choice([0, np.pi / 2, rng.uniform(0, np.pi)])
         stop = start + np.array([np.cos(angle), np.sin(angle)]) * rng.uniform(2, 5) * density
-        ends = [(int(p[0]), int(p[1])) for p in (start, stop)]
+        begin, end = ((int(x), int(y)) for x, y in (start, stop))
         paint = float(rng.uniform(170, 225))
-        cv2.line(image, ends[0], ends[1], (paint, paint, paint), int(0.12 * density), cv2.LINE_AA)
+        cv2.line(image, begin, end, (paint, paint, paint), int(0.12 * density), cv2.LINE_AA)
     for _ in range(int(dirt * area_m2 * 2.5)):  # leaves, litter
-        centre = rng.uniform((0, 0), (width, height))
-        axes = rng.uniform(0.02, 0.06, 2) * density
+        x, y = (int(v) for v in rng.uniform((0, 0), (width, height)))
+        a, b = (max(1, int(axis)) for axis in rng.uniform(0.02, 0.06, 2) * density)
         colour = cv_colour(random_colour(rng, 20, 230))
-        cv2.ellipse(
-            image,
-            (int(centre[0]), int(centre[1])),
-            (max(1, int(axes[0])), max(1, int(axes[1]))),
-            float(rng.uniform(0, 180)),
-            0,
-            360,
-            colour,
-            -1,
-            cv2.LINE_AA,
-        )
-    grain = 1 + 0.04 * smooth_noise(rng, height, width, cell=12, octaves=1)
-    return to_rgb(shade(image.astype(np.float32), grain))
+        turn = float(rng.uniform(0, 180))
+        cv2.ellipse(image, (x, y), (a, b), turn, 0, 360, colour, -1, cv2.LINE_AA)
+    return _worn(rng, image, 0.04, cell=12, octaves=1)
 
 
-def _manhole(rng: np.random.Generator, size: int) -> Rgb:
+def _worn(rng: Generator, image: Rgb, strength: float, *, cell: float, octaves: int) -> Rgb:
+    """The image under noise of its own."""
+    noise = smooth_noise(rng, *image.shape[:2], cell=cell, octaves=octaves)
+    return to_rgb(shade(image.astype(np.float32), 1 + strength * noise))
+
+
+def _disc(image: Rgb, centre: tuple[int, int], radius: int, colour: tuple[float, ...]) -> None:
+    cv2.circle(image, centre, radius, colour, -1, cv2.LINE_AA)
+
+
+def _manhole(rng: Generator, size: int) -> Rgb:
     image = np.full((size, size, 3), 96, np.uint8)
     centre, radius = (size // 2, size // 2), size // 2 - 2
-    cv2.circle(image, centre, radius, (58, 56, 54), -1, cv2.LINE_AA)
+    _disc(image, centre, radius, (58, 56, 54))
     for _ in range(14):
-        x, y = (rng.normal(0, 0.2, 2) * size + size / 2).astype(int)
-        cv2.circle(image, (int(x), int(y)), max(1, size // 20), (128, 124, 118), -1, cv2.LINE_AA)
+        x, y = (rng.normal(0, 0.2, 2) * size + size / 2).astype(int).tolist()
+        _disc(image, (x, y), max(1, size // 20), (128, 124, 118))
     cv2.circle(image, centre, radius - 2, (140, 136, 128), 2, cv2.LINE_AA)
     return image
 
 
-def paint_window(rng: np.random.Generator, height: int, width: int) -> Rgb:
+def paint_window(rng: Generator, height: int, width: int) -> Rgb:
     """A window: frame, panes, what stands behind them."""
     frame = random_colour(rng, 90, 235, chroma=0.35)
     glass = np.array([58, 72, 88], np.float32) * rng.uniform(0.6, 1.3)
-    ramp = np.linspace(1.35, 0.7, height, dtype=np.float32)[:, None] * np.ones(
-        (1, width), np.float32
-    )
+    ramp = np.linspace(1.35, 0.7, height, dtype=np.float32)[:, None]
     cloud = 1 + 0.22 * smooth_noise(rng, height, width, cell=50, octaves=4)
     image = to_rgb(shade(np.broadcast_to(glass, (height, width, 3)), ramp * cloud))
     if rng.random() < 0.6:  # curtains with folds
         part = int(width * rng.uniform(0.15, 0.35))
         folds = 1 + 0.25 * sin(np.arange(part) * rng.uniform(0.3, 0.7))
-        cloth = (
-            (random_colour(rng, 110, 220, chroma=0.4) * folds[:, None])
-            .clip(0, 255)
-            .astype(np.uint8)
-        )
-        image[:, :part] = cloth[None]
-        image[:, width - part :] = cloth[None, ::-1]
+        cloth = random_colour(rng, 110, 220, chroma=0.4) * folds[:, None]
+        image[:, :part] = cloth.clip(0, 255).astype(np.uint8)
+        image[:, width - part :] = image[:, :part][:, ::-1]
     for _ in range(int(rng.integers(1, 4))):  # plants, lamps, vases on the sill
         x, w = int(rng.uniform(0.1, 0.8) * width), int(rng.uniform(0.08, 0.2) * width)
         h = int(rng.uniform(0.1, 0.35) * height)
-        cv2.ellipse(
-            image, (x, height - h // 2), (w, h), 0, 0, 360, cv_colour(random_colour(rng)), -1
-        )
+        colour = cv_colour(random_colour(rng))
+        cv2.ellipse(image, (x, height - h // 2), (w, h), 0, 0, 360, colour, -1)
     bar = max(3, width // 18)
     colour = cv_colour(frame)
     cv2.rectangle(image, (0, 0), (width - 1, height - 1), colour, 2 * bar)
@@ -169,42 +163,40 @@ def paint_window(rng: np.random.Generator, height: int, width: int) -> Rgb:
     for j in range(1, rows + 1):
         y = j * height // (rows + 1)
         cv2.rectangle(image, (0, y - bar // 2), (width, y + bar // 2), colour, -1)
-    grain = 1 + 0.04 * smooth_noise(rng, height, width, cell=8, octaves=2)
-    return to_rgb(shade(image.astype(np.float32), grain))
+    return _worn(rng, image, 0.04, cell=8, octaves=2)
 
 
-def paint_door(rng: np.random.Generator, height: int, width: int) -> Rgb:
+def paint_door(rng: Generator, height: int, width: int) -> Rgb:
     """A door of planks or panels with a handle and a number plate."""
     base = random_colour(rng, 40, 150, chroma=0.6)
     planks = int(rng.integers(4, 9))
-    tone = rng.normal(1, 0.12, planks).astype(np.float32)
-    x = np.arange(width)
-    column = tone[np.minimum(x * planks // width, planks - 1)]
-    seam = np.where((x * planks % width) < planks * 2, 0.5, 1.0)
+    tone = _planks(rng, planks, width, seam=0.5)
     grain = smooth_noise(rng, max(2, height // 16), width, cell=6, octaves=2)
-    grain = resized(grain, width, height)
-    image = to_rgb(
-        shade(
-            base * np.ones((height, width, 3), np.float32),
-            (column * seam)[None] * (1 + 0.09 * grain),
-        )
-    )
+    field = tone[None] * (1 + 0.09 * resized(grain, width, height))
+    image = to_rgb(shade(base * np.ones((height, width, 3), np.float32), field))
     for _ in range(int(rng.integers(1, 4))):
-        x0, x1 = np.sort(rng.uniform(0.08, 0.92, 2)) * width
-        y0, y1 = np.sort(rng.uniform(0.05, 0.95, 2)) * height
-        corners = (int(x0), int(y0)), (int(x1), int(y1))
-        cv2.rectangle(image, corners[0], corners[1], cv_colour(base * 0.5), max(2, width // 30))
+        x0, x1 = (int(x) for x in np.sort(rng.uniform(0.08, 0.92, 2)) * width)
+        y0, y1 = (int(y) for y in np.sort(rng.uniform(0.05, 0.95, 2)) * height)
+        cv2.rectangle(image, (x0, y0), (x1, y1), cv_colour(base * 0.5), max(2, width // 30))
     bar = max(3, width // 16)
     cv2.rectangle(image, (0, 0), (width - 1, height - 1), cv_colour(base * 0.45), bar)
     knob = (int(0.86 * width), int(0.52 * height))
-    cv2.circle(image, knob, max(3, width // 22), (214, 190, 110), -1, cv2.LINE_AA)
+    _disc(image, knob, max(3, width // 22), (214, 190, 110))
     plate = (int(0.3 * width), int(0.14 * height), int(0.7 * width), int(0.24 * height))
     cv2.rectangle(image, plate[:2], plate[2:], (225, 222, 210), -1)
     draw_glyphs(rng, image, plate, np.array([20, 30, 90], np.float32), rows=1)
     return image
 
 
-def paint_shutter(rng: np.random.Generator, height: int, width: int) -> Rgb:
+def _planks(rng: Generator, count: int, texels: int, *, seam: float) -> NDArray[np.float64]:
+    """Tones of boards side by side (texels,), with a dark seam at the beginning of each."""
+    tone = rng.normal(1, 0.12, count).astype(np.float32)
+    at = np.arange(texels)
+    seams = np.where((at * count % texels) < count * 2, seam, 1.0)
+    return np.asarray(tone[np.minimum(at * count // texels, count - 1)] * seams, np.float64)
+
+
+def paint_shutter(rng: Generator, height: int, width: int) -> Rgb:
     """A rolling shutter: horizontal slats, with a graffito."""
     base = random_colour(rng, 110, 200, chroma=0.3)
     slats = 1 + 0.18 * sin(np.arange(height) * (2 * np.pi / 11))
@@ -215,20 +207,20 @@ def paint_shutter(rng: np.random.Generator, height: int, width: int) -> Rgb:
     return image
 
 
-def paint_plain(rng: np.random.Generator, height: int, width: int, *, tone: float = 0.0) -> Rgb:
-    """A painted surface with little on it: ledges, pipes, reveals. ``tone`` 0 chooses one."""
-    level = tone or float(rng.uniform(80, 190))
-    base = np.full(3, level, np.float32) * rng.uniform(0.92, 1.08, 3).astype(np.float32)
+def paint_plain(rng: Generator, height: int, width: int) -> Rgb:
+    """A painted surface with little on it: ledges, pipes, reveals."""
+    base = np.full(3, rng.uniform(80, 190), np.float32)
+    base *= rng.uniform(0.92, 1.08, 3).astype(np.float32)
     field = 1 + 0.09 * smooth_noise(rng, height, width, cell=32, octaves=5)
     return to_rgb(shade(np.broadcast_to(base, (height, width, 3)), field))
 
 
-def paint_glow(rng: np.random.Generator, height: int, width: int) -> Rgb:
+def paint_glow(rng: Generator, height: int, width: int) -> Rgb:
     """The shade of a lamp: nearly white."""
     return np.full((height, width, 3), (255, 244, 220), np.uint8)
 
 
-def paint_poster(rng: np.random.Generator, height: int, width: int) -> Rgb:
+def paint_poster(rng: Generator, height: int, width: int) -> Rgb:
     """A poster: shapes, a headline and small print on a coloured ground."""
     low, high = random_colour(rng, 20, 240), random_colour(rng, 20, 240)
     ramp = np.linspace(0, 1, height, dtype=np.float32)[:, None, None]
@@ -244,56 +236,43 @@ def paint_poster(rng: np.random.Generator, height: int, width: int) -> Rgb:
     border = max(2, width // 40)
     tone = 240 if rng.random() < 0.6 else 25
     cv2.rectangle(image, (0, 0), (width - 1, height - 1), (tone, tone, tone), border)
-    wear = 1 + 0.05 * smooth_noise(rng, height, width, cell=50, octaves=5)
-    return to_rgb(shade(image.astype(np.float32), wear))
+    return _worn(rng, image, 0.05, cell=50, octaves=5)
 
 
-def paint_sign(rng: np.random.Generator, height: int, width: int) -> Rgb:
+def paint_sign(rng: Generator, height: int, width: int) -> Rgb:
     """A shop sign: one line of large letters and an emblem."""
     ground, ink = random_colour(rng, 20, 110), random_colour(rng, 170, 250)
     if rng.random() < 0.4:
         ground, ink = ink, ground
     image = to_rgb(ground * np.ones((height, width, 3), np.float32))
-    emblem = image[:, :height]
-    draw_shapes(rng, emblem, 5)
-    draw_glyphs(
-        rng,
-        image,
-        (int(1.1 * height), int(0.08 * height), width, int(0.98 * height)),
-        ink,
-        rows=1 if rng.random() < 0.6 else 2,
-    )
+    draw_shapes(rng, image[:, :height], 5)
+    box = (int(1.1 * height), int(0.08 * height), width, int(0.98 * height))
+    draw_glyphs(rng, image, box, ink, rows=1 if rng.random() < 0.6 else 2)
     cv2.rectangle(image, (0, 0), (width - 1, height - 1), cv_colour(ink), max(2, height // 20))
-    wear = 1 + 0.05 * smooth_noise(rng, height, width, cell=40, octaves=5)
-    return to_rgb(shade(image.astype(np.float32), wear))
+    return _worn(rng, image, 0.05, cell=40, octaves=5)
 
 
-def paint_wood(rng: np.random.Generator, height: int, width: int) -> Rgb:
+def paint_wood(rng: Generator, height: int, width: int) -> Rgb:
     """A crate's side: boards with grain, nails, braces and a stencil."""
     base = np.array([168, 128, 84], np.float32) * rng.uniform(0.7, 1.15)
     boards = int(rng.integers(4, 7))
-    y = np.arange(height)
-    tone = rng.normal(1, 0.12, boards).astype(np.float32)[
-        np.minimum(y * boards // height, boards - 1)
-    ]
-    seam = np.where((y * boards % height) < boards * 2, 0.4, 1.0)
+    tone = _planks(rng, boards, height, seam=0.4)
     grain = smooth_noise(rng, height, max(2, width // 12), cell=8, octaves=3)
-    grain = resized(grain, width, height)
-    field = (tone * seam)[:, None] * (1 + 0.12 * grain)
+    field = tone[:, None] * (1 + 0.12 * resized(grain, width, height))
     image = to_rgb(shade(np.broadcast_to(base, (height, width, 3)), field))
     for x in (0.04, 0.9):
-        strip = (int(x * width), 0), (int((x + 0.07) * width), height)
-        cv2.rectangle(image, strip[0], strip[1], cv_colour(base * 0.75), -1)
+        end = (int((x + 0.07) * width), height)
+        cv2.rectangle(image, (int(x * width), 0), end, cv_colour(base * 0.75), -1)
         for row in range(boards):
             spot = (int((x + 0.035) * width), int((row + 0.5) * height / boards))
-            cv2.circle(image, spot, 2, (50, 46, 42), -1, cv2.LINE_AA)
+            _disc(image, spot, 2, (50, 46, 42))
     ink = np.array([40, 34, 30], np.float32)
     box = (int(0.16 * width), int(0.3 * height), int(0.86 * width), int(0.7 * height))
     draw_glyphs(rng, image, box, ink, rows=int(rng.integers(1, 3)))
     return image
 
 
-def paint_cloth(rng: np.random.Generator, height: int, width: int) -> Rgb:
+def paint_cloth(rng: Generator, height: int, width: int) -> Rgb:
     """A person from one side: shoes, trousers, a printed or striped coat, a head."""
     coat, legs = random_colour(rng, 20, 230), random_colour(rng, 20, 130)
     image = np.empty((height, width, 3), np.float32)
@@ -309,35 +288,31 @@ def paint_cloth(rng: np.random.Generator, height: int, width: int) -> Rgb:
     picture = to_rgb(image)
     chest = picture[int(0.18 * height) : int(0.45 * height), int(0.2 * width) : int(0.8 * width)]
     draw_shapes(rng, chest, 5)
-    folds = 1 + 0.12 * smooth_noise(rng, height, width, cell=32, octaves=2)
-    return to_rgb(shade(picture.astype(np.float32), folds))
+    return _worn(rng, picture, 0.12, cell=32, octaves=2)
 
 
-def paint_car(rng: np.random.Generator, height: int, width: int, *, side: float = 1.0) -> Rgb:
+def paint_car(rng: Generator, height: int, width: int, *, side: float = 1.0) -> Rgb:
     """A car's side (``side`` 1) or end (0): paint, wheels, windows, lamps, a number plate."""
     paint = random_colour(rng, 30, 220)
-    ramp = np.linspace(1.15, 0.7, height, dtype=np.float32)[:, None] * np.ones(
-        (1, width), np.float32
-    )
+    ramp = np.linspace(1.15, 0.7, height, dtype=np.float32)[:, None]
     image = to_rgb(shade(np.broadcast_to(paint, (height, width, 3)), ramp))
     if side:
         for x in (0.2, 0.8):
             hub = (int(x * width), int(0.92 * height))
             radius = int(0.36 * height)
-            cv2.circle(image, hub, radius, (24, 24, 26), -1, cv2.LINE_AA)
-            cv2.circle(image, hub, int(0.6 * radius), (150, 150, 156), -1, cv2.LINE_AA)
+            _disc(image, hub, radius, (24, 24, 26))
+            _disc(image, hub, int(0.6 * radius), (150, 150, 156))
             for spoke in range(5):
                 angle = 2 * np.pi * spoke / 5
                 tip = hub + 0.55 * radius * np.array([np.cos(angle), np.sin(angle)])
                 cv2.line(image, hub, (int(tip[0]), int(tip[1])), (50, 50, 52), 3, cv2.LINE_AA)
-        for x in (0.33, 0.52, 0.7):
-            cv2.line(
-                image, (int(x * width), 0), (int(x * width), height), cv_colour(paint * 0.5), 2
-            )
+        for share in (0.33, 0.52, 0.7):
+            at = int(share * width)
+            cv2.line(image, (at, 0), (at, height), cv_colour(paint * 0.5), 2)
     else:
         for x in (0.1, 0.9):
             lamp = (int(x * width), int(0.3 * height))
-            cv2.circle(image, lamp, int(0.12 * height), (235, 225, 200), -1, cv2.LINE_AA)
+            _disc(image, lamp, int(0.12 * height), (235, 225, 200))
         plate = (int(0.35 * width), int(0.55 * height), int(0.65 * width), int(0.72 * height))
         cv2.rectangle(image, plate[:2], plate[2:], (235, 235, 225), -1)
         draw_glyphs(rng, image, plate, np.full(3, 20, np.float32), rows=1)
@@ -362,14 +337,9 @@ PAINTERS: dict[str, Callable[..., Rgb]] = {
 
 @dataclass(frozen=True)
 class TextureRecipe:
-    """How to paint one texture.
+    """How to paint one texture of ``width`` by ``height`` texels.
 
-    Parameters
-    ----------
-    painter : a name in :data:`PAINTERS`.
-    width, height : texels.
-    seed : of the texture's random stream.
-    params : further arguments of the painter, as sorted (name, value) pairs.
+    ``painter`` is a name in :data:`PAINTERS`, ``params`` are its further arguments.
     """
 
     painter: str
@@ -382,3 +352,16 @@ class TextureRecipe:
         """The texture, uint8 (height, width, 3), RGB."""
         rng = stream(self.seed, self.painter)
         return PAINTERS[self.painter](rng, self.height, self.width, **dict(self.params))
+
+
+def index_of(recipe: TextureRecipe, recipes: list[TextureRecipe]) -> int:
+    """The recipe's position in a list, at whose end it is put where it is new."""
+    if recipe not in recipes:
+        recipes.append(recipe)
+    return recipes.index(recipe)
+
+
+def texels(size_m: tuple[float, float], per_m: float) -> tuple[int, int]:
+    """Width and height of the texture of a surface."""
+    width, height = (max(8, int(round(side * per_m))) for side in size_m)
+    return width, height

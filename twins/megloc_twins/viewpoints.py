@@ -10,8 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.values import Camera, RigidTransform
-from megloc_twins.frames import Frame, looking_at, noise_seed, reduced
-from megloc_twins.lighting import Condition, Lighting, day_lighting, night_lighting
+from megloc_twins.frames import (
+    Condition,
+    Frame,
+    Lighting,
+    day_lighting,
+    looking_at,
+    night_lighting,
+    noise_seed,
+    reduced,
+)
 from megloc_twins.moving_objects import place_moving_objects
 from megloc_twins.options import SyntheticWorldOptions, stream
 from megloc_twins.rasterization import depth_map, intrinsics, project, sample_grid, visible_surfaces
@@ -27,24 +35,21 @@ _MAX_ANGLE_DEG = 32.0
 _MAX_SIZE_RATIO = 2.0
 _MIN_BASELINE_DEG = 1.5  # less gives a point without depth
 
-Item = TypeVar("Item")
-Bools = NDArray[np.bool_]
-Floats = NDArray[np.float64]
-
 _MAX_OVERLAP = 0.85  # no query is a copy of a mapping image
 _MIN_SUPPORT = 0.6  # share of a query's view that the map can tell it
 _ATTEMPTS = 300
+
+Item = TypeVar("Item")
+Bools = NDArray[np.bool_]
+Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class CoarseView:
     """A view's depth at an eighth of its resolution, and points on a sparse grid of it.
 
-    Parameters
-    ----------
-    camera, cam_from_world : of the view; the frame is that of the surfaces.
-    depth : float32 (h, w), metres, 0 where nothing is seen.
-    points, normals : float64 (P, 3), what the view sees, in the surfaces' frame.
+    ``depth`` is float32 (h, w), metres, 0 where nothing is seen; ``points`` and ``normals``,
+    float64 (P, 3), are of what is seen, in the surfaces' frame.
     """
 
     camera: Camera
@@ -61,9 +66,7 @@ def coarse_view(surfaces: Surfaces, camera: Camera, cam_from_world: RigidTransfo
     depth = depth_map(seen)
     sparse = np.s_[_STRIDE // 2 :: _STRIDE, _STRIDE // 2 :: _STRIDE]
     z = depth[sparse].astype(np.float64)
-    x = np.broadcast_to(grid.x, depth.shape)[sparse] * z
-    y = np.broadcast_to(grid.y, depth.shape)[sparse] * z
-    in_camera = np.stack([x, y, z], axis=-1)[z > 0]
+    in_camera = (grid.rays()[sparse] * z[..., None])[z > 0]
     return CoarseView(
         camera,
         cam_from_world,
@@ -100,9 +103,8 @@ def support(view: CoarseView, others: Sequence[CoarseView]) -> float:
     if not len(view.points) or len(others) < 2:
         return 0.0
     sees = np.stack([visible(view.points, other) for other in others])
-    rays, sizes, slants = map(
-        np.stack, zip(*(_aspect(view, other) for other in others), strict=True)
-    )
+    aspects = [_aspect(view, other) for other in others]
+    rays, sizes, slants = (np.stack(parts) for parts in zip(*aspects, strict=True))
     ray, size, slant = _aspect(view, view)
     matches = sees & _similar((rays * ray).sum(-1), sizes / size, slants / slant)
     between = np.einsum("apk,bpk->abp", rays, rays)
@@ -133,15 +135,8 @@ def query_frames(
     condition: Condition,
     total: int,
 ) -> list[Frame]:
-    """This place's share of the ``total`` queries of a condition.
-
-    ``mapping`` are the mapping frames of the place.
-    """
-    world_from_place = place.place_from_world.inverse()
-    map_views = [
-        coarse_view(place.surfaces, frame.camera, frame.cam_from_world @ world_from_place)
-        for frame in mapping
-    ]
+    """This place's share of the ``total`` queries of a condition; ``mapping`` are its images."""
+    map_views = views_of(place, mapping)
     frames = []
     for number in range(place.index, total, options.num_places):
         sensor_id = f"{condition}_{number:05d}"
@@ -163,12 +158,18 @@ def query_frames(
                 cam_from_world=cam_from_place @ place.place_from_world,
                 lighting=_query_lighting(options, condition, rng, image),
                 moving_objects=place_moving_objects(
-                    place.plan, rng, options.moving_objects, position, yaw=yaw
+                    place.plan, rng, options.moving_objects, position, yaw
                 ),
-                bonnet=False,
             )
         )
     return frames
+
+
+def views_of(place: Place, frames: Iterable[Frame]) -> list[CoarseView]:
+    """What images of a place see of it, in its own frame."""
+    return [
+        coarse_view(place.surfaces, frame.camera, place.cam_from_place(frame)) for frame in frames
+    ]
 
 
 def query_camera(options: SyntheticWorldOptions, rng: np.random.Generator) -> Camera:
@@ -185,21 +186,16 @@ def query_camera(options: SyntheticWorldOptions, rng: np.random.Generator) -> Ca
 def _query_lighting(
     options: SyntheticWorldOptions, condition: Condition, rng: np.random.Generator, image: str
 ) -> Lighting:
-    seed = noise_seed(options, image)
+    seed = noise_seed(options.seed, image)
     if condition == "night":
         return night_lighting(rng, exposure=options.night_exposure, noise_seed=seed)
-    return day_lighting(
-        rng,
-        azimuth=float(rng.uniform(-np.pi, np.pi)),
-        elevation=float(np.radians(rng.uniform(35, 60))),
-        overcast=float(rng.choice([0.1, 0.5, 1.0])),
-        noise_seed=seed,
-    )
+    sun = float(rng.uniform(-np.pi, np.pi)), float(np.radians(rng.uniform(35, 60)))
+    return day_lighting(rng, sun, overcast=float(rng.choice([0.1, 0.5, 1.0])), noise_seed=seed)
 
 
 def _query_poses(
     place: Place, camera: Camera, map_views: list[CoarseView], rng: np.random.Generator
-) -> Iterator[tuple[float, tuple[NDArray[np.float64], float, RigidTransform]]]:
+) -> Iterator[tuple[float, tuple[Floats, float, RigidTransform]]]:
     """Random viewpoints that keep their distance from things, each behind its :func:`misfit`.
 
     A viewpoint is its position (3,), yaw and ``cam_from_place``.
@@ -230,11 +226,9 @@ def misfit(view: CoarseView, map_views: Sequence[CoarseView], *, min_overlap: fl
 
 
 def first_fitting(candidates: Iterable[tuple[float, Item]], place: str) -> Item:
-    """The first candidate whose misfit is 0; failing that, the first of the least.
+    """The first of (misfit, candidate) whose misfit is 0; failing that, the first of the least.
 
-    Parameters
-    ----------
-    candidates : misfit and candidate; drawn no further than needed.
+    No more are drawn than needed.
     """
     best: tuple[float, Item] | None = None
     for candidate in candidates:
@@ -242,6 +236,6 @@ def first_fitting(candidates: Iterable[tuple[float, Item]], place: str) -> Item:
             best = candidate
         if candidate[0] == 0.0:
             break
-    if best is None:  # every floor plan has room for a query
+    if best is None:  # every floor plan has room
         raise RuntimeError(f"no free view in {place}")
     return best[1]

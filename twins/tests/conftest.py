@@ -9,10 +9,9 @@ from typing import Any
 
 import pytest
 from megloc_twins.aachen import AachenTwin, AachenTwinOptions
-from megloc_twins.dataset import SyntheticDataset
 from megloc_twins.fourseasons import FourSeasonsTwin, FourSeasonsTwinOptions
 from megloc_twins.inloc import InLocTwin, InLocTwinOptions
-from megloc_twins.options import SyntheticWorldOptions
+from megloc_twins.options import SyntheticDataset, SyntheticWorldOptions
 from megloc_twins.robotcar import RobotCarTwin, RobotCarTwinOptions
 from megloc_twins.synthetic_kapture import SyntheticKapture
 
@@ -96,3 +95,9 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
         return root
 
     return render
+
+
+@pytest.fixture(scope="module")
+def root(request: pytest.FixtureRequest, rendered: Callable[[str], Path]) -> Path:
+    """Folder of the small dataset that a test file is about, its ``LAYOUT``."""
+    return rendered(request.module.LAYOUT)

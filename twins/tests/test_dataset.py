@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections import defaultdict
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
@@ -13,7 +14,8 @@ import kapture
 import numpy as np
 import pytest
 from kapture.io.csv import kapture_from_dir
-from megloc_twins.dataset import SyntheticDataset
+from kapture.io.features import get_keypoints_fullpath, image_keypoints_from_file
+from megloc_twins.options import SyntheticDataset
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.datasets.official import write_official
@@ -22,6 +24,9 @@ from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import DATASETS
 from megloc_kapture.stages.work import Work
+from megloc_kapture.values import RigidTransform
+
+import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
 
 LAYOUTS = ("aachen", "robotcar", "4seasons", "inloc")
 COUNTS = {
@@ -54,11 +59,15 @@ def hashes(root: Path) -> dict[str, str]:
     }
 
 
-@pytest.mark.parametrize("name", LAYOUTS)
-def test_the_import_is_the_truth(name: str, rendered: Rendered, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "options"), [*((name, {}) for name in LAYOUTS), ("robotcar", {"model": "individual"})]
+)
+def test_the_import_is_the_truth(
+    name: str, options: dict[str, Any], rendered: Rendered, tmp_path: Path
+) -> None:
     """Poses, cameras and sizes, in the official coordinates, as kapture reads them."""
     root = rendered(name)
-    dataset = load_plugin(DATASETS, name).read(root)
+    dataset = load_plugin(DATASETS, name, options).read(root)
     assert dataset.missing is not None and dataset.missing.files == []
     write_official(dataset, tmp_path)
     assert not KaptureFolder(tmp_path / "query").read().trajectories
@@ -69,10 +78,7 @@ def test_the_import_is_the_truth(name: str, rendered: Rendered, tmp_path: Path) 
         assert len(found) == COUNTS[name][f"{part.removesuffix('_gt')} images"]
         for image, pose in found.items():
             assert np.linalg.norm(pose.center()) < 5000
-            official = dataset.world.pose_in_official(pose)
-            assert np.linalg.norm(official.center() - truth[image].center()) < 1e-6
-            turn = rotation(official) * rotation(truth[image]).inv()
-            assert np.degrees(turn.magnitude()) < 1e-6
+            assert_same(dataset.world.pose_in_official(pose), truth[image])
             model, width, height, *params = cameras[image]
             true = true_cameras[image]
             assert (model, width, height) == tuple(true[:3])
@@ -80,6 +86,76 @@ def test_the_import_is_the_truth(name: str, rendered: Rendered, tmp_path: Path) 
             assert [*map(float, params)] == pytest.approx([*map(float, true[3:])], rel=1e-12)
             path = KaptureFolder(tmp_path / part.removesuffix("_gt")).image_path(image)
             assert image_size(path) == (int(width), int(height))
+
+
+@pytest.mark.parametrize(
+    ("name", "published", "count"),
+    [("robotcar", "", 6), ("4seasons", "recording_2021-01-15_13-04-17/", 12)],
+)
+def test_published_poses_are_the_truth(
+    name: str, published: str, count: int, rendered: Rendered, tmp_path: Path
+) -> None:
+    """Without what lies beside the data."""
+    root = rendered(name)
+    for entry in root.iterdir():
+        if entry.name != "ground_truth":
+            (tmp_path / entry.name).symlink_to(entry)
+    dataset = load_plugin(DATASETS, name).read(tmp_path)
+    truth, _ = read(root / "ground_truth/query")
+    poses = dataset.query_gt.poses()
+    assert len(poses) == count
+    assert all(image.startswith(published) for image in poses)
+    for image, pose in poses.items():
+        assert_same(dataset.world.pose_in_official(pose), truth[image])
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("aachen", {"version": "1.0"}),
+        ("aachen", {"version": "1.1"}),
+        ("robotcar", {"model": "merged"}),
+        ("robotcar", {"model": "individual"}),
+    ],
+)
+def test_points_of_the_reference_model_reproject(
+    name: str, options: dict[str, Any], rendered: Rendered, tmp_path: Path
+) -> None:
+    """By kapture's readers and poses, and COLMAP's cameras."""
+    adapter = load_plugin(DATASETS, name, {**options, "reference_model": True})
+    dataset = adapter.read(rendered(name))
+    assert dataset.missing is not None and dataset.missing.files == []
+    write_official(dataset, tmp_path)
+    folder = str(tmp_path / "reference")
+    data = kapture_from_dir(folder)
+    points = data.points3d.as_array()[:, :3]
+    seen: dict[str, list[tuple[int, int]]] = defaultdict(list)
+    for point_id in range(len(points)):
+        track = data.observations[point_id, "sift"]
+        assert len(track) >= 2
+        for image, keypoint_id in track:
+            seen[image].append((point_id, keypoint_id))
+    worst = 0.0
+    for timestamp, sensor, image in kapture.flatten(data.records_camera):
+        model, width, height, *params = data.sensors[sensor].sensor_params
+        size = {"width": int(width), "height": int(height)}
+        camera = pycolmap.Camera(model=model, params=[*map(float, params)], **size)
+        path = get_keypoints_fullpath("sift", folder, image)
+        keypoints = image_keypoints_from_file(path, np.float32, 2)
+        of_point, of_keypoint = np.array(seen[image]).T
+        in_camera = data.trajectories[timestamp, sensor].transform_points(points[of_point])
+        error = np.linalg.norm(camera.img_from_cam(in_camera) - keypoints[of_keypoint], axis=1)
+        worst = max(worst, float(error.max()))
+        assert len(error) > 5
+    assert 0 < worst < 1e-3
+    assert sum(map(len, seen.values())) > 500
+
+
+def assert_same(found: RigidTransform, expected: RigidTransform) -> None:
+    """To 1e-6 m and 1e-6 deg, by scipy."""
+    assert np.linalg.norm(found.center() - expected.center()) < 1e-6
+    rotations = [Rotation.from_quat(p.quat_wxyz, scalar_first=True) for p in (found, expected)]
+    assert np.degrees((rotations[0] * rotations[1].inv()).magnitude()) < 1e-6
 
 
 def read(folder: Path) -> tuple[dict[str, Any], dict[str, list[str]]]:
@@ -90,10 +166,6 @@ def read(folder: Path) -> tuple[dict[str, Any], dict[str, list[str]]]:
         for _, sensor, image in kapture.flatten(theirs.records_camera)
     }
     return KaptureFolder(folder).read().poses(), cameras
-
-
-def rotation(pose: Any) -> Rotation:
-    return Rotation.from_quat(pose.quat_wxyz, scalar_first=True)
 
 
 @pytest.mark.parametrize(

@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from megloc_twins.fourseasons import (
-    DUSK,
-    REFERENCE,
-    WINTER,
-    FourSeasonsTwinOptions,
-)
+from megloc_twins.fourseasons import DUSK, REFERENCE, WINTER, FourSeasonsTwinOptions
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -30,10 +24,7 @@ from megloc_kapture.io.images import read_depth_map, read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import RigidTransform
 
-
-@pytest.fixture(scope="module")
-def root(rendered: Callable[[str], Path]) -> Path:
-    return rendered("4seasons")
+LAYOUT = "4seasons"
 
 
 @pytest.fixture(scope="module")
@@ -68,21 +59,6 @@ def test_the_map_is_recentred(root: Path, dataset: OfficialDataset) -> None:
     assert all(np.linalg.norm(pose.center()) < 100 for pose in dataset.mapping.poses().values())
     for pose in true_poses(root, "mapping").values():
         assert np.linalg.norm(pose.center()) == pytest.approx(6.37e6, rel=1e-2)
-
-
-def test_without_the_truth_beside_it(root: Path, tmp_path: Path) -> None:
-    """What is published makes no use of it."""
-    for entry in root.iterdir():
-        if entry.name != "ground_truth":
-            (tmp_path / entry.name).symlink_to(entry)
-    dataset = FourSeasons().read(tmp_path)
-    truth = true_poses(root, "query")
-    assert dataset.query_gt is not None
-    poses = dataset.query_gt.poses()
-    assert set(poses) == {image for image in truth if image.startswith(WINTER)}
-    assert len(poses) == 12
-    for image, pose in poses.items():
-        assert_same(dataset.world.pose_in_official(pose), truth[image])
 
 
 def test_what_it_asks_for(dataset: OfficialDataset) -> None:

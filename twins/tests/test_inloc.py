@@ -3,39 +3,43 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
 from itertools import permutations
 from pathlib import Path
 
 import numpy as np
 import pytest
 import scipy.io
-from megloc_twins.indoor_floors import (
-    PITCHES_DEG,
-    YAWS_DEG,
+from megloc_twins.frames import lamp_lighting
+from megloc_twins.indoor_rooms import (
+    ROOM_KINDS,
     Floor,
     FloorBuilder,
+    Parts,
+    Recipes,
+    build_module,
+    build_room,
+)
+from megloc_twins.inloc import (
+    PITCHES_DEG,
+    YAWS_DEG,
+    InLocTwinOptions,
     QueryView,
     cam_from_scan,
     cutout_camera,
-    lamp_lighting,
     phone_camera,
     query_views,
+    scanned_points,
 )
-from megloc_twins.indoor_rooms import ROOM_KINDS, Parts, Recipes, build_module, build_room
-from megloc_twins.inloc import InLocTwinOptions, scanned_points
 from megloc_twins.rasterization import NO_SURFACE, depth_map, sample_grid, visible_surfaces
 
 from megloc_kapture.datasets.inloc.adapter import InLoc, InLocOptions
 from megloc_kapture.datasets.official import write_official
+from megloc_kapture.io.colmap_cameras import px_from_cam
 from megloc_kapture.io.dataset_tables import read_groups
 from megloc_kapture.io.images import read_depth_map, read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
 
-
-@pytest.fixture(scope="module")
-def root(rendered: Callable[[str], Path]) -> Path:
-    return rendered("inloc")
+LAYOUT = "inloc"
 
 
 @pytest.fixture(scope="module")
@@ -131,7 +135,7 @@ def test_conditions_come_from_the_truth(root: Path, imported: Path) -> None:
 
 def test_the_default_twin_is_real_work() -> None:
     options = InLocTwinOptions()
-    zones = [zone for floor in options.builder().floors(0, 2) for zone in floor.zones]
+    zones = [zone for floor in options.floors() for zone in floor.zones]
     assert len(zones) * 36 >= 80
     assert options.queries >= 40
     kinds = Counter(zone.kind for zone in zones)
@@ -239,11 +243,8 @@ def test_scanners_stand_nearly_upright_and_turned_at_random(floors: list[Floor])
 
 
 def test_what_a_scanner_measures(floors: list[Floor]) -> None:
-    import pycolmap
-
     floor = floors[0]
     camera = cutout_camera(100, 75)
-    theirs = pycolmap.Camera(model=camera.model, width=100, height=75, params=list(camera.params))
     columns, rows = np.meshgrid(np.arange(100) + 0.5, np.arange(75) + 0.5)
     bright = np.full((75, 100, 3), 128, np.uint8)
     bright[:10] = 5
@@ -260,7 +261,7 @@ def test_what_a_scanner_measures(floors: list[Floor]) -> None:
             assert not known[floor.glass[np.maximum(seen.surface, 0)]].any()
             in_camera = own.apply(points[known])
             pixels = np.column_stack([columns[known], rows[known]])
-            np.testing.assert_allclose(theirs.img_from_cam(in_camera), pixels, atol=1e-3)
+            np.testing.assert_allclose(px_from_cam(camera, in_camera), pixels, atol=1e-3)
             off = in_camera[:, 2] - depth_map(seen)[known]
             assert np.abs(off).max() < 0.006 and 1e-4 < np.std(off) < 2e-3
             np.testing.assert_array_equal(points[known], points[known].astype(np.float32))

@@ -12,13 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from megloc_twins.portable import (
-    averaged,
-    blurred,
-    product,
-    resized,
-    settled_pose,
-)
+from megloc_twins.portable import averaged, blurred, product, resized, settled_pose
 from megloc_twins.rasterization import bilinear
 
 # what the libraries take from a processor can be withheld from them: these run as they do where
@@ -37,13 +31,12 @@ FIELDS = """
 import hashlib
 import numpy as np
 from megloc_twins.surfaces import build_atlas
-from megloc_twins.frames import looking_at
+from megloc_twins.frames import day_lighting, looking_at, night_lighting
 from megloc_twins.synthetic_kapture import rig_geometry
-from megloc_twins.lighting import day_lighting, night_lighting
 from megloc_twins.drawing import periodic_noise, smooth_noise
 from megloc_twins.options import stream
 from megloc_twins.rasterization import sample_colour, sample_grid, visible_surfaces
-from megloc_twins.shading import cast_shadows, cloud_texture, develop, radiance
+from megloc_twins.render import cast_shadows, cloud_texture, develop, radiance
 from megloc_twins.surfaces import SurfaceBuilder
 from megloc_twins.textures import TextureRecipe
 from megloc_kapture.values import Camera
@@ -72,7 +65,7 @@ for _ in range(60):
 surfaces = builder.build()
 grid = sample_grid(Camera("SIMPLE_RADIAL", 320, 240, (230.0, 160.0, 120.0, -0.07)), 2)
 lamps = rng.uniform((-5, -5, 2), (5, 5, 3), (6, 3))
-day = day_lighting(rng, azimuth=1.0, elevation=0.8, overcast=0.2, noise_seed=1)
+day = day_lighting(rng, (1.0, 0.8), overcast=0.2, noise_seed=1)
 night = night_lighting(rng, exposure=1.0, noise_seed=2)
 atlas, clouds = build_atlas(textures), cloud_texture(0)
 for look in (day, night):

@@ -8,9 +8,14 @@ import numpy as np
 import pytest
 from megloc_twins.frames import Frame
 from megloc_twins.options import SyntheticWorldOptions
-from megloc_twins.render import PlaceRenderer, on_bonnet, on_moving_objects, stands_still
-from megloc_twins.robotcar import RobotCarTwinOptions, build_robotcar_moments
-from megloc_twins.shading import add_shadows, cast_shadows
+from megloc_twins.render import (
+    PlaceRenderer,
+    add_shadows,
+    cast_shadows,
+    on_bonnet,
+    on_moving_objects,
+)
+from megloc_twins.robotcar import RobotCarTwinOptions, build_robotcar_frames
 from megloc_twins.squares import build_place
 from megloc_twins.surfaces import SurfaceBuilder, Surfaces
 from megloc_twins.synthetic_kapture import SyntheticWorld, build_world
@@ -158,7 +163,7 @@ SEED = CAR.world().seed
 
 @pytest.fixture(scope="module")
 def car_frames() -> list[Frame]:
-    return build_robotcar_moments(CAR).query_frames()
+    return list(build_robotcar_frames(CAR).queries)
 
 
 @pytest.fixture(scope="module")
@@ -202,7 +207,8 @@ def test_no_feature_is_left_on_the_bonnet_or_on_a_mover(
     extractor = RootSift()
     without = 0
     for frame in (one for one in car_frames if one.sensor_id == "rear"):
-        image, mask = car_renderer.render(frame).image, stands_still(frame, place, SEED)
+        image = car_renderer.render(frame).image
+        mask = ~(on_bonnet(frame, SEED) | on_moving_objects(frame, place))
         found = extractor.extract(image, with_margin(mask, 3.0)).keypoints_px
         column, row = np.floor(found[:, :2]).astype(int).T
         assert len(found) and mask[row, column].all()

@@ -14,8 +14,7 @@ from megloc_twins.aachen import (
     AachenTwinOptions,
     build_aachen_frames,
 )
-from megloc_twins.frames import Frame, in_frame, looking_at
-from megloc_twins.lighting import day_lighting
+from megloc_twins.frames import Frame, day_lighting, in_frame, looking_at
 from megloc_twins.moving_objects import moving_object_surfaces
 from megloc_twins.options import SyntheticWorldOptions
 from megloc_twins.rasterization import depth_map, sample_grid, visible_surfaces
@@ -32,6 +31,7 @@ from megloc_kapture.datasets.formats.sparse_points import SparsePoints
 from megloc_kapture.datasets.official import write_official
 from megloc_kapture.datasets.robotcar.adapter import RobotCar, RobotCarOptions
 from megloc_kapture.features.colmap_sift import ColmapSift
+from megloc_kapture.io.colmap_cameras import new_colmap_camera, px_from_cam
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder
 from megloc_kapture.localization.map_index import MapIndex
 from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
@@ -53,31 +53,18 @@ def rng() -> np.random.Generator:
 
 def colmap_px(frame: Frame, points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Where COLMAP projects world points, (N, 2)."""
-    camera = pycolmap.Camera(
-        model=frame.camera.model,
-        width=frame.camera.width,
-        height=frame.camera.height,
-        params=list(frame.camera.params),
-    )
     w, x, y, z = frame.cam_from_world.quat_wxyz
     pose = pycolmap.Rigid3d(
         pycolmap.Rotation3d(np.array([x, y, z, w])), np.array(frame.cam_from_world.translation)
     )
-    return np.array([camera.img_from_cam(pose * point) for point in points])
+    return px_from_cam(frame.camera, np.array([pose * point for point in points]))
 
 
 @pytest.fixture(scope="module")
 def world() -> SyntheticWorld:
-    return build_world(
-        SyntheticWorldOptions(
-            num_places=2,
-            stations_per_place=5,
-            day_queries=2,
-            night_queries=0,
-            width=160,
-            height=120,
-        )
-    )
+    size = {"width": 160, "height": 120}
+    queries = {"day_queries": 2, "night_queries": 0}
+    return build_world(SyntheticWorldOptions(num_places=2, stations_per_place=5, **queries, **size))
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +137,7 @@ def test_the_same_seed_gives_the_same_points(
 
 def frame(name: str, x: float, *, camera: Camera, yaw_deg: float = 90.0) -> Frame:
     """A camera at (x, 0, 0) that looks along +y unless turned."""
-    lighting = day_lighting(rng(), azimuth=0.0, elevation=1.0, overcast=0.0, noise_seed=0)
+    lighting = day_lighting(rng(), (0.0, 1.0), overcast=0.0, noise_seed=0)
     pose = looking_at(np.array([x, 0.0, 0.0]), np.radians(yaw_deg), 0.0, 0.0)
     return Frame(name, "mapping", "day", 0, 0, name, camera, pose, lighting, (), False)
 
@@ -175,22 +162,14 @@ def test_what_stands_in_front_hides_the_wall() -> None:
     assert len(points) == 2 * 18 * 26
 
 
-def test_nothing_is_seen_without_depth_behind_or_out_of_the_image() -> None:
-    nothing = {"a": np.zeros((30, 40), np.float32), "b": np.zeros((30, 40), np.float32)}
-    pair = [frame("a", 0.0, camera=PINHOLE), frame("b", 0.0, camera=PINHOLE)]
-    assert len(exact_tracks(pair, nothing, points_per_frame=50, rng=rng())) == 0
-    behind = [frame("a", 0.0, camera=PINHOLE), frame("b", 0.0, camera=PINHOLE, yaw_deg=-90.0)]
-    both = {"a": wall(), "b": wall()}
-    assert len(exact_tracks(behind, both, points_per_frame=50, rng=rng())) == 0
-    beside = [frame("a", 0.0, camera=PINHOLE), frame("b", 50.0, camera=PINHOLE)]
-    assert len(exact_tracks(beside, both, points_per_frame=50, rng=rng())) == 0
-    assert len(exact_tracks([], {}, points_per_frame=50, rng=rng())) == 0
-
-
-def test_other_places_are_not_looked_at() -> None:
-    pair = [frame("a", 0.0, camera=PINHOLE), replace(frame("b", 0.0, camera=PINHOLE), place=1)]
-    both = {"a": wall(), "b": wall()}
-    assert len(exact_tracks(pair, both, points_per_frame=50, rng=rng())) == 0
+def test_nothing_is_seen_without_depth_behind_beside_or_in_another_place() -> None:
+    a, b = frame("a", 0.0, camera=PINHOLE), frame("b", 0.0, camera=PINHOLE)
+    behind = frame("b", 0.0, camera=PINHOLE, yaw_deg=-90.0)
+    beside = frame("b", 50.0, camera=PINHOLE)
+    nothing, both = {"a": 0 * wall(), "b": 0 * wall()}, {"a": wall(), "b": wall()}
+    pairs = (([a, b], nothing), ([a, behind], both), ([a, beside], both))
+    for frames, depths in (*pairs, ([a, replace(b, place=1)], both), ([], {})):
+        assert len(exact_tracks(frames, depths, points_per_frame=50, rng=rng())) == 0
 
 
 def test_strong_distortion_folds_nothing_back_into_the_image() -> None:
@@ -318,12 +297,7 @@ def localized(
         result = pycolmap.estimate_and_refine_absolute_pose(
             np.concatenate(px).astype(np.float64),
             np.concatenate(points),
-            pycolmap.Camera(
-                model=camera.model,
-                width=camera.width,
-                height=camera.height,
-                params=list(camera.params),
-            ),
+            new_colmap_camera(camera),
             options,
         )
         if result is None:  # a night's

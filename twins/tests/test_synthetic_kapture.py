@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,8 @@ from megloc_kapture.io.dataset_tables import read_groups, read_protocol, read_wo
 from megloc_kapture.io.images import read_depth_map, read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder, to_kapture
 from megloc_kapture.values import RigidTransform
+
+LAYOUT = "synthetic"
 
 
 @pytest.fixture(scope="module")
@@ -121,11 +122,6 @@ def test_overlap_is_whole_with_itself_and_none_behind(world: SyntheticWorld) -> 
 @pytest.fixture(scope="module")
 def small_world(small: dict[str, SyntheticKapture]) -> SyntheticWorld:
     return build_world(small["synthetic"].options)
-
-
-@pytest.fixture(scope="module")
-def root(rendered: Callable[[str], Path]) -> Path:
-    return rendered("synthetic")
 
 
 def test_what_is_written_is_the_world(root: Path, small_world: SyntheticWorld) -> None:
