@@ -70,7 +70,7 @@ def exact_tracks(
     ``image_ids`` count in ``frames``, ``feature_ids`` from 0 in each image; ``xy_px`` are the
     projections rounded to float32.
     """
-    parts = [(SparsePoints.none(), np.zeros(0, np.int32))]
+    parts = [SparsePoints.none()]
     for frame in frames:
         # those of other places stand behind walls
         here = [index for index, other in enumerate(frames) if other.place == frame.place]
@@ -81,7 +81,7 @@ def exact_tracks(
         found = _grey_points(
             points[enough], of_point, of_image, of_image, px[enough][of_point, of_image]
         )
-        parts.append((found, np.array(here, np.int32)))
+        parts.append(replace(found, image_ids=np.array(here, np.int32)[found.image_ids]))
     joined = SparsePoints.joined(parts)
     feature_ids = np.empty_like(joined.image_ids)
     for image in np.unique(joined.image_ids):
