@@ -32,8 +32,8 @@ from megloc_kapture.io.weights.registry import (
     by_file_name,
     by_sha256,
     lookup,
-    registry,
 )
+from megloc_kapture.io.weights.registry import registry as registered  # not to hide the module
 
 if TYPE_CHECKING:
     import torch
@@ -86,7 +86,7 @@ class WeightsFile:
     @property
     def published(self) -> PublishedFile | None:
         """The registry's file that it should be; None for a user's own and for converted ones."""
-        known = registry().get(self.name)
+        known = registered().get(self.name)
         if known is None or self.path.is_relative_to(weights_folder() / UNVERIFIED):
             return None
         path = self.path.as_posix()
@@ -113,8 +113,8 @@ def find_weights(name: str) -> WeightsFile:
     MissingWeightsError : it is not there; names the file, its folder and the command to add it.
     DataError : a link in the folder of weights leads out of it.
     """
-    if name in registry():
-        weights = registry()[name]
+    if name in registered():
+        weights = registered()[name]
         path = next(files_of(weights), None)
         if path is None:
             raise MissingWeightsError(how_to_get(weights), names=[name])
@@ -402,8 +402,8 @@ def _recognised(source: Path, sha256: str, name: str | None) -> tuple[Weights, s
         found = by_sha256(sha256) or by_file_name(source.name)
         if found is not None:
             return found[0], found[1].name
-        if source.suffix == ".safetensors" and source.stem in registry():
-            return registry()[source.stem], source.name
+        if source.suffix == ".safetensors" and source.stem in registered():
+            return registered()[source.stem], source.name
         raise OptionError(
             f"{source}: neither its sha256 nor its name is in the registry; say what it is with "
             "--name (megloc weights list)"
