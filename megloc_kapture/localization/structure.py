@@ -28,8 +28,6 @@ _MAX_POINTS, _MAX_IMAGES = 300, 4
 _MIN_DEVIATION, _MIN_CORRELATION = 5.0, 0.6
 # surroundings are compared as planes that face the camera
 _MAX_SCALE = 2.0
-
-
 Float32 = NDArray[np.float32]
 
 
