@@ -302,7 +302,7 @@ def pyramid_queries(
     both = dict.fromkeys((pair.query, pair.map) for pair in pairs)
     for image, other in sorted(both, key=itemgetter(0)):
         candidates.setdefault(image, []).append(other)
-    features, stored = PyramidFeatures(output, query, local_type), query.matches(local_type)
+    stored = query.matches(local_type)
 
     @cache
     def side(number: int, image: str, digest: Digest) -> list[object]:
@@ -318,7 +318,7 @@ def pyramid_queries(
 
     items = work.items(local_type, list(candidates), inputs)
     jobs = [job for job in candidates.items() if job[0] not in items.done]
-    features.leave(items.done)
+    features = PyramidFeatures(output, query, local_type, items.done)
     retry = partial(_retry, FolderSpec(query), FolderSpec(mapping), types, method)
     plugins = method.extractor, method.matcher
     with closing(MatchesWriter(output, larger, orphan=True)) as writer:
