@@ -58,8 +58,15 @@ from megloc_kapture.stages.matches import Features, match_all
 from megloc_kapture.stages.work import batched
 
 COLUMNS = (
-    *("image", "other", "matches_before", "matches_after", "added_to_image", "added_to_other"),
-    *("variants_tried", "best_variant", "skipped"),
+    "image",
+    "other",
+    "matches_before",
+    "matches_after",
+    "added_to_image",
+    "added_to_other",
+    "variants_tried",
+    "best_variant",
+    "skipped",
 )
 
 
