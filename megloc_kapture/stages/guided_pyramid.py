@@ -55,8 +55,15 @@ from megloc_kapture.stages.matches import Features, match_all
 from megloc_kapture.stages.work import batched
 
 COLUMNS = (
-    *("image", "other", "matches_before", "matches_after", "added_to_image", "added_to_other"),
-    *("variants_tried", "best_variant", "skipped"),
+    "image",
+    "other",
+    "matches_before",
+    "matches_after",
+    "added_to_image",
+    "added_to_other",
+    "variants_tried",
+    "best_variant",
+    "skipped",
 )
 
 
@@ -206,13 +213,17 @@ class PyramidFeatures:
 
     Files of images that nothing was added to are hard links to those of T where the file system
     has them, so that they take no space twice. Raises DataError where an image of ``folder`` has
-    more or fewer descriptors of ``local_type`` than keypoints.
+    more or fewer descriptors of ``local_type`` than keypoints; ``done`` are images that have been
+    written before.
     """
 
-    def __init__(self, output: Path, folder: KaptureFolder, local_type: str) -> None:
+    def __init__(
+        self, output: Path, folder: KaptureFolder, local_type: str, done: Iterable[str] = ()
+    ) -> None:
         name = pyramid_type(local_type)
         keypoints, descriptors = folder.keypoints(local_type), folder.descriptors(local_type)
-        self._left = [one for one in sorted(folder.read().image_names()) if one in keypoints]
+        images = set(folder.read().image_names()) - set(done)
+        self._left = [image for image in sorted(images) if image in keypoints]
         for image in self._left:
             lengths = descriptors.length(image), keypoints.length(image)
             if lengths[0] != lengths[1]:
@@ -228,11 +239,6 @@ class PyramidFeatures:
             )
             for source, config in zip((keypoints, descriptors), configs, strict=True)
         ]
-
-    def leave(self, images: Iterable[str]) -> None:
-        """Let images be that have been written before."""
-        done = set(images)
-        self._left = [image for image in self._left if image not in done]
 
     def write(
         self, image: str, added_px: NDArray[np.float32], added_descriptors: NDArray[Any]

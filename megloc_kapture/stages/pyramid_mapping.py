@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from functools import cache, partial
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -221,12 +221,20 @@ class _Added:
     descriptors_at: list[tuple[str, int]] = field(default_factory=list)
 
 
+class _Directed(NamedTuple):
+    """What the variants of an image found in another one, how many were tried, and not at all."""
+
+    spooled: list[Spooled]
+    num_variants: int
+    skipped: str
+
+
 class _AllMatched:
     """What the images' variants found, by image and the other one, and what it adds to images."""
 
     def __init__(self, spool: MatchSpool, keypoints: FeatureReader) -> None:
         self._spool, self._keypoints = spool, keypoints
-        self._found: dict[_Pair, tuple[list[Spooled], int, str]] = {}
+        self._found: dict[_Pair, _Directed] = {}
         self.added: dict[str, _Added] = defaultdict(_Added)
         self.seconds = 0.0
 
@@ -242,8 +250,8 @@ class _AllMatched:
         """Keep what the variants of one image came to; ``found`` as :meth:`MatchSpool.write`."""
         self.seconds += seconds
         for other, of_other, count in zip(others, found, num_variants, strict=True):
-            spooled = [Spooled(ImageVariant(*v), count, at) for v, count, at, *_ in of_other]
-            self._found[image, other] = spooled, count, skipped
+            spooled = [Spooled(ImageVariant(*v), num, at) for v, num, at, *_ in of_other]
+            self._found[image, other] = _Directed(spooled, count, skipped)
 
     def combine(
         self, pair: _Pair, base: tuple[NDArray[np.int64], NDArray[Any]], method: PyramidMethod
@@ -251,11 +259,13 @@ class _AllMatched:
         """The matches of a pair with those of the variants of both its images, and its row."""
         if method.options.mode == "off":
             raise ValueError("only pairs that are tried again are combined")
-        sides: tuple[tuple[str, Literal[0, 1], _Pair], ...]
-        sides = (("image", 0, pair), ("other", 1, pair[::-1]))
-        directed = [(*side, self._found[side[2]]) for side in sides if side[2] in self._found]
-        spooled = [(name, side, at) for name, side, _, (found, *_) in directed for at in found]
-        tried = [(side, self._spool.get(pair[side], at)) for _, side, at in spooled]
+        names, found = ("image", "other"), dict[Literal[0, 1], _Directed]()
+        if pair in self._found:
+            found[0] = self._found[pair]
+        if pair[::-1] in self._found:
+            found[1] = self._found[pair[::-1]]
+        spooled = [(side, one) for side, own in found.items() for one in own.spooled]
+        tried = [(side, self._spool.get(pair[side], one)) for side, one in spooled]
         first, second = (
             KeypointUnion(self._keypoints.read(one), self.added[one].px) for one in pair
         )
@@ -263,17 +273,17 @@ class _AllMatched:
         for image, union, new in zip(pair, (first, second), combined.added, strict=True):
             if len(new):
                 self.added[image].px = union.added()
-                self.added[image].descriptors_at += [
-                    (pair[spooled[number][1]], self._spool.descriptor_at(spooled[number][2], match))
-                    for number, match in new.tolist()
-                ]
+            for number, match in new.tolist():
+                side, one = spooled[number]
+                at = self._spool.descriptor_at(one, match)
+                self.added[image].descriptors_at.append((pair[side], at))
         best = ""
         if combined.best is not None:
-            name, _, at = spooled[combined.best]
-            best = f"{name} {at.variant}"
-        count = sum(count for *_, (_, count, _) in directed)
-        skipped = " | ".join(f"{name} {why}" for name, *_, (_, _, why) in directed if why)
-        return combined, tried_row(pair, len(base[0]), combined, count, best, skipped)
+            side, one = spooled[combined.best]
+            best = f"{names[side]} {one.variant}"
+        count = sum(own.num_variants for own in found.values())
+        why = [f"{names[side]} {own.skipped}" for side, own in found.items() if own.skipped]
+        return combined, tried_row(pair, len(base[0]), combined, count, best, " | ".join(why))
 
 
 def pyramid_queries(
@@ -304,7 +314,7 @@ def pyramid_queries(
     both = dict.fromkeys((pair.query, pair.map) for pair in pairs)
     for image, other in sorted(both, key=itemgetter(0)):
         candidates.setdefault(image, []).append(other)
-    features, stored = PyramidFeatures(output, query, local_type), query.matches(local_type)
+    stored = query.matches(local_type)
 
     @cache
     def side(number: int, image: str, digest: Digest) -> list[object]:
@@ -320,7 +330,7 @@ def pyramid_queries(
 
     items = work.items(local_type, list(candidates), inputs)
     jobs = [job for job in candidates.items() if job[0] not in items.done]
-    features.leave(items.done)
+    features = PyramidFeatures(output, query, local_type, items.done)
     retry = partial(_retry, FolderSpec(query), FolderSpec(mapping), types, method)
     plugins = method.extractor, method.matcher
     with closing(MatchesWriter(output, larger, orphan=True)) as writer:

@@ -131,12 +131,13 @@ def localize_views(
         reason = "no map image matches" if candidates else "no map image is a candidate"
         return ClusterLocalization(Failure(reason), (0,) * len(views))
     started = time.perf_counter()
+    indices = {id(typed.index): typed.index for view in views for typed in view.matches}
     clusters = cluster_candidates(
         images,
         [frame_of[image] for image in images],
         options.clusters,
         centers=centers,
-        indices=list({id(typed.index): typed.index for v in views for typed in v.matches}.values()),
+        indices=list(indices.values()),
     )
     seconds = {"clusters": time.perf_counter() - started}
     found = localize_in_clusters(
