@@ -30,7 +30,6 @@ from numpy.typing import NDArray
 
 from megloc_kapture.io.colmap import TriangulationOptions
 from megloc_kapture.io.csv_table import read_csv_table
-from megloc_kapture.io.dataset_tables import table_path
 from megloc_kapture.io.images import read_image_rgb, write_image
 from megloc_kapture.io.kapture import (
     ImagePair,
@@ -50,7 +49,7 @@ from megloc_kapture.plugins import (
     Matcher,
     PluginChoice,
 )
-from megloc_kapture.stages.guided_pyramid import COLUMNS, PyramidMethod
+from megloc_kapture.stages.guided_pyramid import COLUMNS, PyramidMethod, table_path
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.matches import match_pairs
 from megloc_kapture.stages.pyramid_mapping import pyramid_mapping, pyramid_queries

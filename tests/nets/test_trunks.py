@@ -95,7 +95,7 @@ def test_every_activation_is_the_restated_one(trunk: Vgg16Features, image: torch
     assert len(expected) == len(found) == 31
     for one, other in zip(found, expected, strict=True):
         assert one.shape == other.shape and other.std() > 0.05
-        torch.testing.assert_close(one.double(), other, rtol=0, atol=1e-5 * float(other.std()))
+        torch.testing.assert_close(one.double(), other, rtol=0, atol=3e-5 * float(other.std()))
     assert torch.equal(image, before)
 
 

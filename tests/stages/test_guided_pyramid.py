@@ -18,7 +18,6 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.io.colmap import TriangulationOptions
 from megloc_kapture.io.csv_table import read_csv_table
-from megloc_kapture.io.dataset_tables import table_path
 from megloc_kapture.io.images import read_image_rgb, write_image
 from megloc_kapture.io.kapture import (
     ImagePair,
@@ -31,7 +30,7 @@ from megloc_kapture.matching.guided_pyramid import GuidedPyramidOptions, ImageVa
 from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
 from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
 from megloc_kapture.pipeline.executors import single_threaded
-from megloc_kapture.stages.guided_pyramid import COLUMNS, PyramidMethod, retry_query
+from megloc_kapture.stages.guided_pyramid import COLUMNS, PyramidMethod, retry_query, table_path
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.matches import Features, match_pairs
 from megloc_kapture.stages.pyramid_mapping import pyramid_mapping, pyramid_queries

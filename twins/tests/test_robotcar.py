@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from kapture.algo.pose_operations import world_pose_transform_distance
 from kapture.io.csv import kapture_from_dir
-from megloc_twins.aachen import OFFICIAL_FROM_WORLD
 from megloc_twins.frames import WEATHERS, road_lighting
+from megloc_twins.robotcar import OFFICIAL_FROM_WORLD
 
 from megloc_kapture.datasets.official import write_official
 from megloc_kapture.datasets.robotcar.adapter import RobotCar, RobotCarOptions
