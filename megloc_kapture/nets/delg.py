@@ -44,7 +44,7 @@ from torch.nn import functional
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.nets.aslfeat import conv_same
-from megloc_kapture.nets.runtime import first_few, load_strictly
+from megloc_kapture.nets.runtime import batch_counters, first_few, load_strictly
 from megloc_kapture.nets.trunks import (
     RESNET_BLOCKS,
     RESNET_DEPTHS,
@@ -182,7 +182,8 @@ def delg_from(tensors: Mapping[str, torch.Tensor], where: str) -> DelgNet:
             f"(ResNet-101); {_found(tensors)}",
             path=where,
         )
-    return load_strictly(DelgNet(RESNET_DEPTHS[len(blocks)], form), state, where).eval()
+    net = DelgNet(RESNET_DEPTHS[len(blocks)], form)
+    return load_strictly(net, state, where, may_lack=batch_counters(net)).eval()
 
 
 def delg_state(

@@ -19,7 +19,7 @@ from torch import nn
 from torch.nn import functional
 
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.nets.runtime import load_strictly
+from megloc_kapture.nets.runtime import batch_counters, load_strictly
 from megloc_kapture.nets.trunks import (
     IMAGENET_DEVIATION,
     IMAGENET_MEAN,
@@ -263,7 +263,7 @@ def apgem_from(tensors: Mapping[str, torch.Tensor], where: str) -> ApGemNet:
         deviation=_three(tensors, "preprocess.std", IMAGENET_DEVIATION, where),
         normalised_features=bool(tensors.get("model_options.norm_features", False)),
     )
-    return load_strictly(net, state, where).eval()
+    return load_strictly(net, state, where, may_lack=batch_counters(net)).eval()
 
 
 def whitening_from(
@@ -341,4 +341,4 @@ def eigenplaces_from(tensors: Mapping[str, torch.Tensor], where: str) -> EigenPl
     if _LINEAR not in tensors or tensors[_LINEAR].ndim != 2:
         raise DataError(f"no EigenPlaces: a matrix {_LINEAR} expected", path=where)
     network = EigenPlacesNet(101 if _DEEPER in tensors else 50, len(tensors[_LINEAR]))
-    return load_strictly(network, tensors, where).eval()
+    return load_strictly(network, tensors, where, may_lack=batch_counters(network)).eval()

@@ -99,18 +99,21 @@ def sized_tensor(
     return torch.from_numpy(np.asarray(resized)).to(device).permute(2, 0, 1)[None] / 255.0
 
 
+def batch_counters(module: nn.Module) -> set[str]:
+    """Keys of batch normalisation's counters: torch before 0.4.1 and ONNX keep none of them."""
+    return {key for key in module.state_dict() if key.endswith("num_batches_tracked")}
+
+
 def load_strictly(
     module: Net, tensors: Mapping[str, torch.Tensor], where: str, *, may_lack: Collection[str] = ()
 ) -> Net:
     """The module, with a state dict loaded; every key and shape as the module has it.
 
-    Counters of batch normalisation may lack, and what ``may_lack`` names. Raises DataError that
-    names the file ``where`` and the keys that are missing, unexpected, or of another shape.
+    Keys that ``may_lack`` names may be missing. Raises DataError that names the file ``where`` and
+    the keys that are missing, unexpected, or of another shape.
     """
     expected = module.state_dict()
-    # only training needs the counters, which torch before 0.4.1 and ONNX do not keep
-    counters = {key for key in expected if key.endswith("num_batches_tracked")}
-    missing = sorted(set(expected) - set(tensors) - set(may_lack) - counters)
+    missing = sorted(set(expected) - set(tensors) - set(may_lack))
     unexpected = sorted(set(tensors) - set(expected))
     reshaped = [
         f"{key} is {tuple(tensors[key].shape)}, not {tuple(expected[key].shape)}"

@@ -16,7 +16,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from megloc_kapture.nets.runtime import load_strictly
+from megloc_kapture.nets.runtime import batch_counters, load_strictly
 
 CELL_PX = 8
 DESCRIPTOR_SIZE = 256
@@ -227,4 +227,5 @@ def is_superpoint_batchnorm(tensors: Mapping[str, torch.Tensor]) -> bool:
 
 def superpoint_batchnorm(tensors: Mapping[str, torch.Tensor], where: str) -> SuperPointBatchNormNet:
     """The network of a checkpoint of the retraining; raises DataError as :func:`superpoint`."""
-    return load_strictly(SuperPointBatchNormNet(), tensors, where)
+    net = SuperPointBatchNormNet()
+    return load_strictly(net, tensors, where, may_lack=batch_counters(net))

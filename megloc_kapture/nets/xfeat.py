@@ -11,7 +11,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from megloc_kapture.nets.runtime import load_strictly
+from megloc_kapture.nets.runtime import batch_counters, load_strictly
 
 STRIDE = 32
 """Width and height of an input are multiples of it."""
@@ -94,7 +94,7 @@ def load_xfeat(tensors: Mapping[str, torch.Tensor], where: str) -> XFeatNetwork:
     """
     network = XFeatNetwork()
     used = {key: value for key, value in tensors.items() if not key.startswith("fine_matcher.")}
-    return load_strictly(network, used, where).eval()
+    return load_strictly(network, used, where, may_lack=batch_counters(network)).eval()
 
 
 def keypoint_scores(logits: torch.Tensor) -> torch.Tensor:

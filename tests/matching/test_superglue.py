@@ -161,5 +161,5 @@ def test_weights_that_are_missing_or_do_not_fit(tmp_path: Path) -> None:
         matcher(tmp_path / "nowhere.pth")
     path = tmp_path / "wrong.pth"
     torch.save({"bin_score": torch.tensor(1.0)}, path)
-    with pytest.raises(DataError, match=r"wrong\.pth: .*316 missing keys"):
+    with pytest.raises(DataError, match=r"wrong\.pth: .*338 missing keys"):
         matcher(path).match(image(3, 0), image(3, 1))
