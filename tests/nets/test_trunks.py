@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from copy import deepcopy
 
 import numpy as np
 import pytest
@@ -90,12 +91,13 @@ def test_keys_and_shapes_are_torchvisions() -> None:
 
 def test_every_activation_is_the_restated_one(trunk: Vgg16Features, image: torch.Tensor) -> None:
     before = image.clone()
-    found = trunk.taps(image, range(31))
+    # float32 differs between processors by as much as the bound
+    found = deepcopy(trunk).double().taps(image.double(), range(31))
     expected = restated(trunk.state_dict(), image)
     assert len(expected) == len(found) == 31
     for one, other in zip(found, expected, strict=True):
         assert one.shape == other.shape and other.std() > 0.05
-        torch.testing.assert_close(one.double(), other, rtol=0, atol=3e-5 * float(other.std()))
+        torch.testing.assert_close(one.double(), other, rtol=0, atol=1e-5 * float(other.std()))
     assert torch.equal(image, before)
 
 

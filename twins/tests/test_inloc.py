@@ -34,7 +34,6 @@ from megloc_twins.rasterization import NO_SURFACE, depth_map, sample_grid, visib
 
 from megloc_kapture.datasets.inloc.adapter import InLoc, InLocOptions
 from megloc_kapture.datasets.official import write_official
-from megloc_kapture.io.colmap_cameras import px_from_cam
 from megloc_kapture.io.dataset_tables import read_groups
 from megloc_kapture.io.images import read_depth_map, read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
@@ -243,8 +242,11 @@ def test_scanners_stand_nearly_upright_and_turned_at_random(floors: list[Floor])
 
 
 def test_what_a_scanner_measures(floors: list[Floor]) -> None:
+    import pycolmap
+
     floor = floors[0]
     camera = cutout_camera(100, 75)
+    theirs = pycolmap.Camera(model=camera.model, width=100, height=75, params=list(camera.params))
     columns, rows = np.meshgrid(np.arange(100) + 0.5, np.arange(75) + 0.5)
     bright = np.full((75, 100, 3), 128, np.uint8)
     bright[:10] = 5
@@ -261,7 +263,7 @@ def test_what_a_scanner_measures(floors: list[Floor]) -> None:
             assert not known[floor.glass[np.maximum(seen.surface, 0)]].any()
             in_camera = own.apply(points[known])
             pixels = np.column_stack([columns[known], rows[known]])
-            np.testing.assert_allclose(px_from_cam(camera, in_camera), pixels, atol=1e-3)
+            np.testing.assert_allclose(theirs.img_from_cam(in_camera), pixels, atol=1e-3)
             off = in_camera[:, 2] - depth_map(seen)[known]
             assert np.abs(off).max() < 0.006 and 1e-4 < np.std(off) < 2e-3
             np.testing.assert_array_equal(points[known], points[known].astype(np.float32))
