@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import numpy as np
@@ -14,7 +15,7 @@ from megloc_kapture.plugins import HypothesisView, PoseHypothesis, RankingScene
 from megloc_kapture.values import Options
 
 
-class _SumOfViews:
+class _SumOfViews(ABC):
     """Scores that are summed over the views of a hypothesis."""
 
     def score(
@@ -26,8 +27,9 @@ class _SumOfViews:
             dtype=np.float64,
         )
 
+    @abstractmethod
     def _of(self, view: HypothesisView, max_error_px: float) -> float:
-        raise NotImplementedError
+        """What a view adds; ``max_error_px`` is the largest error of an inlier."""
 
 
 class InlierCount(_SumOfViews):
