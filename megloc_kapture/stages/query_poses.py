@@ -70,6 +70,9 @@ from megloc_kapture.stages.work import (
 from megloc_kapture.values import Failure, Options, Pose, RigidTransform
 
 _FIRST_TURN = 5  # candidates; every turn has twice as many as the one before
+# of a pose that is sure: the right pose of a dozen inliers can be decimetres off, and more
+# candidates mend that (docs/performance.md)
+_SURE_INLIERS = 30
 
 
 class LocalizationOptions(Options):
@@ -91,8 +94,8 @@ class LocalizationOptions(Options):
         default=None,
         gt=0,
         le=1,
-        description="candidates are taken in turn, best first, and no more once the pose is as "
-        "likely to be right as this; none: all are taken",
+        description="candidates are taken in turn, best first, and no more once the pose has 30 "
+        "inliers and is as likely to be right as this; none: all are taken",
     )
     rigs: bool = Field(default=False, description="one pose for all cameras of a rig's moment")
     fallback: Fallback = Field(
@@ -196,7 +199,12 @@ def in_turn(
     while sure is not None and few < num_candidates:
         solved = solve(few)
         results = solved if isinstance(solved, list) else [solved.result]
-        if all(isinstance(r, Pose) and (r.confidence or 0.0) >= sure for r in results):
+        if all(
+            isinstance(r, Pose)
+            and (r.confidence or 0.0) >= sure
+            and r.num_inliers >= _SURE_INLIERS
+            for r in results
+        ):
             return solved
         few *= 2
     return solve(num_candidates)
@@ -354,7 +362,7 @@ class LocalizeQueries(PipelineStage):
     """Estimate the poses of the queries from their matches with the map."""
 
     name = "localization"
-    version = 7
+    version = 8
     uses = ("localization", "guided_pyramid.mode", *LOCAL_TYPES)
     inputs = (
         MAPPING,
