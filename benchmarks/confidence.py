@@ -1,7 +1,7 @@
 """The confidence of poses: data for it, its calibration, and how well it tells right from wrong.
 
     .venv/bin/python benchmarks/confidence.py collect --scene DIR [--scene DIR ...] \\
-        [--unrelated DIR] --preset classic -o classic.csv
+        [--unrelated DIR] --preset classic [--set KEY=VALUE ...] -o classic.csv
     .venv/bin/python benchmarks/confidence.py fit classic.csv modern.csv [--write]
 
 A scene is a folder with mapping/, query/ and query_gt/ in kapture. ``collect`` maps each and
@@ -44,6 +44,7 @@ from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.localization import confidence
 from megloc_kapture.localization.confidence import TERMS
 from megloc_kapture.pipeline.localizer import Localizer
+from megloc_kapture.pipeline.presets import assigned
 from megloc_kapture.preprocessing.frames import scaled_camera
 from megloc_kapture.values import Camera, Pose, RigidTransform
 
@@ -135,11 +136,17 @@ def cases(scene: Path, scenes: Sequence[Path], unrelated: Path | None, most: int
 
 
 def collect(
-    scene: Path, scenes: Sequence[Path], unrelated: Path | None, preset: str, most: int
+    scene: Path,
+    scenes: Sequence[Path],
+    unrelated: Path | None,
+    preset: str,
+    most: int,
+    changes: Sequence[str] = (),
 ) -> pd.DataFrame:
     """Localize every query of one map, and keep every pose."""
     with TemporaryDirectory() as folder:
-        built = megloc.build_map(scene / "mapping", preset, workspace=Path(folder) / "map")
+        place = Path(folder) / "map"
+        built = megloc.build_map(scene / "mapping", preset, set=assigned(changes), workspace=place)
         every = {"min_confidence": 0.0}
         localization = built.options.localization.model_copy(update=every)
         options = built.options.model_copy(update={"localization": localization})
@@ -301,6 +308,7 @@ def main() -> None:
     collecting.add_argument("--map", action="append", help="localize in the maps of these only")
     collecting.add_argument("--unrelated", type=Path)
     collecting.add_argument("--preset", default="classic")
+    collecting.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     collecting.add_argument("--most", type=int, default=60, help="images of one folder")
     collecting.add_argument("-o", "--output", type=Path, required=True)
     fitting = commands.add_parser("fit")
@@ -314,9 +322,8 @@ def main() -> None:
         for scene in options.scene:
             if options.map and scene.name not in options.map:
                 continue
-            parts.append(
-                collect(scene, options.scene, options.unrelated, options.preset, options.most)
-            )
+            chosen = options.unrelated, options.preset, options.most, options.set
+            parts.append(collect(scene, options.scene, *chosen))
             pd.concat(parts).to_csv(options.output, index=False)
             print(f"{scene.name}: {len(parts[-1])} queries, {parts[-1].localized.sum()} poses")
         return
