@@ -20,7 +20,7 @@ import numpy as np
 import onnx
 import pytest
 import torch
-from hostile import NUMBERS
+from hostile import EDITS, NUMBERS, TOKENS, Edit, changed
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from onnx import helper, numpy_helper
@@ -327,50 +327,6 @@ READERS = {
     ),
 }
 
-TOKENS = st.sampled_from(
-    [
-        b",",
-        b", ",
-        b"\n",
-        b"\r\n",
-        b"\r",
-        b"#",
-        b" ",
-        b"\0",
-        b"\xff",
-        b'"',
-        b"-",
-        b"..",
-        b"/",
-        b"nan",
-    ]
-    + [b"1e999", b"1e", b"-1", b"0", b"9" * 19, b"cam", b"rig", b"\xc3\xa9", b"\xc2\xa0", b"\x85"]
-    + [
-        b"\xe2\x80\x83",
-        b"\\",
-        b"{",
-        b"[",
-        b"\x7f\xff\xff\xff",
-        b"\xff\xff\xff\x7f",
-        VERSION.encode(),
-    ]
-)
-# (what part of the file before it, in thousandths; bytes taken away there; bytes put there)
-EDITS = st.lists(
-    st.tuples(st.integers(0, 1000), st.integers(0, 6), st.binary(max_size=6) | TOKENS),
-    min_size=1,
-    max_size=6,
-)
-CUTS = st.just(1000) | st.integers(0, 1000)
-
-
-def mutated(whole: bytes, edits: list[tuple[int, int, bytes]], cut: int) -> bytes:
-    content = bytearray(whole)
-    for at, taken, put in edits:
-        begin = at * len(content) // 1000
-        content[begin : begin + taken] = put
-    return bytes(content[: cut * len(content) // 1000])
-
 
 def placed(reader: Reader, folder: Path, content: bytes) -> Path:
     """Write some bytes as the reader's file, with what belongs beside it."""
@@ -414,22 +370,18 @@ def test_whole_files_are_read(name: str, tmp_path: Path) -> None:
 
 
 @EACH
-@given(EDITS, CUTS)
+@given(edits=EDITS)
 @ANY
-def test_mutations(
-    name: str, tmp_path: Path, edits: list[tuple[int, int, bytes]], cut: int
-) -> None:
-    survives(READERS[name], tmp_path, mutated(READERS[name].whole, edits, cut))
+def test_mutations(name: str, tmp_path: Path, edits: list[Edit]) -> None:
+    survives(READERS[name], tmp_path, changed(READERS[name].whole, edits))
 
 
 @pytest.mark.fuzz
 @EACH
-@given(EDITS, CUTS)
+@given(edits=EDITS)
 @MANY
-def test_many_mutations(
-    name: str, tmp_path: Path, edits: list[tuple[int, int, bytes]], cut: int
-) -> None:
-    survives(READERS[name], tmp_path, mutated(READERS[name].whole, edits, cut))
+def test_many_mutations(name: str, tmp_path: Path, edits: list[Edit]) -> None:
+    survives(READERS[name], tmp_path, changed(READERS[name].whole, edits))
 
 
 @pytest.mark.fuzz

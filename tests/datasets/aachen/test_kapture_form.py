@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
-import kapture
 import numpy as np
 import pytest
-from kapture.io.csv import kapture_from_dir, kapture_to_dir
-from kapture_forms import aachen_with_kapture
+from kapture.io.csv import kapture_from_dir
+from kapture_forms import (
+    aachen_with_kapture,
+    assert_linked,
+    assert_same_dataset,
+    assert_same_images,
+    without_images,
+)
 from kloc import kapture_tool
 
 from megloc_kapture.datasets.aachen.adapter import Aachen, AachenOptions
 from megloc_kapture.datasets.official import OfficialDataset, write_official
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.images import write_image
-from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.datasets import choose_dataset
 
 import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
@@ -38,16 +41,10 @@ IMAGES = """4 0.5 -0.5 0.5 0.5 -652.833568325199 84.70595670766824 5.1 9 db/7.jp
 10 1 0 0 0 0 0 2 9 sequences/gopro3_undistorted/a.jpg
 
 """
-DAY = (
-    "query/day/nexus4/IMG_2.jpg",
-    "query/day/milestone/m_1.jpg",
-    "query/day/nexus4/IMG_1.jpg",
-)
-NIGHT = (
-    "query/night/nexus5x_additional_night/IMG_8.jpg",
-    "query/night/nexus5x/IMG_9.jpg",
-    "query/night/nexus5x_additional_night/IMG_7.jpg",
-    "query/night/nexus5x/IMG_5.jpg",
+DAY = tuple(f"query/day/{name}.jpg" for name in ("nexus4/IMG_2", "milestone/m_1", "nexus4/IMG_1"))
+NIGHT = tuple(
+    f"query/night/nexus5x{name}.jpg"
+    for name in ("_additional_night/IMG_8", "/IMG_9", "_additional_night/IMG_7", "/IMG_5")
 )
 
 
@@ -89,80 +86,50 @@ def read(root: Path, **options: object) -> OfficialDataset:
     return Aachen(AachenOptions(**options)).read(root)  # type: ignore[arg-type]
 
 
-def views(dataset: OfficialDataset) -> Iterator[tuple[str, object]]:
-    """What an image is, by its name; ids of sensors are each form's own."""
-    for data in (dataset.mapping, dataset.query):
-        for name in data.records_camera.values():
-            camera = data.camera_of(name)
-            yield name, (camera, data.cam_from_world(name), dataset.groups.get(name))
-
-
-def assert_same(found: OfficialDataset, expected: OfficialDataset) -> None:
-    assert list(views(found)) == list(views(expected))  # in the same order, to the last bit
-    assert found.names == expected.names and list(found.names) == list(expected.names)
-    assert found.protocol == expected.protocol
-    assert (found.priors, found.world) == (expected.priors, expected.world)
-    assert [str(count) for count in found.summary] == [str(count) for count in expected.summary]
-
-
-def test_the_same_dataset_in_both_forms(official: Path, downloaded: Path) -> None:
-    expected = read(official)
+def test_the_same_dataset_in_both_forms(official: Path, downloaded: Path, tmp_path: Path) -> None:
+    expected, found = read(official), read(downloaded)
     assert len(expected.names) == 7 and expected.protocol.pose_file_stem == "Aachen_v1_1"
-    assert_same(read(downloaded), expected)
+    assert_same_dataset(found, expected)
+    assert_linked(found, tmp_path / "out", official / "images_upright")
+    assert kapture_from_dir(str(tmp_path / "out" / "query")).trajectories is None
 
 
 def test_rows_of_tables_have_no_order(official: Path, root: Path) -> None:
     for table in root.glob("*/sensors/*.txt"):
         lines = table.read_text().splitlines()
         table.write_text("\n".join([*lines[:2], *reversed(lines[2:])]) + "\n")
-    assert_same(read(root), read(official))
+    assert_same_dataset(read(root), read(official))
 
 
 def test_queries_that_kapture_merged(official: Path, downloaded: Path, root: Path) -> None:
     parts = [downloaded / part for part in PARTS]
     images = ["--image_transfer", "link_absolute"]
     kapture_tool("kapture_merge", "-i", *parts, "-o", root / "query", *images)
-    assert_same(read(root), read(official))  # as kapture's scripts leave it
+    assert_same_dataset(read(root), read(official))  # as kapture's scripts leave it
     for part in PARTS:
         shutil.rmtree(root / part)
-    assert_same(read(root), read(official))
+    assert_same_dataset(read(root), read(official))
 
 
-def test_kapture_folders_in_a_folder_of_their_own(official: Path, downloaded: Path) -> None:
-    place = downloaded.parent / "aachenv11"
-    if not place.exists():
-        place.mkdir()
-        (place / "kapture").symlink_to(downloaded)
-    assert_same(read(place), read(official))
-
-
-def test_the_official_files_come_first(official: Path, root: Path, tmp_path: Path) -> None:
-    both = Path(shutil.copytree(official, tmp_path / "both"))
-    (both / "kapture").symlink_to(root)
-    assert read(both).links == {"": both / "images_upright"}
-
-
-def test_what_is_written(downloaded: Path, official: Path, tmp_path: Path) -> None:
-    write_official(read(downloaded), tmp_path / "out")
-    for part in ("mapping", "query"):
-        folder = KaptureFolder(tmp_path / "out" / part)
-        for name in folder.read().image_names():
-            link = folder.image_path(name)
-            assert link.is_symlink()
-            assert link.samefile(official / "images_upright" / name)
-        assert not (folder.root / "sensors/records_data/db").exists() or part == "mapping"
-    found = kapture_from_dir(str(tmp_path / "out" / "query"))
-    assert found.trajectories is None
+def test_kapture_folders_in_a_folder_of_their_own(
+    official: Path, downloaded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = tmp_path / "Aachen-Day-Night-v1.1"  # what kapture unpacks to
+    place.mkdir()
+    (place / "kapture").symlink_to(downloaded)
+    assert_same_dataset(read(place), read(official))
+    monkeypatch.setenv("MEGLOC_DATA", str(tmp_path))
+    choice = choose_dataset("aachen", None)
+    choice.check()
+    assert choice.root == place
+    # the official files come first
+    shutil.copytree(official, place, dirs_exist_ok=True)
+    assert read(place).links == {"": place / "images_upright"}
 
 
 def test_the_pose_file_of_v1_0(downloaded: Path, root: Path) -> None:
     for part, gone in (("mapping", "sequences/"), ("query_night", "_additional_night/")):
-        data = kapture_from_dir(str(root / part))
-        for time, sensor, name in list(kapture.flatten(data.records_camera)):
-            if gone in name:
-                del data.records_camera[time][sensor]
-        shutil.rmtree(root / part / "sensors" / "records_data" / gone, ignore_errors=True)
-        kapture_to_dir(str(root / part), data)
+        without_images(root / part, gone)
     assert read(root).protocol.pose_file_stem == "Aachen"
     # the added queries alone are v1.1's, and so is the folder's name
     shutil.rmtree(root / "query_night")
@@ -174,32 +141,26 @@ def test_the_pose_file_of_v1_0(downloaded: Path, root: Path) -> None:
     assert read(named).protocol.pose_file_stem == "Aachen_v1_1"
 
 
-def test_v1_1_is_not_taken_for_v1_0(downloaded: Path) -> None:
+def test_what_kapture_folders_do_not_have(downloaded: Path) -> None:
     with pytest.raises(OptionError, match=r"is v1\.1, whose poses are others"):
         read(downloaded, version="1.0")
-
-
-def test_its_own_model_is_not_there(downloaded: Path) -> None:
     with pytest.raises(OptionError, match="kapture folders"):
         Aachen(AachenOptions(reference_model=True)).check(downloaded)
 
 
-def test_a_download_without_the_night(root: Path, tmp_path: Path) -> None:
+def test_a_partial_download(root: Path, tmp_path: Path) -> None:
     shutil.rmtree(root / "query_night")
     dataset = read(root)
     with pytest.raises(DataError, match="query_night/sensors/sensors.txt; --allow-missing"):
         write_official(dataset, tmp_path / "out")
     write_official(dataset, tmp_path / "out", allow_missing=True)
     assert len(dataset.names) == 3
-
-
-def test_images_that_are_not_there(root: Path, tmp_path: Path) -> None:
-    (name,) = read(root).query.image_names()[:1]
+    name = dataset.query.image_names()[0]
     (root / "query_day/sensors/records_data" / name).unlink()
     dataset = read(root)
-    assert name not in dataset.names
-    with pytest.raises(DataError, match="1 files are missing"):
-        write_official(dataset, tmp_path / "out")
+    assert len(dataset.names) == 2 and name not in dataset.names
+    with pytest.raises(DataError, match="2 files are missing"):
+        write_official(dataset, tmp_path / "again")
 
 
 def test_a_query_of_neither_day_nor_night(root: Path) -> None:
@@ -221,44 +182,22 @@ def test_an_image_of_another_size_than_its_camera(root: Path) -> None:
 def test_input_files_are_what_is_read(downloaded: Path) -> None:
     files = [str(path.relative_to(downloaded)) for path in Aachen().input_files(downloaded)]
     assert len(set(files)) == len(files)
-    tables = {
-        f"{part}/sensors/{name}.txt"
-        for part in ("mapping", *PARTS)
-        for name in ("sensors", "records_camera")
-    } | {"mapping/sensors/trajectories.txt"}
-    assert tables <= set(files)
+    for part in ("mapping", *PARTS):
+        assert f"{part}/sensors/sensors.txt" in files
+        assert f"{part}/sensors/records_camera.txt" in files
+    assert "mapping/sensors/trajectories.txt" in files
     images = {path.removeprefix("mapping/sensors/records_data/") for path in files}
     assert set(read(downloaded).mapping.image_names()) <= images
 
 
-def test_it_is_found_by_the_folder_kapture_unpacks_to(
-    downloaded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "Aachen-Day-Night-v1.1").symlink_to(downloaded)
-    monkeypatch.setenv("MEGLOC_DATA", str(tmp_path))
-    choice = choose_dataset("aachen", None)
-    choice.check()
-    assert choice.root == tmp_path / "Aachen-Day-Night-v1.1"
-
-
 def test_kaptures_own_sample(shared_data: Path, tmp_path: Path) -> None:
     sample = shared_data / "kapture_samples" / "Aachen-Day-Night"
-    if not sample.is_dir():
-        pytest.skip(f"no sample at {sample}")
     for part, theirs in (("mapping", "training"), ("query", "query")):
         shutil.copytree(sample / "kapture" / theirs / "sensors", tmp_path / part / "sensors")
         (tmp_path / part / "sensors/records_data").symlink_to(sample / "images_upright")
     found, expected = read(tmp_path), read(sample)
     assert found.protocol == expected.protocol and found.protocol.pose_file_stem == "Aachen"
-    assert list(found.names.items()) == list(expected.names.items())
-    assert len(found.names) == 4
-    for data in ("mapping", "query"):
-        ours, theirs_ = getattr(expected, data), getattr(found, data)
-        assert ours.image_names() == theirs_.image_names()
-        for name in ours.image_names():
-            assert ours.camera_of(name) == theirs_.camera_of(name)
-    for name, pose in expected.mapping.poses().items():
-        # kapture turns the NVM's centres into translations by its own arithmetic
-        np.testing.assert_allclose(
-            found.mapping.poses()[name].translation, pose.translation, atol=1e-9
-        )
+    assert list(found.names.items()) == list(expected.names.items()) and len(found.names) == 4
+    # kapture turns the NVM's centres into translations by its own arithmetic
+    assert_same_images(found.mapping, expected.mapping, atol=1e-9)
+    assert_same_images(found.query, expected.query)

@@ -1,4 +1,4 @@
-"""Valid files of every format changed at random: a value or one clear error, and nothing else."""
+"""Valid files of every format, and changed at random: a value or one clear error."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hostile import EDITS, Edit, changed
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from kapture.converter.colmap.database import COLMAPDatabase
@@ -86,49 +87,7 @@ COLMAP = ColmapModel(
     POINTS,
 )
 
-# what parsers of numbers trip over
-TOKENS = st.sampled_from(
-    [b"nan", b"-inf", b"1e999", b"-1", b"0", b"1", b"2", b"99999999999", b"18446744073709551616"]
-    + [b"1_0", b"0x1", b".5", b"5.", b"-.5e-3", b"+7", b"1e", b"#", b"\xff", b"\0", b"\n", b"\r\n"]
-    + [b" ", b"\t", b"\x0b", b"\x1c", b"\xc2\xa0", b"\xd9\xa1", b"../x", b"256", b"2147483648"]
-    + [b"179769313486231570000e290", b"8.5070591730234615e37", b"1.7014118346046923e38", b"-0.0"]
-    + [b"9" * 400, b",", b"\xef\xbb\xbf", b"\n\n\n"]
-)
-OFFSETS = st.integers(0, 1 << 16)
-EDITS = st.lists(
-    st.one_of(
-        st.tuples(st.just("insert"), OFFSETS, TOKENS | st.binary(max_size=30)),
-        st.tuples(st.just("token"), OFFSETS, TOKENS),
-        st.tuples(st.just("delete"), OFFSETS, st.integers(1, 40)),
-        st.tuples(st.just("double"), OFFSETS, st.integers(1, 80)),
-        st.tuples(st.just("byte"), OFFSETS, st.integers(0, 255)),
-        st.tuples(st.just("cut"), OFFSETS, st.none()),
-    ),
-    min_size=1,
-    max_size=4,
-)
 MANY = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
-
-
-def changed(content: bytes, edits: list[tuple[str, int, Any]]) -> bytes:
-    """Apply edits; offsets wrap around the length."""
-    for kind, offset, value in edits:
-        k = offset % (len(content) + 1)
-        if kind == "insert":
-            content = content[:k] + value + content[k:]
-        elif kind == "token":  # instead of a field
-            end = min((e for e in (content.find(c, k) for c in b" \n") if e >= 0), default=k)
-            begin = max(content.rfind(b" ", 0, end), content.rfind(b"\n", 0, end)) + 1
-            content = content[:begin] + value + content[end:]
-        elif kind == "delete":
-            content = content[:k] + content[k + value :]
-        elif kind == "double":
-            content = content[: k + value] + content[k:]
-        elif kind == "byte":
-            content = content[:k] + bytes([value]) + content[k + 1 :]
-        else:
-            content = content[:k]
-    return content
 
 
 def outcome(read: Callable[[], Any], path: Path) -> Any:
@@ -152,12 +111,50 @@ def block_bytes(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setitem(TextFile.__init__.__kwdefaults__, "block_bytes", request.param)
 
 
-@pytest.mark.parametrize("reader", TEXTS, ids=lambda reader: reader.__name__)
+READERS = pytest.mark.parametrize("reader", TEXTS, ids=lambda reader: reader.__name__)
+
+
+@READERS
+def test_line_ends_and_blanks_do_not_matter(tmp_path: Path, reader: Callable[[Path], Any]) -> None:
+    text, path = TEXTS[reader].replace("\r\n", "\n"), tmp_path / "file.txt"
+    path.write_bytes(text.encode())
+    expected = repr(reader(path))
+    for other in (
+        text.replace("\n", "\r\n"),
+        text.rstrip("\n"),
+        text + "\n \r\n",
+        "\ufeff" + text,
+        "".join(f" {line}\t\n" for line in text.split("\n")),
+    ):
+        path.write_bytes(other.encode())
+        assert repr(reader(path)) == expected, other
+
+
+@READERS
+def test_what_is_no_such_file(tmp_path: Path, reader: Callable[[Path], Any]) -> None:
+    path = tmp_path / "file.txt"
+    for content in (b"", b"\n\r\n  \n", b"\xef\xbb\xbf"):
+        path.write_bytes(content)
+        if reader in (fourseasons_files.read_keyframe_accuracy, read_wrong_scans):
+            assert not reader(path)
+        else:
+            with pytest.raises(DataError, match=r"file\.txt\b"):
+                reader(path)
+    path.write_bytes(b"1\n2 \xff")
+    with pytest.raises(DataError, match=r"file\.txt:2: not a text file in UTF-8"):
+        reader(path)
+    path.unlink()
+    with pytest.raises(DataError, match=r"file\.txt: file is missing"):
+        reader(path)
+    path.mkdir()
+    with pytest.raises(DataError, match=r"file\.txt: not a plain file"):
+        reader(path)
+
+
+@READERS
 @given(edits=EDITS)
 @MANY
-def test_texts(
-    tmp_path: Path, reader: Callable[[Path], Any], edits: list[tuple[str, int, Any]]
-) -> None:
+def test_texts(tmp_path: Path, reader: Callable[[Path], Any], edits: list[Edit]) -> None:
     path = tmp_path / "file.txt"
     path.write_bytes(changed(TEXTS[reader].encode(), edits))
     outcome(lambda: reader(path), path)
@@ -166,7 +163,7 @@ def test_texts(
 @given(EDITS)
 @MANY
 @pytest.mark.usefixtures("block_bytes")
-def test_nvm(tmp_path: Path, edits: list[tuple[str, int, Any]]) -> None:
+def test_nvm(tmp_path: Path, edits: list[Edit]) -> None:
     path = tmp_path / "m.nvm"
     write_nvm(path, NVM)
     path.write_bytes(changed(path.read_bytes(), edits))
@@ -179,7 +176,7 @@ def test_nvm(tmp_path: Path, edits: list[tuple[str, int, Any]]) -> None:
 @given(st.sampled_from([*TEXT_FILES, *BINARY_FILES]), EDITS)
 @MANY
 @pytest.mark.usefixtures("block_bytes")
-def test_colmap_models(tmp_path: Path, name: str, edits: list[tuple[str, int, Any]]) -> None:
+def test_colmap_models(tmp_path: Path, name: str, edits: list[Edit]) -> None:
     folder = tmp_path / name
     (write_colmap_text if name in TEXT_FILES else write_colmap_binary)(folder, COLMAP)
     (folder / name).write_bytes(changed((folder / name).read_bytes(), edits))
@@ -203,9 +200,7 @@ def rigs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @given(st.sampled_from(["rigs.txt", "frames.txt", "rigs.bin", "frames.bin"]), EDITS)
 @MANY
-def test_colmap_rigs(
-    tmp_path: Path, rigs: Path, name: str, edits: list[tuple[str, int, Any]]
-) -> None:
+def test_colmap_rigs(tmp_path: Path, rigs: Path, name: str, edits: list[Edit]) -> None:
     folder = tmp_path / name
     shutil.copytree(rigs, folder, dirs_exist_ok=True)
     (folder / name).write_bytes(changed((rigs / name).read_bytes(), edits))
@@ -233,7 +228,7 @@ def database(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @given(EDITS)
 @MANY
-def test_colmap_database(tmp_path: Path, database: Path, edits: list[tuple[str, int, Any]]) -> None:
+def test_colmap_database(tmp_path: Path, database: Path, edits: list[Edit]) -> None:
     path = tmp_path / "d.db"
     shutil.copy(database, path)
     path.write_bytes(changed(path.read_bytes(), edits))
