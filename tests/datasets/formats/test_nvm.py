@@ -120,9 +120,6 @@ def test_quaternions_are_normalised_or_refused(tmp_path: Path) -> None:
         read_nvm(path)
 
 
-# ------------------------------------------------------------------------------- against kapture
-
-
 def import_with_kapture(nvm: Path, images: Path, output: Path) -> kapture.Kapture:
     from tools.kapture_import_nvm import import_nvm
 
@@ -141,26 +138,22 @@ def observed(data: kapture.Kapture, folder: Path) -> list[tuple[int, str, float,
     return sorted(rows)
 
 
-def check_cameras(model: NvmModel, data: kapture.Kapture) -> None:
-    sensors = {name: (time, sensor) for time, sensor, name in kapture.flatten(data.records_camera)}
-    for index, name in enumerate(model.names):
-        camera = data.sensors[sensors[name][1]]
-        assert camera.camera_params[2] == model.focal_px[index]
-        assert camera.camera_params[5] == model.k_colmap[index]
-        theirs, ours = data.trajectories[sensors[name]], model.cam_from_world(index)
-        # kapture keeps the length of the quaternion, which has six digits here
-        assert np.allclose(ours.quat_wxyz, theirs.r_raw, atol=1e-6)
-        assert np.allclose(ours.translation, theirs.t_raw, atol=1e-9)
-
-
 def check_against_kapture(models: list[NvmModel], data: kapture.Kapture, folder: Path) -> None:
     """Poses, distortion, points and observations; kapture merges the models of a file."""
     merged = np.concatenate([np.hstack([m.points.xyz, m.points.rgb]) for m in models])
     assert np.allclose(merged, data.points3d.as_array(), atol=1e-9)
     first = 0
     rows: set[tuple[Any, ...]] = set()
+    sensors = {name: (time, sensor) for time, sensor, name in kapture.flatten(data.records_camera)}
     for model in models:
-        check_cameras(model, data)
+        for index, name in enumerate(model.names):
+            camera = data.sensors[sensors[name][1]]
+            assert camera.camera_params[2] == model.focal_px[index]
+            assert camera.camera_params[5] == model.k_colmap[index]
+            theirs, ours = data.trajectories[sensors[name]], model.cam_from_world(index)
+            # kapture keeps the length of the quaternion, which has six digits here
+            assert np.allclose(ours.quat_wxyz, theirs.r_raw, atol=1e-6)
+            assert np.allclose(ours.translation, theirs.t_raw, atol=1e-9)
         points = model.points
         for point, image, (x, y) in zip(
             points.point_ids, points.image_ids, points.xy_px.tolist(), strict=True
@@ -179,14 +172,6 @@ def test_the_published_sample_reads_as_kapture_reads_it(
     assert len(models) == (2 if "two_parts" in name else 1)
     data = import_with_kapture(nvm, shared_data / SAMPLE / "images_upright", tmp_path)
     check_against_kapture(models, data, tmp_path)
-
-
-def test_the_sample_has_the_poses_of_its_published_kapture(shared_data: Path) -> None:
-    [model] = read_nvm(shared_data / SAMPLE / "3D-models/aachen_cvpr2018_db.nvm")
-    assert model.k_colmap[0] == -0.0810989
-    twin = kapture.io.csv.kapture_from_dir(str(shared_data / SAMPLE / "kapture/training"))
-    check_cameras(model, twin)
-    assert len(model.names) == len(twin.records_camera.data_list())
 
 
 def random_model(seed: int, num_images: int = 7, num_points: int = 60) -> NvmModel:
@@ -247,9 +232,6 @@ def test_names_with_blanks_cannot_be_written(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match="blanks"):
             write_nvm(tmp_path / "m.nvm", replace(random_model(3, 1, 1), names=(name,)))
     assert list(tmp_path.iterdir()) == []
-
-
-# ------------------------------------------------------------------------------------ bad input
 
 
 @pytest.mark.parametrize(
