@@ -148,9 +148,6 @@ def test_names_and_ids_must_fit(tmp_path: Path) -> None:
     assert not (tmp_path / "m").exists()
 
 
-# -------------------------------------------------------------------------------- with features
-
-
 def write_database(
     path: Path, names: dict[str, int], *, shift: float = 0.0, descriptors: int | None = None
 ) -> dict[str, tuple[Any, Any]]:
