@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,25 +12,17 @@ from hostile import EDITS, Edit, changed
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from kapture.converter.colmap.database import COLMAPDatabase
-from megloc_twins.model_files import write_colmap_binary, write_colmap_text, write_nvm
 
 from megloc_kapture.datasets.aachen.layout import read_query_list
 from megloc_kapture.datasets.formats import fourseasons_files
 from megloc_kapture.datasets.formats.colmap_database import ColmapDatabase
-from megloc_kapture.datasets.formats.colmap_model import (
-    BINARY_FILES,
-    TEXT_FILES,
-    ColmapImage,
-    ColmapModel,
-)
 from megloc_kapture.datasets.formats.colmap_reading import read_colmap_model, read_colmap_rigs
-from megloc_kapture.datasets.formats.nvm import NvmModel, read_nvm
-from megloc_kapture.datasets.formats.sparse_points import SparsePoints
+from megloc_kapture.datasets.formats.nvm import read_nvm
 from megloc_kapture.datasets.formats.text_lines import TextFile, read_rigid_matrix
 from megloc_kapture.datasets.inloc.layout import read_transformation, read_wrong_scans
 from megloc_kapture.datasets.robotcar import layout as robotcar_layout
 from megloc_kapture.errors import DataError
-from megloc_kapture.values import Camera, RigidTransform
+from megloc_kapture.values import RigidTransform
 
 import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
 
@@ -62,31 +53,19 @@ TEXTS: dict[Callable[[Path], Any], str] = {
     read_wrong_scans: "known wrong:\n\n008\nDUC_scan_12.ptx 31\r\n2017\n",
 }
 
-POINTS = SparsePoints(
-    np.array([[1.5, -2.0, 30.0], [4.0, 5.0, 6.0], [-7.0, 8.0, 9.0]]),
-    np.array([[255, 0, 7], [1, 2, 3], [0, 0, 0]], dtype=np.uint8),
-    np.array([0, 0, 0, 1]),
-    np.array([0, 1, 0, 1], dtype=np.int32),
-    np.array([2, 3, 0, 1], dtype=np.int32),
-    np.array([[10.5, 20.25], [30, 40], [11, 21], [100, 0.5]], dtype=np.float32),
-)
-NVM = NvmModel(
-    ("db/7.jpg", "db/8.jpg"),
-    np.array([1000.0, 900.5]),
-    np.array([[1.0, 0, 0, 0], [0.5, -0.5, 0.5, 0.5]]),
-    np.array([[2.0, 0, -5], [1, 2, 3]]),
-    np.array([-0.08, 0.25]),
-    POINTS,
-)
-COLMAP = ColmapModel(
-    {1: Camera("SIMPLE_RADIAL", 640, 480, (500, 320, 240, 0.1))},
-    (
-        ColmapImage(1, "db/7.jpg", 1, RigidTransform((1.0, 0.0, 0.0, 0.0), (0.5, 0.0, 2.0))),
-        ColmapImage(4, "db/8.jpg", 1, RigidTransform((0.5, 0.5, 0.5, 0.5), (0.5, 0.0, 2.0))),
-    ),
-    POINTS,
-)
+NVM = b"""NVM_V3
 
+2
+db/7.jpg 1000 1 0 0 0 2 0 -5 0.08 0
+db/8.jpg 900.5 0.5 -0.5 0.5 0.5 1 2 3 -0.25 0
+
+3
+1.5 -2 30 255 0 7 3 0 2 10.5 20.25 1 3 30 40 0 0 11 21
+4 5 6 1 2 3 1 1 1 100 0.5
+-7 8 9 0 0 0 0
+
+0
+"""
 MANY = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
@@ -165,48 +144,44 @@ def test_texts(tmp_path: Path, reader: Callable[[Path], Any], edits: list[Edit])
 @pytest.mark.usefixtures("block_bytes")
 def test_nvm(tmp_path: Path, edits: list[Edit]) -> None:
     path = tmp_path / "m.nvm"
-    write_nvm(path, NVM)
-    path.write_bytes(changed(path.read_bytes(), edits))
+    path.write_bytes(changed(NVM, edits))
     found = outcome(lambda: read_nvm(path), path)
     poses = outcome(lambda: read_nvm(path, with_points=False), path)
     if not isinstance(found, str):
         assert [model.names for model in found] == [model.names for model in poses]
 
 
-@given(st.sampled_from([*TEXT_FILES, *BINARY_FILES]), EDITS)
-@MANY
-@pytest.mark.usefixtures("block_bytes")
-def test_colmap_models(tmp_path: Path, name: str, edits: list[Edit]) -> None:
-    folder = tmp_path / name
-    (write_colmap_text if name in TEXT_FILES else write_colmap_binary)(folder, COLMAP)
-    (folder / name).write_bytes(changed((folder / name).read_bytes(), edits))
-    found = outcome(lambda: read_colmap_model(folder), folder)
-    poses = outcome(lambda: read_colmap_model(folder, with_points=False), folder)
-    if not isinstance(found, str):
-        assert poses.images == found.images
-
-
 @pytest.fixture(scope="module")
-def rigs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def model(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """A model with rigs of three cameras as COLMAP writes it, in both forms."""
     pycolmap.set_random_seed(3)
     options = pycolmap.SyntheticDatasetOptions()
     options.num_cameras_per_rig, options.num_frames_per_rig, options.num_points3D = 3, 2, 10
     made = pycolmap.synthesize_dataset(options)
-    folder = tmp_path_factory.mktemp("rigs")
+    folder = tmp_path_factory.mktemp("model")
     made.write_text(folder)
     made.write_binary(folder)
-    return folder
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-@given(st.sampled_from(["rigs.txt", "frames.txt", "rigs.bin", "frames.bin"]), EDITS)
+@pytest.mark.parametrize("form", ["txt", "bin"])
+@given(st.sampled_from(["cameras", "images", "points3D", "rigs", "frames"]), EDITS)
 @MANY
-def test_colmap_rigs(tmp_path: Path, rigs: Path, name: str, edits: list[Edit]) -> None:
-    folder = tmp_path / name
-    shutil.copytree(rigs, folder, dirs_exist_ok=True)
-    (folder / name).write_bytes(changed((rigs / name).read_bytes(), edits))
-    found = outcome(lambda: read_colmap_rigs(folder, binary=name.endswith(".bin")), folder)
+@pytest.mark.usefixtures("block_bytes")
+def test_colmap_models(
+    tmp_path: Path, model: dict[str, bytes], form: str, name: str, edits: list[Edit]
+) -> None:
+    for file, content in model.items():
+        if file.endswith(form):
+            edited = changed(content, edits) if file == f"{name}.{form}" else content
+            (tmp_path / file).write_bytes(edited)
+    found = outcome(lambda: read_colmap_model(tmp_path), tmp_path)
+    poses = outcome(lambda: read_colmap_model(tmp_path, with_points=False), tmp_path)
     if not isinstance(found, str):
-        for cams_from_rig in found.cams_from_rig.values():
+        assert poses.images == found.images
+    rigs = outcome(lambda: read_colmap_rigs(tmp_path, binary=form == "bin"), tmp_path)
+    if not isinstance(rigs, str):
+        for cams_from_rig in rigs.cams_from_rig.values():
             for pose in cams_from_rig.values():
                 assert np.isfinite([*pose.quat_wxyz, *pose.translation]).all()
 
@@ -230,8 +205,7 @@ def database(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @MANY
 def test_colmap_database(tmp_path: Path, database: Path, edits: list[Edit]) -> None:
     path = tmp_path / "d.db"
-    shutil.copy(database, path)
-    path.write_bytes(changed(path.read_bytes(), edits))
+    path.write_bytes(changed(database.read_bytes(), edits))
 
     def read() -> Any:
         with ColmapDatabase(path) as opened:
