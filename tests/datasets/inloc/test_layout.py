@@ -7,8 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.io
-from megloc_twins.model_files import write_transformation
-from scipy.spatial.transform import Rotation
 
 from megloc_kapture.datasets.inloc.layout import (
     Cutout,
@@ -18,7 +16,6 @@ from megloc_kapture.datasets.inloc.layout import (
     read_wrong_scans,
 )
 from megloc_kapture.errors import DataError
-from megloc_kapture.values import RigidTransform
 
 TRANSFORMATION = """Before general icp:
 1 0 0 0
@@ -87,17 +84,6 @@ def test_the_second_matrix_counts(path: Path) -> None:
         path.write_text(text)
         pose = read_transformation(path)
         np.testing.assert_allclose(pose.apply(np.array([[1.0, 0, 0]])), [[5, 3, -0.1]], atol=1e-12)
-
-
-def test_what_is_written_reads_back(path: Path) -> None:
-    rotation = Rotation.from_euler("xyz", [0.02, -0.01, 2.1]).as_matrix()
-    after = RigidTransform.from_matrix(rotation, np.array([12.345678901, -3.0, 0.25]))
-    write_transformation(path, RigidTransform.identity(), after)
-    lines = path.read_text().splitlines()
-    assert [len(line.split()) for line in lines[7:11]] == [4] * 4  # where others look for it
-    read = read_transformation(path)
-    np.testing.assert_allclose(read.rotation_matrix(), rotation, atol=2e-9)
-    np.testing.assert_allclose(read.translation, after.translation, atol=1e-9)
 
 
 @pytest.mark.parametrize(
