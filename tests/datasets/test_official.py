@@ -80,14 +80,6 @@ def test_folders_and_tables_are_written_and_images_linked(
     assert tables.read_protocol(written) == dataset.protocol
 
 
-def test_folders_can_be_linked_one_by_one(dataset: OfficialDataset, tmp_path: Path) -> None:
-    images = dataset.links[""]
-    parted = replace(dataset, links={part: images / part for part in ("db", "query")})
-    write_official(parted, tmp_path / "out")
-    folder = KaptureFolder(tmp_path / "out" / "mapping")
-    assert folder.image_path("db/2.jpg").read_bytes() == b"db/2.jpg"
-
-
 def test_what_is_missing_is_refused_folder_by_folder(
     dataset: OfficialDataset, tmp_path: Path
 ) -> None:

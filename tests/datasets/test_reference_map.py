@@ -111,35 +111,6 @@ def test_the_order_of_observations_in_memory_does_not_matter(tmp_path: Path) -> 
     assert content[0] == content[1]
 
 
-def test_random_models_keep_every_observation(tmp_path: Path) -> None:
-    rng = np.random.default_rng(5)
-    names = tuple(f"{k % 7}/{k}.jpg" for k in rng.permutation(50))
-    number = 4000
-    places = rng.uniform(0, 1000, (50, 300, 2)).astype(np.float32)
-    image_ids, feature_ids = rng.integers(0, 50, number), rng.integers(0, 300, number)
-    model = SparsePoints(
-        rng.normal(size=(500, 3)),
-        np.zeros((500, 3), np.uint8),
-        np.sort(rng.integers(0, 500, number)),
-        image_ids.astype(np.int32),
-        feature_ids.astype(np.int32),
-        places[image_ids, feature_ids],
-    )
-    counts = write_reference_map(tmp_path, data(tuple(sorted(names))), {}, names, model)
-    seen = zip(model.point_ids.tolist(), image_ids.tolist(), model.xy_px.tolist(), strict=True)
-    expected = {(point, names[image], *xy) for point, image, xy in seen}
-    folder = KaptureFolder(tmp_path)
-    read, keypoints = folder.observations()["sift"], folder.keypoints("sift")
-    columns = (read.point_ids.tolist(), read.image_ids.tolist(), read.keypoint_ids.tolist())
-    found = [
-        (point, read.image_names[image], *keypoints.read(read.image_names[image])[keypoint])
-        for point, image, keypoint in zip(*columns, strict=True)
-    ]
-    assert len(found) == len(set(found)) == counts["observations"]
-    assert set(found) == expected
-    assert counts["keypoints"] == len(set(zip(image_ids, feature_ids, strict=True)))
-
-
 def test_names_and_ids_must_fit(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="not unique"):
         write_reference_map(tmp_path / "m", data(), {}, ("a", "a", "b", "c"), points())

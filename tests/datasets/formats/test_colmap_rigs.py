@@ -25,26 +25,10 @@ def truth() -> Any:
     return pycolmap.synthesize_dataset(options)
 
 
-@pytest.mark.parametrize("form", ["text", "binary"])
-def test_what_pycolmap_writes_is_read(tmp_path: Path, truth: Any, form: str) -> None:
-    binary = form == "binary"
-    # models before version 4 have none
-    assert read_colmap_rigs(tmp_path, binary=binary) == ColmapRigs()
-    assert rig_files(tmp_path, binary=binary) == ()
-    getattr(truth, f"write_{form}")(tmp_path)
-    rigs = read_colmap_rigs(tmp_path, binary=binary)
-    assert len(rig_files(tmp_path, binary=binary)) == 2
-    assert rigs.cams_from_rig.keys() == set(truth.rigs)
-    for rig_id, rig in truth.rigs.items():
-        found = rigs.cams_from_rig[rig_id]
-        assert found.keys() == {rig.ref_sensor_id.id, *(s.id for s in rig.non_ref_sensors)}
-        for sensor, theirs in rig.non_ref_sensors.items():
-            ours = found[sensor.id]
-            quat = np.roll(ours.quat_wxyz, -1)
-            np.testing.assert_allclose(quat, theirs.rotation.quat, atol=1e-14)
-            np.testing.assert_allclose(ours.translation, theirs.translation, atol=1e-14)
-        assert found[rig.ref_sensor_id.id].translation == (0, 0, 0)
-    assert rigs.frames == {image_id: image.frame_id for image_id, image in truth.images.items()}
+def test_models_before_version_4_have_none(tmp_path: Path) -> None:
+    for binary in (True, False):
+        assert read_colmap_rigs(tmp_path, binary=binary) == ColmapRigs()
+        assert rig_files(tmp_path, binary=binary) == ()
 
 
 @pytest.mark.parametrize("form", ["text", "binary"])
@@ -63,6 +47,7 @@ def test_a_camera_without_a_known_pose_and_other_sensors_are_left_out(
     getattr(written, f"write_{form}")(tmp_path)
     rigs = read_colmap_rigs(tmp_path, binary=form == "binary")
     assert list(rigs.cams_from_rig[7]) == [1]
+    assert len(rig_files(tmp_path, binary=form == "binary")) == 2
 
 
 @pytest.mark.parametrize("name", ["rigs.bin", "frames.bin"])

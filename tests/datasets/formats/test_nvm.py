@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from kapture.io.records import TransferAction
 from megloc_twins.model_files import write_nvm
-from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.datasets.formats.nvm import NvmModel, read_nvm
 from megloc_kapture.datasets.formats.sparse_points import SparsePoints
 from megloc_kapture.datasets.formats.text_lines import TextFile
 from megloc_kapture.errors import DataError
+from megloc_kapture.io.images import write_image
 
 SAMPLE = "kapture_samples/Aachen-Day-Night"
 
@@ -43,14 +43,6 @@ def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
 def file(path: Path, lines: list[str], end: str = "\n") -> Path:
     path.write_bytes(end.join(["NVM_V3", "", *lines]).encode())
     return path
-
-
-def equal_points(first: SparsePoints, second: SparsePoints) -> bool:
-    return all(
-        getattr(first, name).dtype == getattr(second, name).dtype
-        and np.array_equal(getattr(first, name), getattr(second, name))
-        for name in ARRAYS
-    )
 
 
 def check_model(model: NvmModel) -> None:
@@ -201,29 +193,24 @@ def random_model(seed: int, num_images: int = 7, num_points: int = 60) -> NvmMod
 
 
 @pytest.mark.usefixtures("small_blocks")
-def test_a_model_comes_back_exactly(tmp_path: Path) -> None:
-    written = random_model(1)
-    write_nvm(tmp_path / "m.nvm", written)
-    [read] = read_nvm(tmp_path / "m.nvm")
-    assert read.names == written.names
+def test_what_is_written_comes_back_exactly_and_kapture_reads_it(tmp_path: Path) -> None:
+    model, path = random_model(2), tmp_path / "m.nvm"
+    write_nvm(path, model)
+    [read] = read_nvm(path)
+    assert read.names == model.names
     for name in ("focal_px", "centers", "k_colmap"):
-        assert np.array_equal(getattr(read, name), getattr(written, name))
-    assert np.allclose(read.quat_wxyz, written.quat_wxyz, rtol=0, atol=1e-15)
-    assert equal_points(read.points, written.points)
-
-
-def test_what_we_write_kapture_reads(tmp_path: Path) -> None:
-    model = random_model(2)
-    write_nvm(tmp_path / "m.nvm", model)
+        assert np.array_equal(getattr(read, name), getattr(model, name))
+    assert np.allclose(read.quat_wxyz, model.quat_wxyz, rtol=0, atol=1e-15)
+    for name in ARRAYS:
+        ours, theirs = getattr(read.points, name), getattr(model.points, name)
+        assert ours.dtype == theirs.dtype and np.array_equal(ours, theirs)
     # COLMAP's exporter leaves blanks in blank lines, which kapture does not take for blank
-    text = (tmp_path / "m.nvm").read_text()
+    text = path.read_text()
     assert text.startswith("NVM_V3 \n \n7  \n")
-    (tmp_path / "m.nvm").write_text(text.replace("\n \n", "\n\n"))
+    path.write_text(text.replace("\n \n", "\n\n"))
     for name in model.names:
-        image = tmp_path / "images" / name
-        image.parent.mkdir(parents=True, exist_ok=True)
-        Image.new("L", (64, 48)).save(image)
-    data = import_with_kapture(tmp_path / "m.nvm", tmp_path / "images", tmp_path / "kapture")
+        write_image(tmp_path / "images" / name, np.zeros((48, 64, 3), np.uint8))
+    data = import_with_kapture(path, tmp_path / "images", tmp_path / "kapture")
     check_against_kapture([model], data, tmp_path / "kapture")
 
 

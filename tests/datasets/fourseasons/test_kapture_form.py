@@ -51,17 +51,11 @@ def official(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def converted(official: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def downloaded(official: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("kapture") / "4seasons"
     fourseasons_with_kapture(official, root)
     shutil.copyfile(official / RELOCALIZATION, root / RELOCALIZATION)
     return root
-
-
-@pytest.fixture
-def root(converted: Path, tmp_path: Path) -> Path:
-    """A copy to be changed."""
-    return Path(shutil.copytree(converted, tmp_path / "root", symlinks=True))
 
 
 def on_earth(dataset: OfficialDataset) -> dict[str, RigidTransform]:
@@ -88,8 +82,8 @@ def assert_same(found: OfficialDataset, expected: OfficialDataset) -> None:
         np.testing.assert_allclose(mine.center(), pose.center(), rtol=0, atol=1e-6)
 
 
-def test_the_same_dataset_in_both_forms(official: Path, converted: Path, tmp_path: Path) -> None:
-    found = read(converted)
+def test_the_same_dataset_in_both_forms(official: Path, downloaded: Path, tmp_path: Path) -> None:
+    found = read(downloaded)
     assert_same(found, read(official))
     assert len(found.relocalization) == 2
     # small numbers in a frame whose z is up
@@ -105,17 +99,17 @@ def test_the_same_dataset_in_both_forms(official: Path, converted: Path, tmp_pat
             assert folder.image_path(name).samefile(official / name)
 
 
-def test_recordings_in_the_root(official: Path, converted: Path, tmp_path: Path) -> None:
+def test_recordings_in_the_root(official: Path, downloaded: Path, tmp_path: Path) -> None:
     for name in (DAY, SNOW):
-        shutil.copytree(converted / "records" / name, tmp_path / name, symlinks=True)
+        shutil.copytree(downloaded / "records" / name, tmp_path / name, symlinks=True)
     shutil.copyfile(official / RELOCALIZATION, tmp_path / DAY / RELOCALIZATION)
     assert_same(read(tmp_path), read(official))
 
 
-def test_input_files_are_what_is_read(converted: Path) -> None:
-    files = list(FourSeasons().input_files(converted))
+def test_input_files_are_what_is_read(downloaded: Path) -> None:
+    files = list(FourSeasons().input_files(downloaded))
     assert all(path.is_file() for path in files) and len(set(files)) == len(files)
-    names = {str(path.relative_to(converted)) for path in files}
+    names = {str(path.relative_to(downloaded)) for path in files}
     sensors = f"records/{SNOW}/sensors"
     assert f"{sensors}/records_data/undistorted_images/cam1/{QUERY_TIMES[0]}.png" in names
     assert {RELOCALIZATION, f"{sensors}/trajectories.txt"} <= names

@@ -57,12 +57,6 @@ def downloaded(official: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     return root
 
 
-@pytest.fixture
-def root(downloaded: Path, tmp_path: Path) -> Path:
-    """A copy to be changed."""
-    return Path(shutil.copytree(downloaded, tmp_path / "root", symlinks=True))
-
-
 @pytest.mark.parametrize("depth", [True, False])
 def test_the_same_dataset_in_both_forms(official: Path, downloaded: Path, depth: bool) -> None:
     found, expected = read(downloaded, depth=depth), read(official, depth=depth)

@@ -58,27 +58,6 @@ def test_other_names_are_refused(name: str) -> None:
         parse_cutout_name(name)
 
 
-@pytest.mark.parametrize(
-    ("yaw", "pitch", "forward", "right"),
-    [
-        (0, 0, (-1, 0, 0), (0, 1, 0)),
-        (90, 0, (0, 1, 0), (1, 0, 0)),
-        (180, 0, (1, 0, 0), (0, -1, 0)),
-        (270, 0, (0, -1, 0), (-1, 0, 0)),
-        (0, 30, (-np.cos(np.pi / 6), 0, 0.5), (0, 1, 0)),
-        (90, -30, (0, np.cos(np.pi / 6), -0.5), (1, 0, 0)),
-    ],
-)
-def test_where_cutouts_look(
-    yaw: int, pitch: int, forward: tuple[float, ...], right: tuple[float, ...]
-) -> None:
-    pose = Cutout("DUC", "000", yaw, pitch).cam_from_scan()
-    rotation = pose.rotation_matrix()
-    np.testing.assert_allclose(rotation @ forward, (0, 0, 1), atol=1e-12)
-    np.testing.assert_allclose(rotation @ right, (1, 0, 0), atol=1e-12)
-    assert pose.translation == (0, 0, 0)
-
-
 def test_the_second_matrix_counts(path: Path) -> None:
     for text in (TRANSFORMATION, f"what it says:{TRANSFORMATION}\nfitness 0.1\n"):
         path.write_text(text)

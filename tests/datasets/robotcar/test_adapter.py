@@ -28,16 +28,10 @@ PER_CAMERA = {"dawn": 483, "night": 438, "rain": 421}  # as published
 
 
 @pytest.fixture(scope="module")
-def official(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def downloaded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("robotcar") / "RobotCar-Seasons"
     write_layout(root)
     return root
-
-
-@pytest.fixture
-def root(official: Path, tmp_path: Path) -> Path:
-    """A copy to be broken."""
-    return Path(shutil.copytree(official, tmp_path / "root"))
 
 
 def read(root: Path, **options: object) -> OfficialDataset:
@@ -52,9 +46,9 @@ def scored(dataset: OfficialDataset) -> set[str]:
     return {name for name, group in dataset.groups.items() if group.scored}
 
 
-def test_it_is_a_registered_plugin(official: Path) -> None:
+def test_it_is_a_registered_plugin(downloaded: Path) -> None:
     adapter = load_plugin(DATASETS, "robotcar", {"version": 1})
-    assert isinstance(adapter, RobotCar) and len(adapter.read(official).names) == 4
+    assert isinstance(adapter, RobotCar) and len(adapter.read(downloaded).names) == 4
     with pytest.raises(PluginError, match="queries"):
         load_plugin(DATASETS, "robotcar", {"queries": "some"})
     with pytest.raises(PluginError, match="train_as_map leaves nothing"):
@@ -62,8 +56,8 @@ def test_it_is_a_registered_plugin(official: Path) -> None:
 
 
 @pytest.mark.parametrize("model", ["auto", "merged", "individual"])
-def test_map(official: Path, model: str) -> None:
-    dataset = read(official, model=model)
+def test_map(downloaded: Path, model: str) -> None:
+    dataset = read(downloaded, model=model)
     mapping = dataset.mapping
     assert len(mapping.records_camera) == 9
     for number in REFERENCE:
@@ -86,8 +80,8 @@ def test_map(official: Path, model: str) -> None:
             np.testing.assert_allclose(back, [0.0, 0.0, 1.0], atol=1e-12)
 
 
-def test_version_2(official: Path) -> None:
-    dataset = read(official)
+def test_version_2(downloaded: Path) -> None:
+    dataset = read(downloaded)
     assert len(dataset.query.records_camera) == 12
     assert not dataset.query.trajectories
     assert dict(dataset.names) == {query_name(12): f"rear/{ts(12)}.png"}
@@ -107,8 +101,8 @@ def test_version_2(official: Path) -> None:
     } | per_camera
 
 
-def test_version_1(official: Path) -> None:
-    dataset = read(official, version=1)
+def test_version_1(downloaded: Path) -> None:
+    dataset = read(downloaded, version=1)
     # in the order of the lists, location by location
     order = (11, 13, 12, 14)
     assert list(dataset.names.items()) == [(query_name(n), f"rear/{ts(n)}.jpg") for n in order]
@@ -117,7 +111,7 @@ def test_version_1(official: Path) -> None:
     assert truth is not None and len(truth.poses()) == 2  # half of it is public all the same
     for options in ({"train_as_map": True}, {"queries": "test"}):
         with pytest.raises(OptionError, match="version 2"):
-            read(official, version=1, **options)
+            read(downloaded, version=1, **options)
 
 
 def test_version_is_told_by_the_test_list(root: Path) -> None:
@@ -129,8 +123,8 @@ def test_version_is_told_by_the_test_list(root: Path) -> None:
     assert dataset.query_gt is not None and not dataset.query_gt.trajectories
 
 
-def test_conditions_locations_and_priors(official: Path) -> None:
-    dataset = read(official)
+def test_conditions_locations_and_priors(downloaded: Path) -> None:
+    dataset = read(downloaded)
     reference = dataset.groups[f"overcast-reference/left/{ts(3)}.jpg"]
     assert (reference.condition, reference.location) == ("overcast-reference", "002/left")
     query = dataset.groups[query_name(13, "right")]
@@ -174,17 +168,17 @@ def test_a_query_of_two_locations(root: Path) -> None:
     assert len(dataset.query.records_camera) == 12
 
 
-def test_part_of_the_queries(official: Path) -> None:
+def test_part_of_the_queries(downloaded: Path) -> None:
     for queries, numbers, published in (("train", TRAIN, 2), ("test", TEST, 0)):
-        dataset = read(official, queries=queries)
+        dataset = read(downloaded, queries=queries)
         expected = {query_name(n, camera) for n in numbers for camera in CAMERAS}
         assert set(dataset.query.image_names()) == expected == set(dataset.priors)
         assert dataset.query_gt is not None and len(dataset.query_gt.poses()) == published
         assert len(dataset.names) == (queries == "test")
 
 
-def test_training_images_join_the_map_only_when_asked(official: Path) -> None:
-    dataset = read(official, train_as_map=True)
+def test_training_images_join_the_map_only_when_asked(downloaded: Path) -> None:
+    dataset = read(downloaded, train_as_map=True)
     assert len(dataset.mapping.records_camera) == 9 + 2
     pose = dataset.mapping.cam_from_world(query_name(13))
     assert pose is not None
@@ -197,10 +191,10 @@ def test_training_images_join_the_map_only_when_asked(official: Path) -> None:
     assert dataset.query_gt is not None and not dataset.query_gt.poses()
 
 
-def test_what_is_written(official: Path, tmp_path: Path) -> None:
-    before, out = sorted(official.rglob("*")), tmp_path / "out"
-    write_official(read(official), out)
-    assert (out / "mapping/sensors/records_data").readlink() == official.resolve() / "images"
+def test_what_is_written(downloaded: Path, tmp_path: Path) -> None:
+    before, out = sorted(downloaded.rglob("*")), tmp_path / "out"
+    write_official(read(downloaded), out)
+    assert (out / "mapping/sensors/records_data").readlink() == downloaded.resolve() / "images"
     for part in ("mapping", "query"):
         folder = KaptureFolder(out / part)
         folder.validate(deep=True)
@@ -209,7 +203,7 @@ def test_what_is_written(official: Path, tmp_path: Path) -> None:
     tables = (read_groups(out / "megloc"), read_priors(out / "megloc"))
     assert list(map(len, tables)) == [9 + 12, 12]
     assert read_protocol(out / "megloc").dataset == "robotcar"
-    assert sorted(official.rglob("*")) == before
+    assert sorted(downloaded.rglob("*")) == before
 
 
 def test_truth_that_lies_beside_is_joined_with_the_public_one(root: Path) -> None:
@@ -392,12 +386,12 @@ TEXTS = [
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.sampled_from(TEXTS), EDITS, st.booleans())
 def test_mutated_layouts_are_imported_or_refused(
-    official: Path, tmp_path: Path, file: str, edits: list[Edit], allow_missing: bool
+    downloaded: Path, tmp_path: Path, file: str, edits: list[Edit], allow_missing: bool
 ) -> None:
     root, out = tmp_path / "mutated", tmp_path / "out"
     if not root.exists():
-        shutil.copytree(official, root)
-    original = (official / file).read_bytes()
+        shutil.copytree(downloaded, root)
+    original = (downloaded / file).read_bytes()
     (root / file).write_bytes(changed(original, edits))
     shutil.rmtree(out, ignore_errors=True)
     try:

@@ -39,12 +39,6 @@ def downloaded(official: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     return robotcar_with_kapture(official, place, (8, 6))
 
 
-@pytest.fixture
-def root(downloaded: Path, tmp_path: Path) -> Path:
-    """A copy to be changed."""
-    return Path(shutil.copytree(downloaded, tmp_path / "root", symlinks=True))
-
-
 def read(root: Path, **options: object) -> OfficialDataset:
     return RobotCar(RobotCarOptions(**options)).read(root)  # type: ignore[arg-type]
 

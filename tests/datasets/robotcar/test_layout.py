@@ -6,11 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
-from megloc_kapture.datasets.formats.text_lines import read_rigid_matrix
 from megloc_kapture.datasets.robotcar.layout import (
     ImageKey,
     parse_image,
@@ -22,13 +19,6 @@ from megloc_kapture.datasets.robotcar.layout import (
 from megloc_kapture.errors import DataError
 
 INTRINSICS = "fx 400.000000\nfy 400.000000\ncx 508.222931\ncy 498.187378\n"
-# the published matrix of the rear camera
-EXTRINSICS = (
-    "-0.999802,-0.011530,-0.016233,0.060209\n"
-    "-0.015184,0.968893,0.247013,0.153691\n"
-    "0.012880,0.247210,-0.968876,-2.086142\n"
-    "0,0,0,1\n"
-)
 LOCATION = "dawn/left/1418721355075498.jpg\ndawn/rear/1418721355075498.jpg\n"
 TEST = "rear/1418721355075498.png\nrear/1418721354984638.png\n"
 TRAIN = (
@@ -67,46 +57,6 @@ def test_intrinsics_in_any_order(tmp_path: Path) -> None:
     lines = INTRINSICS.splitlines()
     for order in (lines, lines[::-1], lines[2:] + lines[:2]):
         assert read_intrinsics(written(tmp_path, "\n".join(order))) == expected
-
-
-def test_extrinsics_against_scipy(tmp_path: Path) -> None:
-    car_from_cam = read_rigid_matrix(written(tmp_path, EXTRINSICS))
-    matrix = np.array([[float(v) for v in row.split(",")] for row in EXTRINSICS.splitlines()])
-    # both take the nearest rotation of one with six decimals, by their own measure of near
-    turn = Rotation.from_matrix(matrix[:3, :3])
-    found = Rotation.from_quat(car_from_cam.quat_wxyz, scalar_first=True)
-    assert np.degrees((turn.inv() * found).magnitude()) < 1e-4
-    assert car_from_cam.translation == tuple(matrix[:3, 3])
-    # it looks back and a little down, from behind the car's origin
-    forward = car_from_cam.rotation_matrix()[:, 2]
-    np.testing.assert_allclose(forward, [-0.016, 0.247, -0.969], atol=1e-3)
-
-
-def test_train_poses_are_inverted(tmp_path: Path) -> None:
-    rng = np.random.default_rng(3)
-    turns, centers = Rotation.random(20, rng=rng), rng.uniform(-1e4, 1e4, (20, 3))
-    rows = []
-    for number, (turn, center) in enumerate(zip(turns, centers, strict=True)):
-        matrix = np.vstack([np.column_stack([turn.as_matrix(), center]), [0, 0, 0, 1]])
-        rows.append(f"dawn/rear/{number}.png " + " ".join(map(repr, matrix.ravel().tolist())))
-    poses = read_train_poses(written(tmp_path, "\n".join(rows)))
-    assert [pose.line.number for pose in poses] == list(range(1, 21))
-    for pose, center, turn in zip(poses, centers, turns, strict=True):
-        np.testing.assert_allclose(pose.cam_from_world.center(), center, atol=1e-9)
-        found = Rotation.from_quat(pose.cam_from_world.quat_wxyz, scalar_first=True)
-        assert np.degrees((found * turn).magnitude()) < 1e-9
-
-
-def test_lists_keep_their_order_and_texts(tmp_path: Path) -> None:
-    listed = read_test_list(written(tmp_path, TEST))
-    assert [entry.line.text for entry in listed] == TEST.split()
-    assert [entry.image.condition for entry in listed] == ["", ""]
-    assert [entry.line.number for entry in listed] == [1, 2]
-    # a list that names the conditions is understood too
-    (entry,) = read_test_list(written(tmp_path, "dawn/rear/5.jpg"))
-    assert entry.image == ImageKey("dawn", "rear", "5")
-    location = read_query_location(written(tmp_path, LOCATION))
-    assert [entry.image.camera for entry in location] == ["left", "rear"]
 
 
 @pytest.mark.parametrize(
