@@ -11,6 +11,7 @@ import sys
 import tarfile
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -54,6 +55,7 @@ from megloc_kapture.io.tables import (
 from megloc_kapture.io.weights.containers import read_checkpoint
 
 BUNDLE = Path(__file__).parent.parent / "io/weights/data/tensor_bundle/graph.ckpt-7"
+PARTS = (".index", ".data-00000-of-00001")
 VERSION = "# kapture format: 1.1\n"
 POSE = "0.5, 0.5, 0.5, 0.5, 1.0, -2.0, 3.0"
 CELL = "1.0 0.0 0.0 0.0 1.0 -2.0 3.0"
@@ -150,6 +152,11 @@ def read_tar(path: Path) -> None:
         blobs.read(name)
 
 
+def beside(read: Callable[[Path], object]) -> Callable[[Path], object]:
+    """A reader that is given the file's folder."""
+    return lambda path: read(path.parent)
+
+
 def read_mats(path: Path) -> None:
     content = path.read_bytes()
     with suppress(DataError):
@@ -158,9 +165,13 @@ def read_mats(path: Path) -> None:
     assert found.dtype == np.float64 and found.size * 8 <= len(content) * 1032
 
 
+def part(ending: str) -> bytes:
+    """A file of TensorFlow's checkpoint."""
+    return BUNDLE.with_name(BUNDLE.name + ending).read_bytes()
+
+
 def read_weights(path: Path) -> None:
-    data = BUNDLE.with_name(f"{BUNDLE.name}.data-00000-of-00001").read_bytes()
-    read_checkpoint(path.read_bytes(), str(path), lambda _: data)
+    read_checkpoint(path.read_bytes(), str(path), lambda _: part(PARTS[1]))
 
 
 def read_pairs_again(path: Path) -> None:
@@ -175,9 +186,7 @@ def rows(observations: dict[str, Observations]) -> dict[str, list[tuple[int, str
         kind: [
             (point, found.image_names[image], keypoint)
             for point, image, keypoint in zip(
-                found.point_ids.tolist(),
-                found.image_ids.tolist(),
-                found.keypoint_ids.tolist(),
+                *(a.tolist() for a in (found.point_ids, found.image_ids, found.keypoint_ids)),
                 strict=True,
             )
         ]
@@ -193,24 +202,15 @@ def outcome(read: Callable[..., Any], path: Path, **options: int) -> Any:
         return None
 
 
-def read_observations_twice(path: Path) -> None:
+def read_twice(
+    read: Callable[..., Any], comparable: Callable[[Any], Any], path: Path, **options: int
+) -> None:
     """By both readers, the compiled one in chunks of a few lines: they agree on anything."""
-    plain = outcome(read_observations, path, large_bytes=PLAIN)
-    compiled = outcome(read_observations, path, large_bytes=LARGE, chunk_bytes=50)
+    plain = outcome(read, path, large_bytes=PLAIN)
+    compiled = outcome(read, path, large_bytes=LARGE, **options)
     assert (plain is None) == (compiled is None)
-    if plain is not None:
-        assert rows(plain) == rows(compiled)
-    read_observations(path)
-
-
-def read_points_twice(path: Path) -> None:
-    """By both readers: they agree on anything."""
-    plain = outcome(read_points3d, path, large_bytes=PLAIN)
-    pandas = outcome(read_points3d, path, large_bytes=LARGE)
-    assert (plain is None) == (pandas is None)
-    if plain is not None:
-        assert np.array_equal(plain.view(np.uint64), pandas.view(np.uint64))
-    read_points3d(path)
+    assert plain is None or comparable(plain) == comparable(compiled)
+    read(path)
 
 
 TENSORS = {"a.weight": torch.arange(6.0).reshape(2, 3), "a.count": torch.tensor(7)}
@@ -228,9 +228,15 @@ READERS = {
         for name, content in SENSORS.items()
     },
     "observations": Reader(
-        "observations.txt", b"0, t, a b.jpg, 1, c, 2\n# c\n5, u, c, 07\n", read_observations_twice
+        "observations.txt",
+        b"0, t, a b.jpg, 1, c, 2\n# c\n5, u, c, 07\n",
+        partial(read_twice, read_observations, rows, chunk_bytes=50),
     ),
-    "points": Reader("points3d.txt", b"# X, Y, Z\n1.5,-2e3,.5\n1,2,3\n", read_points_twice),
+    "points": Reader(
+        "points3d.txt",
+        b"# X, Y, Z\n1.5,-2e3,.5\n1,2,3\n",
+        partial(read_twice, read_points3d, lambda points: points.view(np.uint64).tolist()),
+    ),
     "covariances": Reader(
         "reconstruction/point_covariances.npy",
         saved_array(),
@@ -283,23 +289,19 @@ READERS = {
         lambda path: read_mask_counts(path.parent.parent.parent, "t"),
     ),
     "groups": Reader(
-        "groups.csv",
-        b"image,condition,frame,location,scored\na,day,,,1\n",
-        lambda path: read_groups(path.parent),
+        "groups.csv", b"image,condition,frame,location,scored\na,day,,,1\n", beside(read_groups)
     ),
-    "priors": Reader(
-        "priors.csv", b"query,permitted\na,b\na,c\n", lambda path: read_priors(path.parent)
-    ),
-    "names": Reader("names.csv", b"image,name\na,b\n", lambda path: read_names(path.parent)),
+    "priors": Reader("priors.csv", b"query,permitted\na,b\na,c\n", beside(read_priors)),
+    "names": Reader("names.csv", b"image,name\na,b\n", beside(read_names)),
     "world": Reader(
         "world.json",
         b'{"official_from_local": {"quat_wxyz": [0.6, 0, 0.8, 0], "scale": 2}, "unit": "m"}',
-        lambda path: read_world(path.parent),
+        beside(read_world),
     ),
     "protocol": Reader(
         "protocol.json",
         b'{"dataset": "x", "thresholds": [[0.25, 2.0], [5, null]], "pools": {"a": ["b"]}}',
-        lambda path: read_protocol(path.parent),
+        beside(read_protocol),
     ),
     "mat": Reader("x.mat", saved_mat(compressed=False), read_mats),
     "mat, packed": Reader("x.mat", saved_mat(compressed=True), read_mats),
@@ -312,18 +314,9 @@ READERS = {
     "npz": Reader("x.npz", saved_npz(), read_weights),
     "onnx": Reader("x.onnx", saved_onnx(), read_weights),
     "NetVLAD": Reader("x.mat", saved_mat(compressed=True), read_weights),
-    "TensorFlow": Reader(
-        "x.index", BUNDLE.with_name("graph.ckpt-7.index").read_bytes(), read_weights
-    ),
+    "TensorFlow": Reader("x.index", part(".index"), read_weights),
     "TensorFlow in a tar": Reader(
-        "x.tar",
-        saved_tar(
-            {
-                f"g{ending}": BUNDLE.with_name(BUNDLE.name + ending).read_bytes()
-                for ending in (".index", ".data-00000-of-00001")
-            }
-        ),
-        read_weights,
+        "x.tar", saved_tar({f"g{e}": part(e) for e in PARTS}), read_weights
     ),
 }
 
@@ -391,8 +384,6 @@ def test_many_mutations(name: str, tmp_path: Path, edits: list[Edit]) -> None:
 def test_random_bytes(name: str, tmp_path: Path, content: bytes, ended: bool) -> None:
     survives(READERS[name], tmp_path, READERS[name].whole * ended + content)
 
-
-# ------------------------------------- files nearly right, to reach deep into both readers
 
 FIELDS = st.sampled_from(
     ["0", "1", "17", " 5 ", "007", "-1", "x", "", "t", "u u", "a.jpg", "b/c d.jpg", "é", "..", "#"]
