@@ -8,6 +8,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from aachen_files import (
+    ADDED,
+    DATABASE,
+    DAY,
+    DAY_LIST,
+    LIST,
+    MODEL,
+    NIGHT,
+    NIGHT_LIST,
+    NVM,
+    SEQUENCE,
+    UNLISTED,
+    picture,
+    write_v1_0,
+    write_v1_1,
+)
 from hostile import EDITS, Edit, changed
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -18,72 +34,17 @@ from megloc_kapture.datasets.aachen.adapter import Aachen, AachenOptions
 from megloc_kapture.datasets.official import OfficialDataset, write_official
 from megloc_kapture.errors import DataError, PluginError
 from megloc_kapture.io.dataset_tables import read_groups, read_names, read_protocol
-from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import DATASETS
 from megloc_kapture.values import Camera, RigidTransform
 
-DATABASE = ("db/7.jpg", "db/1228.jpg", "db/3.jpg")
-SIZES = {"db/7.jpg": (8, 6), "db/1228.jpg": (6, 8), "db/3.jpg": (8, 6)}
-SEQUENCE = ("sequences/nexus4_sequences/sequence_1/a.jpg", "sequences/gopro3_undistorted/b.png")
-DAY = tuple(f"query/day/{name}.jpg" for name in ("nexus4/IMG_2", "milestone/m_1", "nexus4/IMG_1"))
-NIGHT = ("query/night/nexus5x/IMG_9.jpg",)
-ADDED = ("query/night/nexus5x_additional_night/IMG_8.jpg",)
-UNLISTED = "query/day/nexus4/IMG_3.jpg"
 QUERY_CAMERA = Camera("SIMPLE_RADIAL", 8, 6, (7.5, 4.0, 3.0, -0.0353019))
-
-MODEL, LIST = "3D-models/aachen_cvpr2018_db.nvm", "3D-models/database_intrinsics.txt"
-DAY_LIST = "queries/day_time_queries_with_intrinsics.txt"
-NIGHT_LIST = "queries/night_time_queries_with_intrinsics.txt"
-
-# a pose that tells centre from translation, and a distortion whose sign shows
-NVM = """NVM_V3\x20
-
-3
-db/7.jpg 10.5 1 0 0 0 2.0 0.0 -5.0 0.08 0
-db/1228.jpg 11 0 0 0 1 1.0 2.0 3.0 -0.5 0
-db/3.jpg 12 0.5 0.5 0.5 0.5 700.0 -8.0 -40.0 0.25 0
-
-2
-2 0 5 255 0 9 2 0 4 4.5 3.25 2 1 1 2
-1 1 1 1 2 3 2 2 7 5 5 1 0 3 3
-"""
 POSES = {
     "db/7.jpg": RigidTransform((1.0, 0.0, 0.0, 0.0), (-2.0, 0.0, 5.0)),
     "db/1228.jpg": RigidTransform((0.0, 0.0, 0.0, 1.0), (1.0, 2.0, -3.0)),
     "db/3.jpg": RigidTransform((0.5, 0.5, 0.5, 0.5), (40.0, -700.0, 8.0)),
 }
-INTRINSICS = """db/3.jpg SIMPLE_RADIAL 8 6 12 4.25 3 -0.25
-db/7.jpg SIMPLE_RADIAL 8 6 10.5 4 3 -0.08
-db/1228.jpg SIMPLE_RADIAL 6 8 11 3 4 0.5"""
-CAMERAS = """# Camera list
-9 SIMPLE_RADIAL 8 6 12 4.25 3 -0.25
-2 SIMPLE_RADIAL 6 8 11 3 4 0.5
-5 PINHOLE 8 6 9 9 4 3
-"""
-# the identity's second line is empty; 9 and 5 are shared
-IMAGES = f"""# Image list
-4 1 0 0 0 -2 0 5 9 db/7.jpg
-
-30 0 0 0 1 1 2 -3 2 db/1228.jpg
-1 2 -1
-2 0.5 0.5 0.5 0.5 40 -700 8 9 db/3.jpg
-
-11 1 0 0 0 0 0 1 5 {SEQUENCE[0]}
-
-10 1 0 0 0 0 0 2 5 {SEQUENCE[1]}
-
-"""
-
-
-def put(path: Path, text: str) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text)
-
-
-def picture(path: Path, size: tuple[int, int] = (8, 6)) -> None:
-    write_image(path, np.full((size[1], size[0], 3), 99, np.uint8))
 
 
 def edit(path: str, old: str, new: str) -> Callable[[Path], None]:
@@ -95,40 +56,16 @@ def edit(path: str, old: str, new: str) -> Callable[[Path], None]:
     return change
 
 
-def query_list(names: tuple[str, ...]) -> str:
-    # the published lists end without a line end
-    return "\n".join(f"{name} SIMPLE_RADIAL 8 6 7.5 4 3 -0.0353019" for name in names)
-
-
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
     """Version 1.0."""
-    root = tmp_path / "Aachen-Day-Night"
-    put(root / MODEL, NVM)
-    put(root / LIST, INTRINSICS)
-    put(root / DAY_LIST, query_list(DAY))
-    put(root / NIGHT_LIST, query_list(NIGHT))
-    # not what the adapter reads, and not even valid
-    put(root / "queries/day_time_queries_without_intrinsics.txt", "\n".join(DAY))
-    put(root / "3D-models/aachen_cvpr2018_db.list.txt", "\n".join(DATABASE))
-    for name in DATABASE:
-        picture(root / "images_upright" / name, SIZES[name])
-    for name in (*DAY, *NIGHT, UNLISTED):
-        picture(root / "images_upright" / name)
-    return root
+    return write_v1_0(tmp_path / "Aachen-Day-Night")
 
 
 @pytest.fixture
 def root11(root: Path) -> Path:
     """Version 1.1, in the same tree."""
-    for name in (*SEQUENCE, *ADDED):
-        picture(root / "images_upright" / name)
-    put(root / NIGHT_LIST, query_list(ADDED + NIGHT))
-    model = root / "3D-models/aachen_v_1_1"
-    put(model / "cameras.txt", CAMERAS)
-    put(model / "images.txt", IMAGES)
-    put(model / "points3D.txt", "")
-    return root
+    return write_v1_1(root)
 
 
 def read(root: Path, **options: object) -> OfficialDataset:
@@ -189,7 +126,7 @@ def test_version_11(root11: Path, tmp_path: Path) -> None:
     for name, camera_id in cameras.items():
         assert mapping.record_of(name)[1] == f"camera_{camera_id:05d}"
     assert len({timestamp for timestamp, _ in mapping.records_camera}) == 5
-    assert mapping.camera_of(SEQUENCE[0]) == Camera("PINHOLE", 8, 6, (9, 9, 4, 3))
+    assert mapping.camera_of(SEQUENCE[0]) == Camera("PINHOLE", 8, 6, (9.123456789012345, 9, 4, 3))
     assert query.image_names() == sorted(DAY + NIGHT + ADDED)
     theirs = kapture_from_dir(str(out / "mapping"))
     assert (len(theirs.records_camera.data_list()), len(theirs.sensors)) == (5, 3)

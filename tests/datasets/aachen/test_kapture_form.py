@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from aachen_files import MODEL, write_v1_0, write_v1_1
 from kapture import flatten
 from kapture.io.csv import kapture_from_dir
 from kapture_forms import (
@@ -22,54 +23,14 @@ from scipy.spatial.transform import Rotation
 from megloc_kapture.datasets.aachen.adapter import Aachen, AachenOptions
 from megloc_kapture.datasets.official import OfficialDataset, write_official
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.io.images import write_image
 from megloc_kapture.pipeline.datasets import choose_dataset
-
-import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
 
 PARTS = ("query_day", "query_night")
 
 
-# shared cameras, ids without order, decimals that need all digits
-CAMERAS = """9 SIMPLE_RADIAL 8 6 12.1 4.25 3 -0.0353019
-2 SIMPLE_RADIAL 6 8 11 3 4 0.123456789012345
-"""
-IMAGES = """4 0.5 -0.5 0.5 0.5 -652.833568325199 84.70595670766824 5.1 9 db/7.jpg
-
-30 0.0 0.6 0.0 0.8 1.3 2.1 -3.7 2 db/3.jpg
-
-11 1 0 0 0 0.1 0.2 0.3 9 sequences/nexus4_sequences/sequence_1/b.jpg
-
-10 1 0 0 0 0 0 2 9 sequences/gopro3_undistorted/a.jpg
-
-"""
-DAY = tuple(f"query/day/{name}.jpg" for name in ("nexus4/IMG_2", "milestone/m_1", "nexus4/IMG_1"))
-NIGHT = tuple(
-    f"query/night/nexus5x{name}.jpg"
-    for name in ("_additional_night/IMG_8", "/IMG_9", "_additional_night/IMG_7", "/IMG_5")
-)
-
-
 @pytest.fixture(scope="module")
 def official(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("official") / "Aachen"
-    model = root / "3D-models" / "aachen_v_1_1"
-    for folder in (model, root / "queries", root / "text"):
-        folder.mkdir(parents=True)
-    for name, text in (("cameras", CAMERAS), ("images", IMAGES), ("points3D", "")):
-        (root / "text" / f"{name}.txt").write_text(text)
-    pycolmap.Reconstruction(root / "text").write_binary(model)
-    for when, names in (("day", DAY), ("night", NIGHT)):
-        lines = (
-            f"{name} SIMPLE_RADIAL 8 6 7.{number} 4 3 -0.0353019"
-            for number, name in enumerate(names)
-        )
-        (root / f"queries/{when}_time_queries_with_intrinsics.txt").write_text("\n".join(lines))
-    mapped = [line.split()[-1] for line in IMAGES.splitlines() if line]
-    for name in (*mapped, *DAY, *NIGHT):
-        shape = (8, 6, 3) if name == "db/3.jpg" else (6, 8, 3)
-        write_image(root / "images_upright" / name, np.full(shape, 99, np.uint8))
-    return root
+    return write_v1_1(write_v1_0(tmp_path_factory.mktemp("official") / "Aachen"))
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +45,7 @@ def read(root: Path, **options: object) -> OfficialDataset:
 
 def test_the_same_dataset_in_both_forms(official: Path, downloaded: Path, tmp_path: Path) -> None:
     expected, found = read(official), read(downloaded)
-    assert len(expected.names) == 7 and expected.protocol.pose_file_stem == "Aachen_v1_1"
+    assert len(expected.names) == 5 and expected.protocol.pose_file_stem == "Aachen_v1_1"
     assert_same_dataset(found, expected)
     assert_linked(found, tmp_path / "out", official / "images_upright")
     assert kapture_from_dir(str(tmp_path / "out" / "query")).trajectories is None
@@ -223,7 +184,7 @@ def test_the_sample_is_what_kapture_makes_of_it(sample: Path, tmp_path: Path) ->
     assert_same_kapture(out / "query", sample / "kapture/query")
     kapture_tool(
         "kapture_import_nvm",
-        *("-i", sample / "3D-models/aachen_cvpr2018_db.nvm", "-im", sample / "images_upright"),
+        *("-i", sample / MODEL, "-im", sample / "images_upright"),
         *("-o", tmp_path / "theirs", "--image_transfer", "skip"),
     )
     assert_same_kapture(out / "mapping", tmp_path / "theirs")
