@@ -255,14 +255,6 @@ def test_equal_to_a_stable_sort(
     np.testing.assert_array_equal(indices, np.where(expected == -np.inf, -1, there))
 
 
-def test_queries_come_in_parts() -> None:
-    scores = np.random.default_rng(0).normal(size=(6, 50)).astype(np.float32)
-    best = BestRows(6, 3)
-    best.add(4, 10, scores[4:])
-    best.add(0, 10, scores[:4])
-    np.testing.assert_array_equal(best.result()[0], np.argsort(-scores, axis=1)[:, :3] + 10)
-
-
 TOP = 10
 
 

@@ -29,13 +29,7 @@ from scipy.spatial.transform import Rotation
 from megloc_kapture.datasets.fourseasons.adapter import FourSeasons, FourSeasonsOptions
 from megloc_kapture.datasets.official import write_official
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.dataset_tables import (
-    RelocalizationPair,
-    read_groups,
-    read_priors,
-    read_protocol,
-    read_relocalization,
-)
+from megloc_kapture.io import dataset_tables as tables
 from megloc_kapture.io.images import read_depth_map
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import RigidTransform
@@ -70,25 +64,25 @@ def test_relocalization_files(root: Path, tmp_path: Path, day: str, snow: str, n
     write(root / name, f"{times[25]} {B + 5}\n{times[3]} {B + 5}\n")
     dataset = read(root)
     write_official(dataset, tmp_path / "out")
-    tables = tmp_path / "out/megloc"
+    written = tmp_path / "out/megloc"
     pose_file = Path(name).name
-    assert read_relocalization(tables) == [
-        RelocalizationPair(pose_file, image(day, times[25]), image(snow, B + 5)),
-        RelocalizationPair(pose_file, image(day, times[3]), image(snow, B + 5)),
+    assert tables.read_relocalization(written) == [
+        tables.RelocalizationPair(pose_file, image(day, times[25]), image(snow, B + 5)),
+        tables.RelocalizationPair(pose_file, image(day, times[3]), image(snow, B + 5)),
     ]
     # the images that are asked for, in the recordings that are meant
     assert times_of(dataset.query) == {B + 5}
     assert {n.split("/")[0] for n in dataset.mapping.image_names()} == {day}
     # 20 keyframes around each reference: 5 to 45, and 0 to 23
     near = sorted(image(day, t, c) for t in times[:46] for c in ("cam0", "cam1"))
-    assert read_priors(tables) == {
+    assert tables.read_priors(written) == {
         image(snow, B + 5, "cam0"): tuple(near),
         image(snow, B + 5, "cam1"): tuple(near),
     }
-    groups = read_groups(tables)
+    groups = tables.read_groups(written)
     assert groups[image(snow, B + 5)].scored
     assert not groups[image(snow, B + 5, "cam1")].scored
-    protocol = read_protocol(tables)
+    protocol = tables.read_protocol(written)
     assert protocol.pose_file == "mlad"
     assert protocol.thresholds == ((0.1, None), (0.2, None), (0.5, None))
     assert dataset.query_gt is None
