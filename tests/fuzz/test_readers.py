@@ -29,13 +29,7 @@ from safetensors.torch import save
 from scipy.io import savemat
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.dataset_tables import (
-    read_groups,
-    read_names,
-    read_priors,
-    read_protocol,
-    read_world,
-)
+from megloc_kapture.io import dataset_tables, tables
 from megloc_kapture.io.images import image_size, read_image_rgb
 from megloc_kapture.io.kapture import read_pairs, read_point_covariances, write_pairs
 from megloc_kapture.io.kapture.blobs import TarBlobs
@@ -44,14 +38,6 @@ from megloc_kapture.io.kapture.observations import Observations, read_observatio
 from megloc_kapture.io.kapture.points import read_points3d
 from megloc_kapture.io.kapture.sensors import read_kapture_data
 from megloc_kapture.io.mat_file import read_mat, read_mat_array
-from megloc_kapture.io.tables import (
-    read_clusters,
-    read_consistency,
-    read_mask_counts,
-    read_match_counts,
-    read_refinement,
-    read_status,
-)
 from megloc_kapture.io.weights.containers import read_checkpoint
 
 BUNDLE = Path(__file__).parent.parent / "io/weights/data/tensor_bundle/graph.ckpt-7"
@@ -258,50 +244,54 @@ READERS = {
         "status.csv",
         b"image,status,reason,num_matches,num_inliers,cluster,fallback,candidates,refinement,"
         b'remarks\na,localized,,9,8,0,none,"b,c",,\nd,failed,why,0,0,,rig,,,\n',
-        read_status,
+        tables.read_status,
     ),
     "clusters": Reader(
         "clusters.csv",
         b"image,cluster,chosen,num_matches,num_inliers,score,reason,images,cam_from_world\n"
         + f'a,0,yes,4,3,1.5,,"b,c",{CELL}\n'.encode(),
-        read_clusters,
+        tables.read_clusters,
     ),
     "refinement": Reader(
         "refinement.csv",
         b"image,method,accepted,reason,moved_m,turned_deg,measures,before\n"
         + f"a,icp,yes,,0.1,0.2,m=1;n=2,{CELL}\n".encode(),
-        read_refinement,
+        tables.read_refinement,
     ),
     "consistency": Reader(
         "map_consistency.csv",
         b"frame,method,images,contradicting,moved_m,turned_deg,moved_px,claimed_m,claimed_deg,"
         b"squared_distance,reason\n,icp,3,0,0.1,,1,2,3,4,\n",
-        read_consistency,
+        tables.read_consistency,
     ),
     "match counts": Reader(
         "local_features/t/match_counts.csv",
         b"image,other,matches,verified\na,b,3,2\n",
-        lambda path: read_match_counts(path.parent.parent.parent, "t"),
+        lambda path: tables.read_match_counts(path.parent.parent.parent, "t"),
     ),
     "mask counts": Reader(
         "local_features/t/masked.csv",
         b"image,num_masked\na,3\n",
-        lambda path: read_mask_counts(path.parent.parent.parent, "t"),
+        lambda path: tables.read_mask_counts(path.parent.parent.parent, "t"),
     ),
     "groups": Reader(
-        "groups.csv", b"image,condition,frame,location,scored\na,day,,,1\n", beside(read_groups)
+        "groups.csv",
+        b"image,condition,frame,location,scored\na,day,,,1\n",
+        beside(dataset_tables.read_groups),
     ),
-    "priors": Reader("priors.csv", b"query,permitted\na,b\na,c\n", beside(read_priors)),
-    "names": Reader("names.csv", b"image,name\na,b\n", beside(read_names)),
+    "priors": Reader(
+        "priors.csv", b"query,permitted\na,b\na,c\n", beside(dataset_tables.read_priors)
+    ),
+    "names": Reader("names.csv", b"image,name\na,b\n", beside(dataset_tables.read_names)),
     "world": Reader(
         "world.json",
         b'{"official_from_local": {"quat_wxyz": [0.6, 0, 0.8, 0], "scale": 2}, "unit": "m"}',
-        beside(read_world),
+        beside(dataset_tables.read_world),
     ),
     "protocol": Reader(
         "protocol.json",
         b'{"dataset": "x", "thresholds": [[0.25, 2.0], [5, null]], "pools": {"a": ["b"]}}',
-        beside(read_protocol),
+        beside(dataset_tables.read_protocol),
     ),
     "mat": Reader("x.mat", saved_mat(compressed=False), read_mats),
     "mat, packed": Reader("x.mat", saved_mat(compressed=True), read_mats),
